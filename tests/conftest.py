@@ -5,7 +5,7 @@ Hypothesis draws the same examples every time; HYPOTHESIS_PROFILE=explore draws 
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,15 @@ prepare_environment()
 settings.register_profile("steady", derandomize=True, deadline=None)
 settings.register_profile("explore", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "steady"))
+
+
+@pytest.fixture(autouse=True)
+def _forget_stores() -> Iterator[None]:
+    """Open no store that another test has opened."""
+    from pchem_pipeline.run.stage import open_store  # it brings numpy, which the environment must precede
+
+    yield
+    open_store.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The installed command, run as a user runs it: a process of its own, real files, another folder."""
+"""The command with real files in another folder."""
 
 import os
 import shutil
@@ -18,27 +18,21 @@ simulate:
 """
 
 
-@pytest.fixture(scope="session")
-def kernels(tmp_path_factory):
-    """One cache of compiled kernels for all commands of the session."""
-    return os.environ.get("NUMBA_CACHE_DIR") or str(tmp_path_factory.mktemp("kernels"))
-
-
 @pytest.fixture
-def shell(tmp_path, kernels):
+def shell(tmp_path):
     """Commands in an empty folder whose name has a space and a letter beyond ASCII."""
     folder = tmp_path / "mein Labor µ"
     folder.mkdir()
-    return Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    return Shell(folder)
 
 
 @pytest.fixture(scope="session")
-def camera(make_once, kernels):
+def camera(make_once):
     """A folder with ``frames/*.tif``, four files of 300 frames of 20 x 28 pixels, and ``truth.zarr``."""
 
     def simulate(folder):
         (folder / "camera.yaml").write_text(CAMERA)
-        Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("simulate", "camera.yaml")
+        Shell(folder).ok("simulate", "camera.yaml")
 
     return make_once("camera", simulate)
 
@@ -51,13 +45,13 @@ def frames(shell, camera):
 
 
 @pytest.fixture(scope="session")
-def finished(make_once, camera, kernels):
+def finished(make_once, camera):
     """An uninterrupted run of the camera's frames, tiles of 8 pixels; do not change it."""
 
     def run(folder):
         shutil.copytree(camera / "frames", folder / "frames")
         (folder / "run.yaml").write_text(RUN)
-        Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("run", "run.yaml")
+        Shell(folder).ok("run", "run.yaml")
 
     return make_once("finished", run) / "run.zarr"
 

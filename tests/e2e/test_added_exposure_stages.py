@@ -1,7 +1,5 @@
 """A sensor with pixels whose dark current blinks: after the search the fit gives their steady exposure."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +34,6 @@ def test_exposure_of_blinking_pixels_is_their_steady_one(tmp_path: Path) -> None
             "extended_replicates": 12,
             "candidates": ["dark_current_rts", "exposure_flicker"],
         },
-        "report": {"figure_formats": [], "dpi": 72},
         "compute": {"backend": "serial"},
     }
     path = tmp_path / "run.yaml"
@@ -57,7 +54,7 @@ def test_exposure_of_blinking_pixels_is_their_steady_one(tmp_path: Path) -> None
     assert 12 < blinks.sum() < 40
     added = store.read("model/0002/added_exposure")
     assert ((added > 0).any(axis=0) & blinks).sum() > 0.9 * blinks.sum()
-    run_stages(find_run(path), ["fit", "maps", "ensemble", "electrons", "report"], QUIET)
+    run_stages(find_run(path), ["fit", "maps", "ensemble", "electrons"], QUIET)
     after = store.read("fit/quanta_exposure")
     bias = [np.clip((h - truth) / stderr, -50, 50)[blinks].mean() for h in (before, after)]
     assert bias[0] > 10

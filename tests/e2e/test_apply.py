@@ -1,23 +1,21 @@
 """pchem apply: frames of a characterised camera in electrons, as a user gets them."""
 
 import json
-import os
 import re
 import shutil
 import signal
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import tifffile
 import xarray as xr
 import yaml
-from helpers.commands import Result, Shell
+from helpers.commands import Shell
 from helpers.known_camera import KnownCamera
 
-from pchem_pipeline.cli.app import main
 from pchem_pipeline.commands.apply.characterisation import read_calibration
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.histogram.count import histogram_frames
@@ -37,7 +35,7 @@ def the_camera():
 
 
 @pytest.fixture(scope="module")
-def night(make_once, kernels):
+def night(make_once):
     """A run of 2000 frames at 2 e-, and 500 of a scene, ``night.tif``; one pixel is dead."""
 
     def make(folder):
@@ -50,41 +48,17 @@ def night(make_once, kernels):
         tifffile.imwrite(folder / "night.tif", dn)
         np.save(folder / "electrons.npy", electrons)
         options = ["--store", "run.zarr", "--bit-depth", "14", "--integration-time", "1"]
-        Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok(
-            "run", "dark.tif", *options, "--until", "maps"
-        )
+        Shell(folder).ok("run", "dark.tif", *options, "--until", "maps")
 
     return make_once("night", make)
 
 
-@dataclass
-class Lab(Shell):
-    """The command in this process: the same, but for seconds of start-up."""
-
-    capsys: pytest.CaptureFixture[str] | None = None
-
-    def __call__(self, *arguments):
-        code = 0
-        try:
-            main([str(each) for each in arguments])
-        except SystemExit as end:
-            code = int(end.code or 0)
-        said = self.capsys.readouterr()
-        return Result(code, said.out, said.err)
-
-    def ok(self, *arguments):
-        result = self(*arguments)
-        assert result.code == 0, result.stderr
-        return result
-
-
 @pytest.fixture
-def lab(shell, night, monkeypatch, capsys):
+def lab(shell, night):
     """The folder of the shell with links to the run and its frames."""
     for name in ("run.zarr", "night.tif"):
         (shell.folder / name).symlink_to(night / name)
-    monkeypatch.chdir(shell.folder)
-    return Lab(shell.folder, shell.environment, capsys)
+    return shell
 
 
 def opened(path):
@@ -280,23 +254,21 @@ def test_frames_of_another_camera_or_temperature(lab, night):
     assert "°C" not in cold.stderr
 
 
-def test_errors_where_peaks_overlap_hold_what_the_likelihood_leaves_open(tmp_path, monkeypatch, capsys):
+def test_errors_where_peaks_overlap_hold_what_the_likelihood_leaves_open(shell):
     """A read noise of 0.45 e-: by the curvature of the characterisation they are too small by far."""
-    monkeypatch.chdir(tmp_path)
-    lab = Lab(tmp_path, {}, capsys)
     rng = np.random.default_rng(62)
     camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.45, 0.45), gain=(0.08, 0.12))
-    tifffile.imwrite(tmp_path / "dark.tif", camera.frames(rng, 2.0, 4000)[1])
+    tifffile.imwrite(shell.folder / "dark.tif", camera.frames(rng, 2.0, 4000)[1])
     electrons, frames = camera.frames(rng, 1.0, 300)
-    tifffile.imwrite(tmp_path / "night.tif", frames)
-    lab.ok("run", "dark.tif", "--store", "run.zarr", "--bit-depth", "14", "--until", "fit", "--quiet")
-    lab.ok("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--what", "exposure,numbers")
-    found = opened(tmp_path / "out.zarr").load()
+    tifffile.imwrite(shell.folder / "night.tif", frames)
+    shell.ok("run", "dark.tif", "--store", "run.zarr", "--bit-depth", "14", "--until", "fit", "--quiet")
+    shell.ok("apply", "run.zarr", "night.tif", "--output", "out.zarr", "--what", "exposure,numbers")
+    found = opened(shell.folder / "out.zarr").load()
     pulls = ((found.exposure - 1.0) / found.exposure_stderr).values
     square = np.sqrt(np.nanmean(pulls**2))
     assert 0.7 < square < 1.25
     histograms = histogram_frames(frames)
-    calibration = read_calibration(RunStore.open(tmp_path / "run.zarr"))
+    calibration = read_calibration(RunStore.open(shell.folder / "run.zarr"))
     curved = estimate_exposure(histograms.counts, histograms.origin, calibration)
     np.testing.assert_allclose(curved.exposure, found.exposure, rtol=1e-6)
     assert np.sqrt(np.nanmean(((curved.exposure - 1.0) / curved.stderr) ** 2)) > 1.2 * square
@@ -304,26 +276,22 @@ def test_errors_where_peaks_overlap_hold_what_the_likelihood_leaves_open(tmp_pat
     assert abs(wrong / (1 - found.number_probability.values.mean()) - 1) < 0.1
 
 
-def test_one_frame_is_as_often_right_as_it_says_though_a_bias_may_be_an_electron_off(
-    tmp_path, monkeypatch, capsys
-):
+def test_one_frame_is_as_often_right_as_it_says_though_a_bias_may_be_an_electron_off(shell):
     """At 8 e- and 1,000 frames a tenth of the biases are; and no frame is its own prior."""
-    monkeypatch.chdir(tmp_path)
-    lab = Lab(tmp_path, {}, capsys)
     rng = np.random.default_rng(63)
     camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.15, 0.18))
-    tifffile.imwrite(tmp_path / "bright.tif", camera.frames(rng, 8.0, 1000)[1])
+    tifffile.imwrite(shell.folder / "bright.tif", camera.frames(rng, 8.0, 1000)[1])
     electrons, frames = camera.frames(rng, 1.0, 1)
-    tifffile.imwrite(tmp_path / "one.tif", frames)
-    lab.ok("run", "bright.tif", "--store", "run.zarr", "--bit-depth", "14", "--until", "maps", "--quiet")
-    lab.ok("apply", "run.zarr", "one.tif", "--output", "out.zarr", "--what", "exposure,numbers")
-    found = opened(tmp_path / "out.zarr").load()
+    tifffile.imwrite(shell.folder / "one.tif", frames)
+    shell.ok("run", "bright.tif", "--store", "run.zarr", "--bit-depth", "14", "--until", "maps", "--quiet")
+    shell.ok("apply", "run.zarr", "one.tif", "--output", "out.zarr", "--what", "exposure,numbers")
+    found = opened(shell.folder / "out.zarr").load()
     stated = found.number_probability.values.mean()
     right = (found.electron_number.values == electrons).mean()
     assert abs(right - stated) < 4 * np.sqrt(0.1 * 0.9 / N)
     assert stated < 0.93
     assert float(found.exposure_stderr.max()) < 4.0
-    run = RunStore.open(tmp_path / "run.zarr")
+    run = RunStore.open(shell.folder / "run.zarr")
     pulls = (run.read("maps/quanta_exposure") - 8.0) / run.read("maps/quanta_exposure_stderr")
     assert 0.7 < np.sqrt(np.mean(pulls**2)) < 1.2
     summary = run.attributes("maps")["summary"]
@@ -342,25 +310,25 @@ def stated_and_right(output, electrons, at):
     )
 
 
-def test_a_number_at_the_limit_of_the_adc_is_as_often_right_as_it_says(tmp_path, monkeypatch, capsys):
+def test_a_number_at_the_limit_of_the_adc_is_as_often_right_as_it_says(shell):
     """The limit is seen in the frames alone; a sample there is any electron number from some on."""
-    monkeypatch.chdir(tmp_path)
-    lab = Lab(tmp_path, {}, capsys)
     rng = np.random.default_rng(64)
     camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.2, 0.3))
-    tifffile.imwrite(tmp_path / "dark.tif", camera.frames(rng, 2.0, 2000)[1])
-    lab.ok("run", "dark.tif", "--store", "run.zarr", "--integration-time", "1", "--until", "maps", "--quiet")
+    tifffile.imwrite(shell.folder / "dark.tif", camera.frames(rng, 2.0, 2000)[1])
+    shell.ok(
+        "run", "dark.tif", "--store", "run.zarr", "--integration-time", "1", "--until", "maps", "--quiet"
+    )
     electrons, dn = camera.frames(rng, 2.0, 300)
     for limit in (125, 145):
         frames = np.minimum(dn, limit).astype(np.uint16)
-        tifffile.imwrite(tmp_path / f"{limit}.tif", frames)
-        lab.ok("apply", "run.zarr", f"{limit}.tif", "--output", f"{limit}.zarr")
+        tifffile.imwrite(shell.folder / f"{limit}.tif", frames)
+        shell.ok("apply", "run.zarr", f"{limit}.tif", "--output", f"{limit}.zarr")
         for at in (frames == limit, frames < limit):
-            stated, right = stated_and_right(tmp_path / f"{limit}.zarr", electrons, at)
+            stated, right = stated_and_right(shell.folder / f"{limit}.zarr", electrons, at)
             assert abs(right - stated) < 4 * np.sqrt(0.25 / at.sum()) + 0.003
         # two neighbouring numbers alone would be right in less
-        assert stated_and_right(tmp_path / f"{limit}.zarr", electrons, frames == limit)[0] < 0.8
-        exposure = opened(tmp_path / f"{limit}.zarr").exposure.values
+        assert stated_and_right(shell.folder / f"{limit}.zarr", electrons, frames == limit)[0] < 0.8
+        exposure = opened(shell.folder / f"{limit}.zarr").exposure.values
         assert abs(np.nanmedian(exposure) - 2.0) < 0.03
 
 
@@ -368,7 +336,7 @@ ROW_NOISE = 2.5  # DN: 0.24 e-, as much as the read noise
 
 
 @pytest.fixture(scope="module")
-def striped(make_once, kernels):
+def striped(make_once):
     """A run whose model has row noise, and frames of a scene with it: ``night.tif``."""
 
     def make(folder):
@@ -383,19 +351,17 @@ def striped(make_once, kernels):
             "run: {store: run.zarr}\ninput: {files: [dark.tif], bit_depth: 14}\n"
             f"model: {{effects: [{{tag: row_noise, row_noise_dn: {ROW_NOISE}}}]}}\n"
         )
-        Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels}).ok("run", "run.yaml", "--until", "fit")
+        Shell(folder).ok("run", "run.yaml", "--until", "fit")
 
     return make_once("striped", make)
 
 
-def test_row_noise_of_the_model_is_taken_from_the_frames(striped, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    lab = Lab(tmp_path, {}, capsys)
+def test_row_noise_of_the_model_is_taken_from_the_frames(striped, shell):
     given = ["apply", striped / "run.zarr", striped / "night.tif", "--output"]
-    said = lab.ok(*given, "out.zarr").stderr
+    said = shell.ok(*given, "out.zarr").stderr
     assert "subtracted row_noise" in said
-    lab.ok(*given, "kept.zarr", "--keep-modes")
-    found, kept = (opened(tmp_path / name).load() for name in ("out.zarr", "kept.zarr"))
+    shell.ok(*given, "kept.zarr", "--keep-modes")
+    found, kept = (opened(shell.folder / name).load() for name in ("out.zarr", "kept.zarr"))
     electrons = np.load(striped / "electrons.npy")
     good = found.quality.values == 0
     errors = [(each.electrons.values - electrons)[:, good] for each in (found, kept)]
@@ -417,33 +383,29 @@ def test_row_noise_of_the_model_is_taken_from_the_frames(striped, tmp_path, monk
     assert "row_offset" not in kept
 
 
-def test_a_sample_at_the_limit_less_its_offset_is_censored(striped, tmp_path, monkeypatch, capsys):
+def test_a_sample_at_the_limit_less_its_offset_is_censored(striped, shell):
     """Without the offset of its row each has a limit of its own."""
-    monkeypatch.chdir(tmp_path)
-    lab = Lab(tmp_path, {}, capsys)
     electrons, night = np.load(striped / "electrons.npy"), tifffile.imread(striped / "night.tif")
     for limit in (106, 118):
         frames = np.minimum(night, limit)
-        tifffile.imwrite(f"{limit}.tif", frames)
-        said = lab.ok("apply", striped / "run.zarr", f"{limit}.tif", "--output", f"{limit}.zarr").stderr
+        tifffile.imwrite(shell.folder / f"{limit}.tif", frames)
+        said = shell.ok("apply", striped / "run.zarr", f"{limit}.tif", "--output", f"{limit}.zarr").stderr
         # offsets that the limit hides stay in the frames
         assert ("row_noise not subtracted" in said) == (limit == 106)
-    stated, right = stated_and_right(tmp_path / "118.zarr", electrons, frames == 118)
+    stated, right = stated_and_right(shell.folder / "118.zarr", electrons, frames == 118)
     assert abs(right - stated) < 0.05
     assert stated < 0.8
 
 
-def test_a_twin_has_the_effects_of_the_run_in_its_model(striped, tmp_path, monkeypatch, capsys):
+def test_a_twin_has_the_effects_of_the_run_in_its_model(striped, shell):
     """The run knew of row noise: the twin has it too, and the read noise of its pixels is without it."""
-    monkeypatch.chdir(tmp_path)
-    lab = Lab(tmp_path, {}, capsys)
-    lab.ok("twin", striped / "run.zarr", "--output", "twin.yaml", "--seed", "4", "--frames", "600")
-    content = yaml.safe_load((tmp_path / "twin.yaml").read_text())
+    shell.ok("twin", striped / "run.zarr", "--output", "twin.yaml", "--seed", "4", "--frames", "600")
+    content = yaml.safe_load((shell.folder / "twin.yaml").read_text())
     assert content["model"]["effects"] == content["simulate"]["effects"]
     assert "parameters" not in content["simulate"]
     # the noise of the rows is no part of the pixels': left out of the model it would widen each by a third
     fitted = RunStore.open(striped / "run.zarr").read("fit/read_noise_dn")
-    with np.load(tmp_path / "twin_maps.npz") as maps:
+    with np.load(shell.folder / "twin_maps.npz") as maps:
         np.testing.assert_allclose(np.where(maps["defect"], fitted, maps["read_noise_dn"]), fitted)
 
 

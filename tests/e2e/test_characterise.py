@@ -29,7 +29,7 @@ def test_pixels_whose_gain_or_bias_is_open_do_not_widen_the_components(noise, ex
     signal = rng.poisson(light, (n, *shape)) + noise * rng.standard_normal((n, *shape))
     frames = np.rint(bias + step * signal).astype(np.uint16)
     found = pchem_pipeline.characterise(
-        frames, store=tmp_path / "run.zarr", settings=FAST, integration_time=1.0
+        frames, store=tmp_path / "run.zarr", settings=FAST, integration_time=1.0, until="ensemble"
     )
     width = np.sqrt(found.group("ensemble").component_variance.values[0])
     for k in (8, 12, 16):

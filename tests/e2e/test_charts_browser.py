@@ -1,7 +1,5 @@
 """The charts of a report in a real browser: Debian's Chromium, headless, driven by Playwright."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path

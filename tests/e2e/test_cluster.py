@@ -97,8 +97,9 @@ def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bi
     shutil.rmtree(store / ".pchem" / "done" / "fit")  # as if nothing had been fitted
     RunStore.open(store, writable=True).write("fit/bias", (slice(0, 8), slice(0, 8)), np.zeros((8, 8)))
     (shell.folder / "small.yaml").write_text((shell.folder / "run.yaml").read_text() + SMALL)
-    shell.environment["DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES"] = "0"
-    killed = shell("fit", "small.yaml", "--tiles", "0.0")
+    killed = shell.alone(DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")(
+        "fit", "small.yaml", "--tiles", "0.0"
+    )
     assert killed.code == 3
     (line,) = [each for each in killed.stderr.splitlines() if each.startswith("pchem: ")]
     assert "1 worker died on it, the last at tcp://127.0.0.1" in line

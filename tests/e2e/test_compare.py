@@ -1,7 +1,5 @@
 """Runs compared: a rerun is proven to be the same, and what changed is found and shown."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json
@@ -54,7 +52,7 @@ def numbers(shell, folder="compare"):
 
 
 def test_nothing_changed_is_proven_by_digests(shell, copies):
-    result = shell.ok("compare", "a.zarr", "b.zarr")
+    result = shell.ok("compare", "a.zarr", "b.zarr", "--workers", "1")
     assert result.stdout.split() == [
         f"compare/{name}" for name in ("compare.html", "compare.json", "history.csv")
     ]
@@ -84,7 +82,7 @@ def test_one_value_that_moved_is_found(shell, copies):
     y, x = np.argwhere(np.isfinite(bias))[5]
     bias[y, x] *= 1 + 1e-9
     copies.write("maps/bias", whole(copies, "maps/bias"), bias)
-    result = shell("compare", "a.zarr", "b.zarr", "-o", "out")
+    result = shell("compare", "a.zarr", "b.zarr", "-o", "out", "--workers", "1")
     assert result.code == 3
     assert result.stdout == ""
     assert "maps/bias: 1 value of 560 changed" in result.last

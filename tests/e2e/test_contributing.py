@@ -6,11 +6,11 @@ import re
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.installed import install
 from helpers.places import ROOT
 
 from pchem_pipeline.store.run_store import RunStore
@@ -39,24 +39,8 @@ def write_examples(folder):
         path.write_text(before + added + behind)
 
 
-def install(project, site):
-    """Leave a package as pip leaves it: its modules, and what its pyproject.toml announces."""
-    about = tomllib.loads((project / "pyproject.toml").read_text())
-    info = site / f"{about['project']['name'].replace('-', '_')}-{about['project']['version']}.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {about['project']['name']}\nVersion: {about['project']['version']}\n"
-    )
-    points = about["project"]["entry-points"].items()
-    (info / "entry_points.txt").write_text(
-        "".join(f"[{group}]\n" + "".join(f"{a} = {b}\n" for a, b in rows.items()) for group, rows in points)
-    )
-    for module in about["tool"]["setuptools"]["py-modules"]:
-        shutil.copy(project / f"{module}.py", site)
-
-
 @pytest.fixture(scope="module")
-def done(tmp_path_factory, kernels):
+def done(tmp_path_factory):
     """The folder in which all commands of the page were run, in order."""
     folder = tmp_path_factory.mktemp("contributing")
     shutil.copytree(
@@ -71,7 +55,6 @@ def done(tmp_path_factory, kernels):
     pchem.chmod(0o755)
     environment = {
         **os.environ,
-        "NUMBA_CACHE_DIR": kernels,
         "PYTHONPATH": os.pathsep.join(map(str, (folder, folder / "site"))),
         "PATH": os.pathsep.join([str(folder / "bin"), str(Path(sys.executable).parent), os.environ["PATH"]]),
     }

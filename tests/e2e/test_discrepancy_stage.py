@@ -1,7 +1,6 @@
 """``pchem discrepancy`` on real files: the verdict, the extended model, interruptions, wrong use."""
 
 import json
-import os
 import shutil
 import signal
 import time
@@ -31,9 +30,9 @@ report: {figure_formats: [], dpi: 72}
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory, kernels):
+def fitted(tmp_path_factory):
     """A run that is fitted with the plain model; copy it."""
-    shell = Shell(tmp_path_factory.mktemp("fitted"), {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    shell = Shell(tmp_path_factory.mktemp("fitted"))
     (shell.folder / "run.yaml").write_text(CAMERA)
     shell.ok("simulate", "run.yaml")
     for stage in ("ingest", "histogram", "fit"):
@@ -46,7 +45,7 @@ def copy_of(shell, folder, text=None):
     shutil.copytree(shell.folder, folder, dirs_exist_ok=True)
     if text is not None:
         (folder / "run.yaml").write_text(text)
-    return Shell(folder, shell.environment)
+    return Shell(folder)
 
 
 @pytest.fixture(scope="module")
@@ -118,18 +117,17 @@ def test_an_effect_that_the_model_has_is_not_added_twice(searched, fitted, tmp_p
     assert (tmp_path / "run.effects.yaml").read_text() == text
 
 
-@pytest.mark.parametrize(("moment", "number"), [(0.8, signal.SIGTERM), (2.0, signal.SIGKILL)])
-def test_a_killed_search_goes_on_to_the_same_verdict(searched, fitted, tmp_path, moment, number):
+def test_a_killed_search_goes_on_to_the_same_verdict(searched, fitted, tmp_path):
     shell, _, _ = searched
     other = copy_of(fitted, tmp_path)
-    with other.start("discrepancy", "run.yaml", "--no-refit") as process:
-        markers = tmp_path / "run.zarr" / ".pchem" / "done" / "discrepancy"
-        wanted = int(12 * moment)
-        while process.poll() is None and len(list(markers.glob("*/*"))) < wanted:
-            time.sleep(0.02)
-        process.send_signal(number)
-        assert process.wait(20) == (143 if number == signal.SIGTERM else -number)  # clusters wait for 30 s
-    assert not (tmp_path / "run.zarr" / "discrepancy.json").exists()
+    markers = tmp_path / "run.zarr" / ".pchem" / "done" / "discrepancy"
+    for wanted, number, code in ((9, signal.SIGTERM, 143), (24, signal.SIGKILL, -signal.SIGKILL)):
+        with other.start("discrepancy", "run.yaml", "--no-refit") as process:
+            while process.poll() is None and len(list(markers.glob("*/*"))) < wanted:
+                time.sleep(0.02)
+            process.send_signal(number)
+            assert process.wait(20) == code  # clusters wait for 30 s
+        assert not (tmp_path / "run.zarr" / "discrepancy.json").exists()
     other.ok("discrepancy", "run.yaml", "--no-refit")
     assert verdict(other) == verdict(shell)
     assert (tmp_path / "run.yaml").read_text() == CAMERA  # --no-refit leaves the model alone
@@ -143,8 +141,8 @@ def test_a_killed_search_goes_on_to_the_same_verdict(searched, fitted, tmp_path,
         ("shape: [16, 16]", "shape: [4, 4]", "32 are needed"),
     ],
 )
-def test_what_cannot_be_searched_is_one_clear_line(kernels, tmp_path, old, new, message):
-    other = Shell(tmp_path, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+def test_what_cannot_be_searched_is_one_clear_line(tmp_path, old, new, message):
+    other = Shell(tmp_path)
     (tmp_path / "run.yaml").write_text(CAMERA.replace(old, new))
     other.ok("simulate", "run.yaml")
     result = other("discrepancy", "run.yaml")

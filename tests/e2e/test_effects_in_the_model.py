@@ -1,7 +1,5 @@
 """A run whose model holds the effects of its camera: biased maps come right, and the pages say why."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The inspector in a real browser: Debian's Chromium, headless, driven by Playwright."""
 
-from __future__ import annotations
-
 import json
 import re
 import threading

@@ -1,11 +1,8 @@
 """``pchem joint``: a run whose samples are runs of one sensor, from command line to report and verdict."""
 
-import http.client
 import json
-import os
 import re
 import shutil
-import threading
 import time
 
 import numpy as np
@@ -16,7 +13,7 @@ from helpers.places import ROOT
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.commands.joint import find_joint, run_joint
 from pchem_pipeline.commands.notebook import open_run
-from pchem_pipeline.commands.view import make_server
+from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.discrepancy.verdict import read_verdict
 from pchem_pipeline.run.stage import Options
 from pchem_pipeline.run.target import find_run
@@ -50,13 +47,13 @@ def camera(folder, name, seed, time, dead=0.0):
 
 
 @pytest.fixture(scope="module")
-def joint(tmp_path_factory, kernels):
+def joint(tmp_path_factory):
     """Three exposures and a bias, fitted with one command in a folder of their own; do not change it."""
     folder = tmp_path_factory.mktemp("exposures")
     for seed, seconds in enumerate((1.0, 2.0, 5.0)):
         camera(folder, f"dark_{seconds:g}s", 10 + seed, seconds)
     camera(folder, "bias", 20, 0.001, dead=1.0)
-    shell = Shell(folder, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    shell = Shell(folder)
     manual = (ROOT / "docs" / "howto" / "several_exposures.md").read_text(encoding="utf-8")
     [command] = re.findall(r"^\$ (pchem joint .*)$", manual, re.MULTILINE)
     result = shell.ok(*command.split()[1:])
@@ -150,7 +147,7 @@ def test_nothing_is_done_twice_and_tiles_do_not_matter(joint):
         np.testing.assert_array_equal(other.read(name), store.read(name), err_msg=name)
 
 
-def test_a_changed_time_makes_new_maps_of_the_same_fit(joint, kernels):
+def test_a_changed_time_makes_new_maps_of_the_same_fit(joint):
     path = write(joint, "again", [("dark_1s.zarr", ""), ("dark_2s.zarr", "")])
     store = fit(path)
     first, record = store.read("maps/dark_current"), store.records.read("fit")
@@ -160,7 +157,7 @@ def test_a_changed_time_makes_new_maps_of_the_same_fit(joint, kernels):
     assert states["fit"] == "complete"
     assert (fit(path).read("maps/dark_current") != first).all()
     assert store.records.read("fit") == record
-    shell = Shell(joint, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    shell = Shell(joint)
     rows = shell.ok("status", "again.zarr").stdout.split("\n")
     assert [row.split()[:2] for row in rows[:4]] == [
         [stage, "complete"] for stage in ("ingest", "histogram", "fit", "maps")
@@ -190,14 +187,15 @@ def test_light_levels_and_no_line(joint):
     assert np.isfinite(store.read("maps/conversion_gain")).mean() > 0.8
 
 
-def test_what_looks_at_a_run_looks_at_this_one(joint, kernels, tmp_path):
-    shell = Shell(joint, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+def test_what_looks_at_a_run_looks_at_this_one(joint, tmp_path):
+    shell = Shell(joint)
     assert "maps.fits" in shell.ok("export", "dark.zarr", "-o", str(tmp_path), "--format", "fits,csv").stdout
     assert "spurious_charge" in (tmp_path / "summary.csv").read_text()
     shutil.copytree(joint / "dark.zarr", joint / "same.zarr")
-    words = shell.ok("compare", "dark.zarr", "same.zarr", "-o", str(tmp_path / "compare")).stderr
+    here = ("--workers", "1", "-o", tmp_path)
+    words = shell.ok("compare", "dark.zarr", "same.zarr", *here).stderr
     assert "Nothing changed" in words
-    drawn = shell.ok("figures", "dark.zarr", "-o", str(tmp_path), "--only", "exposures,pixel_fits").stdout
+    drawn = shell.ok("figures", "dark.zarr", *here, "--only", "exposures,pixel_fits").stdout
     assert "exposures.pdf" in drawn
     run = open_run(joint / "dark.zarr")
     assert run.samples.quanta_exposure.dims == ("sample", "y", "x")
@@ -205,26 +203,19 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, kernels, tmp_path):
     assert "4 samples of 6,000 frames in all" in repr(run)
     assert run.pixel(2, 3).histogram.sum() == 1500
     assert "dark_current" in run.maps
-    server, _ = make_server(joint / "dark.zarr")
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
-    connection.request("GET", "/api/pixel?y=2&x=3")
-    answer = connection.getresponse()
+    answer = RunView(RunStore.open(joint / "dark.zarr")).answer(
+        "GET", "/api/pixel?y=2&x=3", {"host": "127.0.0.1:1"}, 1
+    )
     assert answer.status == 200
-    assert json.loads(answer.read())
-    connection.close()
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    assert json.loads(answer.content)
     refused = shell("electrons", "dark.zarr")
     assert refused.code == 4
     assert "was made from samples; electron numbers need" in refused.last
     assert "electrons" not in run.status()
 
 
-def test_killed_it_ends_with_the_same_bits(joint, kernels):
-    shell = Shell(joint, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+def test_killed_it_ends_with_the_same_bits(joint):
+    shell = Shell(joint)
     four = [("dark_1s.zarr", ""), ("dark_2s.zarr", ""), ("dark_5s.zarr", ""), ("bias.zarr", "bias: true")]
     write(joint, "killed", four)
     with shell.start("run", "killed.yaml", "--until", "maps", "--quiet", "--backend", "serial") as process:
@@ -331,9 +322,9 @@ def test_what_is_no_joint_fit_says_so(joint):
     assert target.config.input.against == "none"
 
 
-def test_a_search_looks_at_all_samples_and_the_fit_takes_what_it_names(tmp_path, kernels):
+def test_a_search_looks_at_all_samples_and_the_fit_takes_what_it_names(tmp_path):
     """Charge that does not grow with time: one exposure takes it for dark current, three of them do not."""
-    shell = Shell(tmp_path, {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    shell = Shell(tmp_path)
     for seconds in (1.0, 3.0, 9.0):
         name = f"dark_{seconds:g}s"
         camera(tmp_path, name, int(seconds), seconds)

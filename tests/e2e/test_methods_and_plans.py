@@ -1,7 +1,6 @@
 """``pchem methods`` and ``pchem plan`` as a user runs them."""
 
 import json
-import os
 
 import numpy as np
 import pytest
@@ -12,9 +11,9 @@ from pchem_pipeline.store.run_store import RunStore
 
 
 @pytest.fixture(scope="module")
-def exposures(tmp_path_factory, kernels):
+def exposures(tmp_path_factory):
     """Runs of the same 8 x 8 pixels: bright.zarr (fitted), dark.zarr and half.zarr (histograms)."""
-    shell = Shell(tmp_path_factory.mktemp("exposures"), {**os.environ, "NUMBA_CACHE_DIR": kernels})
+    shell = Shell(tmp_path_factory.mktemp("exposures"))
     rng = np.random.default_rng(4)
     step, bias = rng.normal(11, 0.5, (8, 8)), rng.normal(100, 2, (8, 8))
     for name, light in (("bright", 2.0), ("dark", 0.0), ("half", 1.0)):

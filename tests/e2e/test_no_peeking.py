@@ -3,6 +3,8 @@
 import json
 import shutil
 
+from helpers.commands import Shell
+
 CAMERA = """
 run: {store: run.zarr}
 input: {files: [frames/*.tif], integration_time: 1.0, bit_depth: 14}
@@ -26,7 +28,7 @@ def search(shell):
 def test_without_the_truth_the_verdict_is_the_same(shell, tmp_path):
     (shell.folder / "run.yaml").write_text(CAMERA)
     shell.ok("simulate", "run.yaml")
-    copy = type(shell)(tmp_path / "copy", shell.environment)
+    copy = Shell(tmp_path / "copy")
     shutil.copytree(shell.folder, copy.folder)
     maps, group = copy.folder / "frames" / "truth.npz", copy.folder / "run.zarr" / "truth"
     assert maps.exists()

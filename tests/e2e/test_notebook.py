@@ -1,7 +1,5 @@
 """A run in a notebook: lazy datasets with units and masks, pixels, figures, and the tutorial executed."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

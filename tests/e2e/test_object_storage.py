@@ -1,6 +1,5 @@
 """Camera files and stores on S3: a real server on loopback (moto, installed from PyPI by the extra dev)."""
 
-import os
 import re
 import socket
 import subprocess
@@ -60,14 +59,13 @@ def server(tmp_path):
 @pytest.fixture
 def cloud(shell, server, tmp_path):
     """A shell whose S3 is that server."""
-    shell.environment |= {
-        "AWS_ENDPOINT_URL": server,
-        "AWS_ACCESS_KEY_ID": "key",
-        "AWS_SECRET_ACCESS_KEY": SECRET.decode(),
-        "AWS_DEFAULT_REGION": "us-east-1",
-        "XDG_CACHE_HOME": str(tmp_path / "cache"),
-    }
-    return shell
+    return shell.alone(
+        AWS_ENDPOINT_URL=server,
+        AWS_ACCESS_KEY_ID="key",
+        AWS_SECRET_ACCESS_KEY=SECRET.decode(),
+        AWS_DEFAULT_REGION="us-east-1",
+        XDG_CACHE_HOME=str(tmp_path / "cache"),
+    )
 
 
 def test_frames_are_read_from_s3_and_fetched_once(cloud, server, camera, finished, tmp_path):
@@ -198,7 +196,7 @@ def test_a_store_on_s3_is_locked_for_all_machines(cloud, server, frames):
     assert result.code == 75
     assert "lock.json is damaged; if no pchem command uses this run: python -c" in result.last
     code = result.last.partition('python -c "')[2].rstrip('"')
-    subprocess.run([sys.executable, "-c", code], env={**os.environ, **cloud.environment}, check=True)
+    subprocess.run([sys.executable, "-c", code], env=cloud.environment, check=True)
     cloud.ok("ingest", "run.yaml")
     with pytest.raises(urllib.error.HTTPError, match="404"):
         ask(lock)

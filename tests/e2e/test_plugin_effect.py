@@ -5,10 +5,9 @@ import os
 import shutil
 import subprocess
 import sys
-import tomllib
 
 import pytest
-from helpers.commands import Shell
+from helpers.installed import install
 from helpers.places import TESTS
 
 RUN = """
@@ -26,25 +25,9 @@ BROKEN = {
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """A folder with the package as pip leaves it: its modules, and what its pyproject.toml announces."""
-    folder, source = tmp_path_factory.mktemp("site"), TESTS / "plugin_package"
-    project = tomllib.loads((source / "pyproject.toml").read_text())["project"]
-    shutil.copytree(
-        source / "chessboard_effects",
-        folder / "chessboard_effects",
-        ignore=shutil.ignore_patterns("__pycache__"),
-    )
-    info = folder / f"chessboard_effects-{project['version']}.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text(
-        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
-    )
-    (info / "entry_points.txt").write_text(
-        "".join(
-            f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in points.items())
-            for group, points in project["entry-points"].items()
-        )
-    )
+    """A folder with the package as pip leaves it."""
+    folder = tmp_path_factory.mktemp("site")
+    install(TESTS / "plugin_package", folder)
     return folder
 
 
@@ -65,7 +48,7 @@ def with_plugin(shell, site, stack):
     candidates = ", ".join([RIVALS, "chessboard_offset", *BROKEN])
     (shell.folder / "run.yaml").write_text(RUN.replace("CANDIDATES", candidates))
     path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
-    return Shell(shell.folder, {**shell.environment, "PYTHONPATH": path})
+    return shell.alone(PYTHONPATH=path)
 
 
 def test_a_plug_in_is_found_named_and_added_and_broken_ones_are_left_out(with_plugin, stack):

@@ -89,9 +89,9 @@ def test_neither_tiling_nor_backend_nor_mode_changes_the_answer(shell, frames, f
 
 def test_without_home(shell, frames):
     # nowhere to keep compiled kernels: those of one stage will do
-    shell.environment = {**shell.environment, "HOME": "/dev/null", "XDG_CACHE_HOME": "/dev/null"}
-    del shell.environment["NUMBA_CACHE_DIR"]
-    shell.ok("run", "frames", "--roi", "0:8,0:8", "--until", "histogram", "--quiet")
+    homeless = shell.alone(HOME="/dev/null", XDG_CACHE_HOME="/dev/null")
+    del homeless.environment["NUMBA_CACHE_DIR"]
+    homeless.ok("run", "frames", "--roi", "0:8,0:8", "--until", "histogram", "--quiet")
     assert RunStore.open(shell.folder / "run.zarr").read("histogram/counts").sum() == 1200 * 8 * 8
 
 

@@ -1,7 +1,5 @@
 """The stage simulate: every format holds the same frames, resuming, and what it refuses to overwrite."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``pchem view``: every pixel of one run, to this computer's browser only, and nothing else."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import http.client

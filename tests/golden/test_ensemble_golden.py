@@ -1,7 +1,5 @@
 """Ensemble formulas against mpmath and scipy, along ways that the package does not take."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest

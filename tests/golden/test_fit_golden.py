@@ -1,7 +1,5 @@
 """The fit against independent programs: iminuit for the maximum and its errors, mpmath for the likelihood."""
 
-from __future__ import annotations
-
 import mpmath
 import numpy as np
 import pytest

@@ -4,8 +4,6 @@
 changed, and why, belongs into the commit. Whole runs are compared by ``scripts/validation/nets.py``.
 """
 
-from __future__ import annotations
-
 import os
 from dataclasses import fields
 from pathlib import Path

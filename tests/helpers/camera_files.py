@@ -1,7 +1,5 @@
 """Camera files of a test: opened, read, and refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

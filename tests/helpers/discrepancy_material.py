@@ -1,7 +1,5 @@
 """Synthetic discrepancy verdicts: evidence drawn by hand, and ``discrepancy.json`` of each verdict."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

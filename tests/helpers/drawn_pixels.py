@@ -1,7 +1,5 @@
 """Histograms of simulated pixels for the tests of the fit."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plain EM by the kernels of the fit, step by step."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The mass of an extended law written out term by term, and laws that use every part of it."""
 
-from __future__ import annotations
-
 import math
 
 import mpmath

@@ -1,7 +1,5 @@
 """Pages of a report as their readers get them: tags, words, and that nothing is loaded or run."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from html.parser import HTMLParser

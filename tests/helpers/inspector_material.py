@@ -1,7 +1,5 @@
 """A small run with a report, written array by array: no stage is run and no kernel compiled."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

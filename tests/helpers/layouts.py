@@ -1,7 +1,5 @@
 """Camera files of all formats in many layouts, written by the libraries of the formats."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from functools import partial

@@ -4,8 +4,6 @@ It shares no code with the package. The parameters scatter over the pixels as th
 may be laid out as there: by taps, columns or quadrants, under a lens, with reference columns or dead pixels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

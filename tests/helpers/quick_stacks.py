@@ -1,7 +1,5 @@
 """Stacks from a simulator of their own (plain numpy), and their summaries as a quick look takes them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -4,8 +4,6 @@ Nothing here is shared with the package: every sample has its own row of members
 all components up to a generous last one. Slow and obvious.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Synthetic reports: a sensor drawn from distributions, its fits as the truth plus noise."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small simulated stacks for the tests of the statistics."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Frames as standardised deviations, without a sensor."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the stage fit leaves behind, written with the truth as its estimate."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What something hidden is: hooks along the signal chain, called once per frame, in the order of time."""
 
-from __future__ import annotations
-
 import re
 from typing import Any, ClassVar
 

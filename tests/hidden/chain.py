@@ -1,7 +1,5 @@
 """The forward chain: sensor and electrons, one frame after the other."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

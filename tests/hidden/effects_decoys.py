@@ -3,8 +3,6 @@
 Which of them may be looked at, and which only once, at the end: ``scripts/bench/discrepancy_cases.py``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from hidden.base import Hidden

@@ -1,7 +1,5 @@
 """Hidden effects of the light, the dark current and the electrons."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hidden.base import Course, Hidden, telegraph

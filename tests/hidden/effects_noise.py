@@ -1,7 +1,5 @@
 """Hidden effects between the sense node and the pedestal: noise, coupling, response."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hidden.base import Course, Hidden, telegraph

@@ -1,7 +1,5 @@
 """Hidden effects that a stationary dark stack cannot show, and some outside the package's library."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hidden.base import Hidden

@@ -1,7 +1,5 @@
 """Hidden effects of the pedestal, the converter and the data path."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hidden.base import Course, Hidden, telegraph

@@ -7,8 +7,6 @@
 default into the folder ``sealed`` beside the output folder.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

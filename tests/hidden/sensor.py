@@ -1,7 +1,5 @@
 """A random sensor: the maps of the four parameters and what its converter can hold."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

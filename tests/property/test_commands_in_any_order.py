@@ -1,6 +1,5 @@
 """Commands, kills and changes of the YAML in any order: the end is that of a run from scratch."""
 
-import os
 import shutil
 import subprocess
 import tempfile
@@ -31,7 +30,7 @@ class Commands(RuleBasedStateMachine):
     @initialize()
     def begin(self):
         self.folder = Path(tempfile.mkdtemp())
-        self.shell = Shell(self.folder, dict(os.environ))
+        self.shell = Shell(self.folder)
         (self.folder / "camera.yaml").write_text(CAMERA)
         self.shell.ok("simulate", "camera.yaml", "--quiet")
         files = sorted((self.folder / "frames").iterdir())

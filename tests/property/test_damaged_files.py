@@ -1,7 +1,5 @@
 """A damaged camera file gives the same frames or one clear line: no foreign error, no hang, no hunger."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

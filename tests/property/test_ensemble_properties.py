@@ -1,7 +1,5 @@
 """What must hold for any pixels and any tiling of the ensemble."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The answer for a pixel does not depend on the batch that it is in."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

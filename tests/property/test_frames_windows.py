@@ -1,7 +1,5 @@
 """Any window of any stack in any format equals the same slice of the whole array."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The answer does not depend on how frames and rows are cut."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

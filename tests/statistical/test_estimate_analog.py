@@ -1,13 +1,11 @@
 """What the estimators of the analog effects make of simulated frames: near the truth, else silent."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import drawn_truth, seen, taken
+from helpers.small_sensors import drawn_truth, seen, taken
 
 from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
 from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise

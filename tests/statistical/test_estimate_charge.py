@@ -8,9 +8,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.charge_material import a_sensor, evidence_of
-from helpers.sensor_of_modes import drawn_truth, taken
-from helpers.sensor_of_modes import seen as seen_modes
+from helpers import small_sensors
+from helpers.small_sensors import a_sensor, drawn_truth, some_blocks, taken
 
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
@@ -47,7 +46,8 @@ N = 3000
 
 def seen(*effects, seed=1, n_frames=N):
     """Return the evidence of every second block of frames of a small sensor."""
-    return evidence_of(TRUTH, *effects, n_frames=n_frames, seed=seed, every=2)
+    frames = taken(TRUTH, *effects, n_frames=n_frames, seed=seed)
+    return small_sensors.seen(frames, some_blocks(n_frames, every=2))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -148,7 +148,7 @@ def test_what_would_begin_brighter_than_any_scene_is_no_afterglow(monkeypatch):
 def test_persistence_so_bright_that_it_misleads_the_fits():
     sensor = drawn_truth((32, 32), noise_e=(0.36, 0.42), step=(11.5, 12.5))
     truth = Persistence(peak_e=6.0, decay_frames=200.0, centre_y=0.3, centre_x=0.6, radius=0.05)
-    image, spot = Persistence.estimate(seen_modes(taken(sensor, truth, n_frames=1200, seed=5)))
+    image, spot = Persistence.estimate(small_sensors.seen(taken(sensor, truth, n_frames=1200, seed=5)))
     wanted = truth.peak_e * truth.pattern(np.arange(32), (32, 32))
     for found, share in ((image, 0.05), (spot, 0.005)):
         left = found.peak_e * found.pattern(np.arange(32), (32, 32)) - wanted
@@ -237,7 +237,7 @@ def test_a_sensor_of_few_pixels(shape):
         DarkCurrentRts(fraction=0.5, step_e=0.5),
         CosmicRays(tracks_per_frame=0.002),
     )
-    evidence = evidence_of(a_sensor(shape), *hidden, n_frames=1000)
+    evidence = small_sensors.seen(taken(a_sensor(shape), *hidden, n_frames=1000))
     found = {cls: cls.estimate(evidence) for cls in CLASSES}
     assert abs(found[ExposureDrift][0].drift - 0.9) < 0.3
     assert all(len(hypotheses) <= 6 for hypotheses in found.values())

@@ -1,13 +1,11 @@
 """What the estimators of common modes, ADC and data path make of simulated frames."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, drawn_truth, every_third_block, seen, taken
+from helpers.small_sensors import context_of, drawn_truth, seen, some_blocks, taken
 
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
 from pchem_pipeline.effects.adc.adc_inl import AdcInl
@@ -34,7 +32,7 @@ TRUTH = drawn_truth(SHAPE)
 @functools.cache
 def evidence_of(*effects: Effect, third: bool = True, seed: int = 1) -> Evidence:
     frames = taken(TRUTH, *effects, n_frames=N_FRAMES, seed=seed)
-    return seen(frames, every_third_block(N_FRAMES) if third else None)
+    return seen(frames, some_blocks(N_FRAMES) if third else None)
 
 
 def estimated(effect: Effect, **kwargs: Any) -> list[Any]:

@@ -4,8 +4,6 @@ Each pair on pixels drawn from the law itself: pulls of mean 0 and width 1, inte
 Limits are five standard errors of those figures; a fit without the law misses them.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from itertools import combinations
 

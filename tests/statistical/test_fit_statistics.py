@@ -1,7 +1,5 @@
 """Estimates sit at the right maximum, and gaps are those to the neighbours."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.drawn_pixels import Drawn, draw

@@ -1,7 +1,5 @@
 """Samples that are nearer to the one before are told from chance, whatever the law of the pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pchem_pipeline.discrepancy.observe.digital.groups import nearer_statistics

@@ -1,7 +1,5 @@
 """Effects move the statistics that are named after them, in the direction that the names say."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

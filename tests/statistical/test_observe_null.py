@@ -1,7 +1,5 @@
 """Every statistic is about N(0, 1) for stacks without any effect."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.small_stacks import small_stack

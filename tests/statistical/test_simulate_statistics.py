@@ -4,8 +4,6 @@ Limits are five standard errors from theory, or a probability of 6e-7; each test
 have caught the error that it guards against.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.plain_law import joint_mass

@@ -1,7 +1,5 @@
 """Coverage of intervals, calibration of p-values, and what the tail guard is worth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

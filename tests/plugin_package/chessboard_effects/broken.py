@@ -1,7 +1,5 @@
 """Effects that break: one when it is asked for a guess, one when it is simulated."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field

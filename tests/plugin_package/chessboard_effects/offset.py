@@ -1,7 +1,5 @@
 """An offset whose sign the two colours of pixels swap from frame to frame."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 import numpy as np

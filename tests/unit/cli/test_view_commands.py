@@ -1,7 +1,5 @@
 """The commands that look at runs translate and call once."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

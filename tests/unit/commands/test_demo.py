@@ -1,7 +1,5 @@
 """The demonstration with a hidden effect: what is hidden, and what is refused before anything is written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

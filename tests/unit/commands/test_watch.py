@@ -1,7 +1,5 @@
 """Watching a run: rows that tell rate and remaining time, JSON lines, and an end when the work ends."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The covariance of few replicates against its matrix, by scipy and numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -1,7 +1,5 @@
 """The pure parts of the workflow on made-up statistics: splits, null model, fingerprints, naming, gap."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

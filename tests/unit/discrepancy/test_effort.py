@@ -122,9 +122,6 @@ def noisy_rows():
 
 
 def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tried(noisy_rows):
-    free = find_discrepancies(noisy_rows, settings=QUICK).verdict
-    assert free.effects == ("row_noise",)
-    assert free.limit == ""
     told = []
     short = QUICK.model_copy(update={"effort": 0.002})
     found = find_discrepancies(noisy_rows, settings=short, tell=told.append).verdict

@@ -1,7 +1,5 @@
 """Scan statistics: places and frames that stand out, of values and of events; probabilities count all."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -3,8 +3,6 @@
 Where cells hold several lines, the edges are told line by line.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The size of an effect: as large as its law says, wherever it acts in the signal chain."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The search itself, on an explainer that is made up."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

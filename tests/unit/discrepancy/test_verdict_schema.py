@@ -1,7 +1,5 @@
 """``discrepancy.json``: written and read back the same, older ones read, damaged and later ones refused."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Disagreements are located: on frames from plain numpy, by the maps and series of their evidence."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The door for effects: our files, others' entry points, and what is refused."""
 
-from __future__ import annotations
-
 import importlib
 import logging
 from importlib.metadata import EntryPoint

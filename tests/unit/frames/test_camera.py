@@ -1,7 +1,5 @@
 """The camera's name, serial number, temperature and date, in every format that has a place for them."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import struct

@@ -1,7 +1,5 @@
 """Byte order, left-justified samples and a last axis that is time are seen in some samples at ingest."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Blocks of frames as they stream by: every frame once, whatever the bands, the blocks and the threads."""
 
-from __future__ import annotations
-
 import threading
 import time
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Ready-made histograms: layouts, refusals, and the measured SiPM spectra."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

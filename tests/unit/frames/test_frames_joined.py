@@ -1,7 +1,5 @@
 """Files joined to one stack: order, range, region, bit shift, threads, identity, and what is refused."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import shutil

@@ -1,7 +1,5 @@
 """Readers from elsewhere, doubles, missing optional libraries, and import manners."""
 
-from __future__ import annotations
-
 import builtins
 import bz2
 import gzip

@@ -1,7 +1,5 @@
 """Writers: every format, whole or not at all, readable by the format's own library; disks that are full."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Hostile files: small ones that stand for much, and zarr stores that run code or lead elsewhere."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import io

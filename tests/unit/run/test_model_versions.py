@@ -1,7 +1,5 @@
 """The model of a run as an artefact: its versions, and the one in force."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -30,7 +28,6 @@ from pchem_pipeline.run.model_versions import (
     version_with,
     write_added_exposure,
 )
-from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.table import STAGES
@@ -45,12 +42,6 @@ BLINK: dict[str, Any] = {"tag": "dark_current_rts", "fraction": 0.1}
 
 def settings(*effects: dict[str, Any], **more: Any) -> ModelSettings:
     return ModelSettings.model_validate({"effects": list(effects), **more})
-
-
-@pytest.fixture(autouse=True)
-def _forget_stores():
-    yield
-    open_store.cache_clear()
 
 
 @pytest.fixture

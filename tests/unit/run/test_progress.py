@@ -1,7 +1,5 @@
 """What a run says while it works: bars on terminals, JSON lines, and a file for ``pchem status``."""
 
-from __future__ import annotations
-
 import json
 import os
 import time

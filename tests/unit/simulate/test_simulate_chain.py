@@ -1,7 +1,5 @@
 """The forward chain: its planes, its ADC, and what it says when an effect misbehaves."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import Any, ClassVar, Literal
 

@@ -1,7 +1,5 @@
 """The section simulate: what it accepts, what it refuses and with which words."""
 
-from __future__ import annotations
-
 import pytest
 from pydantic import ValidationError
 

@@ -1,7 +1,5 @@
 """Keyed random numbers: known answers, quantiles, and keys that depend on position alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import special, stats

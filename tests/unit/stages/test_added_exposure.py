@@ -1,7 +1,5 @@
 """Exposure beside H: how effects give it, how it is put together, and how the store keeps it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The ingest stage: copy and reference, resume, identity, histograms, bad input."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Readers say which rows come together; the stages that read frames keep to it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Files of the package appear whole or not at all, whatever fails, and all of them by one function."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -10,7 +10,7 @@ from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.estimators.codes import few_shifts
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
-NOISY = PlainCamera(0.62, 1.2, 9.0, (20, 20), 600)
+NOISY = PlainCamera(0.62, 1.2, 9.0, (16, 16), 600)
 QUICK = DiscrepancySettings(replicates=20, extended_replicates=12, candidates=("row_noise",))
 
 
@@ -37,16 +37,14 @@ def test_perfect_frames_of_a_sensor_of_any_layout_are_not_called_wrong(layout):
 
 
 def test_row_noise_is_found_on_a_noisy_sensor():
-    """A third of the read noise of 5.6 DN, 19 errors of the variance of row means."""
-    found = []
-    for seed in (21, 22, 23):
-        rng = np.random.default_rng(seed)
-        frames = NOISY.frames(seed).astype(np.int64)
-        frames += np.rint(1.9 * rng.standard_normal((*frames.shape[:2], 1))).astype(np.int64)
-        found.append(find_discrepancies(np.maximum(frames, 0).astype(np.uint16), settings=QUICK).verdict)
-    named = [verdict for verdict in found if verdict.verdict == "named"]
-    assert len(named) >= 2
-    assert {verdict.effects for verdict in named} == {("row_noise",)}
+    """A third of the read noise of 5.6 DN, 14 errors of the variance of row means."""
+    rng = np.random.default_rng(21)
+    frames = NOISY.frames(21).astype(np.int64)
+    frames += np.rint(1.9 * rng.standard_normal((*frames.shape[:2], 1))).astype(np.int64)
+    found = find_discrepancies(np.maximum(frames, 0).astype(np.uint16), settings=QUICK).verdict
+    assert found.verdict in ("named", "named_in_part")
+    assert found.effects == ("row_noise",)
+    assert found.limit == ""
 
 
 def test_what_rests_on_the_parameters_does_not_count_where_they_are_not_identified(perfect):

@@ -1,7 +1,5 @@
 """From a stack to its evidence: the kernels against plain numpy, rare samples, odd input."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Waves across rows and columns, found in the spectrum of residuals and told as pickup or measured."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The quick look: nothing on clean stacks whatever their pixels are, and each disturbance with its size."""
 
-from __future__ import annotations
-
 import re
 import zlib
 from collections.abc import Callable
@@ -89,11 +87,10 @@ def test_a_clean_stack_passes_all_checks(clean: QuickLook) -> None:
 def test_clean_stacks_of_other_sensors_pass(
     exposure: float, read_noise: float, shape: tuple[int, int, int]
 ) -> None:
-    for seed in range(3):
-        frames = stack(np.random.default_rng(seed), shape, exposure=exposure, read_noise=read_noise)
-        codes = codes_of(frames, exposure, read_noise)
-        look = quick_look(sums_of(frames), maps_of(shape[1:], exposure, read_noise), codes)
-        assert look.found == ()
+    frames = stack(np.random.default_rng(0), shape, exposure=exposure, read_noise=read_noise)
+    codes = codes_of(frames, exposure, read_noise)
+    look = quick_look(sums_of(frames), maps_of(shape[1:], exposure, read_noise), codes)
+    assert look.found == ()
 
 
 def test_the_covariance_of_pairs_has_the_error_that_theory_gives_it() -> None:
@@ -442,13 +439,14 @@ def test_widths_of_codes_are_found_with_their_size(size: float) -> None:
 
 def test_clipping_is_found() -> None:
     rng = np.random.default_rng(12)
-    frames = stack(rng, SHAPE, lambda dn: np.minimum(dn, 222.0))
+    frames = stack(rng, (800, 16, 16), lambda dn: np.minimum(dn, 222.0))
     unknown, known = (by_name(looked(frames, limits=limits)) for limits in (None, (0, 222)))
     assert (unknown["top_code"].level, known["top_limit"].level) == ("serious", "caution")
 
 
 def test_samples_cut_off_at_0_are_the_black_level_and_no_widths() -> None:
-    frames = stack(np.random.default_rng(12), SHAPE, lambda dn: dn - dn.mean(axis=(0, 1, 2)) + 11.0)
+    shape = (800, 16, 16)
+    frames = stack(np.random.default_rng(12), shape, lambda dn: dn - dn.mean(axis=(0, 1, 2)) + 11.0)
     found = by_name(looked(frames, limits=(0, 65535)))
     assert found["bottom_limit"].found
     assert found["bottom_limit"].size == pytest.approx(np.mean(frames == 0), rel=0.02)
@@ -482,8 +480,8 @@ def test_a_region_that_is_moved_in_the_middle_of_the_run_is_found(n: int) -> Non
 
 @pytest.mark.parametrize("exposure", [0.01, 0.05, 0.3, 30.0])
 def test_pixels_with_few_electrons_in_a_block_do_not_wander(exposure: float) -> None:
-    """The means of blocks are as skewed as Poisson counts of a few; 20,000 pixels, a look at each."""
-    for seed in range(4):
+    """The means of blocks are as skewed as Poisson counts of a few; 10,000 pixels, a look at each."""
+    for seed in range(2):
         frames = stack(np.random.default_rng(seed), (600, 70, 71), exposure=exposure)
         look = quick_look(sums_of(frames, 37), maps_of((70, 71), exposure))
         assert not by_name(look)["wandering_pixels"].found

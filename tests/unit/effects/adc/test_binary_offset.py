@@ -1,10 +1,8 @@
 """Binary offset: the forward model, the regression on bits, and what the estimator makes of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
+from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.discrepancy.observe.digital.groups import BITS
 from pchem_pipeline.effects.adc.binary_offset import BinaryOffset

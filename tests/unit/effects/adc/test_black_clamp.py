@@ -1,10 +1,8 @@
 """Black-level clamp: the forward model, its moments, and what the estimator makes of it and of relatives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import drawn_truth, seen, taken
+from helpers.small_sensors import drawn_truth, seen, taken
 from hidden.chain import hide
 
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow

@@ -1,10 +1,8 @@
 """Stitch point of two gains: the forward model, its law, and what the estimator makes of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, seen
+from helpers.small_sensors import context_of, seen
 from hidden.chain import hide
 
 from pchem_pipeline.effects.adc.gain_stitch import GainStitch

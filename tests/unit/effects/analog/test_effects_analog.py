@@ -1,7 +1,5 @@
 """Effects of the pixel's analog chain: what their forward models do to samples, and what they refuse."""
 
-from __future__ import annotations
-
 from types import MappingProxyType
 
 import numpy as np

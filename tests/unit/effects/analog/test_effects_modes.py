@@ -1,13 +1,11 @@
 """Common modes, ADC and data path: what their forward models do to frames, and what they refuse."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, drawn_truth, offsets
+from helpers.small_sensors import context_of, drawn_truth, offsets
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl

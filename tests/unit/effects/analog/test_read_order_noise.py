@@ -1,10 +1,8 @@
 """Noise in read order: the forward model, and what the estimator makes of it and of relatives."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, drawn_truth, offsets, seen, taken
+from helpers.small_sensors import context_of, drawn_truth, offsets, seen, taken
 from hidden.chain import hide
 
 from pchem_pipeline.effects.analog.read_order_noise import ReadOrderNoise

@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.charge_material import a_sensor, electrons, exposures, simulated
+from helpers.small_sensors import a_sensor, electrons, exposures, simulated
 from scipy import stats
 
 from pchem_pipeline.effects.charge.branching_counts import BranchingCounts

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.charge_material import electrons
+from helpers.small_sensors import electrons
 from scipy import stats
 
 from pchem_pipeline.discrepancy.estimator_check import recovered_strength

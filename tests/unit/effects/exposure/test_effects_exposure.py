@@ -5,7 +5,7 @@ Limits are five standard errors from theory; what they guard against is many mor
 
 import numpy as np
 import pytest
-from helpers.charge_material import exposures
+from helpers.small_sensors import exposures
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile
 from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts

@@ -1,10 +1,8 @@
 """Glow at a place: the forward model, the law of what it adds, and what the estimator makes of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
+from helpers.small_sensors import context_of, drawn_truth, seen, taken
 from hidden.chain import hide
 
 from pchem_pipeline.effects.estimators.spots import best_spot

@@ -1,7 +1,5 @@
 """From effects to the law of the pixels, and what the fit of a tile makes of it."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar, Literal
 
 import numpy as np

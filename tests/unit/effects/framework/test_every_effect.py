@@ -1,14 +1,11 @@
 """Properties of every effect: described, neutral at no strength, the same frames in any division."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.charge_material import a_sensor, simulated
-from helpers.sensor_of_modes import make
+from helpers.small_sensors import a_sensor, make, simulated
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes

@@ -1,12 +1,10 @@
 """What estimators guess where nothing is, or a relative, and of frames without an order in time: nothing."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 
 import pytest
-from helpers.sensor_of_modes import drawn_truth, seen, taken
+from helpers.small_sensors import drawn_truth, seen, taken
 
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence

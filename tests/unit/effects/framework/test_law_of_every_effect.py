@@ -1,10 +1,8 @@
 """The law of a pixel's samples with an effect, against samples that its forward model makes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import make, taken
+from helpers.small_sensors import make, taken
 
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass

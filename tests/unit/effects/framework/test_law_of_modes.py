@@ -1,10 +1,8 @@
 """The law of a pixel's samples under common modes and a real ADC, against what the forward models do."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, offsets
+from helpers.small_sensors import context_of, offsets
 from scipy.special import ndtri
 
 from pchem_pipeline.effects.adc.adc_dnl import AdcDnl

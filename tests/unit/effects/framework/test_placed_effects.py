@@ -1,7 +1,5 @@
 """Effects with a place and a time: in the simulator, the YAML, words and the law of the samples."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,10 +1,8 @@
 """The law of the samples under effects with a place and a time, against frames made by plain numpy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import make
+from helpers.small_sensors import make
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law

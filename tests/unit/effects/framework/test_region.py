@@ -1,7 +1,5 @@
 """Places on the sensor and times in the run: what they hold, how they are written, what is refused."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,10 +1,8 @@
 """Wrong bits: the forward model, the law of a pixel, and what the estimator makes of the counts per code."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
+from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.readout.bit_errors import BitErrors

@@ -1,10 +1,8 @@
 """Misplaced lines: the forward model, in pieces too, the likelihood ratios, and what is made of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
+from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines, own_lines
 from pchem_pipeline.effects.analog.shared_noise import RowNoise

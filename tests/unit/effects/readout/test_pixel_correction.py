@@ -1,10 +1,8 @@
 """Pixel correction: its forward model, what it shows, and what its estimator makes of that."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
+from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.effects.estimators.prediction import PREDICTORS, predicted
 from pchem_pipeline.effects.readout.pixel_correction import PixelCorrection

@@ -1,10 +1,8 @@
 """Repeated lines: the forward model, in pieces too, and the count of equal lines."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from helpers.sensor_of_modes import context_of, drawn_truth, seen, taken
+from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.effects.readout.repeated_lines import RepeatedLines
 

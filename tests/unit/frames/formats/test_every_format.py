@@ -1,7 +1,5 @@
 """What holds in every format and layout: frames come back exactly, damaged or signed samples are refused."""
 
-from __future__ import annotations
-
 import os
 import pickle
 from concurrent.futures import ThreadPoolExecutor

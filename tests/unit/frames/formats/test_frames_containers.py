@@ -1,7 +1,5 @@
 """HDF5, NeXus, zarr and OME-Zarr: where frames lie, facts beside them, parts that are missing, damage."""
 
-from __future__ import annotations
-
 import os
 import pickle
 from pathlib import Path

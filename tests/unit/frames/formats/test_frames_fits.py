@@ -1,7 +1,5 @@
 """FITS: facts of its headers, what must be chosen, what is reported and what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

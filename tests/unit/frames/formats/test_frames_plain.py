@@ -1,7 +1,5 @@
 """Raw bytes with settings or sidecar, npy and SER, written as plain bytes, read back exactly."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import struct

@@ -1,7 +1,5 @@
 """TIFF: stacks as cameras write them, facts of its tags, what is reported and what is refused."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Steps and modes of maps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

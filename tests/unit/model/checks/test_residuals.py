@@ -1,7 +1,5 @@
 """Residuals, RMSE, the noise floor and chi-square."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Differences of runs: value by value, and in standard errors with limits from theory."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The judgement of all pixels of a sensor together: what it flags, and what it leaves alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The compiled tables of electron numbers against the same code, not compiled."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pchem_pipeline.model.electrons import electrons_numba

@@ -1,7 +1,5 @@
 """Electron numbers: the tables against plain sums over k and codes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.plain_law import joint_mass

@@ -1,7 +1,5 @@
 """The ensemble from histograms of the parameter maps, checked cell by cell."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

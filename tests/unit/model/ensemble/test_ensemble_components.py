@@ -1,7 +1,5 @@
 """Appendices A and B: moments of the ensemble and widths of its components."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import poisson

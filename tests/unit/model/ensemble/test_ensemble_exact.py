@@ -1,7 +1,5 @@
 """The exact ensemble: sums of PCDs, tallies of the data, and the mass of the electron number."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.plain_law import joint_mass

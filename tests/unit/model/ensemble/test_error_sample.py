@@ -1,7 +1,5 @@
 """Some pixels stand for all where the errors of the predicted curves are summed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

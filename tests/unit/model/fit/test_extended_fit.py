@@ -1,7 +1,5 @@
 """The fit under an extended law: at the maximum, with the right errors, and what it does with odd pixels."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -1,7 +1,5 @@
 """Every status word from a pixel built for it; degenerate input never raises and never hangs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.drawn_pixels import draw

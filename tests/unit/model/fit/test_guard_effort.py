@@ -1,7 +1,5 @@
 """What the tail guard costs: of a misfit, and of outliers, no histogram is searched twice."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The search ends at the highest maximum that has an answer."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """A climb ends also where its steps lead out of bounds, damped or not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Parameters that all pixels share, with one or several samples of each: slopes, recovery, coverage."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

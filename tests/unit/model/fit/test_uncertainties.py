@@ -1,7 +1,5 @@
 """Standard errors, sandwich errors and profile intervals against independent computations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.drawn_pixels import Drawn, draw

@@ -1,7 +1,5 @@
 """Per-pixel histograms against numpy, their windows, and the choice of the number of bins."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Masses under an extended law, their derivatives, and what the law refuses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.em_trace import evaluated

@@ -1,7 +1,5 @@
 """Density, quantised mass and draws of the PCD."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.plain_law import pcd_mass

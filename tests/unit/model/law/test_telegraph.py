@@ -1,7 +1,5 @@
 """Pixels whose exposure blinks: the likelihood against plain matrices, and what is found in drawn samples."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

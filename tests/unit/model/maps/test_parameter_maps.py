@@ -1,7 +1,5 @@
 """Derived maps, quality, robust summaries and the display."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import beta

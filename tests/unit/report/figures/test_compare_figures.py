@@ -1,7 +1,5 @@
 """The figures, tables and settings of a comparison of runs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

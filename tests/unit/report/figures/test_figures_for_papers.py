@@ -1,7 +1,5 @@
 """Figures as files: sizes, fonts, styles, and numbers beside them that are what is drawn."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

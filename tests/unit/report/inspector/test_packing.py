@@ -1,7 +1,5 @@
 """Maps and histograms in few bytes: what comes back, and what it costs."""
 
-from __future__ import annotations
-
 import gzip
 import tracemalloc
 

@@ -1,7 +1,5 @@
 """The discrepancy verdict in the report and on its own page."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

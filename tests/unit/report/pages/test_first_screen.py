@@ -1,7 +1,5 @@
 """The first screen: criteria, flagged pixels, what to type next, and what the quick look adds."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

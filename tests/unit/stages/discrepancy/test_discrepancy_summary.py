@@ -1,7 +1,5 @@
 """The verdict in the terminal: short, plain, and never an error."""
 
-from __future__ import annotations
-
 import pytest
 from helpers.discrepancy_material import VERDICTS, step, verdict_of
 

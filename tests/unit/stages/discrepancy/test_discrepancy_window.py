@@ -1,7 +1,5 @@
 """Which part of a stack is looked at, the limits it starts from, and what ends the stage."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import signal

@@ -1,7 +1,5 @@
 """The stages maps, ensemble and electrons on a simulated sensor; the fit is its truth."""
 
-from __future__ import annotations
-
 import csv
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The stage fit: a tile, tiles of several samples, and the sensor as a whole."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The plan of a run: said before it starts, and kept."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -39,7 +37,7 @@ def camera(tmp_path):
 
     def write(n_frames: int, **sections: object) -> Path:
         rng = np.random.default_rng(5)
-        shape = (256, 256, 256)
+        shape = (32, 256, 256)
         block = np.rint(100 + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype("<u2")
         file = tmp_path / f"{n_frames}.raw"
         with file.open("wb") as stream:

@@ -1,7 +1,5 @@
 """Bands cover the sensor, cut no tile and no group of rows, and keep to the memory allowed."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The histogram stage on a store: exact arrays, whatever the tiles, the memory and the workers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +14,7 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.histogram.summaries import SummaryAccumulator
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.stage import Options, StageContext, open_store
+from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.histogram import arrays, histogram
 from pchem_pipeline.store.records import StageRecord
@@ -236,12 +234,6 @@ def test_ready_made_histograms_are_copied(tmp_path):
     np.testing.assert_array_equal(store.read("histogram/minimum"), [[10, -3]])
     np.testing.assert_array_equal(store.read("histogram/maximum"), [[12, 5]])
     assert "order in time" in store.attributes("summary")["missing"]
-
-
-@pytest.fixture(autouse=True)
-def _forget_stores():
-    yield
-    open_store.cache_clear()
 
 
 def test_odd_frames_are_in_no_sums_and_empty_ones_in_no_histogram(tmp_path, frames):

@@ -1,7 +1,5 @@
 """The one pass over the camera files: every byte read once, and the results of the separate stages."""
 
-from __future__ import annotations
-
 import json
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +17,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
-from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.bands import cut_rows
 from pchem_pipeline.stages.histogram import memory, single_pass
@@ -244,9 +242,3 @@ def test_rows_are_cut_at_whole_steps():
     assert all(a[1] == b[0] for a, b in pairwise(bands))
     assert all(y0 % 64 == 0 for y0, _ in bands)
     assert 8 <= len(bands) <= 12
-
-
-@pytest.fixture(autouse=True)
-def _forget_stores():
-    yield
-    open_store.cache_clear()

@@ -1,7 +1,5 @@
 """What the inspector is given: which maps, which pixels, and how much of a large sensor."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The stage report on a small simulated run whose fit is its truth."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Effects with a place: found where they are in frames that plain numpy made, and told on the sensor."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -90,7 +88,6 @@ def parts_of(frames):
     return suspected_parts(observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=50), frames)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize(
     ("add", "region"),
     [
@@ -99,8 +96,8 @@ def parts_of(frames):
         (every_eighth, Region.model_validate("every=8/3")),
     ],
 )
-def test_a_part_of_the_sensor_that_differs_is_suspected(add, region, seed):
-    [part] = parts_of(camera(seed, add))
+def test_a_part_of_the_sensor_that_differs_is_suspected(add, region):
+    [part] = parts_of(camera(1, add))
     assert part.when is None
     assert part.region.overlap(region, SHAPE) >= 0.8
 
@@ -111,19 +108,18 @@ def test_frames_that_differ_are_suspected():
     assert part.when.overlap(When(range=((600, 760),)), FRAMES) >= 0.8
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_part_of_sensor_or_run_with_heavy_tails_is_suspected(seed):
+def test_a_part_of_sensor_or_run_with_heavy_tails_is_suspected():
     """What no map and no series of means shows."""
-    [part] = parts_of(camera(seed, tails_of_columns))
+    [part] = parts_of(camera(1, tails_of_columns))
     assert part.when is None
     assert part.region.overlap(Region(columns=((20, 24),)), SHAPE) >= 0.7
-    [part] = parts_of(camera(seed, tails_of_frames))
+    [part] = parts_of(camera(1, tails_of_frames))
     assert part.region is None
     assert part.when.overlap(When(range=((640, 800),)), FRAMES) >= 0.6
 
 
 @pytest.mark.parametrize("add", [nothing, everywhere, tails_everywhere])
-@pytest.mark.parametrize("seed", [4, 5, 6])
+@pytest.mark.parametrize("seed", [4, 5])
 def test_no_part_is_suspected_where_none_differs(add, seed):
     assert parts_of(camera(seed, add)) == ()
 
@@ -142,7 +138,7 @@ def test_a_part_is_suspected_by_what_several_shapes_show_together():
 
     names, found = list(clean.scores), Region(rows=((5, 8),))
     shift = 5.0 / np.sqrt(3.0 * SHAPE[1])
-    assert all(parts(0.0, names) == () for _ in range(10))
+    assert all(parts(0.0, names) == () for _ in range(4))
     # in a map by itself, of thousands of places in two dozen maps, five standard errors are nothing
     assert sum(len(parts(shift, names[:1])) for _ in range(3)) <= 1
     seen = [part.region.overlap(found, SHAPE) for _ in range(4) for part in parts(shift, names[:5])]
@@ -203,7 +199,7 @@ def test_a_region_that_ends_with_the_window_ends_where_the_whole_sensor_shows_it
 def test_an_effect_in_a_tap_of_a_window_is_named_with_its_place():
     window = SensorWindow((100, 124), (40, 72), (512, 512))
     frames = camera(8, rows_of_columns, (24, 32), 1000)
-    settings = DiscrepancySettings(candidates=("row_noise",), replicates=30, extended_replicates=16)
+    settings = DiscrepancySettings(candidates=("row_noise",), replicates=20, extended_replicates=12)
     found = find_discrepancies(frames, settings=settings, window=window)
     assert found.verdict.verdict == "named"
     assert found.verdict.effects == ("row_noise",)

@@ -1,14 +1,12 @@
 """The empirical component: moves of the samples are measured, simulated and fitted, and never compete."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.charge_material import a_uniform_sensor
-from helpers.charge_material import simulated as simulated_frames
+from helpers.small_sensors import a_uniform_sensor
+from helpers.small_sensors import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence

@@ -1,14 +1,12 @@
 """What electrons do to each other is measured in frames made by plain numpy, and simulated as it is told."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.charge_material import a_uniform_sensor
-from helpers.charge_material import simulated as simulated_frames
+from helpers.small_sensors import a_uniform_sensor
+from helpers.small_sensors import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.by_simulation.measured.electrons import electron_chances, measured_electrons

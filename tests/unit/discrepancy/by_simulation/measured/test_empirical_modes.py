@@ -1,14 +1,12 @@
 """Gain, light or noise that samples share: measured by the sums of their scores, simulated as it is told."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.charge_material import a_uniform_sensor
-from helpers.charge_material import simulated as simulated_frames
+from helpers.small_sensors import a_uniform_sensor
+from helpers.small_sensors import simulated as simulated_frames
 from pydantic import ValidationError
 
 from pchem_pipeline.discrepancy.by_simulation.measured.modes import (

@@ -1,13 +1,11 @@
 """Noise that samples share: simulated by its spectrum, measured by its covariances, never on clean data."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.charge_material import a_uniform_sensor
-from helpers.charge_material import simulated as simulated_frames
+from helpers.small_sensors import a_uniform_sensor
+from helpers.small_sensors import simulated as simulated_frames
 
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.measured.noise import (

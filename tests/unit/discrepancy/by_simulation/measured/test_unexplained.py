@@ -1,7 +1,5 @@
 """Of all that can be measured what explains most is simulated first; what fails is told and no more."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any

@@ -5,7 +5,7 @@ from typing import ClassVar, Literal
 import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
-from helpers.sensor_of_modes import context_of
+from helpers.small_sensors import context_of
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import serial
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack

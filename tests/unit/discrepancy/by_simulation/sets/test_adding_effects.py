@@ -1,7 +1,5 @@
 """How effects enter the model: at their best refit, the simplest set that leaves nothing, proven at last."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace

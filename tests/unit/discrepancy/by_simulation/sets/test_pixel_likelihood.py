@@ -1,7 +1,5 @@
 """The likelihood of the pixels tells the numbers of an effect, and tells effects apart."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
