@@ -3,9 +3,8 @@
 A stage is a row of :mod:`pchem_pipeline.stages.table` and a module with a pure ``*_tile`` function, arrays in
 and arrays out, and ``run(context)``. That makes its arrays (``context.create``), then calls
 ``context.run_units(units, task)``. ``task`` is a picklable callable (a module-level function, or a
-``functools.partial`` of one) that takes a unit, opens the store by path (``open_store(path)``), writes whole
-chunks and returns a small JSON-able summary. The marker of a unit is set, in the worker, after its task
-returned.
+``functools.partial`` of one) that takes a unit and the store, writes whole chunks and returns a small
+JSON-able summary, or nothing. The marker of a unit is set, in the worker, after its task returned.
 
 A unit is anything picklable with ``key``, the words for messages, and ``keys``, the markers that it sets: a
 :class:`~pchem_pipeline.store.tiles.Tile`, a band of tiles, or a block of frames. A stage without
@@ -74,6 +73,8 @@ class Named(Generic[T]):
 WHOLE = Named("all", None)
 
 AnyUnit = TypeVar("AnyUnit", bound=Unit)
+#: Does a unit, in a worker, with the store of the run; its summary is JSON data.
+Task = Callable[[AnyUnit, RunStore], Mapping[str, Any] | None]
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ class MarkedTask:
     store: Path
     stage: str
     fingerprint: str
-    task: Callable[[Any], Mapping[str, Any] | None]
+    task: Task[Any]
     tell: Callable[[str, float], None] | None = None
     overtaken: bool = False
 
@@ -121,7 +122,7 @@ class MarkedTask:
         store = open_store(self.store)
         with working(store.records, self.stage, self.fingerprint if self.overtaken else None):
             with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
-                summary = dict(self.task(unit) or {})
+                summary = dict(self.task(unit, store) or {})
             check_work(self.store)
             for key in unit.keys:
                 store.records.mark(self.stage, self.fingerprint, key, summary)
@@ -145,9 +146,8 @@ def _nothing() -> None:
     """Do nothing."""
 
 
-def nothing_left(unit: Any) -> dict[str, Any]:
+def nothing_left(unit: Any, store: RunStore) -> None:
     """Do nothing: the task of units whose work was done beforehand."""
-    return {}
 
 
 @dataclass
@@ -327,7 +327,7 @@ class StageContext:
     def run_units(
         self,
         units: Sequence[AnyUnit],
-        task: Callable[[AnyUnit], Mapping[str, Any] | None],
+        task: Task[AnyUnit],
         *,
         unit_name: str = "tile",
         needs: str | None = None,

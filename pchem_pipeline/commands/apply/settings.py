@@ -87,7 +87,6 @@ class Job:
 
     Attributes:
         run: store of the characterisation.
-        output: store that is written.
         source: the frames.
         kinds: what is wanted.
         prior: as in `ApplySettings`; a file stands as its map in ``prior_map``.
@@ -109,7 +108,6 @@ class Job:
     """
 
     run: Path
-    output: Path
     source: FrameSource
     kinds: tuple[str, ...]
     prior: str = "frames"

@@ -215,7 +215,7 @@ def _surveyed(
             )
             settings, seen = few, _survey(context, source, few)
         known = {"window": _taken_of(settings), "whole": _taken_of(most), **seen.numbers()}
-        context.run_units([WHOLE], lambda _: known, by_tiles=False, total=1)
+        context.run_units([WHOLE], lambda *_: known, by_tiles=False, total=1)
     whole = known.get("whole", known["window"])
     few, most = (settings.model_copy(update=each) for each in (known["window"], whole))
     return few, Survey.of_numbers(known), most
@@ -329,7 +329,7 @@ class _Mapper:
         return found
 
 
-def _simulate(unit: Named[Replicate]) -> dict[str, float]:
+def _simulate(unit: Named[Replicate], store: RunStore) -> dict[str, float]:
     return unit.content()
 
 

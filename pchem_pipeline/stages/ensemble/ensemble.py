@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.progress import parts_told
-from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
+from pchem_pipeline.run.stage import StageContext, nothing_left
 from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
 from pchem_pipeline.stages.electrons.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
@@ -64,7 +63,6 @@ class _Job:
     """What the ensemble is of.
 
     Attributes:
-        store: path of the run.
         config: of the run.
         sensor: the input.
         axes: axes of the ensemble.
@@ -77,7 +75,6 @@ class _Job:
         limits: first and last code of the ADC, DN, where samples lie at one of them; else None.
     """
 
-    store: Path
     config: RunConfig
     sensor: SensorInfo
     axes: EnsembleAxes
@@ -193,9 +190,7 @@ def run(context: StageContext) -> None:
     _create(context, axes, len(tiles))
     numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
     codes = {} if frames is None or everything else _codes(context)
-    job = _Job(
-        store.path, context.config, sensor, axes, numbered, frames, codes, source, truth, effects, limits
-    )
+    job = _Job(context.config, sensor, axes, numbered, frames, codes, source, truth, effects, limits)
     rows = max(1, BAND_BYTES // (sensor.nx * fitted.bins * 4))
     bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
@@ -265,11 +260,10 @@ def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
     store.set_attributes("ensemble_tiles", {"axes": content})
 
 
-def _do_band(band: Band | Tile, *, job: _Job) -> dict[str, Any]:
+def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
     """Sum over each tile of a band; frames, where they are needed, are read once for all of them."""
-    store = open_store(job.store)
-    chosen = _count(job, band) if job.counts_anew else None
-    errors = {} if job.truth is None else _compare(job, band)
+    chosen = _count(store, job, band) if job.counts_anew else None
+    errors = {} if job.truth is None else _compare(store, job, band)
     for key in band.keys:
         number, tile = job.tiles[key]
         own = None
@@ -282,7 +276,6 @@ def _do_band(band: Band | Tile, *, job: _Job) -> dict[str, Any]:
             integers[job.axes.integers["signed_error"]] = errors[key].signed
         for name, row in zip(_SUMS, (integers, floats), strict=True):
             store.write(f"ensemble_tiles/{name}", (slice(number, number + 1), slice(None)), row[None])
-    return {}
 
 
 def _sum_tile(
@@ -376,10 +369,9 @@ def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStrea
     return FrameStream(job.source, [(band.y0, band.y1)], FRAMES_AT_ONCE, frames=frames)
 
 
-def _count(job: _Job, band: Band | Tile) -> PixelHistograms:
+def _count(store: RunStore, job: _Job, band: Band | Tile) -> PixelHistograms:
     """Histogram the chosen frames of a band; the same samples lie outside as in the stored histograms."""
     assert job.frames is not None
-    store = open_store(job.store)
     like = store.array("histogram/counts")
     origin, low, high = _ranges(store, (slice(band.y0, band.y1), slice(None)))
     first, size = occupied(origin, low, high, like.shape[2])
@@ -395,11 +387,11 @@ def _count(job: _Job, band: Band | Tile) -> PixelHistograms:
     return PixelHistograms(counts, origin, under + over)
 
 
-def _compare(job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:
+def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:
     """Compare estimated with true electron numbers of the chosen frames, tile by tile."""
     assert job.truth is not None
     assert job.source is not None
-    store, (y0, x0, t0) = open_store(job.store), job.truth
+    y0, x0, t0 = job.truth
     first, end = job.frames or (0, job.source.shape[0])
     known = min(end, store.array("truth/electron_number").shape[0] - t0)
     found: dict[str, ErrorTally] = {}

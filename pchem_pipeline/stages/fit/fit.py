@@ -22,7 +22,7 @@ from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
 from pchem_pipeline.run.progress import parts_told
-from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.fit.arrays import TileArrays, create_fit_arrays
 from pchem_pipeline.stages.fit.code_sums import CodeSums
 from pchem_pipeline.stages.fit.fitted_model import pixel_places
@@ -90,13 +90,11 @@ class _Job:
     """How tiles are fitted.
 
     Attributes:
-        store: path of the run.
         samples: paths of the runs of its samples; none of a run of one.
         how: several samples are fitted.
         model: of the run.
     """
 
-    store: Path
     samples: tuple[Path, ...]
     how: SampleFit
     model: ModelVersion
@@ -133,7 +131,7 @@ def run(context: StageContext) -> None:
         model.settings.set_aside_e,
     )
     runs = tuple(target.store for target in sample_targets(context.config, context.base_dir))
-    job = _Job(store.path, runs, how, model)
+    job = _Job(runs, how, model)
     counts = [each.array("histogram/counts") for each in ([RunStore.open(run) for run in runs] or [store])]
     if not context.executor.shares_memory:
         _compile(job, counts[0].dtype)
@@ -171,15 +169,14 @@ def _compile(job: _Job, dtype: np.dtype[Any]) -> None:
     replace(job, how=how).tile([histogram] * max(1, len(job.samples)))
 
 
-def _do_tile(tile: Tile, *, job: _Job) -> dict[str, Any]:
+def _do_tile(tile: Tile, store: RunStore, *, job: _Job) -> dict[str, Any]:
     """Fit one tile of the store; the summary counts its pixels, and the samples of each code."""
-    store = open_store(job.store)
     runs = [RunStore.open(path) for path in job.samples] or [store]
     histograms = [each.read_arrays("histogram", _HISTOGRAM, tile.region) for each in runs]
     start = added = codes = None
     bins = sum(each["counts"].shape[2] for each in histograms)
     if not job.samples:
-        start, added = kept_fit(job.store, tile.region), read_added_exposure(store, job.model, tile.region)
+        start, added = kept_fit(store.path, tile.region), read_added_exposure(store, job.model, tile.region)
         codes = CodeSums(histograms[0]["origin"], bins)
     arrays = TileArrays(tile)
     for part in parts_told(tile.parts(bins)):

@@ -26,7 +26,7 @@ from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.quick_look import check_sentence
 from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.style.wording import short_name
-from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
+from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.discrepancy.result import verdict_data
 from pchem_pipeline.stages.maps import NO_TIME
 from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
@@ -79,12 +79,11 @@ def run(context: StageContext) -> None:
             )
     task = functools.partial(
         _write,
-        context.store.path,
-        context.config,
-        context.integration_time,
-        _stage_rows(context),
+        config=context.config,
+        integration_time=context.integration_time,
+        stages=_stage_rows(context),
         # in this process: another would spend more on its imports than on its share of the figures
-        draw_by_workers(1, context.reporter, context.stage),
+        draw=draw_by_workers(1, context.reporter, context.stage),
     )
     done = context.run_units([WHOLE], task, unit_name="report", unit_bytes=ny * nx * _PIXEL_BYTES)
     for text in done.get(WHOLE.key, {}).get("warnings", ()):
@@ -92,27 +91,27 @@ def run(context: StageContext) -> None:
 
 
 def _write(
-    path: Path,
+    unit: Unit,
+    store: RunStore,
+    *,
     config: RunConfig,
     integration_time: float | None,
     stages: list[dict[str, Any]],
     draw: DrawAll | None,
-    unit: Unit,
 ) -> dict[str, Any]:
     """Gather, draw and write; files of figures that this run does not have any more are removed."""
-    store = open_store(path)
     with beside(drawing_workers(None, config.compute)) as hand:
         data = gather(store, config, integration_time, stages, hand)
         rendered = render_report(data, config.report, draw)
     for name, content in rendered.figures.items():
         store.write_file(f"figures/{name}", content)
-    for old in (path / "figures").glob("*.*"):
+    for old in (store.path / "figures").glob("*.*"):
         if old.name not in rendered.figures and old.stem in FIGURE_NAMES:
             old.unlink(missing_ok=True)
     for name, page in rendered.pages.items():
         store.write_file(name, page.encode())
     if not rendered.pages:
-        (path / DISCREPANCY_PAGE).unlink(missing_ok=True)
+        (store.path / DISCREPANCY_PAGE).unlink(missing_ok=True)
     store.write_file("report.json", rendered.json.encode())
     store.write_file("report.html", rendered.html.encode())
     return {

@@ -130,11 +130,11 @@ def test_stop_and_resume(tmp_path: Path, small_chunks: None, monkeypatch: pytest
     stop, done = StopRequest(), []
     real = ingest._copy
 
-    def copy(unit: ingest.CopyUnit, **rest: Any) -> dict[str, Any]:
+    def copy(unit: ingest.CopyUnit, store: RunStore, **rest: Any) -> None:
         done.append(unit.key)
         if len(done) == 5:
             stop.signal = 2
-        return real(unit, **rest)
+        real(unit, store, **rest)
 
     monkeypatch.setattr(ingest, "_copy", copy)
     with pytest.raises(InterruptedRunError):
@@ -252,10 +252,10 @@ def test_file_that_vanishes_while_copying(
     write_stack(tmp_path / "cam")
     real = ingest._copy
 
-    def copy(unit: ingest.CopyUnit, **rest: Any) -> dict[str, Any]:
+    def copy(unit: ingest.CopyUnit, store: RunStore, **rest: Any) -> None:
         if unit.t0 == 16:
             (tmp_path / "cam" / "f11.tif").unlink(missing_ok=True)
-        return real(unit, **rest)
+        real(unit, store, **rest)
 
     monkeypatch.setattr(ingest, "_copy", copy)
     with pytest.raises(

@@ -121,7 +121,7 @@ def test_a_search_that_was_stopped_goes_on_in_the_window_that_it_had(monkeypatch
         return Survey({"next_x": place(columns=[[3, 8]])}, {"neighbours": 0.3})
 
     def run_units(units, task, **_):
-        markers.update({unit.key: json.loads(json.dumps(task(unit))) for unit in units})
+        markers.update({unit.key: json.loads(json.dumps(task(unit, None))) for unit in units})
 
     def context(limit):
         return SimpleNamespace(
