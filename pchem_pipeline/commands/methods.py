@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pchem_pipeline.stages.methods.result import METHODS_FILE, read_methods
+from pchem_pipeline.stages.methods.inputs import METHODS_FILE, open_other_runs, read_methods
 
 if TYPE_CHECKING:
     from pchem_pipeline.run.target import Target
@@ -26,7 +26,6 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
         PchEmError: the comparison cannot be made.
     """
     from pchem_pipeline.runner.session import run_stages, run_status
-    from pchem_pipeline.stages.methods.other_runs import open_other_runs
 
     values = dict(given)
     if "with_runs" in values:

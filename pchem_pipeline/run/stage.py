@@ -206,12 +206,12 @@ class StageContext:
 
     @property
     def sensor(self) -> SensorInfo:
-        """The input as ``ingest`` found it.
+        """The input, with the bit depth and integration time of the configuration, where it sets them.
 
         Raises:
             StoreError: nothing was ingested yet.
         """
-        return SensorInfo.read(self.store)
+        return SensorInfo.read(self.store).with_settings(self.config.input)
 
     @property
     def charge_rate(self) -> str:
@@ -219,21 +219,6 @@ class StageContext:
         exposed = [sample.kind for sample in self.sensor.samples if not sample.bias]
         kinds = exposed if self.config.input.kind == "unknown" and exposed else [self.config.input.kind]
         return "dark_current" if all(kind == "dark" for kind in kinds) else "charge_rate"
-
-    @property
-    def integration_time(self) -> float | None:
-        """Seconds per frame: from the configuration, else from the files."""
-        return self.sensor.with_settings(self.config.input).integration_time
-
-    @property
-    def bit_depth(self) -> int | None:
-        """Bits of the ADC: from the configuration, else from the files."""
-        return self.sensor.with_settings(self.config.input).bit_depth
-
-    @property
-    def adc_limits(self) -> tuple[int, int] | None:
-        """See `SensorInfo.adc_limits`."""
-        return self.sensor.with_settings(self.config.input).adc_limits
 
     @property
     def tile(self) -> tuple[int, int]:

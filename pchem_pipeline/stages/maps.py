@@ -22,6 +22,7 @@ from pchem_pipeline.model.maps.maps import (
     summarise,
 )
 from pchem_pipeline.model.maps.sample_maps import line_map_names, line_maps
+from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.store.files import without_nan
@@ -45,7 +46,7 @@ _CUT = int(FitStatus.BIAS_AMBIGUOUS | FitStatus.OUTSIDE_WINDOW)
 
 def _tell_time(context: StageContext) -> None:
     """Say where the integration time is not known, or is not what the files say."""
-    time, stated = context.integration_time, context.sensor.integration_time
+    time, stated = context.sensor.integration_time, SensorInfo.read(context.store).integration_time
     if time is None:
         context.note(NO_TIME)
     elif stated is not None and abs(time - stated) > _SAME_TIME * stated:
@@ -97,7 +98,7 @@ def run(context: StageContext) -> None:
     Raises:
         StoreError: the fit is missing, or the store refuses.
     """
-    time, line = context.integration_time, _line(context)
+    time, line = context.sensor.integration_time, _line(context)
     of_time = (context.charge_rate,) if time is not None and line is None else ()
     names = [*_SUMMARISED, *(of_time if line is None else line.names)]
     context.create(*(f"maps/{name}" for each in names for name in (each, f"{each}_stderr")))

@@ -161,8 +161,8 @@ class _Search:
         """Return how the frames of a window were taken."""
         return {
             "n_run": self.source.shape[0] - len(window.copied),
-            "bit_depth": self.context.bit_depth,
-            "integration_time": self.context.integration_time or 1.0,
+            "bit_depth": self.context.sensor.bit_depth,
+            "integration_time": self.context.sensor.integration_time or 1.0,
             "window": SensorWindow(
                 window.rows,
                 window.columns,
@@ -239,7 +239,8 @@ def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] |
 
 def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...]:
     """Return as an effect the codes at which samples pile up: the fit has them without a model."""
-    (low, high), ends, store = context.sensor.seen_limits, context.adc_limits, context.store
+    sensor, store = context.sensor, context.store
+    (low, high), ends = sensor.seen_limits, sensor.adc_limits
     if ends is not None and store.has("histogram/minimum"):
         low = ends[0] if (store.read("histogram/minimum") <= ends[0]).mean() > _REACHED else low
         high = ends[1] if (store.read("histogram/maximum") >= ends[1]).mean() > _REACHED else high
@@ -341,8 +342,8 @@ def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) 
         dict(zip(names, z_before.tolist(), strict=True)),
         dict(zip(names, z_after.tolist(), strict=True)) if found.verdict.steps else None,
         [e for e in found.model if e.tag in found.verdict.effects],
-        context.integration_time or 1.0,
-        context.bit_depth or 16,
+        context.sensor.integration_time or 1.0,
+        context.sensor.bit_depth or 16,
         found.code_extended,
     )
     for name, array in arrays.items():

@@ -178,7 +178,7 @@ def run(context: StageContext) -> None:
     source = open_source(context) if frames is not None and (truth or not everything) else None
     fitted_tiles = [tile for tile in tiles if tile.key in ready]
     fitted = _Fitted.read(store, fitted_tiles)
-    limits = fitted.limits(context.adc_limits)
+    limits = fitted.limits(context.sensor.adc_limits)
     axes = fitted.axes(settings)
     if sensor.kind == "histograms":
         context.note("input is histograms: the ensemble has all samples, with equal weight per channel")

@@ -47,7 +47,7 @@ def run(context: StageContext) -> None:
     create_fit_arrays(context)
     how = TileFit(
         context.config.fit,
-        context.adc_limits,
+        context.sensor.adc_limits,
         model.effects,
         model.settings.set_aside_e,
         [sample.bias for sample in samples],

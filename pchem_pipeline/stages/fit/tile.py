@@ -112,9 +112,8 @@ def _fit_model(
 ) -> FitResult:
     """Fit with the PCD or, where the model has effects, with the law that they compose after such a fit.
 
-    Args:
-        fit: :func:`fit_histograms` of the pixels, one sample or several, which takes the other arguments.
-        how, start, added, places: as in :func:`fit_tile`, the pixels along one axis.
+    ``fit`` is :func:`fit_histograms` of the pixels; the other arguments are those of :func:`fit_tile`, with
+    the pixels along one axis.
     """
     settings, effects = how.settings, how.effects
     if not effects:

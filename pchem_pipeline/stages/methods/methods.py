@@ -25,9 +25,7 @@ from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
 from pchem_pipeline.run.stage import Named, StageContext
-from pchem_pipeline.stages.methods.chosen import methods_settings
-from pchem_pipeline.stages.methods.other_runs import open_other_runs
-from pchem_pipeline.stages.methods.result import METHODS_FILE
+from pchem_pipeline.stages.methods.inputs import METHODS_FILE, methods_settings, open_other_runs
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
@@ -108,7 +106,7 @@ def run(context: StageContext) -> None:
     context.create("methods/pixel_y", "methods/pixel_x", lengths=lengths)
     context.create(*(f"methods/{name}" for name in PARAMETERS), lengths=lengths, methods=names)
     units = [_Unit("run", None), *_study_units(context, settings)]
-    task = _Task(tuple(o.path for o in others), settings, context.adc_limits)
+    task = _Task(tuple(o.path for o in others), settings, context.sensor.adc_limits)
     found = context.run_units(units, task, unit_name="part", by_tiles=False)
     if not {unit.key for unit in units} <= found.keys():
         return

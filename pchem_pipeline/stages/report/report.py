@@ -80,7 +80,7 @@ def run(context: StageContext) -> None:
     task = functools.partial(
         _write,
         config=context.config,
-        integration_time=context.integration_time,
+        integration_time=context.sensor.integration_time,
         stages=_stage_rows(context),
         # in this process: another would spend more on its imports than on its share of the figures
         draw=draw_by_workers(1, context.reporter, context.stage),

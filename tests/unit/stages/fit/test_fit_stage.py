@@ -83,7 +83,7 @@ def test_samples_cut_off_at_a_code_that_no_file_states_are_censored(
     dn = 100.0 + 2.0 * rng.standard_normal((12, 14)) + 40.0 * electrons
     np.save(tmp_path / "frames.npy", np.rint(dn).clip(low, high).astype(np.uint16))
     context = fitted(tmp_path, input={"files": ["frames.npy"]}, run={"store": "run.zarr"})
-    assert context.adc_limits == (low, high)
+    assert context.sensor.adc_limits == (low, high)
     for name, truth in (("quanta_exposure", 1.5), ("conversion_gain", 1 / 40.0)):
         value, error = (context.store.read(f"fit/{each}") for each in (name, f"{name}_stderr"))
         pulls = (value - truth) / error
