@@ -19,8 +19,7 @@ import typer
 
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ConfigError, ExitCode, PchEmError
-from pchem_pipeline.cli.apply import apply
-from pchem_pipeline.cli.methods import methods
+from pchem_pipeline.cli.commands import apply, methods, plan, twin
 from pchem_pipeline.cli.options import (
     Output,
     Progress,
@@ -32,8 +31,6 @@ from pchem_pipeline.cli.options import (
     region_of,
     takes_command,
 )
-from pchem_pipeline.cli.plan import plan
-from pchem_pipeline.cli.twin import twin
 from pchem_pipeline.stages.table import STAGES, pipeline, pipeline_of
 
 if TYPE_CHECKING:

@@ -142,10 +142,6 @@ class Prepared:
     clock: tuple[float, float] | None = None
 
 
-def _nothing() -> None:
-    """Do nothing."""
-
-
 def nothing_left(unit: Any, store: RunStore) -> None:
     """Do nothing: the task of units whose work was done beforehand."""
 
@@ -191,7 +187,7 @@ class StageContext:
     config_path: Path | None = None
     notes: list[str] = field(default_factory=list)
     prepared: Mapping[str, Prepared] = field(default_factory=dict)
-    begin: Callable[[], None] = _nothing
+    begin: Callable[[], None] = lambda: None
     created: dict[str, str] = field(default_factory=dict)
 
     @property

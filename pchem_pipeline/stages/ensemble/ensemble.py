@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.frames.stream import FrameSource
     from pchem_pipeline.model.ensemble.settings import EnsembleSettings
-    from pchem_pipeline.model.law.sample_law import SampleLaw
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.stages.bands import Band
     from pchem_pipeline.store.run_store import RunStore
@@ -304,7 +303,7 @@ def _sum_tile(
             some,
             everything,
             job.axes,
-            _law(store, of_pixels, place, job),
+            FittedModel.read(store, place).law(of_pixels).between(*(job.limits or (None, None))),
             fitted_satellites(store, place) if job.effects else None,
             None if errors is None else errors.of(_inside(tile, part)),
         )
@@ -316,13 +315,6 @@ def _sum_tile(
         integers[job.axes.integers["outside_all"]] = outside
         floats[job.axes.floats["share_all"]] = samples / job.sensor.n_frames
     return integers, floats
-
-
-def _law(
-    store: RunStore, maps: list[NDArray[np.float64]], place: tuple[slice, slice], job: _Job
-) -> SampleLaw:
-    """Return the law of the samples, with effects and limits of the codes."""
-    return FittedModel.read(store, place).law(maps).between(*(job.limits or (None, None)))
 
 
 def _read_counted(store: RunStore, tile: Tile, origin: NDArray[np.int64]) -> PixelHistograms:

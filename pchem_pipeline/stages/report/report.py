@@ -17,6 +17,10 @@ from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
+from pchem_pipeline.model.maps.ordered import median_of
+from pchem_pipeline.planning.frames import contour_data, frames_needed, precision
+from pchem_pipeline.planning.point import Point
+from pchem_pipeline.planning.targets import parse_target
 from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
@@ -41,17 +45,16 @@ from pchem_pipeline.stages.report.pixels import (
     pixel_fits,
     pixel_index,
 )
-from pchem_pipeline.stages.report.plan_section import plan_section
 from pchem_pipeline.stages.report.stored import PixelHistograms, StoredRun, read_histograms, read_run
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.stages.table import pipeline
+from pchem_pipeline.store.run_store import RunStore, stored_config
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.report.pages.pictures import DrawAll
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.store.records import StageRecord
-    from pchem_pipeline.store.run_store import RunStore
 
 #: Where a version of the model comes from, in words.
 _SOURCES = {"config": "from the configuration", "verdict": "from the search for missing effects"}
@@ -61,6 +64,9 @@ _FEW_CHANNELS = 12
 _SOME_MASSES = 300
 #: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 940 MiB in all.
 _PIXEL_BYTES = 300
+#: Precisions whose frames the report tells, at the median pixel; those of the figure, and its points an axis.
+_TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
+_DRAWN, _FINE = _TARGETS[:2], 14
 
 
 def run(context: StageContext) -> None:
@@ -166,7 +172,7 @@ def gather(
         quick_look=look,
         stability=stability(),
         # what a single command was given is no setting of the run
-        config_yaml=store.config_text() or dump_config(config),
+        config_yaml=stored_config(store.path) or dump_config(config),
     )
 
 
@@ -191,7 +197,8 @@ def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
     """Choose pixels, and read their histograms."""
     shown = _shown(run, config)
     places, bins = [(y, x) for _, y, x in shown], store.array("histogram/counts").shape[2]
-    full = choose_inspected(run.maps, run.fit, places, _suspects(run), bins=bins)
+    suspects = [] if run.verdict is None else [p for each in run.verdict.where for p in each.pixels]
+    full = choose_inspected(run.maps, run.fit, places, suspects, bins=bins)
     index = np.concatenate([pixel_index(shown, run.sensor.shape), full.index])
     histograms = read_histograms(store, index, run.sensor.shape)
     drawn, held, some = slice(0, len(shown)), slice(len(shown), None), slice(0, len(shown) + _SOME_MASSES)
@@ -231,11 +238,6 @@ def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
     if not chosen:
         chosen = choose_pixels(run.maps["read_noise_e"], run.maps["quanta_exposure"], run.fit["fit_status"])
     return chosen
-
-
-def _suspects(run: StoredRun) -> list[tuple[int, int]]:
-    """Return the pixels to which the verdict points."""
-    return [] if run.verdict is None else [p for each in run.verdict.where for p in each.pixels]
 
 
 def report_data(
@@ -292,6 +294,37 @@ def report_data(
         discrepancy=None if run.verdict is None else verdict_data(run.verdict, run.discrepancy),
         samples=_samples(run, config),
     )
+
+
+def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict[str, Any] | None:
+    """Return the frames that precisions need at the median pixel, or None where no pixel has a value.
+
+    Args:
+        maps: of the run.
+        n_frames: frames of the run, or None where pixels differ.
+    """
+    names = ("quanta_exposure", "read_noise_e", "conversion_gain")
+    medians = [median_of(maps[name]) for name in names if name in maps]
+    if len(medians) < len(names) or not np.isfinite(medians).all():
+        return None
+    exposure, noise, gain = medians
+    try:
+        point = Point(exposure, noise, gain)
+    except ConfigError:
+        return None
+    rows = [
+        {"target": str(target), "name": target.name, "frames": frames_needed(target, point)}
+        for target in map(parse_target, _TARGETS)
+    ]
+    reached = {} if n_frames is None else precision(point, n_frames)
+    mark = (exposure, noise)
+    return {"rows": rows, "reached": reached, "n_frames": n_frames, "mark": mark, "contours": _contours()}
+
+
+@functools.cache
+def _contours() -> dict[str, Any]:
+    """Return the frames over exposure and read noise; relative targets look alike for every sensor."""
+    return contour_data([parse_target(text) for text in _DRAWN], 0.01, fine=_FINE)
 
 
 def _samples(run: StoredRun, config: RunConfig) -> Samples | None:

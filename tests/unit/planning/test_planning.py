@@ -23,7 +23,7 @@ from pchem_pipeline.report.figures.plan import frames_chart, frames_table, plan_
 from pchem_pipeline.report.pages.tables import result_tables
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.style import Look
-from pchem_pipeline.stages.report.plan_section import plan_section
+from pchem_pipeline.stages.report.report import plan_section
 
 GAIN = 1 / 11
 ONE_PERCENT = parse_target("conversion_gain=1%")
