@@ -50,11 +50,6 @@ class CopyUnit:
         """What messages call it, and its marker."""
         return f"frames-{self.t0}-{self.t1 - 1}-rows-{self.y0}-{self.y1 - 1}"
 
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """The one marker that it sets."""
-        return (self.key,)
-
 
 def frames_tile(reader: FrameReader, unit: CopyUnit) -> NDArray[Any]:
     """Return the frames of a unit (frame, y, x)."""

@@ -67,11 +67,6 @@ class SimulateUnit:
         """What messages call it."""
         return f"{self.kind}-{self.start}-{self.stop}"
 
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Its only marker."""
-        return (self.key,)
-
 
 def run(context: StageContext) -> None:
     """Simulate the frames and the truth; files that are there already stay.

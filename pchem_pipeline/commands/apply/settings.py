@@ -75,11 +75,6 @@ class Piece:
         """What messages and markers call it."""
         return f"{self.name}-{self.y0}-{self.t0}"
 
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Its only marker."""
-        return (self.key,)
-
 
 @dataclass(frozen=True)
 class Job:

@@ -32,7 +32,7 @@ from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.progress import parts_told
-from pchem_pipeline.run.stage import StageContext, nothing_left
+from pchem_pipeline.run.stage import StageContext, markers, nothing_left
 from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
 from pchem_pipeline.stages.electrons.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
@@ -263,7 +263,7 @@ def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
     """Sum over each tile of a band; frames, where they are needed, are read once for all of them."""
     chosen = _count(store, job, band) if job.counts_anew else None
     errors = {} if job.truth is None else _compare(store, job, band)
-    for key in band.keys:
+    for key in markers(band):
         number, tile = job.tiles[key]
         own = None
         if chosen is not None:
@@ -396,7 +396,7 @@ def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, ErrorTa
             times = slice(t0 + t, t0 + t + block.shape[0])
             true = store.read("truth/electron_number", (times, slice(y0 + band.y0, y0 + band.y1), columns))
             numbers = tables.convert(block).number
-            for key in band.keys:
+            for key in markers(band):
                 tile = job.tiles[key][1]
                 part = (slice(None), slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
                 tally = compare_electron_numbers(numbers[part], true[part], ERROR_SIZES)
