@@ -86,7 +86,6 @@ def run(context: StageContext) -> None:
     task = functools.partial(
         _write,
         config=context.config,
-        integration_time=context.sensor.integration_time,
         stages=_stage_rows(context),
         # in this process: another would spend more on its imports than on its share of the figures
         draw=draw_by_workers(1, context.reporter, context.stage),
@@ -101,13 +100,12 @@ def _write(
     store: RunStore,
     *,
     config: RunConfig,
-    integration_time: float | None,
     stages: list[dict[str, Any]],
     draw: DrawAll | None,
 ) -> dict[str, Any]:
     """Gather, draw and write; files of figures that this run does not have any more are removed."""
     with beside(drawing_workers(None, config.compute)) as hand:
-        data = gather(store, config, integration_time, stages, hand)
+        data = gather(store, config, stages, hand)
         rendered = render_report(data, config.report, draw)
     for name, content in rendered.figures.items():
         store.write_file(f"figures/{name}", content)
@@ -141,7 +139,6 @@ def _warnings(data: ReportData) -> list[str]:
 def gather(
     store: RunStore,
     config: RunConfig,
-    integration_time: float | None,
     stages: Sequence[Mapping[str, Any]],
     hand: Beside = functools.cache,
 ) -> ReportData:
@@ -150,7 +147,6 @@ def gather(
     Args:
         store: the run.
         config: its configuration.
-        integration_time: seconds, or None.
         stages: rows of the table of stages.
         hand: takes what can be done meanwhile: single pixels, and packing maps for the inspector.
 
@@ -166,7 +162,7 @@ def gather(
     inspector = hand(lambda: _inspector(store, run, pixels(), max(1, threads - 1)))
     look = run_quick_look(store, run, sums)
     return replace(
-        report_data(run, config, integration_time, stages),
+        report_data(run, config, stages),
         pixels=pixels().fits,
         inspector=inspector,
         quick_look=look,
@@ -243,7 +239,6 @@ def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
 def report_data(
     run: StoredRun,
     config: RunConfig,
-    integration_time: float | None,
     stages: Sequence[Mapping[str, Any]],
 ) -> ReportData:
     """Return all that the report shows but its single pixels, from plain data.
@@ -251,7 +246,6 @@ def report_data(
     Args:
         run: what the store holds.
         config: its configuration.
-        integration_time: seconds, or None.
         stages: rows of the table of stages.
     """
     maps, facts, sensor = run.maps, dict(run.facts["ensemble"]), run.sensor
@@ -263,7 +257,7 @@ def report_data(
         shape=sensor.shape,
         kind=config.input.kind,
         n_frames=n_frames,
-        integration_time=integration_time,
+        integration_time=sensor.with_settings(config.input).integration_time,
         camera=sensor.camera.words(),
         maps=maps,
         fit=run.fit,
