@@ -11,7 +11,6 @@ import os
 import sys
 import threading
 import traceback
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -178,7 +177,7 @@ def discrepancy(
     from pchem_pipeline.commands.discrepancy import find_and_add
     from pchem_pipeline.run.target import find_run
 
-    command = replace(command, options=replace(command.options, roi=region_of(roi)))
+    command = command.choosing(roi=region_of(roi))
     text = find_and_add(find_run(target), command, refit=refit, effort=effort)
     if text:
         typer.echo(text)

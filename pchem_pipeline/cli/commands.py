@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -55,9 +54,8 @@ def apply(
     from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
     from pchem_pipeline.run.target import find_run
 
-    command = replace(command, options=replace(command.options, force=force))
     wanted = ApplySettings(kinds_of(what), prior, not keep_modes, format, dataset)
-    for path in apply_to_frames(find_run(target), frames, output, wanted, command):
+    for path in apply_to_frames(find_run(target), frames, output, wanted, command.choosing(force=force)):
         typer.echo(path)
 
 
