@@ -11,7 +11,6 @@ import os
 import sys
 import threading
 import traceback
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -19,8 +18,7 @@ import typer
 
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ConfigError, ExitCode, PchEmError
-from pchem_pipeline.cli.apply import apply
-from pchem_pipeline.cli.methods import methods
+from pchem_pipeline.cli.commands import apply, methods, plan, twin
 from pchem_pipeline.cli.options import (
     Output,
     Progress,
@@ -33,8 +31,6 @@ from pchem_pipeline.cli.options import (
     say,
     takes_command,
 )
-from pchem_pipeline.cli.plan import plan
-from pchem_pipeline.cli.twin import twin
 from pchem_pipeline.stages.table import STAGES, pipeline, pipeline_of
 
 if TYPE_CHECKING:
@@ -182,7 +178,7 @@ def discrepancy(
     from pchem_pipeline.commands.discrepancy import find_and_add
     from pchem_pipeline.run.target import find_run
 
-    command = replace(command, options=replace(command.options, roi=region_of(roi)))
+    command = command.choosing(roi=region_of(roi))
     text = find_and_add(find_run(target), command, refit=refit, effort=effort)
     if text:
         say(text)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
@@ -51,7 +49,8 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
         done = {s.stage for s in run_status(target) if s.state != "missing"}
         stages = [name for name in _AFTERWARDS if name in done]
         if stages:
-            run_stages(target, stages, without_choice(command))
+            # --force and --roi were meant for the search alone
+            run_stages(target, stages, command.choosing(force=False, roi=None))
     found = read_verdict(target.store)
     if found is None:
         raise StoreError(f"{target.store / VERDICT_FILE} is missing; run pchem discrepancy again")
@@ -89,8 +88,3 @@ def _of_histograms(target: Target) -> bool:
         return False
     store = target.stored()
     return store.has("frames") and SensorInfo.read(store).kind != "frames"
-
-
-def without_choice(command: Command) -> Command:
-    """Return the command without --force and --roi, which were meant for the search alone."""
-    return replace(command, options=replace(command.options, force=False, roi=None))

@@ -68,8 +68,7 @@ def gather_run(target: Target) -> ReportData:
     Raises:
         StoreError: the run lacks maps or histograms.
     """
-    store = with_maps(target.stored())
-    return gather(store, target.config, target.sensor(store).integration_time, [])
+    return gather(with_maps(target.stored()), target.config, [])
 
 
 def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pchem_pipeline.stages.methods.result import METHODS_FILE, read_methods
+from pchem_pipeline.stages.methods.inputs import METHODS_FILE, open_other_runs, read_methods
 
 if TYPE_CHECKING:
     from pchem_pipeline.run.target import Target
@@ -26,7 +25,6 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
         PchEmError: the comparison cannot be made.
     """
     from pchem_pipeline.runner.session import run_stages, run_status
-    from pchem_pipeline.stages.methods.other_runs import open_other_runs
 
     values = dict(given)
     if "with_runs" in values:
@@ -36,13 +34,12 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     # before anything of an earlier comparison is given up
     if store.has("histogram/counts"):
         open_other_runs(store, target.base_dir, changed.config.methods.with_runs)
-    chosen = replace(command.options, settings=tuple(values.items()))
-    run_stages(target, ["methods"], replace(command, options=chosen))
+    run_stages(target, ["methods"], command.choosing(settings=tuple(values.items())))
     if command.options.dry_run:
         return ""
     reported = {state.stage: state.state for state in run_status(target)}["report"] != "missing"
     if reported:
-        run_stages(target, ["report"], replace(command, options=replace(command.options, force=False)))
+        run_stages(target, ["report"], command.choosing(force=False))
     result = read_methods(target.stored())
     if result is None:
         return ""

@@ -48,18 +48,9 @@ class ListedModel:
 
     def to_json(self) -> dict[str, object]:
         """Return it as JSON data."""
-        version = self.version
-        return {
-            "number": version.number,
-            "current": self.current,
-            "model": version.model,
-            "source": version.source,
-            "parent": version.parent,
-            "closed_fraction": version.closed_fraction,
-            "made": version.made,
-            "digest": version.digest,
-            "results": list(self.results),
-        }
+        names = ("number", "model", "source", "parent", "closed_fraction", "made", "digest")
+        version = {name: getattr(self.version, name) for name in names}
+        return {**version, "current": self.current, "results": list(self.results)}
 
 
 def list_models(target: Target) -> list[ListedModel]:

@@ -29,7 +29,7 @@ from pchem_pipeline.runner.session import nothing_left_of_a_refusal
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
-from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore, stored_config
 
 _YAML = (".yaml", ".yml")
 #: Settings that differ, as many as a message tells.
@@ -214,7 +214,7 @@ def _came_to_nothing(place: Path, path: Path) -> bool:
         return False
     store = RunStore.open(place)
     records = [store.records.known(name) for name in STAGES]
-    untouched = store.config_text() == path.read_text(encoding="utf-8")
+    untouched = stored_config(place) == path.read_text(encoding="utf-8")
     return untouched and not any(record is not None and record.finished for record in records)
 
 

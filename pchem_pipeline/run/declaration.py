@@ -35,10 +35,6 @@ class SinglePass:
     run: str
 
 
-def _every_run(_: RunConfig) -> bool:
-    return True
-
-
 @dataclass(frozen=True)
 class Stage:
     """A stage of a run.
@@ -76,7 +72,7 @@ class Stage:
     identity: str | None = None
     files: tuple[str, ...] = ()
     summary: str = ""
-    applies: Callable[[RunConfig], bool] = _every_run
+    applies: Callable[[RunConfig], bool] = lambda _: True
     on_demand: bool = False
     may_write_nothing: bool = False
     follows: tuple[str, ...] = ()

@@ -185,11 +185,10 @@ def differences(
     if old.get("version") != new["version"]:
         words.append(f"algorithm version {old.get('version')} -> {new['version']}")
     before: dict[str, Any] = old.get("settings", {})
-    for section in sorted(before.keys() | new["settings"].keys()):
-        for key, was, now in _changes(section, before.get(section), new["settings"].get(section)):
-            default = config is not None and was is not None and not states(config, key)
-            keep = f" (the default; {key}: {was} in the YAML keeps the result)" if default else ""
-            words.append(f"{key} {was} -> {now}{keep}")
+    for key, was, now in changes(before, new["settings"]):
+        default = config is not None and was is not None and not states(config, key)
+        keep = f" (the default; {key}: {was} in the YAML keeps the result)" if default else ""
+        words.append(f"{key} {was} -> {now}{keep}")
     for name in new["upstream"]:
         if old.get("upstream", {}).get(name) != new["upstream"][name]:
             words.append(f"{name} was run again")
@@ -204,16 +203,19 @@ def _input_changes(old: Any, new: Any, models: Mapping[Any, int]) -> list[str]:
         return ["the input has changed"]
     before, after = (models.get(facts.get("model"), "unknown") for facts in (old, new))
     words = [] if old.get("model") == new.get("model") else [f"model {before} -> {after}"]
-    changes = _changes("input", {**old, "model": None}, {**new, "model": None})
-    return words + [_NEWS.get(key, f"{key} {was} -> {now}") for key, was, now in changes]
+    others = changes({**old, "model": None}, {**new, "model": None}, "input")
+    return words + [_NEWS.get(key, f"{key} {was} -> {now}") for key, was, now in others]
 
 
-def _changes(key: str, old: Any, new: Any) -> list[tuple[str, Any, Any]]:
-    """Return the entries that differ: their dotted names, what they were and what they are."""
+def changes(old: Any, new: Any, key: str = "") -> list[tuple[str, Any, Any]]:
+    """Return the entries that differ, key by key: their dotted names, what they were and what they are.
+
+    A section that only one has is one entry.
+    """
     if isinstance(old, dict) and isinstance(new, dict):
         return [
             change
             for name in sorted(old.keys() | new.keys())
-            for change in _changes(f"{key}.{name}", old.get(name), new.get(name))
+            for change in changes(old.get(name), new.get(name), f"{key}.{name}" if key else name)
         ]
     return [] if old == new else [(key, old, new)]

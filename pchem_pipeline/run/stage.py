@@ -3,12 +3,12 @@
 A stage is a row of :mod:`pchem_pipeline.stages.table` and a module with a pure ``*_tile`` function, arrays in
 and arrays out, and ``run(context)``. That makes its arrays (``context.create``), then calls
 ``context.run_units(units, task)``. ``task`` is a picklable callable (a module-level function, or a
-``functools.partial`` of one) that takes a unit, opens the store by path (``open_store(path)``), writes whole
-chunks and returns a small JSON-able summary. The marker of a unit is set, in the worker, after its task
-returned.
+``functools.partial`` of one) that takes a unit and the store, writes whole chunks and returns a small
+JSON-able summary, or nothing. The marker of a unit is set, in the worker, after its task returned.
 
-A unit is anything picklable with ``key``, the words for messages, and ``keys``, the markers that it sets: a
-:class:`~pchem_pipeline.store.tiles.Tile`, a band of tiles, or a block of frames. A stage without
+A unit is anything picklable with ``key``, its name in messages and its marker: a
+:class:`~pchem_pipeline.store.tiles.Tile`, or a block of frames; a band of tiles has ``keys``, the markers of
+its tiles. A stage without
 parallel units has one, ``WHOLE``, which is done in this process.
 """
 
@@ -48,12 +48,7 @@ class Unit(Protocol):
 
     @property
     def key(self) -> str:
-        """What messages call it."""
-        ...
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """The markers that it sets when it is done."""
+        """What messages call it, and its marker."""
         ...
 
 
@@ -64,16 +59,21 @@ class Named(Generic[T]):
     key: str
     content: T
 
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Its only marker."""
-        return (self.key,)
-
 
 #: The only unit of a stage that is not divided.
 WHOLE = Named("all", None)
 
 AnyUnit = TypeVar("AnyUnit", bound=Unit)
+
+
+def markers(unit: Unit) -> tuple[str, ...]:
+    """Return the markers that a unit sets when it is done: its key, or of several tiles its ``keys``."""
+    found: tuple[str, ...] = getattr(unit, "keys", (unit.key,))
+    return found
+
+
+#: Does a unit, in a worker, with the store of the run; its summary is JSON data.
+Task = Callable[[AnyUnit, RunStore], Mapping[str, Any] | None]
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class MarkedTask:
     store: Path
     stage: str
     fingerprint: str
-    task: Callable[[Any], Mapping[str, Any] | None]
+    task: Task[Any]
     tell: Callable[[str, float], None] | None = None
     overtaken: bool = False
 
@@ -121,9 +121,9 @@ class MarkedTask:
         store = open_store(self.store)
         with working(store.records, self.stage, self.fingerprint if self.overtaken else None):
             with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
-                summary = dict(self.task(unit) or {})
+                summary = dict(self.task(unit, store) or {})
             check_work(self.store)
-            for key in unit.keys:
+            for key in markers(unit):
                 store.records.mark(self.stage, self.fingerprint, key, summary)
         return summary
 
@@ -141,13 +141,8 @@ class Prepared:
     clock: tuple[float, float] | None = None
 
 
-def _nothing() -> None:
-    """Do nothing."""
-
-
-def nothing_left(unit: Any) -> dict[str, Any]:
+def nothing_left(unit: Any, store: RunStore) -> None:
     """Do nothing: the task of units whose work was done beforehand."""
-    return {}
 
 
 @dataclass
@@ -191,7 +186,7 @@ class StageContext:
     config_path: Path | None = None
     notes: list[str] = field(default_factory=list)
     prepared: Mapping[str, Prepared] = field(default_factory=dict)
-    begin: Callable[[], None] = _nothing
+    begin: Callable[[], None] = lambda: None
     created: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -206,12 +201,12 @@ class StageContext:
 
     @property
     def sensor(self) -> SensorInfo:
-        """The input as ``ingest`` found it.
+        """The input, with the bit depth and integration time of the configuration, where it sets them.
 
         Raises:
             StoreError: nothing was ingested yet.
         """
-        return SensorInfo.read(self.store)
+        return SensorInfo.read(self.store).with_settings(self.config.input)
 
     @property
     def charge_rate(self) -> str:
@@ -219,21 +214,6 @@ class StageContext:
         exposed = [sample.kind for sample in self.sensor.samples if not sample.bias]
         kinds = exposed if self.config.input.kind == "unknown" and exposed else [self.config.input.kind]
         return "dark_current" if all(kind == "dark" for kind in kinds) else "charge_rate"
-
-    @property
-    def integration_time(self) -> float | None:
-        """Seconds per frame: from the configuration, else from the files."""
-        return self.sensor.with_settings(self.config.input).integration_time
-
-    @property
-    def bit_depth(self) -> int | None:
-        """Bits of the ADC: from the configuration, else from the files."""
-        return self.sensor.with_settings(self.config.input).bit_depth
-
-    @property
-    def adc_limits(self) -> tuple[int, int] | None:
-        """See `SensorInfo.adc_limits`."""
-        return self.sensor.with_settings(self.config.input).adc_limits
 
     @property
     def tile(self) -> tuple[int, int]:
@@ -310,7 +290,7 @@ class StageContext:
         }
         if self.options.roi is not None:
             chosen &= {t.key for t in roi_tiles(self.options.roi, grid)}
-        return [unit for unit in units if unit is WHOLE or chosen & set(unit.keys)]
+        return [unit for unit in units if unit is WHOLE or chosen & set(markers(unit))]
 
     def pending(self, units: Sequence[AnyUnit], *, by_tiles: bool = True) -> list[AnyUnit]:
         """Return the chosen units that are not done; with ``--force`` all the chosen ones.
@@ -322,12 +302,12 @@ class StageContext:
         chosen = self.selected(units) if by_tiles else list(units)
         if self.options.force and (by_tiles or not some_tiles):
             return chosen
-        return [unit for unit in chosen if not set(unit.keys) <= done]
+        return [unit for unit in chosen if not set(markers(unit)) <= done]
 
     def run_units(
         self,
         units: Sequence[AnyUnit],
-        task: Callable[[AnyUnit], Mapping[str, Any] | None],
+        task: Task[AnyUnit],
         *,
         unit_name: str = "tile",
         needs: str | None = None,
@@ -353,9 +333,11 @@ class StageContext:
             StoreError: the store cannot be written.
         """
         self.begin()
-        self._know_total(sum(len(unit.keys) for unit in units) if total is None else total)
+        self._know_total(sum(len(markers(unit)) for unit in units) if total is None else total)
         todo = self._ready(self._pending_of(units, by_tiles, total), needs)
-        self.store.records.unmark(self.stage, self.fingerprint, (key for unit in todo for key in unit.keys))
+        self.store.records.unmark(
+            self.stage, self.fingerprint, (key for unit in todo for key in markers(unit))
+        )
         fatal: list[BaseException] = []
         shown = len(self.selected(units) if by_tiles else units)
         undivided = list(units) == [WHOLE]
@@ -395,7 +377,7 @@ class StageContext:
     def _fill(self, units: Sequence[AnyUnit]) -> None:
         """Where units are left undone, write "no value" for their pixels into the maps of the stage."""
         done = self.store.records.done(self.stage, self.fingerprint)
-        if all(set(unit.keys) <= done for unit in units):
+        if all(set(markers(unit)) <= done for unit in units):
             return
         for name, stage in self.created.items():
             if stage == self.stage and "frame" not in VARIABLES[name].dims:
@@ -411,7 +393,7 @@ class StageContext:
         if total is None:
             return self.pending(units, by_tiles=by_tiles)
         done = self.store.records.done(self.stage, self.fingerprint)
-        return [unit for unit in units if not set(unit.keys) <= done]
+        return [unit for unit in units if not set(markers(unit)) <= done]
 
     def _know_total(self, n_keys: int) -> None:
         """Record how many markers the stage will have, before the first is set: a kill must not lose it."""
@@ -426,9 +408,9 @@ class StageContext:
             return units
         there = self.tiles_done(needs)
         for unit in units:
-            if not set(unit.keys) <= there:
+            if not set(markers(unit)) <= there:
                 self.failed[unit.key] = f"stage {needs} of {self.store.path} is not finished"
-        return [unit for unit in units if set(unit.keys) <= there]
+        return [unit for unit in units if set(markers(unit)) <= there]
 
     def _failed(self, unit: Unit, outcome: Outcome, fatal: list[BaseException]) -> None:
         error = outcome.error

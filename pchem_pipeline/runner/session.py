@@ -52,6 +52,10 @@ class Command:
     log_json: Path | None = None
     max_memory: int | None = None
 
+    def choosing(self, **options: Any) -> Command:
+        """Return the command with other options of the stages."""
+        return replace(self, options=replace(self.options, **options))
+
 
 def with_overrides(target: Target, command: Command) -> Target:
     """Return the target with the command line's compute settings."""
@@ -65,7 +69,7 @@ def cropped(target: Target, command: Command) -> tuple[Target, Command]:
     roi = command.options.roi
     if roi is None:
         return target, command
-    return target.changed("input", roi=roi), replace(command, options=replace(command.options, roi=None))
+    return target.changed("input", roi=roi), command.choosing(roi=None)
 
 
 def up_to(last: str, stages: Sequence[str]) -> Sequence[str]:
@@ -130,7 +134,7 @@ def _bring_samples(target: Target, stages: Sequence[str], command: Command) -> N
     """
     if not target.config.input.samples or not any(STAGES[name].reads_input for name in stages):
         return
-    own = replace(command, options=replace(command.options, force=False, tiles=None, roi=None))
+    own = command.choosing(force=False, tiles=None, roi=None)
     reporter = Reporter("off", quiet=command.quiet)
     for sample in sample_targets(target.config, target.base_dir):
         reporter.info(f"sample {sample.store.name}")

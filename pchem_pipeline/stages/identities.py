@@ -47,7 +47,7 @@ def _sample_content(context: StageContext) -> dict[str, Any]:
 
 def adc_limits(context: StageContext) -> dict[str, Any]:
     """Return what the files may say and the settings of the fit do not: the limits of the ADC."""
-    limits = context.adc_limits
+    limits = context.sensor.adc_limits
     return {"adc_limits": None if limits is None else list(limits)}
 
 
@@ -59,7 +59,7 @@ def fit_inputs(context: StageContext) -> dict[str, Any]:
 def integration_time(context: StageContext) -> dict[str, Any]:
     """Return what the files may say and the settings of the maps do not: time, or the samples' exposures."""
     if not context.config.input.samples:
-        return {"integration_time": context.integration_time, "rate": context.charge_rate}
+        return {"integration_time": context.sensor.integration_time, "rate": context.charge_rate}
     from pchem_pipeline.stages.samples import exposure_axis
 
     settings = context.config.input
@@ -82,10 +82,10 @@ def verdict(context: StageContext) -> dict[str, str] | None:
 
 def other_samples(context: StageContext) -> dict[str, Any]:
     """Return which other runs join a comparison of methods, their state, and what the command line chose."""
-    from pchem_pipeline.stages.methods import chosen, other_runs
+    from pchem_pipeline.stages.methods import inputs
 
-    given = chosen.chosen_settings(context)
-    content = {**adc_limits(context), "with_runs": other_runs.other_samples(context)}
+    given = inputs.chosen_settings(context)
+    content = {**adc_limits(context), "with_runs": inputs.other_samples(context)}
     return {**content, "chosen": given} if given else content
 
 

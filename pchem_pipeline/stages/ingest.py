@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,12 +20,13 @@ from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histo
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.input_identity import keep_ingested, known_identity, shortened
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.stage import WHOLE, StageContext, nothing_left, open_store
+from pchem_pipeline.run.stage import WHOLE, StageContext, Task, nothing_left
 from pchem_pipeline.stages.samples import check_samples, sample_sensor
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.reader import FrameReader
     from pchem_pipeline.frames.sequence import FrameSequence
+    from pchem_pipeline.store.run_store import RunStore
 
 #: frames, rows, columns: streams in the order of time and by tile alike
 _CHUNK = (256, 128, 128)
@@ -49,11 +49,6 @@ class CopyUnit:
     def key(self) -> str:
         """What messages call it, and its marker."""
         return f"frames-{self.t0}-{self.t1 - 1}-rows-{self.y0}-{self.y1 - 1}"
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """The one marker that it sets."""
-        return (self.key,)
 
 
 def frames_tile(reader: FrameReader, unit: CopyUnit) -> NDArray[Any]:
@@ -97,10 +92,10 @@ def run(context: StageContext) -> None:
         return
     chunk = chunk_shape(reader.shape, reader.dtype.itemsize)
     units = list(copy_units(reader.shape, reader.dtype.itemsize, chunk))
-    task: Callable[[CopyUnit], dict[str, Any]] = nothing_left
+    task: Task[CopyUnit] = nothing_left
     if done is None:
         create_frames(context, reader)
-        task = functools.partial(_copy, store=context.store.path, reader=reader)
+        task = functools.partial(_copy, reader=reader)
     # the frames of a row of chunks, those that the reader holds, and the compressed ones
     held = 0 if done else 3 * chunk[0] * chunk[1] * reader.shape[2] * reader.dtype.itemsize
     context.run_units(units, task, unit_name="block", by_tiles=False, unit_bytes=held)
@@ -165,15 +160,13 @@ def copy_units(shape: tuple[int, int, int], itemsize: int, chunk: tuple[int, int
             yield CopyUnit(t0, min(t0 + chunk[0], n_frames), y0, min(y0 + rows, ny))
 
 
-def _copy(unit: CopyUnit, *, store: Path, reader: FrameReader) -> dict[str, Any]:
+def _copy(unit: CopyUnit, store: RunStore, *, reader: FrameReader) -> None:
     """Read the frames of a unit and write them into the store, a row of chunks at a time."""
-    opened = open_store(store)
-    rows = opened.array("frames/dn").chunks[1]
+    rows = store.array("frames/dn").chunks[1]
     for y in range(unit.y0, unit.y1, rows):
         part = replace(unit, y0=y, y1=min(y + rows, unit.y1))
         region = (slice(part.t0, part.t1), slice(part.y0, part.y1), slice(None))
-        opened.write("frames/dn", region, frames_tile(reader, part))
-    return {}
+        store.write("frames/dn", region, frames_tile(reader, part))
 
 
 def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:

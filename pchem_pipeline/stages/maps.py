@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,11 +22,13 @@ from pchem_pipeline.model.maps.maps import (
     summarise,
 )
 from pchem_pipeline.model.maps.sample_maps import line_map_names, line_maps
-from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
+    from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
 
 _OF_FIT = ("correlation", "fit_status", "likelihood_gap")
@@ -45,7 +46,7 @@ _CUT = int(FitStatus.BIAS_AMBIGUOUS | FitStatus.OUTSIDE_WINDOW)
 
 def _tell_time(context: StageContext) -> None:
     """Say where the integration time is not known, or is not what the files say."""
-    time, stated = context.integration_time, context.sensor.integration_time
+    time, stated = context.sensor.integration_time, SensorInfo.read(context.store).integration_time
     if time is None:
         context.note(NO_TIME)
     elif stated is not None and abs(time - stated) > _SAME_TIME * stated:
@@ -97,7 +98,7 @@ def run(context: StageContext) -> None:
     Raises:
         StoreError: the fit is missing, or the store refuses.
     """
-    time, line = context.integration_time, _line(context)
+    time, line = context.sensor.integration_time, _line(context)
     of_time = (context.charge_rate,) if time is not None and line is None else ()
     names = [*_SUMMARISED, *(of_time if line is None else line.names)]
     context.create(*(f"maps/{name}" for each in names for name in (each, f"{each}_stderr")))
@@ -111,7 +112,6 @@ def run(context: StageContext) -> None:
         _tell_time(context)
     task = functools.partial(
         _do_tile,
-        store=context.store.path,
         integration_time=time,
         rate=context.charge_rate,
         line=line,
@@ -139,23 +139,21 @@ def _line(context: StageContext) -> Line | None:
 
 def _do_tile(
     tile: Tile,
+    store: RunStore,
     *,
-    store: Path,
     integration_time: float | None,
     rate: str,
-    line: Line | None = None,
-    n_frames: int | None = None,
-) -> dict[str, Any]:
-    opened = open_store(store)
+    line: Line | None,
+    n_frames: int | None,
+) -> None:
     needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS), *_OF_FIT]
-    needed += [path for name in INTERVALS for path in interval_names(name) if opened.has(f"fit/{path}")]
-    fit = opened.read_arrays("fit", needed, tile.region)
-    opened.write_arrays("maps", maps_tile(fit, integration_time, rate, n_frames), tile.region)
+    needed += [path for name in INTERVALS for path in interval_names(name) if store.has(f"fit/{path}")]
+    fit = store.read_arrays("fit", needed, tile.region)
+    store.write_arrays("maps", maps_tile(fit, integration_time, rate, n_frames), tile.region)
     if line is not None:
-        samples = opened.read_arrays("samples", ("quanta_exposure", "covariance"), tile.region)
+        samples = store.read_arrays("samples", ("quanta_exposure", "covariance"), tile.region)
         for group, arrays in zip(("maps", "samples"), line_tile(samples, line), strict=True):
-            opened.write_arrays(group, arrays, tile.region)
-    return {}
+            store.write_arrays(group, arrays, tile.region)
 
 
 def line_tile(

@@ -25,7 +25,7 @@ from pchem_pipeline.frames.formats.map_files import read_image
 from pchem_pipeline.frames.identity import content_identity
 from pchem_pipeline.frames.writing import WRITERS, write_frames
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
-from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.scene import with_scene
@@ -35,6 +35,8 @@ from pchem_pipeline.store.files import storage_error, write_atomic
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from pchem_pipeline.store.run_store import RunStore
 
 TRUTH_FILE = "truth.npz"
 # memory for the frames in the making, over all workers
@@ -64,11 +66,6 @@ class SimulateUnit:
     def key(self) -> str:
         """What messages call it."""
         return f"{self.kind}-{self.start}-{self.stop}"
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Its only marker."""
-        return (self.key,)
 
 
 def run(context: StageContext) -> None:
@@ -107,7 +104,6 @@ def run(context: StageContext) -> None:
         _do,
         settings=settings,
         folder=folder,
-        store=context.store.path,
         workers=context.executor.workers,
         alone=len(_frame_units(files)) == 1,
     )
@@ -121,13 +117,19 @@ def frames_tile(truth: TruthMaps, settings: SimulateSettings, frames: tuple[int,
 
 
 def _do(
-    unit: SimulateUnit, *, settings: SimulateSettings, folder: Path, store: Path, workers: int, alone: bool
+    unit: SimulateUnit,
+    store: RunStore,
+    *,
+    settings: SimulateSettings,
+    folder: Path,
+    workers: int,
+    alone: bool,
 ) -> dict[str, Any]:
     truth, settings = _sensor(settings.model_dump_json())
     if unit.kind == "electrons":
         _, electrons = simulate_block(truth, settings, (unit.start, unit.stop))
         region = (slice(unit.start, unit.stop), slice(None), slice(None))
-        open_store(store).write("truth/electron_number", region, electrons)
+        store.write("truth/electron_number", region, electrons)
         return {}
     step = frames_per_block(settings, settings.shape[0], _BUDGET // workers)
     for name, start, stop in unit.files:

@@ -40,10 +40,6 @@ _LINE = ("linearity_residual", "linearity_residual_stderr", "linearity_chi2", "l
 _SINGLE_PASS = SinglePass(("ingest", "histogram"), f"{_HERE}.histogram.single_pass:count_in_one_pass")
 
 
-def _is_simulated(config: RunConfig) -> bool:
-    return config.simulate is not None
-
-
 _ALL = (
     Stage(
         "simulate",
@@ -55,7 +51,7 @@ _ALL = (
         run=f"{_HERE}.simulate:run",
         identity=f"{_HERE}.simulate:scene_identity",
         summary="Simulate a camera: write its frames and true parameters.",
-        applies=_is_simulated,
+        applies=lambda config: config.simulate is not None,
     ),
     Stage(
         "ingest",

@@ -366,10 +366,6 @@ class RunStore:
         """Keep the resolved YAML of the run, its digest before it: no cut file is without one."""
         write_atomic(self.path / _PRIVATE / "config.yaml", _digest_line(text.encode()) + text.encode())
 
-    def config_text(self) -> str | None:
-        """Return the resolved YAML that made the run, or None; see `stored_config`."""
-        return stored_config(self.path)
-
     # -- housekeeping -------------------------------------------------------------------------
 
     @contextmanager

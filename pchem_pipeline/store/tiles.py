@@ -39,11 +39,6 @@ class Tile:
         return f"{self.iy}.{self.ix}"
 
     @property
-    def keys(self) -> tuple[str, ...]:
-        """The marker names that this unit of work sets: its own."""
-        return (self.key,)
-
-    @property
     def region(self) -> tuple[slice, slice]:
         """Index of the tile's pixels in a ``(y, x)`` map."""
         return slice(self.y0, self.y1), slice(self.x0, self.x1)

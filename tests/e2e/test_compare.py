@@ -22,7 +22,7 @@ from pchem_pipeline.report.pages.summary import criteria
 from pchem_pipeline.report.style.wording import percent
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore, stored_config
 
 
 @pytest.fixture
@@ -99,7 +99,8 @@ def test_lost_and_new_arrays_settings_and_versions(shell, copies):
     copies.delete("fit/goodness_p")
     copies.delete("fit/n_iterations")
     shutil.rmtree(shell.folder / "a.zarr" / "ensemble" / "epcd_independent")
-    copies.write_config((copies.config_text() or "").replace("gap_threshold: 5.0", "gap_threshold: 7.0"))
+    text = stored_config(copies.path) or ""
+    copies.write_config(text.replace("gap_threshold: 5.0", "gap_threshold: 7.0"))
     assert "fit/goodness_p: missing" in here(shell, "a.zarr", "b.zarr")
     [pair] = numbers(shell)["comparisons"]
     assert pair["what"] == ["fit/goodness_p: missing."]  # what is new, or no result, counts nothing

@@ -18,7 +18,7 @@ from pchem_pipeline.effects.framework.registry import effect_class
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED
-from pchem_pipeline.stages.fit.fit import fit_tile
+from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
 
 FROZEN = Path(__file__).parent / "data" / "frozen_fits.npz"
 ADC = (0, (1 << 14) - 1)
@@ -63,7 +63,8 @@ def fitted(kind: str, histograms: Arrays) -> Arrays:
     nothing = np.zeros((counts.shape[0], 1), np.uint32)
     tile = {"counts": counts[:, None], "origin": origin[:, None], "under": nothing, "over": nothing}
     effects = [effect_class(each["tag"])(**each) for each in EFFECTS] if kind == "effects" else []
-    return {name: array[:, 0] for name, array in fit_tile(tile, settings, ADC, effects).items()}
+    found = fit_tile([tile], TileFit(settings, ADC, effects))["fit"]
+    return {name: array[:, 0] for name, array in found.items()}
 
 
 @pytest.fixture(scope="module")

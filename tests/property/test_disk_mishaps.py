@@ -29,12 +29,11 @@ SENSOR = SensorInfo("frames", 10, 8, 16, "uint16", 14, 4.87, "copy", {})
 NUMBERS = [errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EROFS]
 
 
-def fit_tile(path, value, tile):
-    open_store(path).write("fit/bias", tile.region, np.full(tile.shape, value + tile.ix))
+def fit_tile(tile, store, *, value):
+    store.write("fit/bias", tile.region, np.full(tile.shape, value + tile.ix))
 
 
-def maps_tile(path, tile):
-    store = open_store(path)
+def maps_tile(tile, store):
     bias = store.read("fit/bias", tile.region)
     assert np.isfinite(bias).all()  # a marker stands for what is in the store
     store.write("maps/bias", tile.region, 2 * bias)
@@ -42,17 +41,17 @@ def maps_tile(path, tile):
 
 def fit_run(context):
     context.create("fit/bias")
-    task = functools.partial(fit_tile, context.store.path, context.config.fit.gap_threshold)
+    task = functools.partial(fit_tile, value=context.config.fit.gap_threshold)
     context.run_units(context.tiles(), task)
 
 
 def maps_run(context):
     context.create("maps/bias")
-    context.run_units(context.tiles(), functools.partial(maps_tile, context.store.path), needs="fit")
+    context.run_units(context.tiles(), maps_tile, needs="fit")
 
 
 def page_run(context):
-    def page(unit):
+    def page(unit, store):
         context.store.write_file("report.html", b"<html>" + context.store.read("maps/bias").tobytes())
 
     context.run_units([WHOLE], page)

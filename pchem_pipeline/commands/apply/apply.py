@@ -126,7 +126,7 @@ def apply_to_frames(
         context.fingerprint = fingerprint_of(made.content)
         for remark in made.remarks:
             reporter.warning(remark)
-        _do(context, replace(made.job, output=store.path), made)
+        _do(context, made)
         if wanted.format == "zarr":
             how = f'xarray.open_zarr("{output}", group="applied", consolidated=False)'
             reporter.info(f"apply: open it with {how}")
@@ -141,7 +141,7 @@ class _Made:
     """All that is known before anything is written.
 
     Attributes:
-        job: without the output.
+        job: of the workers.
         content: what decides the result, as JSON data.
         remarks: for the user.
         calibration: of all pixels.
@@ -186,7 +186,6 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         )
     prior_map = _prior_map(wanted.prior, sensor.shape) if numbers else None
     job = Job(
-        target.store,
         target.store,
         frames,
         wanted.kinds,
@@ -344,7 +343,7 @@ def _create_converted(context: StageContext, job: Job, n_segments: int) -> None:
 # -- the work --------------------------------------------------------------------------------------
 
 
-def _do(context: StageContext, job: Job, made: _Made) -> None:
+def _do(context: StageContext, made: _Made) -> None:
     """Bring the output up to date.
 
     Raises:
@@ -355,7 +354,7 @@ def _do(context: StageContext, job: Job, made: _Made) -> None:
         context.store.delete("applied_parts")  # what a failure after the last step may have left
         context.reporter.info(f"apply: {context.store.path} is up to date")
         return
-    job, made = _with_moments(context, job, made)
+    job, made = _with_moments(context, made.job, made)
     if job.removed and not context.failed:
         job = _with_offsets(context, job, made)
     if job.counts and not context.failed:

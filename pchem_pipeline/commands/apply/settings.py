@@ -75,11 +75,6 @@ class Piece:
         """What messages and markers call it."""
         return f"{self.name}-{self.y0}-{self.t0}"
 
-    @property
-    def keys(self) -> tuple[str, ...]:
-        """Its only marker."""
-        return (self.key,)
-
 
 @dataclass(frozen=True)
 class Job:
@@ -87,7 +82,6 @@ class Job:
 
     Attributes:
         run: store of the characterisation.
-        output: store that is written.
         source: the frames.
         kinds: what is wanted.
         prior: as in `ApplySettings`; a file stands as its map in ``prior_map``.
@@ -109,7 +103,6 @@ class Job:
     """
 
     run: Path
-    output: Path
     source: FrameSource
     kinds: tuple[str, ...]
     prior: str = "frames"

@@ -15,7 +15,6 @@ from pchem_pipeline.commands.apply.characterisation import read_calibration, wit
 from pchem_pipeline.commands.apply.settings import Job, Piece
 from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
 from pchem_pipeline.use.common_modes import Offsets, estimate_offsets
@@ -41,11 +40,13 @@ def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> NDA
     return found.of_samples(job.modes, rows)
 
 
-def _calibration(job: Job, rows: slice, limits: tuple[int | None, int | None]) -> Calibration:
+def _calibration(
+    output: RunStore, job: Job, rows: slice, limits: tuple[int | None, int | None]
+) -> Calibration:
     run = RunStore.open(job.run)
     extra = None if job.offset_variance is None else job.offset_variance[rows]
     found = read_calibration(run, rows, removed=job.removed, extra_variance=extra, limits=limits)
-    return with_moments(found, open_store(job.output), rows) if job.moments else found
+    return with_moments(found, output, rows) if job.moments else found
 
 
 def _codes(frames: NDArray[Any], job: Job, offsets: NDArray[np.float32]) -> NDArray[Any]:
@@ -56,20 +57,17 @@ def _codes(frames: NDArray[Any], job: Job, offsets: NDArray[np.float32]) -> NDAr
 # -- errors of the calibration ---------------------------------------------------------------------
 
 
-def moments_piece(piece: Piece, *, job: Job, settings: FitSettings) -> dict[str, Any]:
+def moments_piece(piece: Piece, output: RunStore, *, job: Job, settings: FitSettings) -> None:
     """Write the errors of the calibration of some rows."""
-    rows = slice(piece.y0, piece.y1)
-    write_moments(RunStore.open(job.run), open_store(job.output), rows, settings)
-    return {}
+    write_moments(RunStore.open(job.run), output, slice(piece.y0, piece.y1), settings)
 
 
 # -- offsets of frames, rows and columns -----------------------------------------------------------
 
 
-def offsets_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
+def offsets_piece(piece: Piece, output: RunStore, *, job: Job) -> dict[str, Any]:
     """Find and write the offsets of some frames; the summary tells how well they are known."""
-    output = open_store(job.output)
-    calibration = _calibration(job, _WHOLE, job.cut)
+    calibration = _calibration(output, job, _WHOLE, job.cut)
     left, largest = np.zeros(len(job.modes.parts)), 0.0
     ends, known = [0, np.iinfo(np.int64).max] if job.limits is None else list(job.limits), calibration.usable
     reached = [False, False]
@@ -91,11 +89,10 @@ def offsets_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
 # -- histograms and exposure -----------------------------------------------------------------------
 
 
-def count_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
+def count_piece(piece: Piece, output: RunStore, *, job: Job) -> dict[str, Any]:
     """Count the frames of some rows; write the range of their codes, and their exposure if wanted."""
     from pchem_pipeline.model.histogram.count import HistogramAccumulator
 
-    output = open_store(job.output)
     rows = slice(piece.y0, piece.y1)
     shape = (piece.y1 - piece.y0, job.source.shape[2])
     accumulator = HistogramAccumulator(shape, job.bins, piece.t1)
@@ -115,7 +112,7 @@ def count_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
     output.write("applied_parts/range", (_WHOLE, rows, _WHOLE), ends)
     if not job.estimates:
         return {}
-    _write_exposure(output, found, _calibration(job, rows, job.cut), job, rows)
+    _write_exposure(output, found, _calibration(output, job, rows, job.cut), job, rows)
     return {"outside": int(((found.under > 0) | (found.over > 0)).sum())}
 
 
@@ -155,12 +152,11 @@ def _write_exposure(
 # -- samples ---------------------------------------------------------------------------------------
 
 
-def convert_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
+def convert_piece(piece: Piece, output: RunStore, *, job: Job) -> None:
     """Write electrons and electron numbers of a piece, and the sums over its frames."""
-    output = open_store(job.output)
     rows = slice(piece.y0, piece.y1)
     # without offsets each sample has limits of its own
-    calibration = _calibration(job, rows, (None, None) if job.removed else job.cut)
+    calibration = _calibration(output, job, rows, (None, None) if job.removed else job.cut)
     tables = _tables(output, job, calibration, rows) if "numbers" in job.kinds else None
     sums = np.zeros((N_SUMS, *calibration.shape))
     sums[4] = np.inf
@@ -182,7 +178,6 @@ def convert_piece(piece: Piece, *, job: Job) -> dict[str, Any]:
     output.write(
         "applied_parts/sums", (slice(piece.number, piece.number + 1), _WHOLE, rows, _WHOLE), sums[None]
     )
-    return {}
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.report.comparison import Setting
+from pchem_pipeline.run.fingerprint import changes
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.run_store import RunStore
 
@@ -27,7 +27,7 @@ def settings_that_differ(one: RunConfig, other: RunConfig) -> list[Setting]:
     left, right = (config.model_dump(mode="json", by_alias=True) for config in (one, other))
     return [
         Setting(name, _text(before), _text(after), _readers(name))
-        for name, before, after in _differing(left, right)
+        for name, before, after in changes(left, right)
     ]
 
 
@@ -51,15 +51,6 @@ def _versions(store: RunStore) -> dict[str, Any]:
             for name, version in record.versions.items():
                 found.setdefault(name, set()).add(version)
     return {name: ", ".join(sorted(versions)) for name, versions in found.items()}
-
-
-def _differing(one: Any, other: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield what differs, key by key; a section that only one has is one difference."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        for key in sorted(one.keys() | other.keys()):
-            yield from _differing(one.get(key), other.get(key), f"{name}.{key}" if name else key)
-    elif one != other:
-        yield name, one, other
 
 
 def _text(value: Any) -> str:

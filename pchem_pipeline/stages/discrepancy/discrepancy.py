@@ -162,8 +162,8 @@ class _Search:
         """Return how the frames of a window were taken."""
         return {
             "n_run": self.source.shape[0] - len(window.copied),
-            "bit_depth": self.context.bit_depth,
-            "integration_time": self.context.integration_time or 1.0,
+            "bit_depth": self.context.sensor.bit_depth,
+            "integration_time": self.context.sensor.integration_time or 1.0,
             "window": SensorWindow(
                 window.rows,
                 window.columns,
@@ -216,7 +216,7 @@ def _surveyed(
             )
             settings, seen = few, _survey(context, source, few)
         known = {"window": _taken_of(settings), "whole": _taken_of(most), **seen.numbers()}
-        context.run_units([WHOLE], lambda _: known, by_tiles=False, total=1)
+        context.run_units([WHOLE], lambda *_: known, by_tiles=False, total=1)
     whole = known.get("whole", known["window"])
     few, most = (settings.model_copy(update=each) for each in (known["window"], whole))
     return few, Survey.of_numbers(known), most
@@ -240,7 +240,8 @@ def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] |
 
 def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...]:
     """Return as an effect the codes at which samples pile up: the fit has them without a model."""
-    (low, high), ends, store = context.sensor.seen_limits, context.adc_limits, context.store
+    sensor, store = context.sensor, context.store
+    (low, high), ends = sensor.seen_limits, sensor.adc_limits
     if ends is not None and store.has("histogram/minimum"):
         low = ends[0] if (store.read("histogram/minimum") <= ends[0]).mean() > _REACHED else low
         high = ends[1] if (store.read("histogram/maximum") >= ends[1]).mean() > _REACHED else high
@@ -330,7 +331,7 @@ class _Mapper:
         return found
 
 
-def _simulate(unit: Named[Replicate]) -> dict[str, float]:
+def _simulate(unit: Named[Replicate], store: RunStore) -> dict[str, float]:
     return unit.content()
 
 
@@ -342,8 +343,8 @@ def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) 
         dict(zip(names, z_before.tolist(), strict=True)),
         dict(zip(names, z_after.tolist(), strict=True)) if found.verdict.steps else None,
         [e for e in found.model if e.tag in found.verdict.effects],
-        context.integration_time or 1.0,
-        context.bit_depth or 16,
+        context.sensor.integration_time or 1.0,
+        context.sensor.bit_depth or 16,
         found.code_extended,
     )
     for name, array in arrays.items():

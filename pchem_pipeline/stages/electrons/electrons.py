@@ -8,7 +8,6 @@ large as the stack.
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from pchem_pipeline.model.electrons.electrons import (
     number_tables,
 )
 from pchem_pipeline.run.frame_source import open_source
-from pchem_pipeline.run.stage import StageContext, open_store
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import BAND_BYTES, tile_bands
 from pchem_pipeline.stages.fit.fitted_model import fitted_pixels
 
@@ -84,16 +83,14 @@ def run(context: StageContext) -> None:
     depth = context.store.array("electrons/electron_number").chunks[0]
     rows = BAND_BYTES // (depth * nx * 2)
     bands = tile_bands(context, "fit", rows, source.rows_per_read)
-    task = functools.partial(_do_band, store=context.store.path, source=source, depth=depth)
+    task = functools.partial(_do_band, source=source, depth=depth)
     context.run_units(bands, task, unit_name="band", needs="fit")
 
 
-def _do_band(band: Band, *, store: Path, source: FrameSource, depth: int) -> dict[str, Any]:
-    opened = open_store(store)
+def _do_band(band: Band, store: RunStore, *, source: FrameSource, depth: int) -> None:
     rows = slice(band.y0, band.y1)
-    tables = read_tables(opened, rows)
+    tables = read_tables(store, rows)
     with FrameStream(source, [(band.y0, band.y1)], depth) as stream:
         for start, (frames,) in stream:
             region = (slice(start, start + frames.shape[0]), rows, slice(None))
-            opened.write("electrons/electron_number", region, tables.convert(frames).number)
-    return {}
+            store.write("electrons/electron_number", region, tables.convert(frames).number)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +32,7 @@ from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.progress import parts_told
-from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
+from pchem_pipeline.run.stage import StageContext, markers, nothing_left
 from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
 from pchem_pipeline.stages.electrons.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
@@ -47,7 +46,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.frames.stream import FrameSource
     from pchem_pipeline.model.ensemble.settings import EnsembleSettings
-    from pchem_pipeline.model.law.sample_law import SampleLaw
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.stages.bands import Band
     from pchem_pipeline.store.run_store import RunStore
@@ -64,7 +62,6 @@ class _Job:
     """What the ensemble is of.
 
     Attributes:
-        store: path of the run.
         config: of the run.
         sensor: the input.
         axes: axes of the ensemble.
@@ -77,7 +74,6 @@ class _Job:
         limits: first and last code of the ADC, DN, where samples lie at one of them; else None.
     """
 
-    store: Path
     config: RunConfig
     sensor: SensorInfo
     axes: EnsembleAxes
@@ -181,7 +177,7 @@ def run(context: StageContext) -> None:
     source = open_source(context) if frames is not None and (truth or not everything) else None
     fitted_tiles = [tile for tile in tiles if tile.key in ready]
     fitted = _Fitted.read(store, fitted_tiles)
-    limits = fitted.limits(context.adc_limits)
+    limits = fitted.limits(context.sensor.adc_limits)
     axes = fitted.axes(settings)
     if sensor.kind == "histograms":
         context.note("input is histograms: the ensemble has all samples, with equal weight per channel")
@@ -193,9 +189,7 @@ def run(context: StageContext) -> None:
     _create(context, axes, len(tiles))
     numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
     codes = {} if frames is None or everything else _codes(context)
-    job = _Job(
-        store.path, context.config, sensor, axes, numbered, frames, codes, source, truth, effects, limits
-    )
+    job = _Job(context.config, sensor, axes, numbered, frames, codes, source, truth, effects, limits)
     rows = max(1, BAND_BYTES // (sensor.nx * fitted.bins * 4))
     bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
@@ -265,12 +259,11 @@ def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
     store.set_attributes("ensemble_tiles", {"axes": content})
 
 
-def _do_band(band: Band | Tile, *, job: _Job) -> dict[str, Any]:
+def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
     """Sum over each tile of a band; frames, where they are needed, are read once for all of them."""
-    store = open_store(job.store)
-    chosen = _count(job, band) if job.counts_anew else None
-    errors = {} if job.truth is None else _compare(job, band)
-    for key in band.keys:
+    chosen = _count(store, job, band) if job.counts_anew else None
+    errors = {} if job.truth is None else _compare(store, job, band)
+    for key in markers(band):
         number, tile = job.tiles[key]
         own = None
         if chosen is not None:
@@ -282,7 +275,6 @@ def _do_band(band: Band | Tile, *, job: _Job) -> dict[str, Any]:
             integers[job.axes.integers["signed_error"]] = errors[key].signed
         for name, row in zip(_SUMS, (integers, floats), strict=True):
             store.write(f"ensemble_tiles/{name}", (slice(number, number + 1), slice(None)), row[None])
-    return {}
 
 
 def _sum_tile(
@@ -311,7 +303,7 @@ def _sum_tile(
             some,
             everything,
             job.axes,
-            _law(store, of_pixels, place, job),
+            FittedModel.read(store, place).law(of_pixels).between(*(job.limits or (None, None))),
             fitted_satellites(store, place) if job.effects else None,
             None if errors is None else errors.of(_inside(tile, part)),
         )
@@ -323,13 +315,6 @@ def _sum_tile(
         integers[job.axes.integers["outside_all"]] = outside
         floats[job.axes.floats["share_all"]] = samples / job.sensor.n_frames
     return integers, floats
-
-
-def _law(
-    store: RunStore, maps: list[NDArray[np.float64]], place: tuple[slice, slice], job: _Job
-) -> SampleLaw:
-    """Return the law of the samples, with effects and limits of the codes."""
-    return FittedModel.read(store, place).law(maps).between(*(job.limits or (None, None)))
 
 
 def _read_counted(store: RunStore, tile: Tile, origin: NDArray[np.int64]) -> PixelHistograms:
@@ -376,10 +361,9 @@ def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStrea
     return FrameStream(job.source, [(band.y0, band.y1)], FRAMES_AT_ONCE, frames=frames)
 
 
-def _count(job: _Job, band: Band | Tile) -> PixelHistograms:
+def _count(store: RunStore, job: _Job, band: Band | Tile) -> PixelHistograms:
     """Histogram the chosen frames of a band; the same samples lie outside as in the stored histograms."""
     assert job.frames is not None
-    store = open_store(job.store)
     like = store.array("histogram/counts")
     origin, low, high = _ranges(store, (slice(band.y0, band.y1), slice(None)))
     first, size = occupied(origin, low, high, like.shape[2])
@@ -395,11 +379,11 @@ def _count(job: _Job, band: Band | Tile) -> PixelHistograms:
     return PixelHistograms(counts, origin, under + over)
 
 
-def _compare(job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:
+def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:
     """Compare estimated with true electron numbers of the chosen frames, tile by tile."""
     assert job.truth is not None
     assert job.source is not None
-    store, (y0, x0, t0) = open_store(job.store), job.truth
+    y0, x0, t0 = job.truth
     first, end = job.frames or (0, job.source.shape[0])
     known = min(end, store.array("truth/electron_number").shape[0] - t0)
     found: dict[str, ErrorTally] = {}
@@ -412,7 +396,7 @@ def _compare(job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:
             times = slice(t0 + t, t0 + t + block.shape[0])
             true = store.read("truth/electron_number", (times, slice(y0 + band.y0, y0 + band.y1), columns))
             numbers = tables.convert(block).number
-            for key in band.keys:
+            for key in markers(band):
                 tile = job.tiles[key][1]
                 part = (slice(None), slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
                 tally = compare_electron_numbers(numbers[part], true[part], ERROR_SIZES)

@@ -23,33 +23,37 @@ class TileArrays:
     """The arrays of the groups ``fit`` and ``samples`` of a tile, filled piece by piece.
 
     Attributes:
-        values: by path; pixels of the tile along the dimensions y and x.
+        values: by group and name; pixels of the tile along the dimensions y and x.
     """
 
     def __init__(self, tile: Tile) -> None:
         self._tile = tile
-        self.values: dict[str, NDArray[Any]] = {}
+        self.values: dict[str, dict[str, NDArray[Any]]] = {}
 
-    def add(self, part: tuple[slice, slice], found: Mapping[str, NDArray[Any]]) -> None:
+    def add(self, part: tuple[slice, slice], found: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
         """Take the arrays of a piece of the tile."""
-        for path, values in found.items():
-            variable = VARIABLES[path]
-            y = variable.dims.index("y")
-            shape = (*values.shape[:y], *self._tile.shape, *values.shape[y + 2 :])
-            whole = self.values.setdefault(path, np.empty(shape, values.dtype))
-            whole[variable.index(part)] = values
+        for group, arrays in found.items():
+            held = self.values.setdefault(group, {})
+            for name, values in arrays.items():
+                variable = VARIABLES[f"{group}/{name}"]
+                y = variable.dims.index("y")
+                shape = (*values.shape[:y], *self._tile.shape, *values.shape[y + 2 :])
+                whole = held.setdefault(name, np.empty(shape, values.dtype))
+                whole[variable.index(part)] = values
 
     def leave_out(self, excluded: NDArray[np.bool_]) -> None:
         """Take the values of excluded pixels (y, x) away, and give them their word."""
-        for path, values in self.values.items():
-            if values.dtype.kind == "f":
-                values[(slice(None),) * VARIABLES[path].dims.index("y") + (excluded,)] = np.nan
-        self.values["fit/fit_status"][excluded] = int(FitStatus.EXCLUDED)
+        for group, arrays in self.values.items():
+            for name, values in arrays.items():
+                if values.dtype.kind == "f":
+                    before = VARIABLES[f"{group}/{name}"].dims.index("y")
+                    values[(slice(None),) * before + (excluded,)] = np.nan
+        self.values["fit"]["fit_status"][excluded] = int(FitStatus.EXCLUDED)
 
     def write(self, store: RunStore) -> None:
         """Write them into a run."""
-        for path, values in self.values.items():
-            store.write(path, VARIABLES[path].index(self._tile.region), values)
+        for group, arrays in self.values.items():
+            store.write_arrays(group, arrays, self._tile.region)
 
 
 def create_fit_arrays(context: StageContext) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
@@ -57,7 +56,8 @@ def judge_sensor(context: StageContext) -> int:
         if pool is not None:
             pixels = kept[band[0].start] if kept else _judged(store, band)
             weak, ambiguous = pool.reasons(pixels, context.config.fit)
-            of_gain = bool(context.sensor.samples) | moves_gain(_exposure(store, band), pixels.noise)
+            exposure = store.read("fit/quanta_exposure", band).ravel()
+            of_gain = bool(context.sensor.samples) | moves_gain(exposure, pixels.noise)
             weak |= ambiguous & of_gain
             new[weak.reshape(words.shape)] |= weakly
             new[(ambiguous & ~of_gain).reshape(words.shape)] |= unsure
@@ -65,10 +65,6 @@ def judge_sensor(context: StageContext) -> int:
         if not np.array_equal(new, words):
             store.write("fit/fit_status", band, new)
     return found
-
-
-def _exposure(store: RunStore, band: _Region) -> NDArray[np.float64]:
-    return store.read("fit/quanta_exposure", band).ravel()
 
 
 def _judged(store: RunStore, band: _Region) -> Judged:

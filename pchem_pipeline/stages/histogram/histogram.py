@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, mos
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_scores, odd_frames
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, frame_statistics
 from pchem_pipeline.run.frame_source import open_source
-from pchem_pipeline.run.stage import StageContext, nothing_left, open_store
+from pchem_pipeline.run.stage import StageContext, Task, nothing_left
 from pchem_pipeline.stages.bands import Band, plan_bands
 from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, create_counts, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
@@ -33,6 +32,8 @@ from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import equal_rows
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pchem_pipeline.frames.histogram_files import HistogramInput
     from pchem_pipeline.store.tiles import Tile
 
@@ -139,7 +140,7 @@ def bins_of(source: FrameSource, frames: int, most: int, rows: int) -> int:
     return choose_bins(ranges, most)
 
 
-def _do_band(band: Band, *, job: CountJob, source: FrameSource, threads: int) -> None:
+def _do_band(band: Band, store: RunStore, *, job: CountJob, source: FrameSource, threads: int) -> None:
     """Count a band and write its chunks."""
     rows = [(band.y0, band.y1)]
     with FrameStream(source, rows, job.settings.window_frames, threads=threads) as stream:
@@ -188,7 +189,7 @@ def _copy_histograms(context: StageContext) -> None:
     from pchem_pipeline.frames.histogram_files import read_histograms
 
     given = read_histograms(context.config.input, context.base_dir)
-    task = functools.partial(_copy_tile, store=context.store.path, given=given)
+    task = functools.partial(_copy_tile, given=given)
     _copied(context, given.counts, "input is histograms, without order in time", task)
 
 
@@ -201,23 +202,23 @@ def _copy_shown_sample(context: StageContext) -> None:
         StoreError: the run of the sample is gone, or the store refuses.
     """
     place = sample_targets(context.config, context.base_dir)[context.sensor.shown].store
-    task = functools.partial(_copy_sample_tile, store=context.store.path, sample=place)
+    task = functools.partial(_copy_sample_tile, sample=place)
     _copied(context, RunStore.open(place).array("histogram/counts"), "in the runs of the samples", task)
 
 
-def _copied(context: StageContext, counts: Any, missing: str, task: Callable[[Tile], Any]) -> None:
+def _copied(context: StageContext, counts: Any, missing: str, task: Task[Tile]) -> None:
     """Make the arrays, as wide as ``counts``, and do all tiles; summaries are ``missing`` for that reason."""
     create_counts(context, counts.shape[2], counts.dtype)
     context.store.set_attributes("summary", {"missing": missing})
     context.run_units(context.tiles(), task)
 
 
-def _copy_sample_tile(tile: Tile, *, store: Path, sample: Path) -> None:
+def _copy_sample_tile(tile: Tile, store: RunStore, *, sample: Path) -> None:
     arrays = RunStore.open(sample).read_arrays("histogram", ("counts", *MAPS), tile.region)
-    open_store(store).write_arrays("histogram", arrays, tile.region)
+    store.write_arrays("histogram", arrays, tile.region)
 
 
-def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> None:
+def _copy_tile(tile: Tile, store: RunStore, *, given: HistogramInput) -> None:
     counts, origin = given.counts[tile.region], given.origin[tile.region]
     occupied = counts > 0
     last = counts.shape[2] - 1
@@ -229,4 +230,4 @@ def _copy_tile(tile: Tile, *, store: Path, given: HistogramInput) -> None:
         minimum=(origin + occupied.argmax(axis=2)).astype(np.int32),
         maximum=(origin + last - occupied[:, :, ::-1].argmax(axis=2)).astype(np.int32),
     )
-    open_store(store).write_arrays("histogram", vars(values), tile.region)
+    store.write_arrays("histogram", vars(values), tile.region)

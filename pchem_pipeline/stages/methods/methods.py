@@ -24,10 +24,8 @@ from pchem_pipeline.methods.registry import methods
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
-from pchem_pipeline.run.stage import Named, StageContext, open_store
-from pchem_pipeline.stages.methods.chosen import methods_settings
-from pchem_pipeline.stages.methods.other_runs import open_other_runs
-from pchem_pipeline.stages.methods.result import METHODS_FILE
+from pchem_pipeline.run.stage import Named, StageContext
+from pchem_pipeline.stages.methods.inputs import METHODS_FILE, methods_settings, open_other_runs
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
@@ -45,17 +43,16 @@ _Unit = Named[StudyPoint | None]
 class _Task:
     """Does a unit."""
 
-    store: Path
     others: tuple[Path, ...]
     settings: MethodsSettings
     adc_limits: tuple[int, int] | None
 
-    def __call__(self, unit: _Unit) -> dict[str, Any]:
+    def __call__(self, unit: _Unit, store: RunStore) -> dict[str, Any]:
         """Compare the methods and return the numbers as plain data."""
         numbers = Settings(self.settings.em_iterations, self.settings.em_tolerance)
         if unit.content is not None:
             return study_point(unit.content, numbers)
-        return _compare_run(self, numbers)
+        return _compare_run(store, self, numbers)
 
 
 def choose(shape: tuple[int, int], n_pixels: int, seed: int) -> NDArray[np.int64]:
@@ -109,7 +106,7 @@ def run(context: StageContext) -> None:
     context.create("methods/pixel_y", "methods/pixel_x", lengths=lengths)
     context.create(*(f"methods/{name}" for name in PARAMETERS), lengths=lengths, methods=names)
     units = [_Unit("run", None), *_study_units(context, settings)]
-    task = _Task(context.store.path, tuple(o.path for o in others), settings, context.adc_limits)
+    task = _Task(tuple(o.path for o in others), settings, context.sensor.adc_limits)
     found = context.run_units(units, task, unit_name="part", by_tiles=False)
     if not {unit.key for unit in units} <= found.keys():
         return
@@ -152,9 +149,8 @@ def _study_units(context: StageContext, settings: MethodsSettings) -> list[_Unit
     ]
 
 
-def _compare_run(task: _Task, numbers: Settings) -> dict[str, Any]:
+def _compare_run(store: RunStore, task: _Task, numbers: Settings) -> dict[str, Any]:
     """Compare the methods on the run's pixels, and store their estimates."""
-    store = open_store(task.store)
     shape = store.array("fit/bias").shape
     place = choose((shape[0], shape[1]), task.settings.pixels, task.settings.seed)
     stores = [store, *(_readable(path) for path in task.others)]

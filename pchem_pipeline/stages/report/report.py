@@ -31,7 +31,7 @@ from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.maps.ordered import median_of
 from pchem_pipeline.planning.frames import contour_data, frames_needed, precision
 from pchem_pipeline.planning.point import Point
-from pchem_pipeline.planning.targets import Target, parse_target
+from pchem_pipeline.planning.targets import parse_target
 from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
@@ -45,7 +45,7 @@ from pchem_pipeline.report.pages.summary import check_sentence
 from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.run.stage import WHOLE, StageContext, Unit, open_store
+from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
 from pchem_pipeline.stages.discrepancy.result import verdict_data
 from pchem_pipeline.stages.maps import NO_TIME
 from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
@@ -62,13 +62,13 @@ from pchem_pipeline.stages.report.pixels import (
 from pchem_pipeline.stages.report.stored import PixelHistograms, StoredRun, read_histograms, read_run
 from pchem_pipeline.stages.samples import exposure_axis
 from pchem_pipeline.stages.table import pipeline
+from pchem_pipeline.store.run_store import RunStore, stored_config
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.report.pages.pictures import DrawAll
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.store.records import StageRecord
-    from pchem_pipeline.store.run_store import RunStore
 
 #: Where a version of the model comes from, in words.
 _SOURCES = {"config": "from the configuration", "verdict": "from the search for missing effects"}
@@ -78,6 +78,9 @@ _FEW_CHANNELS = 12
 _SOME_MASSES = 300
 #: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 940 MiB in all.
 _PIXEL_BYTES = 300
+#: Precisions whose frames the report tells, at the median pixel; those of the figure, and its points an axis.
+_TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
+_DRAWN, _FINE = _TARGETS[:2], 14
 
 
 def run(context: StageContext) -> None:
@@ -96,12 +99,10 @@ def run(context: StageContext) -> None:
             )
     task = functools.partial(
         _write,
-        context.store.path,
-        context.config,
-        context.integration_time,
-        _stage_rows(context),
+        config=context.config,
+        stages=_stage_rows(context),
         # in this process: another would spend more on its imports than on its share of the figures
-        draw_by_workers(1, context.reporter, context.stage),
+        draw=draw_by_workers(1, context.reporter, context.stage),
     )
     done = context.run_units([WHOLE], task, unit_name="report", unit_bytes=ny * nx * _PIXEL_BYTES)
     for text in done.get(WHOLE.key, {}).get("warnings", ()):
@@ -109,27 +110,26 @@ def run(context: StageContext) -> None:
 
 
 def _write(
-    path: Path,
+    unit: Unit,
+    store: RunStore,
+    *,
     config: RunConfig,
-    integration_time: float | None,
     stages: list[dict[str, Any]],
     draw: DrawAll | None,
-    unit: Unit,
 ) -> dict[str, Any]:
     """Gather, draw and write; files of figures that this run does not have any more are removed."""
-    store = open_store(path)
     with beside(drawing_workers(None, config.compute)) as hand:
-        data = gather(store, config, integration_time, stages, hand)
+        data = gather(store, config, stages, hand)
         rendered = render_report(data, config.report, draw)
     for name, content in rendered.figures.items():
         store.write_file(f"figures/{name}", content)
-    for old in (path / "figures").glob("*.*"):
+    for old in (store.path / "figures").glob("*.*"):
         if old.name not in rendered.figures and old.stem in FIGURE_NAMES:
             old.unlink(missing_ok=True)
     for name, page in rendered.pages.items():
         store.write_file(name, page.encode())
     if not rendered.pages:
-        (path / DISCREPANCY_PAGE).unlink(missing_ok=True)
+        (store.path / DISCREPANCY_PAGE).unlink(missing_ok=True)
     store.write_file("report.json", rendered.json.encode())
     store.write_file("report.html", rendered.html.encode())
     return {
@@ -153,7 +153,6 @@ def _warnings(data: ReportData) -> list[str]:
 def gather(
     store: RunStore,
     config: RunConfig,
-    integration_time: float | None,
     stages: Sequence[Mapping[str, Any]],
     hand: Beside = functools.cache,
 ) -> ReportData:
@@ -162,7 +161,6 @@ def gather(
     Args:
         store: the run.
         config: its configuration.
-        integration_time: seconds, or None.
         stages: rows of the table of stages.
         hand: takes what can be done meanwhile: single pixels, and packing maps for the inspector.
 
@@ -178,13 +176,13 @@ def gather(
     inspector = hand(lambda: _inspector(store, run, pixels(), max(1, threads - 1)))
     look = run_quick_look(store, run, sums)
     return replace(
-        report_data(run, config, integration_time, stages),
+        report_data(run, config, stages),
         pixels=pixels().fits,
         inspector=inspector,
         quick_look=look,
         stability=stability(),
         # what a single command was given is no setting of the run
-        config_yaml=store.config_text() or dump_config(config),
+        config_yaml=stored_config(store.path) or dump_config(config),
     )
 
 
@@ -255,7 +253,6 @@ def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
 def report_data(
     run: StoredRun,
     config: RunConfig,
-    integration_time: float | None,
     stages: Sequence[Mapping[str, Any]],
 ) -> ReportData:
     """Return all that the report shows but its single pixels, from plain data.
@@ -263,7 +260,6 @@ def report_data(
     Args:
         run: what the store holds.
         config: its configuration.
-        integration_time: seconds, or None.
         stages: rows of the table of stages.
     """
     maps, facts, sensor = run.maps, dict(run.facts["ensemble"]), run.sensor
@@ -275,7 +271,7 @@ def report_data(
         shape=sensor.shape,
         kind=config.input.kind,
         n_frames=n_frames,
-        integration_time=integration_time,
+        integration_time=sensor.with_settings(config.input).integration_time,
         camera=sensor.camera.words(),
         maps=maps,
         fit=run.fit,
@@ -306,6 +302,37 @@ def report_data(
         discrepancy=None if run.verdict is None else verdict_data(run.verdict, run.discrepancy),
         samples=_samples(run, config),
     )
+
+
+def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict[str, Any] | None:
+    """Return the frames that precisions need at the median pixel, or None where no pixel has a value.
+
+    Args:
+        maps: of the run.
+        n_frames: frames of the run, or None where pixels differ.
+    """
+    names = ("quanta_exposure", "read_noise_e", "conversion_gain")
+    medians = [median_of(maps[name]) for name in names if name in maps]
+    if len(medians) < len(names) or not np.isfinite(medians).all():
+        return None
+    exposure, noise, gain = medians
+    try:
+        point = Point(exposure, noise, gain)
+    except ConfigError:
+        return None
+    rows = [
+        {"target": str(target), "name": target.name, "frames": frames_needed(target, point)}
+        for target in map(parse_target, _TARGETS)
+    ]
+    reached = {} if n_frames is None else precision(point, n_frames)
+    mark = (exposure, noise)
+    return {"rows": rows, "reached": reached, "n_frames": n_frames, "mark": mark, "contours": _contours()}
+
+
+@functools.cache
+def _contours() -> dict[str, Any]:
+    """Return the frames over exposure and read noise; relative targets look alike for every sensor."""
+    return contour_data([parse_target(text) for text in _DRAWN], 0.01, fine=_FINE)
 
 
 def _samples(run: StoredRun, config: RunConfig) -> Samples | None:
@@ -403,43 +430,6 @@ _PARTS = {
     "electrons": "no electron numbers",
     "components": "no component widths",
 }
-
-
-_TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
-_DRAWN = _TARGETS[:2]
-_FINE = 14  # points along each axis of the figure
-
-
-def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict[str, Any] | None:
-    """Return the numbers of the section, or None where no pixel has a value.
-
-    Args:
-        maps: of the run.
-        n_frames: frames of the run, or None where pixels differ.
-    """
-    names = ("quanta_exposure", "read_noise_e", "conversion_gain")
-    medians = [median_of(maps[name]) for name in names if name in maps]
-    if len(medians) < len(names) or not np.isfinite(medians).all():
-        return None
-    exposure, noise, gain = medians
-    try:
-        point = Point(exposure, noise, gain)
-    except ConfigError:
-        return None
-    rows = [
-        {"target": str(target), "name": target.name, "frames": frames_needed(target, point)}
-        for target in map(parse_target, _TARGETS)
-    ]
-    reached = {} if n_frames is None else precision(point, n_frames)
-    mark = (exposure, noise)
-    return {"rows": rows, "reached": reached, "n_frames": n_frames, "mark": mark, "contours": _contours()}
-
-
-@functools.cache
-def _contours() -> dict[str, Any]:
-    """Return the frames over exposure and read noise; relative targets look alike for every sensor."""
-    targets: list[Target] = [parse_target(text) for text in _DRAWN]
-    return contour_data(targets, 0.01, fine=_FINE)
 
 
 def drawing_executor(workers: int, n_figures: int) -> Executor:

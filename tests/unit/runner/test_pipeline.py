@@ -28,32 +28,31 @@ CALLS: list[str] = []
 BROKEN: set[str] = set()
 
 
-def number_tile(path, value, tile):
+def number_tile(tile, store, *, value):
     CALLS.append(tile.key)
     if tile.key in BROKEN:
         raise ValueError("this tile is odd")
-    open_store(path).write("fit/bias", tile.region, np.full(tile.shape, value + tile.iy))
+    store.write("fit/bias", tile.region, np.full(tile.shape, value + tile.iy))
     return {"iy": tile.iy}
 
 
-def double_tile(path, tile):
-    store = open_store(path)
+def double_tile(tile, store):
     store.write("maps/bias", tile.region, 2 * store.read("fit/bias", tile.region))
 
 
 def fit_run(context):
     context.create("fit/bias")
     value = context.config.fit.gap_threshold
-    context.run_units(context.tiles(), functools.partial(number_tile, context.store.path, value))
+    context.run_units(context.tiles(), functools.partial(number_tile, value=value))
 
 
 def maps_run(context):
     context.create("maps/bias")
-    context.run_units(context.tiles(), functools.partial(double_tile, context.store.path), needs="fit")
+    context.run_units(context.tiles(), double_tile, needs="fit")
 
 
 def ensemble_run(context):
-    context.run_units([WHOLE], lambda unit: {"sum": 1})
+    context.run_units([WHOLE], lambda unit, store: {"sum": 1})
 
 
 def stage(name, upstream, settings, writes, run):

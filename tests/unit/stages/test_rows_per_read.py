@@ -12,6 +12,7 @@ from astropy.io import fits
 
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.run.stage import markers
 from pchem_pipeline.stages.bands import tile_bands
 from pchem_pipeline.store.tiles import tile_grid
 
@@ -83,4 +84,4 @@ def test_bands_of_tiles_are_decoded_once_where_it_pays(rows: int, workers: int, 
     )
     found = tile_bands(context, "fit", 10_000, rows)
     assert len(found) == bands
-    assert {key for band in found for key in band.keys} == {tile.key for tile in tiles}
+    assert {key for band in found for key in markers(band)} == {tile.key for tile in tiles}

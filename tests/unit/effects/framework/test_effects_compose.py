@@ -17,9 +17,8 @@ from pchem_pipeline.effects.framework.compose import along_chain, model_words, p
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
-from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.stages.fit.fit import fit_tile
+from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
 
 
 class Broken(Effect):
@@ -86,12 +85,12 @@ def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
         "under": np.zeros((2, 2), np.uint32),
         "over": np.zeros((2, 2), np.uint32),
     }
-    plain = fit_tile(histogram, FitSettings(), None)
-    again = fit_tile(histogram, FitSettings(), None, ())
+    plain = fit_tile([histogram], TileFit())["fit"]
+    again = fit_tile([histogram], TileFit())["fit"]
     for name, values in plain.items():
         np.testing.assert_array_equal(again[name], values)
     trap = RtsNoise(fraction=0.1, amplitude_e=1.5, probability=0.2)
-    extended = fit_tile(histogram, FitSettings(), None, [RowNoise(row_noise_dn=1.0), trap])
+    extended = fit_tile([histogram], TileFit(effects=[RowNoise(row_noise_dn=1.0), trap]))["fit"]
     ends = {path for name in INTERVALS for path in interval_names(name)}  # only where they are asked for
     stored = [variable for variable in variables_of("fit") if variable.name not in ends]
     assert set(extended) == {variable.name for variable in stored}

@@ -15,7 +15,7 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import log_pcd
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
-from pchem_pipeline.stages.fit.fit import fit_tile
+from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
 from pchem_pipeline.store.run_store import RunStore
 
 EXACT, DENSITY = FitSettings(likelihood="exact"), FitSettings(likelihood="density")
@@ -111,7 +111,8 @@ def test_a_law_with_effects_starts_at_the_comb_of_electrons_that_are_there(start
     counts, step = few_electrons(32, 100)
     histogram = {"counts": counts[:, None], "origin": np.full((100, 1), 85, np.int32)}
     histogram |= {name: np.zeros((100, 1), np.int32) for name in ("under", "over")}
-    found = fit_tile(histogram, FitSettings(likelihood=start), None, [RowNoise(row_noise_dn=0.1)])
+    how = TileFit(FitSettings(likelihood=start), effects=[RowNoise(row_noise_dn=0.1)])
+    found = fit_tile([histogram], how)["fit"]
     off = np.abs(found["conversion_gain"][:, 0] * step - 1)
     assert (off > 1).any() == (start == "density")
 

@@ -20,7 +20,7 @@ from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_posterior
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.stages.fit.fit import fit_tile
+from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
 
 Array = NDArray[np.float64]
 CASES = [(2.0, 11.0, 0.3), (0.15, 9.0, 0.2), (1.5, 12.0, 0.46)]
@@ -191,8 +191,9 @@ def tile(n: int = 4) -> tuple[Drawn, dict[str, NDArray[np.generic]]]:
 
 def test_settings_bring_intervals_and_sandwich_errors_into_the_store() -> None:
     pixels, histogram = tile()
-    plain = fit_tile(histogram, FitSettings(), None)
-    full = fit_tile(histogram, FitSettings(intervals="profile", errors="sandwich", interval_level=0.95), None)
+    plain = fit_tile([histogram], TileFit())["fit"]
+    settings = FitSettings(intervals="profile", errors="sandwich", interval_level=0.95)
+    full = fit_tile([histogram], TileFit(settings))["fit"]
     for name in INTERVALS:
         low, high = (full[path][0] for path in interval_names(name))
         middle = full[name][0] if name in full else full["conversion_gain"][0] * full["read_noise_dn"][0]
@@ -213,7 +214,8 @@ def test_settings_bring_intervals_and_sandwich_errors_into_the_store() -> None:
     assert (full["bias_stderr"] != plain["bias_stderr"]).all()
     np.testing.assert_array_equal(full["bias"], plain["bias"])
     # with effects it is the profile of their law
-    with_noise = fit_tile(histogram, FitSettings(intervals="profile"), None, [RowNoise(row_noise_dn=1.0)])
+    how = TileFit(FitSettings(intervals="profile"), effects=[RowNoise(row_noise_dn=1.0)])
+    with_noise = fit_tile([histogram], how)["fit"]
     assert (with_noise["bias_low"] < with_noise["bias"]).all()
     assert (with_noise["bias"] < with_noise["bias_high"]).all()
     assert (with_noise["read_noise_dn_high"] < full["read_noise_dn"]).all()

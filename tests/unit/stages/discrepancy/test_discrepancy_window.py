@@ -118,7 +118,7 @@ def test_a_search_that_was_stopped_goes_on_in_the_window_that_it_had(monkeypatch
         return Survey({"next_x": place(columns=[[3, 8]])}, {"neighbours": 0.3})
 
     def run_units(units, task, **_):
-        markers.update({unit.key: json.loads(json.dumps(task(unit))) for unit in units})
+        markers.update({unit.key: json.loads(json.dumps(task(unit, None))) for unit in units})
 
     def context(limit):
         return SimpleNamespace(
@@ -245,9 +245,8 @@ def test_the_work_is_that_of_all_searches_and_looks(monkeypatch):
     rng = np.random.default_rng(2)
     light = 11.0 * (rng.poisson(2.0, (400, 32, 32)) + 0.3 * rng.standard_normal((400, 32, 32)))
     values = np.rint(100.0 + light).astype(np.uint16)
-    sensor = SimpleNamespace(seen_limits=(None, None))
-    limits = {"sensor": sensor, "adc_limits": None, "store": None}
-    context = SimpleNamespace(bit_depth=12, integration_time=1.0, **limits)
+    sensor = SimpleNamespace(bit_depth=12, integration_time=1.0, seen_limits=(None, None), adc_limits=None)
+    context = SimpleNamespace(sensor=sensor, store=None)
     search = discrepancy._Search(context, Stack(values), (), None, Survey({}, {}), lambda _: None)
     named = SimpleNamespace(verdict=verdict_of("named").costing(30.04), model=())
     monkeypatch.setattr(discrepancy, "find_discrepancies", lambda *_, **__: named)
@@ -270,7 +269,7 @@ def test_a_verdict_is_not_lost_where_no_pixel_of_the_other_window_can_be_used():
     notes: list[str] = []
     values = np.full((400, 24, 24), 7, np.uint16)
     values[:, 12:, 12:] += np.arange(400, dtype=np.uint16)[:, None, None] % 5
-    context = SimpleNamespace(bit_depth=12, integration_time=1.0, note=notes.append)
+    context = SimpleNamespace(sensor=SimpleNamespace(bit_depth=12, integration_time=1.0), note=notes.append)
     seen = Survey({}, {})
     search = discrepancy._Search(context, Stack(values), (), None, seen, lambda _: None)
     window = Window(np.arange(400), (12, 24), (12, 24))
@@ -296,7 +295,8 @@ def test_a_name_that_does_not_hold_elsewhere_is_in_part():
 
 def context(low, high, **ends):
     store = SimpleNamespace(has=lambda _: bool(ends), read=lambda name: ends[name.partition("/")[2]])
-    return SimpleNamespace(sensor=SimpleNamespace(seen_limits=(low, high)), adc_limits=(0, 4095), store=store)
+    sensor = SimpleNamespace(seen_limits=(low, high), adc_limits=(0, 4095))
+    return SimpleNamespace(sensor=sensor, store=store)
 
 
 def test_the_limits_of_the_run_are_in_the_model_of_the_search_once():

@@ -158,7 +158,7 @@ def test_dark_current_is_of_the_dark_alone(prepared: Path, tmp_path: Path, kind:
     assert context.store.has(f"maps/{wanted}")
     assert not context.store.has(f"maps/{other}")
     assert wanted in context.store.attributes("maps")["summary"]
-    data = report_data(read_run(context.store), context.config, context.integration_time, [])
+    data = report_data(read_run(context.store), context.config, [])
     words = wanted.replace("_", " ")
     assert words in sentence(data)
     assert [number.label for number in key_numbers(data) if number.name == wanted] == [words]

@@ -16,8 +16,7 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.fit import together
-from pchem_pipeline.stages.fit.fit import fit_tile
-from pchem_pipeline.stages.fit.samples import SampleFit, fit_samples_tile
+from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
 from pchem_pipeline.store.run_store import RunStore
 
 WEAK = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED))
@@ -82,7 +81,7 @@ def test_samples_cut_off_at_a_code_that_no_file_states_are_censored(
     dn = 100.0 + 2.0 * rng.standard_normal((12, 14)) + 40.0 * electrons
     np.save(tmp_path / "frames.npy", np.rint(dn).clip(low, high).astype(np.uint16))
     context = fitted(tmp_path, input={"files": ["frames.npy"]}, run={"store": "run.zarr"})
-    assert context.adc_limits == (low, high)
+    assert context.sensor.adc_limits == (low, high)
     for name, truth in (("quanta_exposure", 1.5), ("conversion_gain", 1 / 40.0)):
         value, error = (context.store.read(f"fit/{each}") for each in (name, f"{name}_stderr"))
         pulls = (value - truth) / error
@@ -119,8 +118,12 @@ def tile(branching=0.0):
     return [histogram(rng, exposure, branching) for exposure in (1.0, 3.0, 7.0, 0.0)]
 
 
+def by_path(groups):
+    return {f"{group}/{name}": values for group, arrays in groups.items() for name, values in arrays.items()}
+
+
 def test_the_shown_sample_stands_where_a_run_of_one_has_its_own():
-    arrays = fit_samples_tile(tile(), SampleFit([False, False, False, True], 1, FitSettings()))
+    arrays = by_path(fit_tile(tile(), TileFit(bias=[False, False, False, True], shown=1)))
     ends = {path for name in (*PARAMETERS, "read_noise_e") for path in interval_names(name)}
     named = {v.path for v in variables_of("fit") if v.name not in ends | set(FREE_SATELLITES)}
     assert {path for path in arrays if path.startswith("fit/")} == named
@@ -145,9 +148,9 @@ def test_the_shown_sample_stands_where_a_run_of_one_has_its_own():
 )
 def test_effects_go_with_several_samples(settings):
     given, bias = tile(BRANCHING), [False, False, False, True]
-    plain = fit_samples_tile(given, SampleFit(bias, 1, FitSettings()))
-    how = SampleFit(bias, 1, settings, effects=(BranchingCounts(branching=BRANCHING),))
-    arrays = fit_samples_tile(given, how)
+    plain = by_path(fit_tile(given, TileFit(bias=bias, shown=1)))
+    how = TileFit(settings, None, (BranchingCounts(branching=BRANCHING),), (), bias, 1)
+    arrays = by_path(fit_tile(given, how))
     n = plain["fit/bias"].size
     # the plain model is refused almost everywhere, the law with the effect as often as chance wants
     assert (plain["fit/goodness_p"] < 0.01).mean() > 0.9
@@ -175,7 +178,7 @@ def test_tile_has_every_array_in_its_place() -> None:
     }
     ends = {path for name in INTERVALS for path in interval_names(name)}
     absent = ends | set(FREE_SATELLITES)
-    arrays = fit_tile(histogram, FitSettings(), None)
+    arrays = fit_tile([histogram], TileFit())["fit"]
     assert set(arrays) == {variable.name for variable in variables_of("fit")} - absent
     expected = fit_histograms(
         pixels.counts, pixels.origin, histogram["under"].ravel(), histogram["over"].ravel()

@@ -133,7 +133,7 @@ def test_figures_that_are_no_longer_made_are_removed_and_others_kept(folder: Pat
 
 def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder: Path) -> None:
     context = make_context(folder, {"pixels": [[2, 1], [15, 23]]})
-    data = gather(context.store, context.config, 4.87, [])
+    data = gather(context.store, context.config, [])
     assert [(pixel.y, pixel.x) for pixel in data.pixels] == [(2, 1), (15, 23)]
     assert data.pixels[0].status == "fewer than 3 occupied bins"
     assert data.pixels[1].counts.sum() == FRAMES
@@ -149,7 +149,7 @@ def test_a_report_is_the_same_whoever_works_on_it(folder: Path) -> None:
         compute = context.config.compute.model_copy(update={"workers": workers})
         config = context.config.model_copy(update={"compute": compute})
         with beside(workers) as hand:
-            data = gather(context.store, config, 4.87, [], hand)
+            data = gather(context.store, config, [], hand)
             pages.append(page_without_pictures(data))
     assert 'id="inspector-app"' in pages[0]
     assert len(set(pages)) == 1  # without pytest's comparison
@@ -161,7 +161,7 @@ def test_figures_alone_pack_no_maps(folder: Path, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(report, "read_maps", fail)
     context = make_context(folder)
-    data = gather(context.store, context.config, None, [])
+    data = gather(context.store, context.config, [])
     assert report_figures(data, ReportSettings())
     with pytest.raises(AssertionError, match="packed"):
         data.inspector()  # type: ignore[misc]
@@ -169,7 +169,7 @@ def test_figures_alone_pack_no_maps(folder: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_a_histogram_is_that_of_its_pixel(folder: Path) -> None:
     context = make_context(folder)
-    pixel = gather(context.store, context.config, None, []).pixels[0]
+    pixel = gather(context.store, context.config, []).pixels[0]
     frames = np.load(next(folder.rglob("*.npy")))[:, pixel.y, pixel.x]
     shown = np.repeat(pixel.origin + np.arange(pixel.counts.size), pixel.counts)
     np.testing.assert_array_equal(shown, np.sort(frames))
@@ -180,7 +180,7 @@ def test_what_a_run_lacks_is_said(folder: Path) -> None:
     context.store.delete("ensemble")
     for name in ("maps/charge_rate", "maps/charge_rate_stderr"):
         context.store.delete(name)
-    data = gather(context.store, context.config, None, [])
+    data = gather(context.store, context.config, [])
     assert set(data.missing) == {"charge_rate", "ensemble", "nuced", "electrons", "components", "methods"}
     assert "input.integration_time" in data.missing["charge_rate"]
 
@@ -191,7 +191,7 @@ def test_pixels_of_unfinished_tiles_are_not_called_good(folder: Path) -> None:
         values = context.store.read(name)
         values[8:, :8] = np.nan
         context.store.write_array(name, values)
-    data = gather(context.store, context.config, None, [])
+    data = gather(context.store, context.config, [])
     assert data.unfitted.sum() == 64
     assert any("64 pixels not fitted yet" in flag.text for flag in flags(data))
     counted = report_numbers(data)["fit_status"]

@@ -1,17 +1,55 @@
-"""Other runs of the same pixels at other exposures: found, checked, and read beside a run."""
+"""What a comparison of methods is given and leaves: settings, other runs of the same pixels, its result."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic_core import to_jsonable_python
+
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.stages.methods.chosen import methods_settings
+from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
+    from pchem_pipeline.methods.settings import MethodsSettings
     from pchem_pipeline.run.stage import StageContext
+
+#: File of the result in the folder of a run.
+METHODS_FILE = "methods.json"
+
+
+def read_methods(store: RunStore) -> dict[str, Any] | None:
+    """Return the content of ``methods.json`` of a run, or None where there is none.
+
+    Raises:
+        StoreError: it cannot be read.
+    """
+    result = read_json(store.path / METHODS_FILE)
+    if result is not None and not (isinstance(result, dict) and "study" in result):
+        raise StoreError(f"{store.path / METHODS_FILE} is damaged; run pchem methods with --force")
+    return result
+
+
+def chosen_settings(context: StageContext) -> dict[str, Any]:
+    """Return what the command line chooses, as JSON data; unasked, what it chose for the last result.
+
+    The result of a command with ``--pixels`` is thereby up to date until another one is asked for, whatever
+    the YAML says.
+    """
+    if context.options.settings is not None:
+        chosen: dict[str, Any] = to_jsonable_python(dict(context.options.settings))
+        return chosen
+    record = context.store.records.known("methods")
+    kept = {} if record is None else record.content.get("input") or {}
+    return dict(kept.get("chosen", {}))
+
+
+def methods_settings(context: StageContext) -> MethodsSettings:
+    """Return the settings of the comparison."""
+    section = context.config.methods
+    return type(section).model_validate({**section.model_dump(), **chosen_settings(context)})
 
 
 def other_samples(context: StageContext) -> dict[str, Any]:

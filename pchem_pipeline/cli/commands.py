@@ -1,0 +1,199 @@
+"""The commands ``pchem apply``, ``twin``, ``methods`` and ``plan``; the last takes no option of a run's."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.cli.options import Target, on_this_machine, say, takes_command
+
+if TYPE_CHECKING:
+    from pchem_pipeline.runner.session import Command
+
+
+@takes_command(without=("force", "dry_run", "tiles", "roi"))
+def apply(
+    target: Target,
+    frames: Annotated[list[str], typer.Argument(help="camera files, globs or folders of the same sensor")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="store, or folder of files, to write")],
+    what: Annotated[
+        str, typer.Option(help="electrons, numbers, exposure, separated by commas, or all")
+    ] = "all",
+    prior: Annotated[
+        str,
+        typer.Option(
+            help="numbers: prior exposure: frames (estimated from these frames), flat (all numbers equally "
+            "likely), run (from the characterisation), a number (e⁻), or a file with a map (npy, TIFF, FITS)"
+        ),
+    ] = "frames",
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="dataset of an HDF5, zarr or FITS file [default: as in the run]"),
+    ] = None,
+    format: Annotated[Literal["zarr", "tiff", "fits"], typer.Option(help="format of the output")] = "zarr",
+    keep_modes: Annotated[
+        bool,
+        typer.Option(
+            "--keep-modes",
+            help="do not subtract row, column and frame noise, drift and pickup of the model",
+        ),
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="replace existing calibrated frames")] = False,
+    *,
+    command: Command,
+) -> None:
+    """Convert other frames of the sensor to electrons, electron numbers and a map of the exposure.
+
+    With standard errors, a quality layer and provenance. Continues after an interruption.
+    """
+    from pchem_pipeline.commands.apply.apply import apply_to_frames
+    from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
+    from pchem_pipeline.run.target import find_run
+
+    wanted = ApplySettings(kinds_of(what), prior, not keep_modes, format, dataset)
+    for path in apply_to_frames(find_run(target), frames, output, wanted, command.choosing(force=force)):
+        typer.echo(path)
+
+
+def twin(
+    target: Target,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", help="YAML file to write; maps are written beside it", callback=on_this_machine
+        ),
+    ],
+    scene: Annotated[
+        str | None,
+        typer.Option(
+            help="e⁻ per frame: a number, or a file with an image or a sequence of images (npy, TIFF, FITS) "
+            "[default: exposure of the run]"
+        ),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="number of frames [default: as in the run]")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="random seed of the frames")] = 1,
+    redraw: Annotated[
+        int | None,
+        typer.Option(min=0, help="random seed: draw the maps within their errors [default: fitted maps]"),
+    ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option(help="simulate another sensor of this type with rows x columns, such as 512x512"),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="replace existing files")] = False,
+) -> None:
+    """Write a simulated copy of the camera: a YAML for pchem simulate, with maps, effects and ADC.
+
+    A sensor of another size has the same distributions and spatial correlations.
+    """
+    from pchem_pipeline.commands.twin import write_twin
+    from pchem_pipeline.run.target import find_run
+
+    written = write_twin(
+        find_run(target),
+        output,
+        scene=scene,
+        frames=frames,
+        seed=seed,
+        redraw=redraw,
+        shape=None if size is None else _shape(size),
+        force=force,
+    )
+    for path in written:
+        typer.echo(path)
+
+
+def _shape(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"([1-9]\d*)\s*x\s*([1-9]\d*)", text)
+    if match is None:
+        raise ConfigError(f"--size {text}: write rows x columns, such as 512x512")
+    return int(match[1]), int(match[2])
+
+
+@takes_command(without=("tiles", "roi"))
+def methods(
+    target: Target,
+    with_runs: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--with",
+            help="store of a run of the same pixels at another exposure, preferably dark (repeatable)",
+        ),
+    ] = None,
+    pixels: Annotated[
+        int | None, typer.Option(min=1, help="pixels to compare [default: methods.pixels]")
+    ] = None,
+    study_pixels: Annotated[
+        int | None,
+        typer.Option(min=0, help="simulated pixels at each read noise [default: methods.study_pixels]"),
+    ] = None,
+    *,
+    command: Command,
+) -> None:
+    """Compare other characterisation methods with PCH-EM.
+
+    Photon transfer, EMVA 1288, PCH peaks and valleys, cumulants and others, on the same pixels and simulated.
+    """
+    from pchem_pipeline.commands.methods import compare_methods
+    from pchem_pipeline.run.target import find_run
+
+    given = {"with_runs": with_runs, "pixels": pixels, "study_pixels": study_pixels}
+    known = {name: value for name, value in given.items() if value is not None}
+    text = compare_methods(find_run(target), command, known)
+    if text:
+        say(text)
+
+
+def plan(
+    run: Annotated[
+        Path | None, typer.Argument(help="a run: its median pixel is the default of the options")
+    ] = None,
+    read_noise: Annotated[float | None, typer.Option(help="read noise, e⁻, quantisation included")] = None,
+    exposure: Annotated[
+        float | None, typer.Option(help="quanta exposure per frame, e⁻ [default: best]")
+    ] = None,
+    gain: Annotated[float | None, typer.Option(help="conversion gain, e⁻/DN [default: 0.09]")] = None,
+    target: Annotated[
+        list[str] | None,
+        typer.Option(help="target precision per pixel: conversion_gain=1%, bias=0.02e-, read_noise_e=2%, …"),
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="available frames: print the precision that they reach")
+    ] = None,
+    samples: Annotated[
+        str | None, typer.Option(help="divide the frames over several exposures: 0,2,8 in e⁻, or best")
+    ] = None,
+    max_exposure: Annotated[float, typer.Option(min=0.01, help="largest allowed exposure, e⁻")] = 10.0,
+    max_frames: Annotated[float, typer.Option(min=1, help="largest allowed number of frames")] = 1e7,
+    verify: Annotated[bool, typer.Option("--verify", help="simulate the plan with other pixels")] = False,
+    pixels: Annotated[int, typer.Option(min=10, help="simulated pixels of --verify")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="random seed of --verify")] = 1,
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            help="draw the frames needed over exposure and read noise: .svg, .png or .pdf",
+            callback=on_this_machine,
+        ),
+    ] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="write the numbers to this file", callback=on_this_machine)
+    ] = None,
+) -> None:
+    """Compute how many frames are needed for a precision.
+
+    From the Cramer-Rao bound and simulated pixels; --verify simulates the plan with others.
+    """
+    from pchem_pipeline.commands.plan import PlanRequest, make_plan
+
+    request = PlanRequest(
+        run=run, read_noise_e=read_noise, quanta_exposure=exposure, conversion_gain=gain,
+        targets=tuple(target or ()), frames=frames, samples=samples, max_exposure=max_exposure,
+        max_frames=max_frames, verify=verify, pixels=pixels, seed=seed, figure=figure, json=json,
+    )  # fmt: skip
+    say(make_plan(request))

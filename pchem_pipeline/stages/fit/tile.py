@@ -1,0 +1,177 @@
+"""The fit of a tile under the model of a run, whether it was given one sample of its pixels or several.
+
+Several share one g, mu and sigma for each pixel, with an H for each exposure: the group ``fit`` holds the
+shared parameters with H of the shown sample, as a run of one sample has them; the group ``samples`` what each
+exposure has of its own.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
+from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.errors.fisher import correlations
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.excluding_codes import Interval
+from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
+from pchem_pipeline.model.law.sample_law import SampleLaw
+
+#: Pixels of which effects are told nothing: no value, or one electron off.
+_UNUSABLE = FAILED | AMBIGUOUS
+
+
+@dataclass(frozen=True)
+class TileFit:
+    """How the pixels of a tile are fitted.
+
+    Attributes:
+        settings: of the fit.
+        adc_limits: first and last code of the ADC, DN, or None where they are not known.
+        effects: of the run's model; the plain fit is where the one under their law starts.
+        set_aside: codes that the fit leaves out, e- on the comb of the fit with the PCD.
+        bias: of several samples, which hold no electrons; empty for one sample.
+        shown: the sample whose H stands in ``fit``.
+    """
+
+    settings: FitSettings = field(default_factory=FitSettings)
+    adc_limits: tuple[int, int] | None = None
+    effects: Sequence[Effect] = ()
+    set_aside: Sequence[Interval] = ()
+    bias: Sequence[bool] = ()
+    shown: int = 0
+
+
+def fit_tile(
+    histograms: Sequence[Mapping[str, NDArray[Any]]],
+    how: TileFit,
+    start: NDArray[np.float64] | None = None,
+    added: AddedExposure | None = None,
+    places: PixelPlaces | None = None,
+) -> dict[str, dict[str, NDArray[Any]]]:
+    """Return the arrays of a tile by group and name: of ``fit``, and with several samples of ``samples``.
+
+    Args:
+        histograms: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of each sample.
+        how: they are fitted.
+        start: (H, g, mu, sigma, likelihood gap) of a fit of fewer frames, (y, x, 5), NaN where there is none.
+        added: exposure that the effects add to the pixels, (j, y, x); None: it counts as part of H.
+        places: of the pixels; None: not known.
+    """
+    shape = histograms[0]["counts"].shape[:2]
+    counts = [each["counts"].reshape(-1, each["counts"].shape[2]) for each in histograms]
+    origins = [each["origin"].ravel() for each in histograms]
+    found = _fit_model(
+        functools.partial(
+            fit_histograms,
+            counts if how.bias else counts[0],
+            origins if how.bias else origins[0],
+            under=np.ravel(sum(each["under"].astype(np.int64) + each["over"] for each in histograms)),
+            dark=list(how.bias) or None,
+            adc_limits=how.adc_limits,
+        ),
+        how,
+        None if start is None else start.reshape(-1, start.shape[2]),
+        added,
+        places,
+    )
+    fitted = _fit_arrays(found, how.shown, effects=bool(how.effects))
+    arrays = {"fit": {name: values.reshape(shape + values.shape[1:]) for name, values in fitted.items()}}
+    if how.bias:
+        with np.errstate(invalid="ignore"):
+            errors = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+        own = {
+            "quanta_exposure": found.quanta_exposure,
+            "quanta_exposure_stderr": errors[:, : len(histograms)],
+            "mean": found.mean,
+            "variance": found.variance,
+        }
+        arrays["samples"] = {
+            **{name: np.ascontiguousarray(values.T).reshape(-1, *shape) for name, values in own.items()},
+            "covariance": found.covariance.reshape(shape + found.covariance.shape[1:]),
+        }
+    return arrays
+
+
+def _fit_model(
+    fit: Callable[..., FitResult],
+    how: TileFit,
+    start: NDArray[np.float64] | None,
+    added: AddedExposure | None,
+    places: PixelPlaces | None,
+) -> FitResult:
+    """Fit with the PCD or, where the model has effects, with the law that they compose after such a fit.
+
+    ``fit`` is :func:`fit_histograms` of the pixels; the other arguments are those of :func:`fit_tile`, with
+    the pixels along one axis.
+    """
+    settings, effects = how.settings, how.effects
+    if not effects:
+        return fit(settings=settings, start=start, excluding=how.set_aside)
+    # the law is integrated over the cells: a start with all of them would be in vain
+    likelihood = "density" if settings.likelihood == "density" else "auto"
+    simple = settings.model_copy(update={"likelihood": likelihood, "intervals": "normal"})
+    plain = fit(settings=simple, start=start)
+    return fit(
+        settings=settings, start=plain, law=_laws(plain, effects, added, places), excluding=how.set_aside
+    )
+
+
+def _laws(
+    plain: FitResult,
+    effects: Sequence[Effect],
+    added: AddedExposure | None,
+    places: PixelPlaces | None,
+) -> SampleLaw | list[SampleLaw]:
+    """Return the law that the effects compose after the plain fit, or a list of one for each sample."""
+    usable = (plain.fit_status & int(_UNUSABLE)) == 0
+    shared = [getattr(plain, name) for name in PARAMETERS[1:]]
+    if plain.quanta_exposure.ndim == 1:
+        return sample_law(effects, pixel_maps([plain.quanta_exposure, *shared], usable), added, places)
+    return [
+        sample_law(effects, pixel_maps([np.ascontiguousarray(exposure), *shared], usable), added, places)
+        for exposure in plain.quanta_exposure.T
+    ]
+
+
+def _fit_arrays(result: FitResult, shown: int = 0, *, effects: bool = False) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the group ``fit`` of some pixels, by name, pixels along the first axis.
+
+    Args:
+        result: of the pixels.
+        shown: the sample whose H it is, where there are several.
+        effects: whether the model has effects, with which pixels may have free satellites.
+    """
+    n_samples = result.covariance.shape[1] - 3
+    places = [shown, *range(n_samples, n_samples + 3)]
+    covariance = result.covariance[:, places][:, :, places]
+    with np.errstate(invalid="ignore"):
+        errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    arrays: dict[str, NDArray[Any]] = {
+        f"{name}_stderr": errors[:, index] for index, name in enumerate(PARAMETERS)
+    }
+    arrays["correlation"] = correlations(covariance)
+    arrays["quanta_exposure"] = result.quanta_exposure.reshape(-1, n_samples)[:, shown]
+    if result.intervals is not None:
+        arrays |= {
+            path: result.intervals[:, place, side]
+            for place, name in zip([*places, n_samples + 3], INTERVALS, strict=True)
+            for side, path in enumerate(interval_names(name))
+        }
+    known = {*arrays, *(() if effects else FREE_SATELLITES)}
+    arrays |= {
+        v.name: getattr(result, v.name)
+        for v in variables_of("fit")
+        if v.name not in known and hasattr(result, v.name)
+    }
+    return arrays
