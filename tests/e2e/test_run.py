@@ -53,7 +53,7 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
     shutil.copytree(finished, shell.folder / "run.zarr")
     (shell.folder / "run.yaml").write_text(RUN.replace("4.87", "5"))
     rows = dict(line.split(maxsplit=1) for line in shell.ok("status", "run.yaml").stdout.splitlines())
-    assert rows["maps"] == "stale - input.integration_time 4.87 -> 5.0  (with model 1)"
+    assert rows["maps"] == "stale - input.integration_time 4.87 → 5.0  (with model 1)"
     assert rows["ensemble"] == "complete  (with model 1)"  # it reads no maps
     assert rows["report"] == "stale - maps is stale  (with model 1)"
     export = shell.ok("export", "run.yaml", "--format", "csv")
@@ -63,7 +63,7 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
     result = shell.ok("status", "run.yaml")
     rows = dict(line.split(maxsplit=1) for line in result.stdout.splitlines())
     assert rows["histogram"] == "complete"
-    assert rows["fit"] == "stale - fit.gap_threshold 5.0 -> 6.0  (with model 1)"
+    assert rows["fit"] == "stale - fit.gap_threshold 5.0 → 6.0  (with model 1)"
     assert rows["report"].startswith("stale")
     dry = shell.ok("run", "run.yaml", "--dry-run")
     assert "fit: stale - fit.gap_threshold 5.0 → 6.0 → would run" in dry.stderr

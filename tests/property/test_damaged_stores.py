@@ -185,10 +185,10 @@ def test_pixels_of_a_tile_that_failed_have_no_value(finished, tmp_path, monkeypa
     shutil.copytree(finished, folder)
     do_tile = maps._do_tile
 
-    def failing(tile, **more):
+    def failing(tile, store, **more):
         if tile.key == "0.1":
             raise ValueError("odd")
-        return do_tile(tile, **more)
+        return do_tile(tile, store, **more)
 
     monkeypatch.setattr(maps, "_do_tile", failing)
     assert "maps: 1 of 2 units failed" in asked(lambda: run(folder / "run.yaml", ["maps"], force=True))
