@@ -534,8 +534,8 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
 
 def _interval(gap: GapChange) -> str:
     low, high = gap.interval_after
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return ""
+    if not (math.isfinite(low) and 0.0 < high < math.inf):
+        return ""  # of a gap below 0 nothing remains
     return f"; remaining: {f'{micronats(low)} to ' if low > 0.0 else 'at most '}{micronats(high)}"
 
 
