@@ -69,7 +69,6 @@ def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
     assert (shell.folder / "run.zarr" / "report.html").exists()
 
 
-@pytest.mark.filterwarnings("default:Data has no positive values")  # of a histogram without any
 def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell):
     np.save(shell.folder / "a.npy", np.full((100, 8, 8), 100, np.uint16))
     (shell.folder / "run.yaml").write_text(OF_ONE_FILE)

@@ -198,7 +198,8 @@ def _frames_chart(means: DataTable, power: DataTable) -> Chart:
         Line(power["frequency"], power["power"], label="mean power"),
         _one(),
     )
-    panel = Panel(Axis("power / chance", log=True), spectrum)
+    some = bool((power["power"] > 0.0).any())  # of frames that are all alike there is none
+    panel = Panel(Axis("power / chance", log=some), spectrum)
     below = Stack((panel,), Axis("frequency (1/frame)", log=True), height_mm=44.0)
     ends = centre - 2 * error, centre + 2 * error
     return Chart((_series(means["frame"], means["mean"], ends, "mean", "frame", 0.7), below))
