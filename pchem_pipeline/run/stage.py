@@ -8,8 +8,7 @@ JSON-able summary, or nothing. The marker of a unit is set, in the worker, after
 
 A unit is anything picklable with ``key``, its name in messages and its marker: a
 :class:`~pchem_pipeline.store.tiles.Tile`, or a block of frames; a band of tiles has ``keys``, the markers of
-its tiles. A stage without
-parallel units has one, ``WHOLE``, which is done in this process.
+its tiles. A stage without parallel units has one, ``WHOLE``, which is done in this process.
 """
 
 from __future__ import annotations
