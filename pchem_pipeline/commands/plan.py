@@ -165,16 +165,16 @@ def _plan_lines(
 ) -> list[str]:
     point = plan.point
     at = f"exposure {point.quanta_exposure:.3g} e-{'' if exposure_given else ' (the best)'}"
-    lines = [
-        f"one sample, read noise {point.read_noise_e:.4g} e-, {at}, {point.conversion_gain:.3g} e-/DN",
-        "",
-    ]
-    lines += [
-        f"{target!s:<34}{bound:>14,.0f} frames (Cramer-Rao bound)"
-        for target, bound in zip(targets, plan.bounds, strict=True)
-    ]
+    lines = [f"one sample, read noise {point.read_noise_e:.4g} e-, {at}, {point.conversion_gain:.3g} e-/DN"]
     if targets:
-        lines.append(f"{'simulated, at most 5 % flagged':<34}{plan.needed:>14,.0f} frames")
+        lines += [
+            "",
+            *(
+                f"{target!s:<34}{bound:>14,.0f} frames (Cramer-Rao bound)"
+                for target, bound in zip(targets, plan.bounds, strict=True)
+            ),
+            f"{'simulated, at most 5 % flagged':<34}{plan.needed:>14,.0f} frames",
+        ]
     if targets and request.frames is not None:
         enough = plan.needed <= request.frames
         lines.append(f"{request.frames:,} frames are {'enough' if enough else 'too few'}")
@@ -183,7 +183,7 @@ def _plan_lines(
         unit, size = ("e-", value) if name == "bias" else ("%", 100 * value)
         if name != "dark_current":  # what the charge rate is called in the dark
             lines.append(f"  {name:<20}{size:>10.3g} {unit}")
-    if exposure_given and np.isfinite(plan.best_exposure):
+    if exposure_given and np.isfinite(plan.best_frames):
         limit = " (the largest allowed)" if plan.best_exposure > 0.99 * request.max_exposure else ""
         best = f"best exposure: {plan.best_exposure:.3g} e-{limit}, {plan.best_frames:,.0f} frames"
         lines += ["", f"{best}, no quantity flagged in 95 % of the pixels"]

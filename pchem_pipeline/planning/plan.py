@@ -90,7 +90,7 @@ def plan_one_sample(
     aims = tuple(targets) or (Target("conversion_gain", 1.0, "%"),)
     best, best_frames = _best(aims, point, max_exposure, max_frames)
     if not exposure_given:
-        if not np.isfinite(best_frames):
+        if not np.isfinite(best) or (targets and not np.isfinite(best_frames)):
             raise ConfigError(_hopeless(aims[0], point, "at any exposure", ""))
         point = replace(point, quanta_exposure=best)
     bounds = tuple(frames_needed(target, point) for target in targets)
@@ -126,8 +126,11 @@ def _out_of_reach(
         if several.frames <= max_frames:
             cure = f"; several samples (--samples best) need at least {several.frames:,.0f}"
     # a larger number is as good as none
-    bound = f" (bound: {float(f'{asked:.2g}'):,.0f} frames)" if asked < 1e12 else " (no number suffices)"
-    return _hopeless(target, point, f"at an exposure of {point.quanta_exposure:.3g} e-", f"{bound}{cure}")
+    bound = f"bound: {float(f'{asked:.2g}'):,.0f} frames" if asked < 1e12 else "no number suffices"
+    flagged = "; more than 5 % of simulated pixels stay flagged" if asked <= max_frames else ""
+    return _hopeless(
+        target, point, f"at an exposure of {point.quanta_exposure:.3g} e-", f" ({bound}{flagged}){cure}"
+    )
 
 
 def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
@@ -140,7 +143,7 @@ def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
 def _best(
     targets: Sequence[Target], point: Point, max_exposure: float, max_frames: float
 ) -> tuple[float, float]:
-    """Return the exposure with the fewest frames until few pixels are flagged, of whatever quantity.
+    """Return the exposure at which simulated pixels reach the targets soonest, few flagged in any quantity.
 
     Exposures are simulated in the order of their bounds, as long as these promise anything.
     """

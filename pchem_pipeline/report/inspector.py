@@ -345,7 +345,7 @@ def embedded(data: ReportData) -> Embedded | None:
 
 
 def script() -> str:
-    """Return the inspector's script."""
+    """Return the script of the pixel inspector."""
     return text_of("inspector.js")
 
 

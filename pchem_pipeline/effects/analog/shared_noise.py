@@ -176,7 +176,7 @@ def _expected(evidence: Evidence, time: TimeSeries) -> float:
     expected = float(mean_variance(evidence))
     for means, axis in ((time.row_readout, 1), (time.column_readout, 0)):
         excess, error = line_excess(means, mean_variance(evidence, axis))
-        if excess > 2.0 * error:
+        if excess > POSSIBLE * error:
             expected += excess / means.shape[1]
     return expected
 

@@ -10,13 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pchem_pipeline.effects.types import (
-    AnyArray,
-    BoolArray,
-    Evidence,
-    FloatArray,
-    IntArray,
-)
+from pchem_pipeline.effects.types import AnyArray, BoolArray, Evidence, FloatArray, IntArray
 
 
 def run_position(frames: IntArray, n_run: int) -> FloatArray:
@@ -24,14 +18,9 @@ def run_position(frames: IntArray, n_run: int) -> FloatArray:
     return np.asarray(frames.clip(0, n_run - 1) / max(n_run - 1, 1), np.float64)
 
 
-def responsivity(evidence: Evidence, inside: BoolArray | None = None) -> float:
-    """Return the mean change of r per DN of a common offset, in (0, 1] (see the module's text).
-
-    Args:
-        evidence: of some pixels.
-        inside: those that count, (y, x); None: all.
-    """
-    ratio = _of_usable((evidence.readout_std / evidence.maps.read_noise_dn) ** 2, evidence, inside)
+def responsivity(evidence: Evidence) -> float:
+    """Return the mean change of r per DN of a common offset, in (0, 1] (see the module's text)."""
+    ratio = (evidence.readout_std / evidence.maps.read_noise_dn)[evidence.maps.usable] ** 2
     ratio = ratio[np.isfinite(ratio)]
     return float(np.clip(ratio.mean(), 0.02, 1.0)) if ratio.size else 1.0
 
@@ -43,12 +32,8 @@ def mean_response(evidence: Evidence, inside: BoolArray | None = None) -> float:
         evidence: of some pixels.
         inside: those that count, (y, x); None: all.
     """
-    return float(np.mean(_of_usable(evidence.readout_std / evidence.maps.read_noise_dn**2, evidence, inside)))
-
-
-def _of_usable(values: FloatArray, evidence: Evidence, inside: BoolArray | None) -> FloatArray:
-    usable = evidence.maps.usable
-    return values[usable if inside is None else usable & inside]
+    usable = evidence.maps.usable if inside is None else evidence.maps.usable & inside
+    return float(np.mean((evidence.readout_std / evidence.maps.read_noise_dn**2)[usable]))
 
 
 def mean_variance(evidence: Evidence, axis: int | tuple[int, int] = (0, 1)) -> FloatArray:

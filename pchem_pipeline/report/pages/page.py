@@ -208,7 +208,7 @@ class KeyFact:
 
 @dataclass(frozen=True)
 class Finding:
-    """What came out.
+    """The result that a section states: how serious it is, in a word and in a sentence.
 
     Attributes:
         level: good, note, caution or serious (a class of the style sheet).
@@ -229,7 +229,7 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A section of a page: what came out, tables, figures, further tables.
+    """A section of a page: its result, tables, figures, further tables.
 
     Attributes:
         id: anchor in the page.

@@ -161,6 +161,10 @@ def test_out_of_reach_says_why_and_what_would_help():
         one(["conversion_gain=1%"], point(2.0, 1.5))
     with pytest.raises(ConfigError, match=r"an exposure of .* e- needs"):
         one(["conversion_gain=1%"], point(0.001, 0.3), max_frames=1e5)
+    with pytest.raises(ConfigError, match="5 % of simulated pixels stay flagged"):
+        one(["quanta_exposure=5%"], point(12.0, 0.305), max_frames=1000)
+    # without a target the precision of the frames that there are
+    assert one([], point(noise=0.8), given=False, budget=2000).frames == 2000
     with pytest.raises(ConfigError, match="not reached within --max-frames"):
         plan_samples([ONE_PERCENT], [0.0, 1e-4], point(), budget=None, max_exposure=1, max_frames=1e7)
     with pytest.raises(ConfigError, match="choose from the shared parameters"):
