@@ -282,10 +282,6 @@ def figures(
     width: Annotated[
         str | None, typer.Option(help="width such as 88mm, 18cm or 3.5in [default: each figure's own]")
     ] = None,
-    style: Annotated[
-        str | None,
-        typer.Option(help="matplotlib style sheet (file or name), applied on top of the style of pchem"),
-    ] = None,
     only: Annotated[str, typer.Option(help="names of figures, separated by commas [default: all]")] = "",
     dpi: Annotated[
         int, typer.Option(min=72, max=1200, help="resolution of PNG and of maps, dots per inch")
@@ -296,9 +292,7 @@ def figures(
     """Write figures for a paper, with their numbers as CSV."""
     from pchem_pipeline.commands.figures import Wanted, figures_of_run
 
-    wanted = Wanted(
-        _listed(formats, "--format"), width, style, _listed(only, "--only"), dpi, workers, progress
-    )
+    wanted = Wanted(_listed(formats, "--format"), width, _listed(only, "--only"), dpi, workers, progress)
     for path in figures_of_run(target, output, wanted):
         typer.echo(path)
 

@@ -171,29 +171,19 @@ def plan(
     ] = None,
     max_exposure: Annotated[float, typer.Option(min=0.01, help="largest allowed exposure, e⁻")] = 10.0,
     max_frames: Annotated[float, typer.Option(min=1, help="largest allowed number of frames")] = 1e7,
-    verify: Annotated[bool, typer.Option("--verify", help="simulate the plan with other pixels")] = False,
-    pixels: Annotated[int, typer.Option(min=10, help="simulated pixels of --verify")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, help="random seed of --verify")] = 1,
-    figure: Annotated[
-        Path | None,
-        typer.Option(
-            help="draw the frames needed over exposure and read noise: .svg, .png or .pdf",
-            callback=on_this_machine,
-        ),
-    ] = None,
     json: Annotated[
         Path | None, typer.Option(help="write the numbers to this file", callback=on_this_machine)
     ] = None,
 ) -> None:
     """Compute how many frames are needed for a precision.
 
-    From the Cramer-Rao bound and simulated pixels; --verify simulates the plan with others.
+    From the Cramer-Rao bound and simulated pixels.
     """
     from pchem_pipeline.commands.plan import PlanRequest, make_plan
 
     request = PlanRequest(
         run=run, read_noise_e=read_noise, quanta_exposure=exposure, conversion_gain=gain,
         targets=tuple(target or ()), frames=frames, samples=samples, max_exposure=max_exposure,
-        max_frames=max_frames, verify=verify, pixels=pixels, seed=seed, figure=figure, json=json,
+        max_frames=max_frames, json=json,
     )  # fmt: skip
     say(make_plan(request))

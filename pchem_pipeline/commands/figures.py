@@ -12,12 +12,12 @@ from pchem_pipeline.compute.executor import map_all
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.figures.paper import FORMATS, PaperFigure, draw_paper_figure, read_style_sheet
+from pchem_pipeline.report.figures.paper import FORMATS, PaperFigure, draw_paper_figure
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.report.report import drawing_executor, drawing_workers, gather
-from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.store.files import write_atomic
 
 #: Narrowest and widest figure, mm.
 _WIDTHS = (40.0, 400.0)
@@ -31,7 +31,6 @@ class Wanted:
     Attributes:
         formats: pdf, svg, png.
         width: such as ``88mm`` or ``3.5in``; None: each figure's own.
-        style: path or name of a matplotlib style sheet.
         only: names of figures; empty: all.
         dpi: resolution of PNG and of maps, dots per inch.
         workers: processes that draw; None: as the run's section ``compute`` says.
@@ -40,7 +39,6 @@ class Wanted:
 
     formats: Sequence[str] = ("pdf",)
     width: str | None = None
-    style: str | None = None
     only: Sequence[str] = ()
     dpi: int = 600
     workers: int | None = None
@@ -83,7 +81,7 @@ def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:
         The files written, figure by figure.
 
     Raises:
-        ConfigError: an unknown format, width, style or figure.
+        ConfigError: an unknown format, width or figure.
         StoreError: the run has no maps, or the folder cannot be written.
     """
     unknown = [name for name in wanted.formats if name not in FORMATS]
@@ -91,16 +89,11 @@ def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:
         what = f"{', '.join(unknown)} cannot be drawn" if unknown else "no format"
         raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
     width = None if wanted.width is None else millimetres(wanted.width)
-    sheet = {} if wanted.style is None else read_style_sheet(wanted.style)
     target = find_run(path)
     data = gather_run(target)
     warn_if_old(target, ("maps", "ensemble"), "drawn in this state")
-    settings = target.config.report
     kinds = tuple(dict.fromkeys(wanted.formats))
-    jobs = [
-        PaperFigure(each, kinds, width, wanted.dpi, sheet)
-        for each in _chosen(run_figures(data, settings), wanted.only)
-    ]
+    jobs = [PaperFigure(each, kinds, width, wanted.dpi) for each in _chosen(run_figures(data), wanted.only)]
     workers = drawing_workers(wanted.workers, target.config.compute)
     return _drawn(jobs, folder, workers, Reporter(wanted.progress))
 
@@ -115,10 +108,6 @@ def _chosen(found: list[Figure], only: Sequence[str]) -> list[Figure]:
 
 def _drawn(jobs: list[PaperFigure], folder: Path, workers: int, reporter: Reporter) -> list[Path]:
     """Draw with several processes and write each figure when it is there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(error, folder) from error
     written: dict[str, list[Path]] = {}
 
     def write(job: PaperFigure, files: dict[str, bytes]) -> None:

@@ -15,7 +15,6 @@ from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.pages.report import render_report
-from pchem_pipeline.report.settings import ReportSettings
 
 #: What a canvas shows, as text; its number of different colours.
 SHOWN = "(canvas) => canvas.toDataURL()"
@@ -38,13 +37,13 @@ def data() -> ReportData:
 @pytest.fixture(scope="module")
 def page_url(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("charts") / "report.html"
-    path.write_text(render_report(data, ReportSettings(dpi=72)).html)
+    path.write_text(render_report(data).html)
     return path.as_uri()
 
 
 @pytest.fixture(scope="module")
 def names(data: ReportData) -> set[str]:
-    figures = run_figures(data, ReportSettings())
+    figures = run_figures(data)
     return {each.name for each in figures if not each.chart.still and each.section}
 
 
@@ -162,13 +161,13 @@ def test_the_legend_has_values_and_hides_what_it_names(
 
 def test_keys_read_values_and_zoom(open_page: Callable[..., Any]) -> None:
     page = open_page()
-    figure = chart(page, "rounding")
+    figure = chart(page, "frame_means")
     panel, canvas = figure.locator(".panel").nth(0), figure.locator("canvas").nth(0)
     before = canvas.evaluate(SHOWN)
     panel.focus()
     page.keyboard.press("ArrowRight")
-    assert "1/g (DN per electron): " in figure.locator(".spoken").inner_text()
-    assert "read noise" in figure.locator(".spoken").inner_text()
+    assert "frame: " in figure.locator(".spoken").inner_text()
+    assert "mean" in figure.locator(".spoken").inner_text()
     page.keyboard.press("+")
     page.wait_for_timeout(50)
     assert canvas.evaluate(SHOWN) != before

@@ -41,7 +41,7 @@ from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.stages.report.report import draw_by_workers, drawing_workers
-from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
 #: The maps that are compared.
@@ -94,10 +94,6 @@ def compare_runs(
     draw = draw_by_workers(drawing_workers(workers, find_run(paths[0]).config.compute), reporter, "figures")
     page, numbers = render_comparison(found, draw)
     files = {COMPARE_PAGE: page, COMPARE_JSON: numbers, HISTORY_CSV: history_csv(found.history)}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(error, folder) from error
     for name, text in files.items():
         write_atomic(folder / name, text.encode())
     if found.changed:

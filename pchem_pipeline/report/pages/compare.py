@@ -14,7 +14,6 @@ from pchem_pipeline.report.pages.pictures import DrawAll, draw_here
 from pchem_pipeline.report.pages.report_json import json_value
 from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import (
     count,
     cut,
@@ -31,7 +30,6 @@ COMPARE_PAGE, COMPARE_JSON = "compare.html", "compare.json"
 #: Version of the layout of ``compare.json``.
 COMPARE_VERSION = 1
 
-_SETTINGS = ReportSettings(figure_formats=(), dpi=200)
 #: At most so many sentences on what changed are shown; the JSON has all.
 _MOST_WORDS = 12
 #: Of more runs than so many no maps are drawn pair by pair, and of the ensembles the last ones.
@@ -94,7 +92,7 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
     whole = list(ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]]))
     times = list(history_figures(found.history, found.against))
     every = [*whole, *times, *(each for figures in maps.values() for each in figures)]
-    drawn = (draw or draw_here)(every, _SETTINGS)
+    drawn = (draw or draw_here)(every)
 
     sections = [
         Section(id="verdict", title="Result", verdict=_finding(found.changed, sentence_of(found))),

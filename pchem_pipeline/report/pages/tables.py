@@ -15,7 +15,6 @@ from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.figures.ensemble import bias_remark
 from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.figures.methods import crossing_text, gain_rmse, percent_text
-from pchem_pipeline.report.figures.plan import frames_text, target_text
 from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.figures.trust import noise_shares
 from pchem_pipeline.report.pages.summary import check_title
@@ -484,16 +483,16 @@ def _plan(data: ReportData) -> Table | None:
         unit, scale = ("e⁻", 1.0) if row["name"] == "bias" else ("%", 100.0)
         rows.append(
             {
-                "precision": target_text(row["target"]),
-                "frames needed": frames_text(row["frames"]),
+                "precision": row["target"].replace("_e to", " (e⁻) to").replace("_", " ").replace("e-", "e⁻"),
+                "frames needed": f"{row['frames']:,.0f}" if math.isfinite(row["frames"]) else "none suffice",
                 "this run's": "" if reached is None else f"{short(scale * reached, 2)} {unit}",
             }
         )
-    exposure, noise = plan["mark"]
     return Table.of(
         "plan-table",
         "Frames for a precision",
-        f"Cramer-Rao bound for the median pixel (H = {short(exposure)} e⁻, read noise {short(noise)} e⁻). "
+        f"Cramer-Rao bound for the median pixel (H = {short(plan['exposure'])} e⁻, read noise "
+        f"{short(plan['read_noise'])} e⁻). "
         "Best exposure, other sensors, several samples, check by simulation: pchem plan.",
         rows,
         "plan",

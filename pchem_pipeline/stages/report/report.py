@@ -1,4 +1,4 @@
-"""Stage ``report``: report.html, report.json and the figures, from what the other stages stored."""
+"""Stage ``report``: report.html and report.json, from what the other stages stored."""
 
 from __future__ import annotations
 
@@ -29,11 +29,10 @@ from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.maps.ordered import median_of
-from pchem_pipeline.planning.frames import contour_data, frames_needed, precision
+from pchem_pipeline.planning.frames import frames_needed, precision
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import parse_target
 from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
-from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
@@ -42,7 +41,6 @@ from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.pictures import DrawAll, Drawn, draw_figure
 from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.pages.summary import check_sentence
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
@@ -78,9 +76,8 @@ _FEW_CHANNELS = 12
 _SOME_MASSES = 300
 #: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 940 MiB in all.
 _PIXEL_BYTES = 300
-#: Precisions whose frames the report tells, at the median pixel; those of the figure, and its points an axis.
+#: Precisions whose frames the report tells, at the median pixel.
 _TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
-_DRAWN, _FINE = _TARGETS[:2], 14
 
 
 def run(context: StageContext) -> None:
@@ -117,26 +114,17 @@ def _write(
     stages: list[dict[str, Any]],
     draw: DrawAll | None,
 ) -> dict[str, Any]:
-    """Gather, draw and write; files of figures that this run does not have any more are removed."""
+    """Gather, draw and write."""
     with beside(drawing_workers(None, config.compute)) as hand:
         data = gather(store, config, stages, hand)
-        rendered = render_report(data, config.report, draw)
-    for name, content in rendered.figures.items():
-        store.write_file(f"figures/{name}", content)
-    for old in (store.path / "figures").glob("*.*"):
-        if old.name not in rendered.figures and old.stem in FIGURE_NAMES:
-            old.unlink(missing_ok=True)
+        rendered = render_report(data, draw)
     for name, page in rendered.pages.items():
         store.write_file(name, page.encode())
     if not rendered.pages:
         (store.path / DISCREPANCY_PAGE).unlink(missing_ok=True)
     store.write_file("report.json", rendered.json.encode())
     store.write_file("report.html", rendered.html.encode())
-    return {
-        "figures": len(rendered.figures),
-        "html_bytes": len(rendered.html.encode()),
-        "warnings": _warnings(data),
-    }
+    return {"warnings": _warnings(data)}
 
 
 def _warnings(data: ReportData) -> list[str]:
@@ -325,14 +313,7 @@ def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict
         for target in map(parse_target, _TARGETS)
     ]
     reached = {} if n_frames is None else precision(point, n_frames)
-    mark = (exposure, noise)
-    return {"rows": rows, "reached": reached, "n_frames": n_frames, "mark": mark, "contours": _contours()}
-
-
-@functools.cache
-def _contours() -> dict[str, Any]:
-    """Return the frames over exposure and read noise; relative targets look alike for every sensor."""
-    return contour_data([parse_target(text) for text in _DRAWN], 0.01, fine=_FINE)
+    return {"rows": rows, "reached": reached, "exposure": exposure, "read_noise": noise}
 
 
 def _samples(run: StoredRun, config: RunConfig) -> Samples | None:
@@ -460,12 +441,13 @@ def draw_by_workers(workers: int, reporter: Reporter, label: str) -> DrawAll:
         label: of the bar.
     """
 
-    def draw(figures: Sequence[Figure], settings: ReportSettings) -> Mapping[str, Drawn]:
+    def draw(figures: Sequence[Figure]) -> Mapping[str, Drawn]:
         drawn: dict[str, Drawn] = {}
-        task = functools.partial(draw_figure, settings=settings)
         executor = drawing_executor(workers, len(figures))
         with reporter.progress(label, len(figures), "figure") as advance:
-            map_all(executor, task, figures, lambda each, value: drawn.update({each.name: value}), advance)
+            map_all(
+                executor, draw_figure, figures, lambda each, value: drawn.update({each.name: value}), advance
+            )
         return drawn
 
     return draw

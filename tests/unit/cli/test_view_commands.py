@@ -25,10 +25,10 @@ def test_figures_are_asked_for_as_given(monkeypatch: pytest.MonkeyPatch) -> None
         return [Path("out/ensemble.pdf")]
 
     monkeypatch.setattr(figures, "figures_of_run", call)
-    options = ["--format", "pdf, svg", "--width", "88mm", "--style", "my.mplstyle", "--dpi", "300"]
+    options = ["--format", "pdf, svg", "--width", "88mm", "--dpi", "300"]
     shown = invoke("figures", "run.zarr", "-o", "out", *options, "--only", "ensemble", "--workers", "2")
     assert shown == "out/ensemble.pdf\n"
-    wanted = Wanted(("pdf", "svg"), "88mm", "my.mplstyle", ("ensemble",), 300, 2, "auto")
+    wanted = Wanted(("pdf", "svg"), "88mm", ("ensemble",), 300, 2, "auto")
     assert seen == [(Path("run.zarr"), Path("out"), wanted)]
 
 
@@ -38,7 +38,6 @@ def test_figures_are_asked_for_as_given(monkeypatch: pytest.MonkeyPatch) -> None
         (Wanted(("pdf", "jpg")), "--format: jpg cannot be drawn; choose from pdf, svg, png"),
         (Wanted(()), "--format: no format"),
         (Wanted(width="88 px"), "--width '88 px': write a length such as 88mm"),
-        (Wanted(style="none.mplstyle"), "--style none.mplstyle: no such file"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted: Wanted, words: str) -> None:
