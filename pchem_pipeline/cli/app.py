@@ -151,7 +151,7 @@ def run(
 
 
 @app.command()
-@takes_command(without=("tiles", "roi"))
+@takes_command(without=("roi",))
 def discrepancy(
     target: Target,
     refit: Annotated[
@@ -334,15 +334,8 @@ def compare(
     label: Annotated[
         list[str] | None,
         typer.Option(
-            help="label of a run in the history, such as a setpoint; once per run, in the same order "
-            "[default: see --against]"
-        ),
-    ] = None,
-    against: Annotated[
-        Literal["date", "temperature", "label"] | None,
-        typer.Option(
-            help="axis of the history: date or sensor temperature from the files, or the number at the start "
-            "of the label [default: label if there are labels, else date]"
+            help="label of a run in the history, such as a setpoint; once per run, in the same order: its "
+            "number is the axis [default: dates of the files]"
         ),
     ] = None,
     fdr: Annotated[
@@ -362,7 +355,7 @@ def compare(
         runs,
         output,
         tolerance=tolerance,
-        history=HistorySettings(label or (), against, fdr),
+        history=HistorySettings(label or (), fdr),
         workers=workers,
         progress=progress,
     ):

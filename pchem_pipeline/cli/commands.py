@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.runner.session import Command
 
 
-@takes_command(without=("force", "dry_run", "tiles", "roi"))
+@takes_command(without=("force", "dry_run", "roi"))
 def apply(
     target: Target,
     frames: Annotated[list[str], typer.Argument(help="camera files, globs or folders of the same sensor")],
@@ -24,10 +24,10 @@ def apply(
         str, typer.Option(help="electrons, numbers, exposure, separated by commas, or all")
     ] = "all",
     prior: Annotated[
-        str,
+        Literal["frames", "flat", "run"],
         typer.Option(
             help="numbers: prior exposure: frames (estimated from these frames), flat (all numbers equally "
-            "likely), run (from the characterisation), a number (e⁻), or a file with a map (npy, TIFF, FITS)"
+            "likely) or run (from the characterisation)"
         ),
     ] = "frames",
     dataset: Annotated[
@@ -116,7 +116,7 @@ def _shape(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-@takes_command(without=("tiles", "roi"))
+@takes_command(without=("roi",))
 def methods(
     target: Target,
     with_runs: Annotated[

@@ -98,7 +98,7 @@ def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bi
     RunStore.open(store, writable=True).write("fit/bias", (slice(0, 8), slice(0, 8)), np.zeros((8, 8)))
     (shell.folder / "small.yaml").write_text((shell.folder / "run.yaml").read_text() + SMALL)
     killed = shell.alone(DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")(
-        "fit", "small.yaml", "--tiles", "0.0"
+        "fit", "small.yaml", "--roi", "0:8,0:8"
     )
     assert killed.code == 3
     (line,) = [each for each in killed.stderr.splitlines() if each.startswith("pchem: ")]

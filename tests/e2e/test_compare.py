@@ -215,8 +215,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
     assert "The camera over time" in page
     assert f"Hot pixels : {len(rows[2]['hot_new'].split())} new, " in page
     assert "-20 C" in page
-    wrong = {"labels": ["one"]}, {"rate": 0.0}, {"against": "label"}, {"against": "temperature"}
-    for each in wrong:
+    for each in ({"labels": ["one"]}, {"rate": 0.0}):
         with pytest.raises(ConfigError, match="--"):
             comparison_of(
                 [shell.folder / "a.zarr", shell.folder / "b.zarr"],
@@ -226,7 +225,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
             )
 
 
-def test_the_history_against_the_temperature_that_the_files_state(shell, copies, finished):
+def test_the_history_has_date_and_temperature_of_the_files(shell, copies, finished):
     """The sensor's temperature and the date of the frames come from the camera files."""
     other_capture(copies)
     for name, temperature, taken in (("a", -20.0, 1.75e9), ("b", -5.5, 1.76e9)):
@@ -234,15 +233,14 @@ def test_the_history_against_the_temperature_that_the_files_state(shell, copies,
         sensor = SensorInfo.read(store)
         replace(sensor, camera=CameraFacts("Camera <X>", "7", temperature, taken)).write(store)
     paths = [shell.folder / "a.zarr", shell.folder / "b.zarr"]
-    found = comparison_of(paths, 1e-12, Reporter("off"), HistorySettings(against="temperature"))
-    assert [row.label for row in found.history] == ["-20 °C", "-5.5 °C"]
+    found = comparison_of(paths, 1e-12, Reporter("off"), HistorySettings(["-20 °C", "-5.5 °C"]))
     assert [row.place for row in found.history] == [-20.0, -5.5]
     assert found.history[0].date.startswith("2025-06-15T")
     text = history_csv(found.history).splitlines()
     assert text[0].startswith("label,date,temperature,run,")
     assert text[2].split(",")[2] == "-5.5"
-    (figure,) = history_figures(found.history, found.against)
-    assert figure.tables[0]["sensor temperature, °C"].tolist() == [-20.0, -5.5]
+    (figure,) = history_figures(found.history, found.labelled)
+    assert figure.tables[0]["label"].tolist() == [-20.0, -5.5]
 
 
 def test_bad_input_gets_one_line(shell, finished):

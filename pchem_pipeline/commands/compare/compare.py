@@ -77,7 +77,7 @@ def compare_runs(
         paths: stores, or the YAML files that made them; two or more.
         folder: where to write; made if needed.
         tolerance: relative difference that counts as rounding, where the frames are the same.
-        history: labels of the runs, what they are drawn against, and when a pixel counts as moved.
+        history: labels of the runs, and when a pixel counts as moved.
         workers: processes that draw; None: as the first run's section ``compute`` says.
         progress: auto | on | off.
 
@@ -128,7 +128,7 @@ def comparison_of(
     sides = list(zip(runs, targets, stores, states, strict=True))
     pairs = [_pair(sides[0], side, tolerance, history.rate, reporter) for side in sides[1:]]
     rows = history_rows(runs, stores, pairs, history, states)
-    return Comparison(runs, pairs, tolerance, rows, history.axis, history.rate)
+    return Comparison(runs, pairs, tolerance, rows, bool(history.labels), history.rate)
 
 
 def _letters(n: int) -> list[str]:
