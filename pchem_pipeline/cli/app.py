@@ -25,7 +25,6 @@ from pchem_pipeline.cli.options import (
     Quiet,
     Strict,
     Target,
-    Workers,
     on_this_machine,
     region_of,
     say,
@@ -286,14 +285,20 @@ def figures(
     dpi: Annotated[
         int, typer.Option(min=72, max=1200, help="resolution of PNG and of maps, dots per inch")
     ] = 600,
-    workers: Workers = None,
     progress: Progress = "auto",
 ) -> None:
     """Write figures for a paper, with their numbers as CSV."""
-    from pchem_pipeline.commands.figures import Wanted, figures_of_run
+    from pchem_pipeline.commands.figures import figures_of_run
 
-    wanted = Wanted(_listed(formats, "--format"), width, _listed(only, "--only"), dpi, workers, progress)
-    for path in figures_of_run(target, output, wanted):
+    for path in figures_of_run(
+        target,
+        output,
+        formats=_listed(formats, "--format"),
+        width=width,
+        only=_listed(only, "--only"),
+        dpi=dpi,
+        progress=progress,
+    ):
         typer.echo(path)
 
 
@@ -341,7 +346,6 @@ def compare(
     fdr: Annotated[
         float, typer.Option(help="false-discovery rate for pixels that changed since the first run")
     ] = 0.01,
-    workers: Workers = None,
     progress: Progress = "auto",
 ) -> None:
     """Compare runs and write their history; exit code 3 if something changed.
@@ -356,7 +360,6 @@ def compare(
         output,
         tolerance=tolerance,
         history=HistorySettings(label or (), fdr),
-        workers=workers,
         progress=progress,
     ):
         typer.echo(path)

@@ -35,9 +35,7 @@ def copies(shell, finished):
 def here(shell, *names):
     """Compare in this process: the message where something changed, else nothing."""
     try:
-        compare_runs(
-            [shell.folder / name for name in names], shell.folder / "compare", workers=1, progress="off"
-        )
+        compare_runs([shell.folder / name for name in names], shell.folder / "compare", progress="off")
     except ChangedError as change:
         return str(change)
     return ""
@@ -52,7 +50,7 @@ def numbers(shell, folder="compare"):
 
 
 def test_nothing_changed_is_proven_by_digests(shell, copies):
-    result = shell.ok("compare", "a.zarr", "b.zarr", "--workers", "1")
+    result = shell.ok("compare", "a.zarr", "b.zarr")
     assert result.stdout.split() == [
         f"compare/{name}" for name in ("compare.html", "compare.json", "history.csv")
     ]
@@ -82,7 +80,7 @@ def test_one_value_that_moved_is_found(shell, copies):
     y, x = np.argwhere(np.isfinite(bias))[5]
     bias[y, x] *= 1 + 1e-9
     copies.write("maps/bias", whole(copies, "maps/bias"), bias)
-    result = shell("compare", "a.zarr", "b.zarr", "-o", "out", "--workers", "1")
+    result = shell("compare", "a.zarr", "b.zarr", "-o", "out")
     assert result.code == 3
     assert result.stdout == ""
     assert "maps/bias: 1 value of 560 changed" in result.last
@@ -181,7 +179,6 @@ def test_the_history_of_a_camera(shell, copies, finished):
             [shell.folder / f"{name}.zarr" for name in "abc"],
             shell.folder / "history",
             history=HistorySettings(labels, rate=0.05),
-            workers=1,
             progress="off",
         )
     with (shell.folder / "history" / "history.csv").open() as file:

@@ -13,7 +13,7 @@ from helpers.places import ROOT
 
 import pchem_pipeline
 from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError
-from pchem_pipeline.commands.figures import Wanted, figures_of_run
+from pchem_pipeline.commands.figures import figures_of_run
 from pchem_pipeline.report.charts.on_paper import drawing_bytes
 from pchem_pipeline.store.run_store import RunStore
 
@@ -90,7 +90,7 @@ def test_pixels_outside_are_refused(run, place):
 
 def test_figures_are_those_of_pchem_figures(run, finished, tmp_path):
     assert len(run.figures) > 10
-    figures_of_run(finished, tmp_path, Wanted(("svg",), only=("electron_numbers",), progress="off"))
+    figures_of_run(finished, tmp_path, formats=("svg",), only=("electron_numbers",), progress="off")
     drawn = drawing_bytes(run.figure("electron_numbers"), "svg", dpi=600, title="Estimated electron numbers")
     assert drawn == (tmp_path / "electron_numbers.svg").read_bytes()
     assert run.figure("map_bias", width=60).get_figwidth() == pytest.approx(60 / 25.4)

@@ -14,15 +14,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.compute.environment import available_workers
-from pchem_pipeline.compute.executor import (
-    Beside,
-    Executor,
-    PoolExecutor,
-    SerialExecutor,
-    beside,
-    can_start_processes,
-    map_all,
-)
+from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import dump_config
@@ -64,7 +56,6 @@ from pchem_pipeline.store.run_store import RunStore, stored_config
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.report.pages.pictures import DrawAll
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.store.records import StageRecord
 
@@ -98,8 +89,7 @@ def run(context: StageContext) -> None:
         _write,
         config=context.config,
         stages=_stage_rows(context),
-        # in this process: another would spend more on its imports than on its share of the figures
-        draw=draw_by_workers(1, context.reporter, context.stage),
+        draw=draw_and_say(context.reporter, context.stage),
     )
     done = context.run_units([WHOLE], task, unit_name="report", unit_bytes=ny * nx * _PIXEL_BYTES)
     for text in done.get(WHOLE.key, {}).get("warnings", ()):
@@ -112,10 +102,10 @@ def _write(
     *,
     config: RunConfig,
     stages: list[dict[str, Any]],
-    draw: DrawAll | None,
+    draw: DrawAll,
 ) -> dict[str, Any]:
     """Gather, draw and write."""
-    with beside(drawing_workers(None, config.compute)) as hand:
+    with beside(_workers(config.compute)) as hand:
         data = gather(store, config, stages, hand)
         rendered = render_report(data, draw)
     for name, page in rendered.pages.items():
@@ -155,7 +145,7 @@ def gather(
     Raises:
         StoreError: maps or histograms are missing.
     """
-    threads = drawing_workers(None, config.compute)
+    threads = _workers(config.compute)
     run = read_run(store, threads)
     # two ways of about the same length: single pixels and packed maps, the quick look and figures and tables
     pixels = hand(functools.partial(_of_pixels, store, run, config))
@@ -413,41 +403,26 @@ _PARTS = {
 }
 
 
-def drawing_executor(workers: int, n_figures: int) -> Executor:
-    """Return who draws: processes, since drawing shares its settings within one; or this one alone."""
-    count = min(workers, available_workers(), n_figures)
-    several = count > 1 and can_start_processes()
-    return PoolExecutor(count, processes=True) if several else SerialExecutor()
-
-
-def drawing_workers(wanted: int | None, settings: ComputeSettings) -> int:
-    """Return how many may work on a report at a time: as asked for, else as the section ``compute`` says."""
-    if wanted is not None:
-        return wanted
+def _workers(settings: ComputeSettings) -> int:
+    """Return how many may work on a report at a time."""
     workers = available_workers() if settings.workers == "auto" else settings.workers
     if settings.max_memory is not None:
         workers = min(workers, max(1, ((settings.max_memory << 20) - BASE_BYTES) // SECOND_PROGRAM_BYTES))
     return workers
 
 
-def draw_by_workers(workers: int, reporter: Reporter, label: str) -> DrawAll:
-    """Return a function that draws figures with up to so many processes.
+def draw_and_say(reporter: Reporter, label: str) -> DrawAll:
+    """Return a function that draws figures in this process, under a bar with this label.
 
-    It raises the first error of a figure once the others are drawn.
-
-    Args:
-        workers: of the run.
-        reporter: hears of each figure.
-        label: of the bar.
+    Others would spend more on their imports than on their share of the figures.
     """
 
-    def draw(figures: Sequence[Figure]) -> Mapping[str, Drawn]:
-        drawn: dict[str, Drawn] = {}
-        executor = drawing_executor(workers, len(figures))
+    def draw(figures: Sequence[Figure]) -> dict[str, Drawn]:
+        drawn = {}
         with reporter.progress(label, len(figures), "figure") as advance:
-            map_all(
-                executor, draw_figure, figures, lambda each, value: drawn.update({each.name: value}), advance
-            )
+            for figure in figures:
+                drawn[figure.name] = draw_figure(figure)
+                advance()
         return drawn
 
     return draw

@@ -12,11 +12,10 @@ import pytest
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute import executor as executor_module
-from pchem_pipeline.compute.executor import SerialExecutor, Stop, beside, make_executor
+from pchem_pipeline.compute.executor import Stop, beside, make_executor
 from pchem_pipeline.compute.memory import BASE_BYTES, affordable, keep_to_limit, resident_bytes
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import make_config
-from pchem_pipeline.stages.report.report import drawing_executor
 
 BACKENDS = ["serial", "threads", "processes", "distributed"]
 
@@ -163,7 +162,6 @@ def test_without_shared_memory_there_are_no_worker_processes(monkeypatch):
     monkeypatch.setattr(executor_module._SPAWN, "Lock", lock)
     with pytest.raises(ConfigError, match="use --backend threads"):
         make_executor(ComputeSettings(backend="processes", workers=2)).map(abs, [1], lambda *_: None)
-    assert isinstance(drawing_executor(2, 9), SerialExecutor)
 
 
 def test_no_scheduler_at_the_address():

@@ -14,12 +14,11 @@ from matplotlib.patches import StepPatch
 from PIL import Image
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.commands.figures import millimetres
+from pchem_pipeline.commands.figures import millimetres, paper_files
 from pchem_pipeline.report.charts.on_paper import Look
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import DataTable, Figure, csv_text
-from pchem_pipeline.report.figures.paper import PaperFigure, draw_paper_figure
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +56,7 @@ def test_columns_of_different_lengths_are_refused() -> None:
 
 
 def test_the_numbers_are_those_drawn(data: ReportData, found: dict[str, Figure]) -> None:
-    files = draw_paper_figure(PaperFigure(found["map_bias"], ()))
+    files = paper_files(found["map_bias"], ())
     rows = rows_of(files["map_bias_histogram.csv"])
     figure = found["map_bias"].draw(Look(88.0))
     [steps] = [artist for artist in figure.axes[0].patches if isinstance(artist, StepPatch)]
@@ -139,8 +138,8 @@ def test_what_a_verdict_draws_is_in_its_tables(found: dict[str, Figure]) -> None
 
 
 def test_files_have_the_width_asked_for_and_fonts_inside(found: dict[str, Figure]) -> None:
-    wanted = PaperFigure(found["map_read_noise_e"], ("pdf", "png", "svg"), 120.0, 200)
-    files = draw_paper_figure(wanted)
+    wanted = found["map_read_noise_e"], ("pdf", "png", "svg"), 120.0, 200
+    files = paper_files(*wanted)
     assert set(files) == {
         f"map_read_noise_e{end}" for end in (".pdf", ".png", ".svg", ".csv", "_histogram.csv")
     }
@@ -152,7 +151,7 @@ def test_files_have_the_width_asked_for_and_fonts_inside(found: dict[str, Figure
     with Image.open(io.BytesIO(files["map_read_noise_e.png"])) as image:
         assert image.width == pytest.approx(120.0 / 25.4 * 200, abs=1)
     assert b"<text" not in files["map_read_noise_e.svg"]
-    assert draw_paper_figure(wanted) == files
+    assert paper_files(*wanted) == files
 
 
 @pytest.mark.parametrize(

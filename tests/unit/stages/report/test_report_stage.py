@@ -7,26 +7,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.inspector_material import page_without_pictures
-from helpers.report_material import report_data
 from helpers.written_fit import write_fit
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.compute.executor import SerialExecutor, beside
+from pchem_pipeline.compute.executor import beside
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.figures.catalogue import report_figures
-from pchem_pipeline.report.pages.pictures import Drawn, draw_figure
 from pchem_pipeline.report.pages.report import RenderedReport
 from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.run.fingerprint import status
-from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.report import report
 from pchem_pipeline.stages.report.pixels import choose_pixels
-from pchem_pipeline.stages.report.report import draw_by_workers, drawing_executor, gather
+from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.run_store import RunStore
 
@@ -212,20 +209,3 @@ def test_few_or_no_pixels_to_choose_from() -> None:
     words = np.array([[2, 2], [8, 2]], dtype=np.uint16)
     assert choose_pixels(nan, nan, words) == [("no fit", 0, 0), ("no fit", 1, 0)]
     assert {(y, x) for _, y, x in choose_pixels(one, one, np.zeros((2, 2), np.uint16))} == {(0, 0), (1, 0)}
-
-
-def test_figures_are_the_same_whoever_draws_them() -> None:
-    shown = [
-        each
-        for each in report_figures(report_data((12, 16)))
-        if each.name in ("fit_status", "component_widths")
-    ]
-    here = {figure.name: draw_figure(figure) for figure in shown}
-    reporter = Reporter("off", quiet=True)
-    assert draw_by_workers(2, reporter, "report")(shown) == here
-    assert all(isinstance(drawn, Drawn) for drawn in here.values())
-
-
-def test_one_worker_draws_here() -> None:
-    assert isinstance(drawing_executor(1, 9), SerialExecutor)
-    assert isinstance(drawing_executor(8, 1), SerialExecutor)
