@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.base.plain import plain
 from pchem_pipeline.planning.plan import Plan, SamplesPlan, plan_one_sample, plan_samples
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target, parse_target
@@ -77,7 +78,7 @@ def make_plan(request: PlanRequest) -> str:
     if effects:
         lines += ["", _effects_line(effects, known, noise)]
     if request.json is not None:
-        write_json(request.json, content)
+        write_json(request.json, plain(content))
         lines += ["", str(request.json)]
     return "\n".join(lines)
 
@@ -174,15 +175,11 @@ def _plan_json(plan: Plan, targets: Sequence[Target]) -> dict[str, Any]:
             {"target": str(target), "frames_bound": bound}
             for target, bound in zip(targets, plan.bounds, strict=True)
         ],
-        "frames_simulated": _finite(plan.needed),
+        "frames_simulated": plan.needed,
         "precision": plan.precision,
-        "best_exposure": _finite(plan.best_exposure),
-        "best_frames": _finite(plan.best_frames),
+        "best_exposure": plan.best_exposure,
+        "best_frames": plan.best_frames,
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def _several(
@@ -243,8 +240,8 @@ def _split_json(plan: SamplesPlan, targets: Sequence[Target]) -> dict[str, Any]:
         "shares": list(plan.split.shares),
         "frames": plan.frames,
         "frames_per_sample": list(plan.per_sample),
-        "frames_bound": _finite(plan.split.frames),
-        "frames_evenly": _finite(plan.even),
+        "frames_bound": plan.split.frames,
+        "frames_evenly": plan.even,
         "frames_simulated": plan.needed,
         "targets": [{"target": str(target)} for target in targets],
     }

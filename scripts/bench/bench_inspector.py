@@ -92,7 +92,7 @@ def make_page(size: int) -> str:
         inspector=lambda: InspectorData(tuple(entries), sample, "a quarter", "pchem view"),
     )
     dot = Drawn(DOT, 9, 9)
-    return render_report(data, lambda figures: {each.name: dot for each in figures}).html
+    return render_report(data, lambda figures: {each.name: dot for each in figures})["report.html"]
 
 
 def measure(page: Page, path: Path) -> dict[str, float]:

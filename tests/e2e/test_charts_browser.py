@@ -37,7 +37,7 @@ def data() -> ReportData:
 @pytest.fixture(scope="module")
 def page_url(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("charts") / "report.html"
-    path.write_text(render_report(data).html)
+    path.write_text(render_report(data)["report.html"])
     return path.as_uri()
 
 

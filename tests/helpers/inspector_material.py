@@ -70,7 +70,7 @@ def page_without_pictures(data: ReportData) -> str:
         dot = Drawn("data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA=", 10, 10)
         return {figure.name: dot for figure in figures}
 
-    return render_report(data, dots).html
+    return render_report(data, dots)["report.html"]
 
 
 def make_run(

@@ -6,12 +6,12 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
+from pchem_pipeline.base.plain import plain
 from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import Finding, Section, render_page
 from pchem_pipeline.report.pages.pictures import DrawAll, draw_here
-from pchem_pipeline.report.pages.report_json import json_value
 from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
 from pchem_pipeline.report.style.wording import (
@@ -129,7 +129,7 @@ def _pair_section(pair: Pair, found: Comparison, figures: Sequence[Figure]) -> S
 
 
 def _numbers(found: Comparison) -> dict[str, Any]:
-    numbers: dict[str, Any] = json_value(
+    numbers: dict[str, Any] = plain(
         {
             "compare_version": COMPARE_VERSION,
             "changed": found.changed,

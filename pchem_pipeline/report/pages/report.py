@@ -9,7 +9,7 @@ What a paper would say of the run, and cite, is at the end.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 
@@ -245,23 +245,8 @@ PAGE: tuple[Maker, ...] = (
 )
 
 
-@dataclass(frozen=True)
-class RenderedReport:
-    """The files of a report.
-
-    Attributes:
-        html: the page.
-        json: the numbers.
-        pages: further pages, by file name.
-    """
-
-    html: str
-    json: str
-    pages: dict[str, str] = field(default_factory=dict)
-
-
-def render_report(data: ReportData, draw: DrawAll | None = None) -> RenderedReport:
-    """Draw everything and return the files of the report; nothing is written.
+def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, str]:
+    """Draw everything and return the files of the report by name; nothing is written.
 
     Args:
         data: what the run found.
@@ -273,12 +258,13 @@ def render_report(data: ReportData, draw: DrawAll | None = None) -> RenderedRepo
     makers = (result_tables, method_tables, emva_tables, provenance_tables)
     tables = [table for make in makers for table in make(data)]
     sections = page_sections(Material(data, shown, tables, verdict))
-    pages = {}
+    files = {}
     if data.discrepancy is not None and verdict is not None:
         parts = evidence(data.discrepancy, others)
-        pages[DISCREPANCY_PAGE] = _discrepancy_page(data, verdict, parts, drawn)
-    numbers, inspector = report_json(data), embedded(data)
-    page = render_page(
+        files[DISCREPANCY_PAGE] = _discrepancy_page(data, verdict, parts, drawn)
+    inspector = embedded(data)
+    files["report.json"] = report_json(data)
+    files["report.html"] = render_page(
         "report.html.j2",
         sections,
         drawn,
@@ -287,7 +273,7 @@ def render_report(data: ReportData, draw: DrawAll | None = None) -> RenderedRepo
         data=data,
         inspector=inspector,
     )
-    return RenderedReport(page, numbers, pages)
+    return files
 
 
 def _discrepancy_page(

@@ -107,13 +107,11 @@ def _write(
     """Gather, draw and write."""
     with beside(_workers(config.compute)) as hand:
         data = gather(store, config, stages, hand)
-        rendered = render_report(data, draw)
-    for name, page in rendered.pages.items():
-        store.write_file(name, page.encode())
-    if not rendered.pages:
+        files = render_report(data, draw)
+    for name, text in files.items():
+        store.write_file(name, text.encode())
+    if DISCREPANCY_PAGE not in files:
         (store.path / DISCREPANCY_PAGE).unlink(missing_ok=True)
-    store.write_file("report.json", rendered.json.encode())
-    store.write_file("report.html", rendered.html.encode())
     return {"warnings": _warnings(data)}
 
 

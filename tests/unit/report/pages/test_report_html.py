@@ -21,7 +21,7 @@ from pchem_pipeline.report.figures.figure import DataTable, csv_text
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector import script, text_of
 from pchem_pipeline.report.pages.page import GLOSSARY, chart_script, explained, figure_tables
-from pchem_pipeline.report.pages.report import RenderedReport, citation, render_report
+from pchem_pipeline.report.pages.report import citation, render_report
 from pchem_pipeline.report.pages.summary import answers, flags, key_numbers, sentence
 from pchem_pipeline.report.pages.tables import result_tables
 
@@ -40,13 +40,13 @@ def data() -> ReportData:
 
 
 @pytest.fixture(scope="module")
-def report(data: ReportData) -> RenderedReport:
+def report(data: ReportData) -> dict[str, str]:
     return render_report(data)
 
 
 @pytest.fixture(scope="module")
-def page(report: RenderedReport) -> Page:
-    return harmless(report.html)
+def page(report: dict[str, str]) -> Page:
+    return harmless(report["report.html"])
 
 
 def test_nothing_is_loaded_from_anywhere(page: Page) -> None:
@@ -117,7 +117,7 @@ def test_words_of_the_field_lead_to_the_glossary(page: Page) -> None:
     assert "DSNU_1288" in page.text
 
 
-def test_figures_carry_their_numbers(page: Page, report: RenderedReport, data: ReportData) -> None:
+def test_figures_carry_their_numbers(page: Page, report: dict[str, str], data: ReportData) -> None:
     kept = json.loads(next(words for words in page.words if words.startswith('{"') and "ensemble" in words))
     assert set(kept) == {str(a["id"]).removeprefix("figure-") for a in page.of("figure")}
     figure = next(each for each in report_figures(data) if each.name == "profiles")
@@ -161,11 +161,11 @@ def test_hostile_metadata_is_shown_not_run(data: ReportData) -> None:
         ensemble={},
     )
     rendered = render_report(odd)
-    shown = harmless(rendered.html)
+    shown = harmless(rendered["report.html"])
     test_nothing_is_loaded_from_anywhere(shown)
     assert shown.text.count('<script>alert("x")</script>') >= 6
     assert "{{ 7*7 }}" in shown.text
-    assert json.loads(rendered.json)["title"] == HOSTILE
+    assert json.loads(rendered["report.json"])["title"] == HOSTILE
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -179,7 +179,7 @@ def test_names_change_nothing_around_them() -> None:
         config_yaml=turned,
         inputs=[{"name": turned, "size": 1, "hash": "0"}],
     )
-    html = render_report(odd).html
+    html = render_report(odd)["report.html"]
     assert "\u202e" not in html
     assert html.count("\u200e\\u202e\u200egpj.raw") == 2
     assert "W" * 201 not in html
@@ -192,7 +192,7 @@ def test_a_third_of_the_pixels_failed() -> None:
     data = report_data((24, 24), failed=0.34)
     levels = {flag.level: flag.text for flag in flags(data)}
     assert "10 % allowed" in levels["serious"]
-    page = Page(render_report(data).html)
+    page = Page(render_report(data)["report.html"])
     assert "one Gaussian fits as well" in page.text
     assert "✕ Serious" in page.text
 
@@ -254,7 +254,7 @@ def bare() -> ReportData:
 
 @pytest.mark.usefixtures("undrawn")
 def test_all_pixels_failed() -> None:
-    page = Page(render_report(all_failed()).html)
+    page = Page(render_report(all_failed())["report.html"])
     assert "None of the 64 pixels could be fitted" in page.text
     assert "no pixel has a value" in page.text
     assert "not known" not in sentence(all_failed())
@@ -266,7 +266,7 @@ def test_all_pixels_failed() -> None:
 
 
 def test_ready_made_histograms_are_channels_and_say_what_is_left_out() -> None:
-    page = Page(render_report(channels()).html)
+    page = Page(render_report(channels())["report.html"])
     assert "of 5 channels" in page.text
     assert "4 far <red>" in page.text
     assert "Not shown: no integration time" in page.text
@@ -277,8 +277,8 @@ def test_ready_made_histograms_are_channels_and_say_what_is_left_out() -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_nothing_at_all() -> None:
     rendered = render_report(bare())
-    assert "None of the 16 pixels" in Page(rendered.html).text
-    assert json.loads(rendered.json)["summary"] == {}
+    assert "None of the 16 pixels" in Page(rendered["report.html"]).text
+    assert json.loads(rendered["report.json"])["summary"] == {}
 
 
 def test_a_large_sensor_stays_small_on_disk() -> None:
@@ -289,7 +289,7 @@ def test_a_large_sensor_stays_small_on_disk() -> None:
     maps = {name: 1.0 + 0.1 * rng.standard_normal(shape) for name in MAP_NAMES}
     status = (rng.random(shape) < 0.3).astype(np.uint16) * int(FitStatus.POOR_FIT)
     large = replace(base, shape=shape, maps=maps, fit={"fit_status": status}, truth={}, pixels=())
-    html = render_report(large).html
+    html = render_report(large)["report.html"]
     assert 0.5e6 < len(html.encode()) < 8e6
 
 

@@ -15,7 +15,6 @@ from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.figures.catalogue import report_figures
-from pchem_pipeline.report.pages.report import RenderedReport
 from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.run.fingerprint import status
@@ -66,7 +65,7 @@ def folder(base: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write without drawing: fast."""
-    monkeypatch.setattr(report, "render_report", lambda data, draw: RenderedReport("page", "{}"))
+    monkeypatch.setattr(report, "render_report", lambda data, draw: {"report.html": "page"})
 
 
 def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
