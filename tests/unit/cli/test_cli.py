@@ -211,7 +211,6 @@ def test_a_full_disk_behind_stdout_is_one_line():
         ("demo", "--output", "s3://lab/x"),
         ("twin", "run.zarr", "--output", "s3://lab/twin.yaml"),
         ("plan", "--read-noise", "0.3", "--json", "s3://lab/plan.json"),
-        ("plan", "--read-noise", "0.3", "--figure", "s3://lab/plan.svg"),
         ("run", "run.yaml", "--log-json", "s3://lab/log.jsonl"),
     ],
 )
