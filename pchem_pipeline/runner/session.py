@@ -35,7 +35,7 @@ class Command:
     """What the command line asked for, beside the configuration.
 
     Attributes:
-        options: force, dry run, tiles, region.
+        options: force, dry run, region.
         workers: overrides ``compute.workers``.
         backend: overrides ``compute.backend``.
         progress: auto | on | off.
