@@ -151,8 +151,8 @@ def store() -> str:
         "",
         "`run.zarr` is a zarr group (format 3). Every array has dimension names, `units` and `long_name`:",
         '`xarray.open_zarr("run.zarr", group="fit", consolidated=False)`; type `*`: type of the data.',
-        "Arrays that a run did not need are missing. The folder also has `report.html`, `report.json`,",
-        "`figures/` (see `report.figure_formats`) and the versions of the model (`model/0001.json`, ...).",
+        "Arrays that a run did not need are missing. The folder also has `report.html`, `report.json` and",
+        "the versions of the model (`model/0001.json`, ...).",
     ]
     variables = sorted(VARIABLES.values(), key=lambda v: list(VARIABLES).index(v.path))
     for group, members in groupby(variables, key=lambda v: v.group):

@@ -102,11 +102,6 @@ def _uncollected() -> Iterator[None]:
             gc.enable()
 
 
-def is_compiled(function: Callable[..., Any]) -> bool:
-    """Return whether a kernel was compiled before, for any types, on this machine."""
-    return not isinstance(function, _Kernel) or function._cache.is_filled()
-
-
 def types_of(arguments: tuple[Any, ...]) -> list[Any]:
     """Return numba's types of examples; what is a type already stays."""
     return [each if isinstance(each, numba.types.Type) else numba.typeof(each) for each in arguments]

@@ -225,10 +225,6 @@ class KernelCache:
         words = re.sub(r"\W+", "_", f"{module.rpartition('.')[2]}.{name}")
         return f"{words}-{source_state(module)[:32]}"
 
-    def is_filled(self) -> bool:
-        """Return whether the kernel was compiled before, for any types."""
-        return any(cache_folder().glob(f"{self._stem()}-*.nbc"))
-
     def _read(self, path: Path, target_context: Any) -> Any:
         """Return what a file holds; None where there is none, or a damaged one."""
         from numba.core.compiler import CompileResult

@@ -8,9 +8,9 @@ each field is the comment that ``pchem init`` writes.
 from __future__ import annotations
 
 import re
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 from pydantic_core import PydanticCustomError
 
 #: kind of the complaint about a value that must not be repeated in a message
@@ -23,9 +23,22 @@ _SECRETS = re.compile(
 
 
 class Section(BaseModel):
-    """A frozen YAML section: unknown keys, NaN and infinities are refused."""
+    """A frozen YAML section: unknown keys, NaN and infinities are refused.
+
+    Attributes:
+        removed: keys of earlier versions, which are read and do nothing.
+    """
+
+    removed: ClassVar[tuple[str, ...]] = ()
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_removed(cls, data: Any) -> Any:
+        if not cls.removed or not isinstance(data, dict):
+            return data
+        return {key: value for key, value in data.items() if key not in cls.removed}
 
 
 def holds_secret(place: str) -> bool:

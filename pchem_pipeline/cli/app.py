@@ -25,7 +25,6 @@ from pchem_pipeline.cli.options import (
     Quiet,
     Strict,
     Target,
-    Workers,
     on_this_machine,
     region_of,
     say,
@@ -151,7 +150,7 @@ def run(
 
 
 @app.command()
-@takes_command(without=("tiles", "roi"))
+@takes_command(without=("roi",))
 def discrepancy(
     target: Target,
     refit: Annotated[
@@ -282,24 +281,24 @@ def figures(
     width: Annotated[
         str | None, typer.Option(help="width such as 88mm, 18cm or 3.5in [default: each figure's own]")
     ] = None,
-    style: Annotated[
-        str | None,
-        typer.Option(help="matplotlib style sheet (file or name), applied on top of the style of pchem"),
-    ] = None,
     only: Annotated[str, typer.Option(help="names of figures, separated by commas [default: all]")] = "",
     dpi: Annotated[
         int, typer.Option(min=72, max=1200, help="resolution of PNG and of maps, dots per inch")
     ] = 600,
-    workers: Workers = None,
     progress: Progress = "auto",
 ) -> None:
     """Write figures for a paper, with their numbers as CSV."""
-    from pchem_pipeline.commands.figures import Wanted, figures_of_run
+    from pchem_pipeline.commands.figures import figures_of_run
 
-    wanted = Wanted(
-        _listed(formats, "--format"), width, style, _listed(only, "--only"), dpi, workers, progress
-    )
-    for path in figures_of_run(target, output, wanted):
+    for path in figures_of_run(
+        target,
+        output,
+        formats=_listed(formats, "--format"),
+        width=width,
+        only=_listed(only, "--only"),
+        dpi=dpi,
+        progress=progress,
+    ):
         typer.echo(path)
 
 
@@ -340,21 +339,13 @@ def compare(
     label: Annotated[
         list[str] | None,
         typer.Option(
-            help="label of a run in the history, such as a setpoint; once per run, in the same order "
-            "[default: see --against]"
-        ),
-    ] = None,
-    against: Annotated[
-        Literal["date", "temperature", "label"] | None,
-        typer.Option(
-            help="axis of the history: date or sensor temperature from the files, or the number at the start "
-            "of the label [default: label if there are labels, else date]"
+            help="label of a run in the history, such as a setpoint; once per run, in the same order: its "
+            "number is the axis [default: dates of the files]"
         ),
     ] = None,
     fdr: Annotated[
         float, typer.Option(help="false-discovery rate for pixels that changed since the first run")
     ] = 0.01,
-    workers: Workers = None,
     progress: Progress = "auto",
 ) -> None:
     """Compare runs and write their history; exit code 3 if something changed.
@@ -368,8 +359,7 @@ def compare(
         runs,
         output,
         tolerance=tolerance,
-        history=HistorySettings(label or (), against, fdr),
-        workers=workers,
+        history=HistorySettings(label or (), fdr),
         progress=progress,
     ):
         typer.echo(path)

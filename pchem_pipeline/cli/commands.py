@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.runner.session import Command
 
 
-@takes_command(without=("force", "dry_run", "tiles", "roi"))
+@takes_command(without=("force", "dry_run", "roi"))
 def apply(
     target: Target,
     frames: Annotated[list[str], typer.Argument(help="camera files, globs or folders of the same sensor")],
@@ -24,10 +24,10 @@ def apply(
         str, typer.Option(help="electrons, numbers, exposure, separated by commas, or all")
     ] = "all",
     prior: Annotated[
-        str,
+        Literal["frames", "flat", "run"],
         typer.Option(
             help="numbers: prior exposure: frames (estimated from these frames), flat (all numbers equally "
-            "likely), run (from the characterisation), a number (e⁻), or a file with a map (npy, TIFF, FITS)"
+            "likely) or run (from the characterisation)"
         ),
     ] = "frames",
     dataset: Annotated[
@@ -116,7 +116,7 @@ def _shape(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-@takes_command(without=("tiles", "roi"))
+@takes_command(without=("roi",))
 def methods(
     target: Target,
     with_runs: Annotated[
@@ -171,29 +171,19 @@ def plan(
     ] = None,
     max_exposure: Annotated[float, typer.Option(min=0.01, help="largest allowed exposure, e⁻")] = 10.0,
     max_frames: Annotated[float, typer.Option(min=1, help="largest allowed number of frames")] = 1e7,
-    verify: Annotated[bool, typer.Option("--verify", help="simulate the plan with other pixels")] = False,
-    pixels: Annotated[int, typer.Option(min=10, help="simulated pixels of --verify")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, help="random seed of --verify")] = 1,
-    figure: Annotated[
-        Path | None,
-        typer.Option(
-            help="draw the frames needed over exposure and read noise: .svg, .png or .pdf",
-            callback=on_this_machine,
-        ),
-    ] = None,
     json: Annotated[
         Path | None, typer.Option(help="write the numbers to this file", callback=on_this_machine)
     ] = None,
 ) -> None:
     """Compute how many frames are needed for a precision.
 
-    From the Cramer-Rao bound and simulated pixels; --verify simulates the plan with others.
+    From the Cramer-Rao bound and simulated pixels.
     """
     from pchem_pipeline.commands.plan import PlanRequest, make_plan
 
     request = PlanRequest(
         run=run, read_noise_e=read_noise, quanta_exposure=exposure, conversion_gain=gain,
         targets=tuple(target or ()), frames=frames, samples=samples, max_exposure=max_exposure,
-        max_frames=max_frames, verify=verify, pixels=pixels, seed=seed, figure=figure, json=json,
+        max_frames=max_frames, json=json,
     )  # fmt: skip
     say(make_plan(request))

@@ -48,17 +48,12 @@ _COMMON: tuple[tuple[str, Any, Any], ...] = (
         False,
     ),
     (
-        "tiles",
-        Annotated[str | None, typer.Option(help="only these tiles, iy.ix: 0.3,2.1 or ranges 0:2.0:4")],
-        None,
-    ),
-    (
         "roi",
         Annotated[
             str | None,
             typer.Option(
                 help="region y0:y1,x0:x1 in pixels; ingest and run FILES crop to it, other commands process "
-                "its tiles"
+                "only its tiles"
             ),
         ],
         None,
@@ -211,16 +206,11 @@ def _command(
     *,
     force: bool = False,
     dry_run: bool = False,
-    tiles: str | None = None,
     roi: str | None = None,
     **rest: Any,
 ) -> Command:
     """Return what the common options ask for."""
     from pchem_pipeline.run.stage import Options
     from pchem_pipeline.runner.session import Command
-    from pchem_pipeline.store.tiles import tile_ranges
 
-    if tiles is not None:
-        tile_ranges(tiles)  # what is no list of tiles is told before anything is read
-
-    return Command(Options(force=force, dry_run=dry_run, tiles=tiles, roi=region_of(roi)), **rest)
+    return Command(Options(force=force, dry_run=dry_run, roi=region_of(roi)), **rest)

@@ -17,7 +17,7 @@ from pchem_pipeline.report.pages.emva import COLUMNS as EMVA_COLUMNS
 from pchem_pipeline.report.pages.emva import MAPS as EMVA_MAPS
 from pchem_pipeline.report.pages.emva import emva_rows
 from pchem_pipeline.run.target import Target, find_run, with_maps
-from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
 #: Formats that maps can be exported to, their CSV summary, and a table in the words of EMVA 1288.
@@ -60,10 +60,6 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     target = find_run(path)
     store = with_maps(target.stored())
     warn_if_old(target, ("maps",), "written in this state")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(error, folder) from error
     written: list[Path] = []
     images = _images(store) if set(formats) - {"csv", "emva"} else []
     for name in dict.fromkeys(formats):

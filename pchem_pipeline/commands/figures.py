@@ -4,47 +4,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.compute.executor import map_all
+from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import run_figures
-from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.figures.paper import FORMATS, PaperFigure, draw_paper_figure, read_style_sheet
+from pchem_pipeline.report.figures.figure import Figure, csv_text
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.runner.session import run_status
-from pchem_pipeline.stages.report.report import drawing_executor, drawing_workers, gather
-from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.stages.report.report import gather
+from pchem_pipeline.store.files import write_atomic
+
+#: File formats of figures for papers.
+FORMATS = ("pdf", "svg", "png")
 
 #: Narrowest and widest figure, mm.
 _WIDTHS = (40.0, 400.0)
 _UNITS = {"mm": 1.0, "cm": 10.0, "in": 25.4, "pt": 25.4 / 72.0, "": 1.0}
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """How the figures are wanted.
-
-    Attributes:
-        formats: pdf, svg, png.
-        width: such as ``88mm`` or ``3.5in``; None: each figure's own.
-        style: path or name of a matplotlib style sheet.
-        only: names of figures; empty: all.
-        dpi: resolution of PNG and of maps, dots per inch.
-        workers: processes that draw; None: as the run's section ``compute`` says.
-        progress: auto | on | off.
-    """
-
-    formats: Sequence[str] = ("pdf",)
-    width: str | None = None
-    style: str | None = None
-    only: Sequence[str] = ()
-    dpi: int = 600
-    workers: int | None = None
-    progress: ProgressMode = "auto"
 
 
 def millimetres(text: str) -> float:
@@ -71,38 +49,64 @@ def gather_run(target: Target) -> ReportData:
     return gather(with_maps(target.stored()), target.config, [])
 
 
-def figures_of_run(path: Path, folder: Path, wanted: Wanted) -> list[Path]:
+def figures_of_run(
+    path: Path,
+    folder: Path,
+    *,
+    formats: Sequence[str] = ("pdf",),
+    width: str | None = None,
+    only: Sequence[str] = (),
+    dpi: int = 600,
+    progress: ProgressMode = "auto",
+) -> list[Path]:
     """Write the figures of a run and their numbers.
 
     Args:
         path: the run's store, or the YAML that made it.
         folder: where to write; made if needed.
-        wanted: which, and how.
+        formats: pdf, svg, png.
+        width: such as ``88mm`` or ``3.5in``; None: each figure's own.
+        only: names of figures; empty: all.
+        dpi: resolution of PNG, and of maps inside the other formats, dots per inch.
+        progress: auto | on | off.
 
     Returns:
         The files written, figure by figure.
 
     Raises:
-        ConfigError: an unknown format, width, style or figure.
+        ConfigError: an unknown format, width or figure.
         StoreError: the run has no maps, or the folder cannot be written.
     """
-    unknown = [name for name in wanted.formats if name not in FORMATS]
-    if unknown or not wanted.formats:
+    unknown = [name for name in formats if name not in FORMATS]
+    if unknown or not formats:
         what = f"{', '.join(unknown)} cannot be drawn" if unknown else "no format"
         raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
-    width = None if wanted.width is None else millimetres(wanted.width)
-    sheet = {} if wanted.style is None else read_style_sheet(wanted.style)
+    width_mm = None if width is None else millimetres(width)
     target = find_run(path)
     data = gather_run(target)
     warn_if_old(target, ("maps", "ensemble"), "drawn in this state")
-    settings = target.config.report
-    kinds = tuple(dict.fromkeys(wanted.formats))
-    jobs = [
-        PaperFigure(each, kinds, width, wanted.dpi, sheet)
-        for each in _chosen(run_figures(data, settings), wanted.only)
-    ]
-    workers = drawing_workers(wanted.workers, target.config.compute)
-    return _drawn(jobs, folder, workers, Reporter(wanted.progress))
+    chosen, written = _chosen(run_figures(data), only), []
+    with Reporter(progress).progress("figures", len(chosen), "figure") as advance:
+        for figure in chosen:
+            for name, content in paper_files(figure, tuple(dict.fromkeys(formats)), width_mm, dpi).items():
+                write_atomic(folder / name, content)
+                written.append(folder / name)
+            advance()
+    return written
+
+
+def paper_files(
+    figure: Figure, formats: Sequence[str], width_mm: float | None = None, dpi: int = 600
+) -> dict[str, bytes]:
+    """Draw a figure and return its files and those of its tables by name; pure."""
+    drawing = figure.draw(Look(width_mm or figure.width_mm, dpi=dpi))
+    files = {
+        f"{figure.name}.{kind}": drawing_bytes(drawing, kind, dpi=dpi, title=figure.title) for kind in formats
+    }
+    for table in figure.tables:
+        part = f"_{table.part}" if table.part else ""
+        files[f"{figure.name}{part}.csv"] = csv_text(table).encode()
+    return files
 
 
 def _chosen(found: list[Figure], only: Sequence[str]) -> list[Figure]:
@@ -111,24 +115,6 @@ def _chosen(found: list[Figure], only: Sequence[str]) -> list[Figure]:
     if unknown:
         raise ConfigError(f"--only: this run has no figure {unknown[0]}; it has {', '.join(names)}")
     return [figure for figure in found if not only or figure.name in only]
-
-
-def _drawn(jobs: list[PaperFigure], folder: Path, workers: int, reporter: Reporter) -> list[Path]:
-    """Draw with several processes and write each figure when it is there."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(error, folder) from error
-    written: dict[str, list[Path]] = {}
-
-    def write(job: PaperFigure, files: dict[str, bytes]) -> None:
-        written[job.figure.name] = [folder / name for name in files]
-        for name, content in files.items():
-            write_atomic(folder / name, content)
-
-    with reporter.progress("figures", len(jobs), "figure") as advance:
-        map_all(drawing_executor(workers, len(jobs)), draw_paper_figure, jobs, write, advance)
-    return [path for job in jobs for path in written[job.figure.name]]
 
 
 def warn_if_old(target: Target, stages: Sequence[str], words: str) -> None:

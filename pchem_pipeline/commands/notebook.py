@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError, install_hint, quoted
 from pchem_pipeline.base.variables import PARAMETERS, variable_at
-from pchem_pipeline.commands.figures import gather_run
-from pchem_pipeline.commands.notebook_plots import Plots, width_of
+from pchem_pipeline.commands.figures import gather_run, millimetres
 from pchem_pipeline.model.fit.result import html_table
 from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD
 from pchem_pipeline.report.charts.chart import COLUMN_MM
 from pchem_pipeline.report.charts.on_paper import Look, draw_chart
-from pchem_pipeline.report.data import PixelFit, ReportData
-from pchem_pipeline.report.figures.pixels import cell_tables, cells_chart, has_fit, pixels_chart
+from pchem_pipeline.report.data import PixelFit
+from pchem_pipeline.report.figures.catalogue import run_figures
+from pchem_pipeline.report.figures.pixels import has_fit, pixels_chart
 from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_versions
 from pchem_pipeline.run.sensor import SensorInfo
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.discrepancy.verdict import Verdict
     from pchem_pipeline.report.charts.on_paper import Drawing
+    from pchem_pipeline.report.figures.figure import Figure
     from pchem_pipeline.run.progress import ProgressMode
     from pchem_pipeline.use.twin import Twin
 
@@ -86,7 +87,6 @@ class Run:
         config: its configuration.
         shape: rows and columns of the sensor (for ready-made histograms: one row of channels).
         n_frames: frames of each pixel.
-        plot: the figures of the report; ``run.plot.maps()``, ``run.plot.ensemble()``, ...
     """
 
     def __init__(self, target: Target) -> None:
@@ -98,7 +98,6 @@ class Run:
         self.config: RunConfig = target.config
         self.shape: tuple[int, int] = self._sensor.shape
         self.n_frames: int = self._sensor.n_frames
-        self.plot = Plots(lambda: self._data, target.config.report)
 
     def __repr__(self) -> str:
         states = run_status(self._target)
@@ -354,9 +353,27 @@ class Run:
         found = self.group(group)
         return {name: found[name] for name in names}
 
+    # -- figures ------------------------------------------------------------------------------
+
     @cached_property
-    def _data(self) -> ReportData:
-        return gather_run(self._target)
+    def figures(self) -> Mapping[str, Figure]:
+        """The figures of the report and of the discrepancy page by name, undrawn, with their numbers."""
+        return {figure.name: figure for figure in run_figures(gather_run(self._target))}
+
+    def figure(self, name: str, width: float | str | None = None) -> Drawing:
+        """Draw a figure of the report or of the discrepancy page, such as ``ensemble`` or ``map_bias``.
+
+        Args:
+            name: one of :attr:`figures`.
+            width: mm, or a text such as ``"3.5in"``; None: the figure's own.
+
+        Raises:
+            ConfigError: the run has no such figure, or no figure can be so wide.
+        """
+        if name not in self.figures:
+            raise ConfigError(f"this run has no figure {name}; it has {', '.join(self.figures)}")
+        figure = self.figures[name]
+        return figure.draw(Look(figure.width_mm if width is None else millimetres(str(width))))
 
 
 def lazy_dataset(store: RunStore, group: str) -> xr.Dataset:
@@ -444,8 +461,4 @@ class Pixel(PixelFit):
         Args:
             width: of the figure, mm, or a text such as ``"3.5in"``.
         """
-        return draw_chart(Look(width_of(width)), pixels_chart([self]))
-
-    def plot_cells(self, width: float | str = COLUMN_MM) -> Drawing:
-        """Draw the density with the edges between electron numbers, as the report does."""
-        return draw_chart(Look(width_of(width)), cells_chart(cell_tables(self.parameters, self)))
+        return draw_chart(Look(millimetres(str(width))), pixels_chart([self]))

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
-from pchem_pipeline.planning.frames import contour_data
+from pchem_pipeline.base.plain import plain
 from pchem_pipeline.planning.plan import Plan, SamplesPlan, plan_one_sample, plan_samples
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target, parse_target
-from pchem_pipeline.store.files import write_atomic, write_json
-
-if TYPE_CHECKING:
-    from pchem_pipeline.planning.verify import Verification
+from pchem_pipeline.store.files import write_json
 
 _DEFAULT_GAIN = 0.09  # e-/DN, of the cameras that this package was made for
-_ERRORS = ("wanted", "rmse", "rmse_stderr", "robust_sd")
-_FIGURES = (".svg", ".png", ".pdf")
 
 
 @dataclass(frozen=True)
@@ -38,10 +33,6 @@ class PlanRequest:
         samples: exposures separated by commas, or ``best``.
         max_exposure: largest exposure to choose, e-.
         max_frames: more are as good as never.
-        verify: simulate the plan once more, with pixels of its own.
-        pixels: of these, their number.
-        seed: of this simulation.
-        figure: file for the contours.
         json: file for the numbers.
     """
 
@@ -54,15 +45,11 @@ class PlanRequest:
     samples: str | None = None
     max_exposure: float = 10.0
     max_frames: float = 1e7
-    verify: bool = False
-    pixels: int = 1000
-    seed: int = 1
-    figure: Path | None = None
     json: Path | None = None
 
 
 def make_plan(request: PlanRequest) -> str:
-    """Return the plan in words; write its figure and its JSON where asked.
+    """Return the plan in words; write its JSON where asked.
 
     Args:
         request: from the command line.
@@ -77,8 +64,6 @@ def make_plan(request: PlanRequest) -> str:
         raise ConfigError("--read-noise is missing: give it in e-, quantisation included, or give a run")
     if not request.targets and request.frames is None:
         raise ConfigError("--target is missing: give a precision, such as conversion_gain=1%, or --frames")
-    if request.figure is not None and request.figure.suffix not in _FIGURES:
-        raise ConfigError(f"--figure {request.figure}: cannot be drawn; use the suffix {', '.join(_FIGURES)}")
     exposure = known.get("quanta_exposure") if request.quanta_exposure is None else request.quanta_exposure
     gain = known.get("conversion_gain", _DEFAULT_GAIN)
     if request.conversion_gain is not None:
@@ -92,12 +77,9 @@ def make_plan(request: PlanRequest) -> str:
     )
     if effects:
         lines += ["", _effects_line(effects, known, noise)]
-    if request.figure is not None:
-        _draw(request.figure, targets or [Target("conversion_gain", 1.0, "%")], content, gain)
-        lines += ["", str(request.figure)]
     if request.json is not None:
-        write_json(request.json, content)
-        lines += [str(request.json)]
+        write_json(request.json, plain(content))
+        lines += ["", str(request.json)]
     return "\n".join(lines)
 
 
@@ -149,15 +131,7 @@ def _one(
         max_exposure=request.max_exposure,
         max_frames=request.max_frames,
     )
-    content = _plan_json(plan, targets)
-    lines = _plan_lines(plan, request, targets, exposure_given)
-    if request.verify:
-        check = _verified(
-            request, targets, point=plan.point, frames={plan.point.quanta_exposure: plan.frames}
-        )
-        lines += ["", _check_line(check)]
-        content["verified"] = [_verification_json(check)]
-    return lines, content
+    return _plan_lines(plan, request, targets, exposure_given), _plan_json(plan, targets)
 
 
 def _plan_lines(
@@ -201,57 +175,10 @@ def _plan_json(plan: Plan, targets: Sequence[Target]) -> dict[str, Any]:
             {"target": str(target), "frames_bound": bound}
             for target, bound in zip(targets, plan.bounds, strict=True)
         ],
-        "frames_simulated": _finite(plan.needed),
+        "frames_simulated": plan.needed,
         "precision": plan.precision,
-        "best_exposure": _finite(plan.best_exposure),
-        "best_frames": _finite(plan.best_frames),
-    }
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
-def _verified(
-    request: PlanRequest, targets: Sequence[Target], point: Point, frames: Mapping[float, float]
-) -> Verification:
-    """Simulate a plan; ``frames`` has those of each exposure."""
-    from pchem_pipeline.planning.verify import verify
-
-    aims = targets or [Target("conversion_gain", 1.0, "%")]
-    numbers = [max(int(np.ceil(n)), 2) for n in frames.values()]
-    return verify(aims, point, list(frames), numbers, request.pixels, request.seed)
-
-
-def _check_line(result: Verification) -> str:
-    parts = []
-    for check in result.checks:
-        unit, scale = ("e-", 1.0) if check.target.name == "bias" else ("%", 100.0)
-        parts.append(
-            f"{check.target.name} {scale * check.rmse:.3g} ± {scale * check.rmse_stderr:.1g} {unit}, "
-            f"{'reached' if check.reached else 'not reached'}"
-        )
-    caution = f", {result.n_flagged} flagged" if result.n_flagged else ""
-    return (
-        f"simulated, {result.n_frames:,} frames, {result.n_pixels:,} pixels fitted "
-        f"({result.n_failed} without a value{caution}): rms error of {'; '.join(parts)}"
-    )
-
-
-def _verification_json(result: Verification) -> dict[str, Any]:
-    return {
-        "frames": result.n_frames,
-        "pixels": result.n_pixels,
-        "failed": result.n_failed,
-        "flagged": result.n_flagged,
-        "checks": [
-            {
-                **{name: _finite(getattr(check, name)) for name in _ERRORS},
-                "target": str(check.target),
-                "reached": bool(check.reached),
-            }
-            for check in result.checks
-        ],
+        "best_exposure": plan.best_exposure,
+        "best_frames": plan.best_frames,
     }
 
 
@@ -269,13 +196,7 @@ def _several(
         max_exposure=request.max_exposure,
         max_frames=request.max_frames,
     )
-    lines, content = _split_lines(plan, targets), _split_json(plan, targets)
-    if request.verify:
-        frames = {h: float(n) for h, n in zip(plan.split.exposures, plan.per_sample, strict=True) if n}
-        check = _verified(request, targets, plan.point, frames)
-        lines += [*([""] if lines[-1] else []), _check_line(check)]
-        content["verified"] = [_verification_json(check)]
-    return lines, content
+    return _split_lines(plan, targets), _split_json(plan, targets)
 
 
 def _exposures(text: str) -> list[float] | None:
@@ -319,21 +240,8 @@ def _split_json(plan: SamplesPlan, targets: Sequence[Target]) -> dict[str, Any]:
         "shares": list(plan.split.shares),
         "frames": plan.frames,
         "frames_per_sample": list(plan.per_sample),
-        "frames_bound": _finite(plan.split.frames),
-        "frames_evenly": _finite(plan.even),
+        "frames_bound": plan.split.frames,
+        "frames_evenly": plan.even,
         "frames_simulated": plan.needed,
         "targets": [{"target": str(target)} for target in targets],
     }
-
-
-def _draw(path: Path, targets: Sequence[Target], content: dict[str, Any], gain: float) -> None:
-    from pchem_pipeline.report.charts.chart import COLUMN_MM
-    from pchem_pipeline.report.charts.on_paper import Look, draw_chart, drawing_bytes
-    from pchem_pipeline.report.figures.plan import frames_chart, frames_table
-
-    mark = None
-    if content["samples"] == 1:
-        mark = (content["quanta_exposure"], content["read_noise_e"])
-    look = Look(COLUMN_MM * min(len(targets), 2))
-    drawing = draw_chart(look, frames_chart(frames_table(contour_data(targets, gain)), mark))
-    write_atomic(path, drawing_bytes(drawing, path.suffix[1:], title="Frames needed"))

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.run.target import Target
 
-#: Bits of the ADC where the run does not say, and frames where nothing else is asked for.
-_BIT_DEPTH, TWIN_FRAMES = 16, 1000
+#: Bits of the ADC where the run does not say.
+_BIT_DEPTH = 16
 _HEAD = """# Simulated copy of the camera of {run}: pchem run makes its frames and characterises them.
 # The effects of its model are simulated, and are in the model here.
 """

@@ -11,7 +11,6 @@ from __future__ import annotations
 import base64
 import contextlib
 import json
-import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError, quoted
+from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.report.inspector import MapEntry, packed_facts, served_page
 from pchem_pipeline.run.sensor import SensorInfo
@@ -175,9 +175,9 @@ class RunView:
         content = {
             "origin": int(histograms.origin[0]) + int(kept.start),
             "counts": counts[kept].tolist(),
-            "deciding": None if deciding is None else _floats(deciding[:, 0]),
-            "mass": None if mass is None or not np.isfinite(mass).all() else _floats(mass[kept]),
-            "values": {path: _floats(self.store.read(path, region))[0] for path in self._maps},
+            "deciding": None if deciding is None else deciding[:, 0],
+            "mass": None if mass is None or not np.isfinite(mass).all() else mass[kept],
+            "values": {path: float(self.store.read(path, region).item()) for path in self._maps},
         }
         return _json(content)
 
@@ -220,14 +220,8 @@ def _text(status: HTTPStatus, text: str) -> Answer:
 
 
 def _json(content: Any) -> Answer:
-    text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    text = json.dumps(plain(content), separators=(",", ":"), allow_nan=False)
     return Answer(HTTPStatus.OK, text.encode(), "application/json")
-
-
-def _floats(values: Any) -> list[float | None]:
-    """Return numbers as JSON has them: null where there is no value."""
-    flat = np.asarray(values, dtype=np.float64).ravel().tolist()
-    return [value if math.isfinite(value) else None for value in flat]
 
 
 class _Handler(BaseHTTPRequestHandler):

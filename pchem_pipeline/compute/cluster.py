@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import platform
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -38,7 +37,7 @@ class OtherVersionsError(ConfigError):
 
 
 class DistributedExecutor:
-    """A dask.distributed cluster: local, at an address, or made by a class from the settings."""
+    """A dask.distributed cluster: local, or at an address."""
 
     shares_memory = False
 
@@ -46,7 +45,7 @@ class DistributedExecutor:
         """Connect to the cluster, or make it, and wait for its first worker.
 
         Raises:
-            ConfigError: no scheduler answers, or the class of the cluster cannot be had.
+            ConfigError: no scheduler answers, or one is to be started that a run does not start.
             IncompleteRunError: no worker came in ``compute.wait_for_workers`` seconds.
             MissingDependencyError: dask.distributed is not installed.
         """
@@ -58,14 +57,15 @@ class DistributedExecutor:
             ) from error
         except ValueError as error:
             raise ConfigError(f"{error}; correct that file") from error
+        if settings.cluster is not None and settings.scheduler is None:
+            raise ConfigError(
+                "compute.cluster: a run starts no such cluster; start it, and give its address or scheduler "
+                "file as compute.scheduler"
+            )
         self._cluster: Any = None
         try:
             if settings.scheduler is not None:
                 self._client = distributed.Client(**_address(settings.scheduler), timeout="20s")
-            elif settings.cluster is not None:
-                self._cluster = _cluster_class(settings.cluster.cls)(**settings.cluster.kwargs)
-                self._cluster.scale(settings.cluster.scale)
-                self._client = distributed.Client(self._cluster)
             else:
                 self._cluster = distributed.LocalCluster(
                     n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1"
@@ -177,8 +177,8 @@ class DistributedExecutor:
 
 
 _MORE_MEMORY = (
-    "give each more memory (fewer workers on a machine, dask worker --memory-limit, memory_limit in "
-    "compute.cluster.kwargs) or smaller pieces (--max-memory)"
+    "give each more memory (fewer workers on a machine, dask worker --memory-limit) or smaller pieces "
+    "(--max-memory)"
 )
 
 
@@ -195,14 +195,6 @@ def _address(scheduler: str) -> dict[str, str]:
     if not Path(scheduler).exists():
         raise FileNotFoundError("no such scheduler file")
     return {"scheduler_file": scheduler}
-
-
-def _cluster_class(name: str) -> Any:
-    module, _, attribute = name.rpartition(".")
-    try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"compute.cluster.class: cannot import {name} ({error})") from error
 
 
 def library_versions() -> dict[str, str]:

@@ -125,31 +125,6 @@ def beside(threads: int) -> Iterator[Beside]:
         pool.shutdown(cancel_futures=True)
 
 
-def map_all(
-    executor: Executor,
-    function: Callable[[T], Any],
-    items: Sequence[T],
-    take: Callable[[T, Any], None],
-    advance: Callable[[], None] = lambda: None,
-) -> None:
-    """Call ``function`` on each item and ``take(item, value)`` here, in any order.
-
-    The first error is raised when all have ended; ``advance`` is called after each.
-    """
-    errors: list[BaseException] = []
-
-    def on_result(item: T, outcome: Outcome) -> None:
-        advance()
-        if outcome.error is None:
-            take(item, outcome.value)
-        else:
-            errors.append(outcome.error)
-
-    executor.map(function, items, on_result)
-    if errors:
-        raise errors[0]
-
-
 class SerialExecutor:
     """One item after the other, in this thread."""
 
@@ -164,15 +139,6 @@ class SerialExecutor:
 
     def close(self) -> None:
         """Nothing to free."""
-
-
-def can_start_processes() -> bool:
-    """Return whether worker processes can be had: they need shared memory."""
-    try:
-        _SPAWN.Lock()
-    except OSError:
-        return False
-    return True
 
 
 def _begin_worker() -> None:
@@ -200,11 +166,13 @@ class PoolExecutor:
 
     def _pool(self) -> Pool:
         if self._processes:
-            if not can_start_processes():
+            try:
+                _SPAWN.Lock()
+            except OSError as error:
                 raise ConfigError(
                     "no shared memory for worker processes (on Linux: /dev/shm is read-only or full); use "
                     "--backend threads"
-                )
+                ) from error
             return ProcessPoolExecutor(self.workers, mp_context=_SPAWN, initializer=_begin_worker)
         return ThreadPoolExecutor(self.workers, thread_name_prefix="tile")
 

@@ -2,56 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from pchem_pipeline.base.settings import Section
-
-_QUEUES = ("HTCondor", "LSF", "Moab", "OAR", "PBS", "SGE", "SLURM")
-#: A YAML, and the store that keeps it, may be somebody else's: it names a cluster and how large it is, but
-#: nothing that is run or loaded.
-_CLASSES = ("distributed.LocalCluster", *(f"dask_jobqueue.{name}Cluster" for name in _QUEUES))
-_ARGUMENTS = (
-    "account", "cores", "dashboard_address", "death_timeout", "disk", "host", "interface", "job_cpu",
-    "job_mem", "local_directory", "log_directory", "memory", "memory_limit", "n_workers", "nanny",
-    "processes", "project", "queue", "resource_spec", "threads_per_worker", "walltime",
-)  # fmt: skip
-_WORD = re.compile(r"(?!-)[\w.,:/=+@%-]*", re.ASCII)  # no more: it becomes part of a job's script
-
-
-class ClusterSettings(Section):
-    """A dask cluster made by the run, for example ``dask_jobqueue.SLURMCluster``."""
-
-    cls: str = Field(alias="class", description="distributed.LocalCluster, or one of dask_jobqueue")
-    kwargs: dict[str, Any] = Field(default_factory=dict, description="arguments of the class: sizes, names")
-    scale: int = Field(default=1, ge=1, description="number of workers to request")
-
-    @field_validator("cls")
-    @classmethod
-    def _known_class(cls, value: str) -> str:
-        if value not in _CLASSES:
-            raise ValueError(
-                f"{value} is not one of {', '.join(_CLASSES)}; start other clusters yourself, and give the "
-                "address as compute.scheduler"
-            )
-        return value
-
-    @field_validator("kwargs")
-    @classmethod
-    def _harmless(cls, value: dict[str, Any]) -> dict[str, Any]:
-        for name, given in value.items():
-            plain = (
-                _WORD.fullmatch(given) if isinstance(given, str) else isinstance(given, int | float | None)
-            )
-            if name not in _ARGUMENTS or not plain:
-                raise ValueError(
-                    f"{name}: {given!r} is not taken from a run's YAML, only numbers and single words for "
-                    f"{', '.join(_ARGUMENTS)}; others belong into your own configuration of dask "
-                    "(~/.config/dask)"
-                )
-        return value
 
 
 class ComputeSettings(Section):
@@ -80,4 +35,6 @@ class ComputeSettings(Section):
         description="distributed: seconds to wait for a worker before the run stops; more if jobs wait in a "
         "queue",
     )
-    cluster: ClusterSettings | None = Field(default=None, description="distributed: {class, kwargs, scale}")
+    cluster: dict[str, Any] | None = Field(
+        default=None, description="of earlier versions; start a cluster yourself, and give its scheduler"
+    )

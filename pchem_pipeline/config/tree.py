@@ -64,7 +64,7 @@ class RunConfig(Section):
     methods: MethodsSettings = Field(
         default_factory=MethodsSettings, description="comparison with other methods (pchem methods)"
     )
-    report: ReportSettings = Field(default_factory=ReportSettings, description="report.html and figures")
+    report: ReportSettings = Field(default_factory=ReportSettings, description="report.html")
     compute: ComputeSettings = Field(default_factory=ComputeSettings, description="backend, workers, memory")
 
     @field_validator(

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.methods.base import PixelSamples, Sample, Settings
 from pchem_pipeline.methods.compare import MethodResult, compare
@@ -92,4 +93,4 @@ def _gain_bounds(point: StudyPoint) -> dict[str, float | None]:
     both = inverse_information(two * (n / 2))[0, 0]
     transfer = gain_variance(exposure, 0.0, noise, n / 2, n / 2)
     found = {"one sample": one, "a dark and a bright sample": both, "photon_transfer": transfer}
-    return {name: float(np.sqrt(value)) if np.isfinite(value) else None for name, value in found.items()}
+    return {name: plain(np.sqrt(value)) for name, value in found.items()}

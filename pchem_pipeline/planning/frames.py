@@ -5,12 +5,10 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
 from pchem_pipeline.planning.point import FloatArray, Point
 from pchem_pipeline.planning.targets import TARGET_NAMES, Target
@@ -89,41 +87,3 @@ def best_exposure(targets: Sequence[Target], point: Point, low: float, high: flo
     ends = grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)]
     found = min(grid[best], minimize_scalar(needed, bounds=ends, method="bounded").x, key=needed)
     return float(np.exp(found)), needed(found)
-
-
-def frames_grid(
-    target: Target, exposures: FloatArray, read_noises: FloatArray, conversion_gain: float
-) -> FloatArray:
-    """Return the frames needed over a grid, shape (read noises, exposures); infinite where none suffice.
-
-    Args:
-        target: what is wanted.
-        exposures: H, e-.
-        read_noises: s_e, e-.
-        conversion_gain: g, e-/DN, for targets in DN.
-    """
-    return np.array(
-        [
-            [frames_needed(target, Point(float(h), float(s), conversion_gain)) for h in exposures]
-            for s in read_noises
-        ]
-    )
-
-
-def contour_data(targets: Sequence[Target], conversion_gain: float, *, fine: int = 28) -> dict[str, Any]:
-    """Return the frames that one sample needs over exposure and read noise, for a figure.
-
-    Args:
-        targets: what is wanted.
-        conversion_gain: g, e-/DN, for targets in DN.
-        fine: points along each axis.
-    """
-    exposures, noises = exposure_grid(0.05, 30.0, fine), np.linspace(0.15, 0.9, fine)
-    noises = noises[noises >= conversion_gain * np.sqrt(QUANTISATION_VARIANCE)]
-    return {
-        "exposures": exposures,
-        "read_noises": noises,
-        "frames": {
-            str(target): frames_grid(target, exposures, noises, conversion_gain) for target in targets
-        },
-    }

@@ -14,10 +14,6 @@ from pchem_pipeline.model.checks.run_differences import MapDifference, Reasons
 State = Literal["identical", "equal", "changed", "lost", "new"]
 
 
-#: What a history is drawn against.
-Against = Literal["date", "temperature", "label"]
-
-
 @dataclass(frozen=True)
 class RunFacts:
     """One run.
@@ -135,8 +131,7 @@ class HistoryRow:
         label: as given, else the date.
         date: when its frames were taken, else written, UTC, ISO 8601; empty where that is not known.
         temperature: of the sensor as its frames say, degrees Celsius; None where they do not.
-        place: number that the label begins with, days of the date, or the temperature; NaN where there is
-            none.
+        place: number that the label begins with, or days of the date; NaN where there is none.
         run: what its maps say.
         hot_pixels: pixels far above the others in exposure, as in the report of the run.
         hot_new, hot_gone: pixels (y, x) that are hot here and not in the first run, and the reverse.
@@ -171,7 +166,7 @@ class Comparison:
         pairs: the first with each of the others.
         tolerance: relative difference that counts as rounding.
         history: a row for each run.
-        against: what the history is drawn against.
+        labelled: whether the history is drawn against labels, not against dates.
         rate: false-discovery rate at which pixels count as moved.
     """
 
@@ -179,7 +174,7 @@ class Comparison:
     pairs: Sequence[Pair]
     tolerance: float
     history: Sequence[HistoryRow] = ()
-    against: Against = "date"
+    labelled: bool = False
     rate: float = 0.01
 
     @property

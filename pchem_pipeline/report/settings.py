@@ -1,10 +1,10 @@
-"""The YAML section ``report``: what the report shows and how figures are saved."""
+"""The YAML section ``report``: what the report shows."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from pchem_pipeline.base.settings import Section
 
@@ -49,33 +49,12 @@ class Criteria(Section):
 class ReportSettings(Section):
     """Settings of the stage ``report``."""
 
+    removed: ClassVar[tuple[str, ...]] = ("figure_formats", "dpi", "map_stretch", "histogram_bins")
+
     pixels: tuple[PixelPosition, ...] = Field(
         default=(),
         max_length=16,
         description="pixels whose fits are drawn, [[y, x], ...]; empty: four pixels at low and high "
         "read noise and low and high quanta exposure",
     )
-    figure_formats: tuple[Literal["svg", "png", "pdf"], ...] = Field(
-        default=(),
-        description="formats of files that each report writes to figures/: svg, png, pdf; empty: none (the "
-        "page has its own, and `pchem figures` draws them for papers later)",
-    )
-    dpi: int = Field(
-        default=300, ge=72, le=1200, description="resolution of PNG figures and of maps, dots per inch"
-    )
-    map_stretch: Literal["beta", "linear"] = Field(
-        default="beta",
-        description="colours of the maps: 'beta' by rank (Beta(2,2) transform, histogram-equalised), "
-        "'linear' by value from the 1st to the 99th percentile",
-    )
     criteria: Criteria = Field(default_factory=Criteria, description="limits of the sensor; null: no limit")
-    histogram_bins: int = Field(
-        default=128, ge=8, le=1024, description="largest number of bins in histograms of maps"
-    )
-
-    @field_validator("figure_formats")
-    @classmethod
-    def _no_doubles(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        if len(set(value)) != len(value):
-            raise ValueError("a format is listed twice; list each of svg, png, pdf at most once")
-        return value

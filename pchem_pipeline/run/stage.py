@@ -33,7 +33,7 @@ from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.store.files import is_fatal
 from pchem_pipeline.store.records import check_work, working
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.store.tiles import Tile, parse_tiles, roi_tiles, tile_grid, tile_shape
+from pchem_pipeline.store.tiles import Tile, roi_tiles, tile_grid, tile_shape
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
@@ -82,14 +82,12 @@ class Options:
     Attributes:
         force: do it again.
         dry_run: say what would be done.
-        tiles: only these.
-        roi: only this region.
+        roi: only the tiles of this region.
         settings: of a stage on demand, in place of those of its section; None: those of its last result.
     """
 
     force: bool = False
     dry_run: bool = False
-    tiles: str | None = None
     roi: tuple[int, int, int, int] | None = None
     settings: tuple[tuple[str, Any], ...] | None = None
 
@@ -280,15 +278,10 @@ class StageContext:
                 )
 
     def selected(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:
-        """Return the units that ``--tiles`` and ``--roi`` choose (all of them without these options)."""
-        if self.options.tiles is None and self.options.roi is None:
+        """Return the units that ``--roi`` chooses (all of them without it)."""
+        if self.options.roi is None:
             return list(units)
-        grid = self.tiles()
-        chosen = {
-            t.key for t in (grid if self.options.tiles is None else parse_tiles(self.options.tiles, grid))
-        }
-        if self.options.roi is not None:
-            chosen &= {t.key for t in roi_tiles(self.options.roi, grid)}
+        chosen = {tile.key for tile in roi_tiles(self.options.roi, self.tiles())}
         return [unit for unit in units if unit is WHOLE or chosen & set(markers(unit))]
 
     def pending(self, units: Sequence[AnyUnit], *, by_tiles: bool = True) -> list[AnyUnit]:
@@ -297,9 +290,8 @@ class StageContext:
         Units that are no tiles (``by_tiles=False``) are always chosen, and not forced by a choice of tiles.
         """
         done = self.store.records.done(self.stage, self.fingerprint)
-        some_tiles = self.options.tiles is not None or self.options.roi is not None
         chosen = self.selected(units) if by_tiles else list(units)
-        if self.options.force and (by_tiles or not some_tiles):
+        if self.options.force and (by_tiles or self.options.roi is None):
             return chosen
         return [unit for unit in chosen if not set(markers(unit)) <= done]
 
@@ -319,7 +311,7 @@ class StageContext:
         Units that raise are kept in :attr:`failed` and stop nothing, except errors that would hit
         every unit (a full disk, vanished camera files). With ``needs``, an upstream stage of the same
         tiles, units that it has not finished are failures too. ``by_tiles=False`` is for units that
-        ``--tiles`` and ``--roi`` do not choose, such as blocks of frames. A stage that learns only on its way
+        ``--roi`` does not choose, such as blocks of frames. A stage that learns only on its way
         what its units are calls this several times and says in ``total`` how many markers that makes so far;
         it resumes also under ``--force``, which has made it start anew. ``unit_bytes`` is the memory that a
         worker takes for a unit: fewer work at once where ``compute.max_memory`` says so. Returns the

@@ -34,18 +34,16 @@ def execute(name: str, context: StageContext) -> StageState:
     clock = time.perf_counter(), cpu_seconds()
     stage = STAGES[name]
     before = status(stage, context)
-    chosen = context.options.tiles is not None or context.options.roi is not None
     if before.state == "complete" and not context.options.force:
-        if chosen:
-            context.selected(())
+        context.selected(())  # refuses regions that the sensor does not have
         context.reporter.info(f"{name}: up to date")
         return before
     for upstream in stage.upstream:
         if context.store.records.known(upstream) is None:
             place = quoted(context.config_path or context.store.path)
             raise StoreError(f"{name} needs {upstream} first; run: pchem {upstream} {place}")
-    if chosen and stage.upstream:
-        context.selected(())  # refuses tiles and regions that the sensor does not have
+    if stage.upstream:
+        context.selected(())
     if context.options.dry_run:
         context.reporter.info(f"{name}: {before.words()} -> would run")
         return before
@@ -60,7 +58,7 @@ def execute(name: str, context: StageContext) -> StageState:
     prepared = context.prepared.get(name)
     if prepared is not None and prepared.clock is not None:
         clock = prepared.clock
-    return _perform(stage, context, before, restart=not chosen, clock=clock)
+    return _perform(stage, context, before, restart=context.options.roi is None, clock=clock)
 
 
 def _perform(

@@ -35,7 +35,7 @@ class Command:
     """What the command line asked for, beside the configuration.
 
     Attributes:
-        options: force, dry run, tiles, region.
+        options: force, dry run, region.
         workers: overrides ``compute.workers``.
         backend: overrides ``compute.backend``.
         progress: auto | on | off.
@@ -134,7 +134,7 @@ def _bring_samples(target: Target, stages: Sequence[str], command: Command) -> N
     """
     if not target.config.input.samples or not any(STAGES[name].reads_input for name in stages):
         return
-    own = command.choosing(force=False, tiles=None, roi=None)
+    own = command.choosing(force=False, roi=None)
     reporter = Reporter("off", quiet=command.quiet)
     for sample in sample_targets(target.config, target.base_dir):
         reporter.info(f"sample {sample.store.name}")
@@ -262,7 +262,7 @@ def _plan(target: Target, todo: Sequence[str], command: Command) -> list[str]:
 
 def _check_failed_pixels(context: StageContext, name: str) -> None:
     """Raise an error if more pixels have no value than allowed, unless only some tiles were chosen."""
-    if context.options.tiles is not None or context.options.roi is not None:
+    if context.options.roi is not None:
         return
     from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 

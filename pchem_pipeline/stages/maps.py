@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, poorest
 from pchem_pipeline.model.errors.fisher import covariance_from
@@ -25,7 +26,6 @@ from pchem_pipeline.model.maps.sample_maps import line_map_names, line_maps
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.samples import exposure_axis
-from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
@@ -193,7 +193,7 @@ def _summarise(context: StageContext, names: list[str]) -> None:
             outlier_sigmas=settings.outlier_sigmas,
         )
         percentiles = {f"{p:g}": value for p, value in summary.percentiles.items()}
-        found[name] = without_nan(asdict(summary) | {"percentiles": percentiles})
+        found[name] = plain(asdict(summary) | {"percentiles": percentiles})
     facts = {"summary": found, "fit_status": status_counts(status), "goodness": _misfits(context)}
     context.store.set_attributes("maps", facts)
 

@@ -129,7 +129,7 @@ _ALL = (
         run=f"{_HERE}.report.report:run",
         files=("report.html", "report.json", "discrepancy.html"),
         identity=f"{_HERE}.identities:verdict",
-        summary="Write report.html, report.json and figure files.",
+        summary="Write report.html and report.json.",
     ),
     Stage(
         "electrons",

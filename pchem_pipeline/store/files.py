@@ -6,7 +6,6 @@ import contextlib
 import errno
 import hashlib
 import json
-import math
 import os
 import re
 import secrets
@@ -196,22 +195,6 @@ def link_out_of(folder: Path) -> Path | None:
 def canonical_json(value: Any) -> bytes:
     """Return the one JSON text of a value: sorted keys, no spaces, no NaN."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-
-
-def without_nan(value: Any) -> Any:
-    """Return JSON data: NaN and infinities, which JSON has not, become None.
-
-    Args:
-        value: numbers, text, and lists and dictionaries of them.
-
-    Returns:
-        The same, with None where a number is not finite.
-    """
-    if isinstance(value, dict):
-        return {key: without_nan(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [without_nan(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_json(path: Path, value: Any) -> None:

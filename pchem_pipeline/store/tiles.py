@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -100,45 +99,6 @@ def tile_grid(shape: tuple[int, int], size: TileSize) -> list[Tile]:
 def equal_rows(ny: int, height: int) -> list[tuple[int, int]]:
     """Return first row and end of bands of ``ny`` rows, from top to bottom; the last may be lower."""
     return [(y, min(y + height, ny)) for y in range(0, ny, height)]
-
-
-_PART = re.compile(r"^(\d+)(?::(\d+))?\.(\d+)(?::(\d+))?$")
-
-
-def tile_ranges(text: str) -> list[tuple[int, int, int, int]]:
-    """Return first row, end, first column and end of each part of a list of tiles.
-
-    Raises:
-        ConfigError: the text is no such list.
-    """
-    found = []
-    for part in text.replace(" ", "").split(","):
-        match = _PART.match(part)
-        if match is None:
-            raise ConfigError(f"--tiles: {part!r} is not a tile; write iy.ix, such as 0.3, or ranges 0:2.0:4")
-        y0, x0 = int(match[1]), int(match[3])
-        found.append((y0, int(match[2] or y0 + 1), x0, int(match[4] or x0 + 1)))
-    return found
-
-
-def parse_tiles(text: str, grid: list[Tile]) -> list[Tile]:
-    """Select tiles by name: ``"0.3,2.1"`` or ranges ``"0:2.0:4"`` (rows 0 and 1, columns 0 to 3).
-
-    Raises:
-        ConfigError: the text is no list of tiles, or names tiles that the sensor does not have.
-    """
-    wanted: set[tuple[int, int]] = set()
-    for y0, y1, x0, x1 in tile_ranges(text):
-        # one beyond the last tile is enough to be told that it does not exist
-        rows, columns = range(y0, min(y1, grid[-1].iy + 2)), range(x0, min(x1, grid[-1].ix + 2))
-        wanted |= {(iy, ix) for iy in rows for ix in columns}
-    known = {(tile.iy, tile.ix): tile for tile in grid}
-    missing = sorted(wanted - known.keys())
-    if missing or not wanted:
-        last = grid[-1]
-        name = f"{missing[0][0]}.{missing[0][1]}" if missing else text
-        raise ConfigError(f"--tiles: there is no tile {name}; this sensor has 0.0 to {last.iy}.{last.ix}")
-    return [known[key] for key in sorted(wanted)]
 
 
 def roi_tiles(roi: tuple[int, int, int, int], grid: list[Tile]) -> list[Tile]:

@@ -33,7 +33,6 @@ from pchem_pipeline.report.inspector import (  # noqa: E402  # noqa: E402
 )
 from pchem_pipeline.report.pages.pictures import Drawn  # noqa: E402
 from pchem_pipeline.report.pages.report import render_report  # noqa: E402
-from pchem_pipeline.report.settings import ReportSettings  # noqa: E402
 
 #: Median, spread between pixels and standard error of one pixel: as of the paper's sensor.
 MAPS = {
@@ -93,8 +92,7 @@ def make_page(size: int) -> str:
         inspector=lambda: InspectorData(tuple(entries), sample, "a quarter", "pchem view"),
     )
     dot = Drawn(DOT, 9, 9)
-    settings = ReportSettings(figure_formats=())
-    return render_report(data, settings, lambda figures, _: {each.name: dot for each in figures}).html
+    return render_report(data, lambda figures: {each.name: dot for each in figures})["report.html"]
 
 
 def measure(page: Page, path: Path) -> dict[str, float]:

@@ -143,7 +143,7 @@ def run(store: Path, environment: dict[str, str]) -> "subprocess.Popen[str]":
 
 def write_config(folder: Path, compute: dict[str, object]) -> Path:
     """Write the YAML of a run into a new folder; return where its store will be."""
-    content = {"run": {"store": "run.zarr"}, "compute": compute, "report": {"figure_formats": []}}
+    content = {"run": {"store": "run.zarr"}, "compute": compute}
     content["input"] = {
         "files": ["../stack.raw"],
         "mode": "reference",

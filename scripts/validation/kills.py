@@ -45,14 +45,12 @@ simulate:
   integration_time: {time}
   effects: [{{tag: row_noise, row_noise_dn: 1.2}}]
 discrepancy: {{replicates: 20, extended_replicates: 12, candidates: [row_noise]}}
-report: {{figure_formats: [], dpi: 72}}
 """
 
 JOINT = """
 run: {store: joint.zarr, tile: 8}
 compute: {backend: threads, workers: 2}
 input: {samples: [{run: a.yaml}, {run: b.yaml}]}
-report: {figure_formats: [], dpi: 72}
 """
 
 #: seconds that a command may take to end after a signal that it hears

@@ -145,7 +145,6 @@ class Folder:
             np.save(self.path / name / "frames.npy", codes(frames))
             files = [f"{name}/frames.npy"]
             content["input"] = {"files": files, "integration_time": time, "bit_depth": 14}
-        content["report"] = {"figure_formats": [], "dpi": 72}
         for section, settings in sections.items():
             content[section] = {**content.get(section, {}), **settings}
         (self.path / f"{name}.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
@@ -229,7 +228,6 @@ def joint(at: Folder) -> None:
             "samples": samples,
             "joint": {"store": f"{name}.zarr", "tile": 8},
             "fit": {"likelihood": likelihood},
-            "report": {"figure_formats": [], "dpi": 72},
         }
         (at.path / f"{name}.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
         at.pchem("joint", f"{name}.yaml")

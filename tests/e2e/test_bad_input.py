@@ -16,7 +16,6 @@ GOOD = np.random.default_rng(2).integers(90, 130, (40, 8, 9), dtype=np.uint16)
 OF_ONE_FILE = """
 run: {store: run.zarr}
 input: {files: [a.npy]}
-report: {figure_formats: [], dpi: 72}
 """
 
 

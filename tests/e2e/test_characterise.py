@@ -9,7 +9,7 @@ import pytest
 import pchem_pipeline
 from pchem_pipeline.base.errors import ConfigError
 
-FAST = {"report": {"figure_formats": [], "dpi": 72}, "run": {"tile": 8}}
+FAST = {"run": {"tile": 8}}
 TRUTH = {"conversion_gain": 0.1, "read_noise_e": 0.25}
 
 

@@ -12,10 +12,9 @@ from helpers.quick_stacks import stack, sums_of
 from helpers.report_material import report_data
 
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.catalogue import run_figures
+from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.pages.report import render_report
-from pchem_pipeline.report.settings import ReportSettings
 
 #: What a canvas shows, as text; its number of different colours.
 SHOWN = "(canvas) => canvas.toDataURL()"
@@ -37,15 +36,19 @@ def data() -> ReportData:
 
 @pytest.fixture(scope="module")
 def page_url(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("charts") / "report.html"
-    path.write_text(render_report(data, ReportSettings(dpi=72)).html)
-    return path.as_uri()
+    folder = tmp_path_factory.mktemp("charts")
+    for name, text in render_report(data).items():
+        (folder / name).write_text(text)
+    return (folder / "report.html").as_uri()
 
 
 @pytest.fixture(scope="module")
-def names(data: ReportData) -> set[str]:
-    figures = run_figures(data, ReportSettings())
-    return {each.name for each in figures if not each.chart.still and each.section}
+def names(data: ReportData) -> dict[str, list[str]]:
+    pages = {"report": report_figures(data), "discrepancy": discrepancy_figures(data.discrepancy)}
+    return {
+        page: sorted(each.name for each in figures if not each.chart.still and each.section)
+        for page, figures in pages.items()
+    }
 
 
 @pytest.fixture
@@ -98,10 +101,13 @@ def drag(page: Any, over: Any, start: tuple[float, float], end: tuple[float, flo
 
 @pytest.mark.parametrize(("width", "scheme"), [(1200, "light"), (1200, "dark"), (400, "light")])
 def test_every_chart_is_drawn(
-    open_page: Callable[..., Any], names: set[str], width: int, scheme: str
+    open_page: Callable[..., Any], names: dict[str, list[str]], width: int, scheme: str
 ) -> None:
     page = open_page(width, color_scheme=scheme)
-    for name in sorted(names):
+    assert names["discrepancy"]
+    for file, name in [(file, name) for file, shown in names.items() for name in shown]:
+        if not page.url.endswith(f"{file}.html"):
+            page.goto(page.url.replace("report.html", f"{file}.html"))
         figure = chart(page, name)
         canvases = figure.locator("canvas").all()
         assert canvases
@@ -162,13 +168,13 @@ def test_the_legend_has_values_and_hides_what_it_names(
 
 def test_keys_read_values_and_zoom(open_page: Callable[..., Any]) -> None:
     page = open_page()
-    figure = chart(page, "rounding")
+    figure = chart(page, "frame_means")
     panel, canvas = figure.locator(".panel").nth(0), figure.locator("canvas").nth(0)
     before = canvas.evaluate(SHOWN)
     panel.focus()
     page.keyboard.press("ArrowRight")
-    assert "1/g (DN per electron): " in figure.locator(".spoken").inner_text()
-    assert "read noise" in figure.locator(".spoken").inner_text()
+    assert "frame: " in figure.locator(".spoken").nth(0).inner_text()
+    assert "mean" in figure.locator(".spoken").nth(0).inner_text()
     page.keyboard.press("+")
     page.wait_for_timeout(50)
     assert canvas.evaluate(SHOWN) != before

@@ -82,24 +82,16 @@ def test_other_versions_are_refused(executor, monkeypatch, tmp_path):
     assert not list(tmp_path.glob("[0-9]*-*"))
 
 
-SMALL = """
-compute:
-  backend: distributed
-  cluster:
-    class: distributed.LocalCluster
-    kwargs: {n_workers: 1, threads_per_worker: 1, memory_limit: 170MiB, dashboard_address: null}
-"""
-
-
 def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bits(shell, finished):
     shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
     store = shell.folder / "run.zarr"
     shutil.rmtree(store / ".pchem" / "done" / "fit")  # as if nothing had been fitted
     RunStore.open(store, writable=True).write("fit/bias", (slice(0, 8), slice(0, 8)), np.zeros((8, 8)))
-    (shell.folder / "small.yaml").write_text((shell.folder / "run.yaml").read_text() + SMALL)
-    killed = shell.alone(DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")(
-        "fit", "small.yaml", "--tiles", "0.0"
-    )
+    environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"}
+    with cluster_processes(shell.folder, 1, "--memory-limit", "170MiB", environment=environment) as (file, _):
+        settings = f"compute: {{backend: distributed, scheduler: {file}}}\n"
+        (shell.folder / "small.yaml").write_text((shell.folder / "run.yaml").read_text() + settings)
+        killed = shell("fit", "small.yaml", "--roi", "0:8,0:8")
     assert killed.code == 3
     (line,) = [each for each in killed.stderr.splitlines() if each.startswith("pchem: ")]
     assert "1 worker died on it, the last at tcp://127.0.0.1" in line

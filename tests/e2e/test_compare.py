@@ -35,9 +35,7 @@ def copies(shell, finished):
 def here(shell, *names):
     """Compare in this process: the message where something changed, else nothing."""
     try:
-        compare_runs(
-            [shell.folder / name for name in names], shell.folder / "compare", workers=1, progress="off"
-        )
+        compare_runs([shell.folder / name for name in names], shell.folder / "compare", progress="off")
     except ChangedError as change:
         return str(change)
     return ""
@@ -52,7 +50,7 @@ def numbers(shell, folder="compare"):
 
 
 def test_nothing_changed_is_proven_by_digests(shell, copies):
-    result = shell.ok("compare", "a.zarr", "b.zarr", "--workers", "1")
+    result = shell.ok("compare", "a.zarr", "b.zarr")
     assert result.stdout.split() == [
         f"compare/{name}" for name in ("compare.html", "compare.json", "history.csv")
     ]
@@ -82,7 +80,7 @@ def test_one_value_that_moved_is_found(shell, copies):
     y, x = np.argwhere(np.isfinite(bias))[5]
     bias[y, x] *= 1 + 1e-9
     copies.write("maps/bias", whole(copies, "maps/bias"), bias)
-    result = shell("compare", "a.zarr", "b.zarr", "-o", "out", "--workers", "1")
+    result = shell("compare", "a.zarr", "b.zarr", "-o", "out")
     assert result.code == 3
     assert result.stdout == ""
     assert "maps/bias: 1 value of 560 changed" in result.last
@@ -181,7 +179,6 @@ def test_the_history_of_a_camera(shell, copies, finished):
             [shell.folder / f"{name}.zarr" for name in "abc"],
             shell.folder / "history",
             history=HistorySettings(labels, rate=0.05),
-            workers=1,
             progress="off",
         )
     with (shell.folder / "history" / "history.csv").open() as file:
@@ -215,8 +212,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
     assert "The camera over time" in page
     assert f"Hot pixels : {len(rows[2]['hot_new'].split())} new, " in page
     assert "-20 C" in page
-    wrong = {"labels": ["one"]}, {"rate": 0.0}, {"against": "label"}, {"against": "temperature"}
-    for each in wrong:
+    for each in ({"labels": ["one"]}, {"rate": 0.0}):
         with pytest.raises(ConfigError, match="--"):
             comparison_of(
                 [shell.folder / "a.zarr", shell.folder / "b.zarr"],
@@ -226,7 +222,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
             )
 
 
-def test_the_history_against_the_temperature_that_the_files_state(shell, copies, finished):
+def test_the_history_has_date_and_temperature_of_the_files(shell, copies, finished):
     """The sensor's temperature and the date of the frames come from the camera files."""
     other_capture(copies)
     for name, temperature, taken in (("a", -20.0, 1.75e9), ("b", -5.5, 1.76e9)):
@@ -234,15 +230,14 @@ def test_the_history_against_the_temperature_that_the_files_state(shell, copies,
         sensor = SensorInfo.read(store)
         replace(sensor, camera=CameraFacts("Camera <X>", "7", temperature, taken)).write(store)
     paths = [shell.folder / "a.zarr", shell.folder / "b.zarr"]
-    found = comparison_of(paths, 1e-12, Reporter("off"), HistorySettings(against="temperature"))
-    assert [row.label for row in found.history] == ["-20 °C", "-5.5 °C"]
+    found = comparison_of(paths, 1e-12, Reporter("off"), HistorySettings(["-20 °C", "-5.5 °C"]))
     assert [row.place for row in found.history] == [-20.0, -5.5]
     assert found.history[0].date.startswith("2025-06-15T")
     text = history_csv(found.history).splitlines()
     assert text[0].startswith("label,date,temperature,run,")
     assert text[2].split(",")[2] == "-5.5"
-    (figure,) = history_figures(found.history, found.against)
-    assert figure.tables[0]["sensor temperature, °C"].tolist() == [-20.0, -5.5]
+    (figure,) = history_figures(found.history, found.labelled)
+    assert figure.tables[0]["label"].tolist() == [-20.0, -5.5]
 
 
 def test_bad_input_gets_one_line(shell, finished):

@@ -25,7 +25,6 @@ discrepancy:   # quick
   replicates: 20
   extended_replicates: 12
   candidates: [row_noise, frame_noise]
-report: {figure_formats: [], dpi: 72}
 """
 
 

@@ -39,7 +39,6 @@ def configured(folder: Path, effects: list[dict[str, Any]], tile: int = 8) -> Pa
             "truth_frames": 500,
         },
         "model": {"effects": effects},
-        "report": {"figure_formats": [], "dpi": 72},
         "compute": {"backend": "serial"},
     }
     path = folder / "run.yaml"

@@ -69,7 +69,6 @@ def write(folder, name, samples, tile=8, **input_settings):
         *(f"  {key}: {value}" for key, value in input_settings.items()),
         "  samples:",
         *(f"    - {{run: {run}, {rest}}}" for run, rest in samples),
-        "report: {figure_formats: [], dpi: 72}",
     ]
     path.write_text("\n".join([*lines, ""]))
     return path

@@ -14,7 +14,6 @@ SPECTRA = sorted(SIPM.glob("*.csv"))
 
 YAML = """
 run: {store: sipm.zarr}
-report: {figure_formats: [], dpi: 72}
 input:
   files:
 """

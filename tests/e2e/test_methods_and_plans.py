@@ -20,7 +20,7 @@ def exposures(tmp_path_factory):
         electrons = rng.poisson(light, (1500, 8, 8)) + 0.3 * rng.standard_normal((1500, 8, 8))
         np.save(shell.folder / f"{name}.npy", np.rint(electrons * step + bias).astype(np.uint16))
         text = f"run: {{store: {name}.zarr, tile: 8}}\ninput: {{files: [{name}.npy], bit_depth: 12}}\n"
-        (shell.folder / f"{name}.yaml").write_text(text + "report: {figure_formats: [], dpi: 72}\n")
+        (shell.folder / f"{name}.yaml").write_text(text)
         for stage in ("ingest", "histogram"):
             shell.ok(stage, f"{name}.yaml", "--quiet")
     shell.ok("run", "bright.yaml", "--quiet")

@@ -13,6 +13,7 @@ from helpers.places import ROOT
 
 import pchem_pipeline
 from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError
+from pchem_pipeline.commands.figures import figures_of_run
 from pchem_pipeline.report.charts.on_paper import drawing_bytes
 from pchem_pipeline.store.run_store import RunStore
 
@@ -76,8 +77,7 @@ def test_a_pixel_is_that_of_the_store(run, store):
     known = z.values[pixel.expected.values > 5]
     # 20 to 30 bins: the mean square of N(0, 1) within five standard errors
     assert abs((known**2).mean() - 1) < 5 * np.sqrt(2 / known.size)
-    for figure in (pixel.plot(), pixel.plot_cells(width="60mm")):
-        assert figure._repr_png_().startswith(b"\x89PNG")
+    assert pixel.plot(width="60mm")._repr_png_().startswith(b"\x89PNG")
     assert pixel.plot().axes[0].get_title("left").startswith(f"pixel y = {y}, x = {x}\n")
     assert len(run.pixels([(0, 0), (1, 2)])) == 2
 
@@ -88,27 +88,14 @@ def test_pixels_outside_are_refused(run, place):
         run.pixel(*place)
 
 
-def test_figures_are_those_of_the_report(run, finished, tmp_path):
-    assert set(run.plot.names) == {path.stem for path in (finished / "figures").glob("*.svg")}
-    assert len(run.plot.names) > 10
-    [report] = (path.read_bytes() for path in (finished / "figures").glob("electron_numbers.svg"))
-    drawn = drawing_bytes(run.plot.electrons(), "svg", title="Estimated electron numbers")
-    assert drawn == report
-    maps = run.plot.maps("bias", "analog_read_noise_e", width=60)
-    assert list(maps) == ["bias", "analog_read_noise_e"]
-    assert maps["bias"].get_figwidth() == pytest.approx(60 / 25.4)
-    assert maps._repr_html_().count("data:image/png;base64,") == 2
-    assert [path.name for path in maps.save(tmp_path / "out", ("svg",))] == [
-        "bias.svg",
-        "analog_read_noise_e.svg",
-    ]
-    assert len(run.plot.discrepancy()) == 0
-    with pytest.raises(ConfigError, match="this run has no figure nothing; it has cluster_edges"):
-        run.plot.figure("nothing")
-    with pytest.raises(StoreError, match="this run has no map gain; it has quanta_exposure"):
-        run.plot.map("gain")
-    with pytest.raises(ConfigError, match="jpg cannot be drawn"):
-        maps.save(tmp_path, ("jpg",))
+def test_figures_are_those_of_pchem_figures(run, finished, tmp_path):
+    assert len(run.figures) > 10
+    figures_of_run(finished, tmp_path, formats=("svg",), only=("electron_numbers",), progress="off")
+    drawn = drawing_bytes(run.figure("electron_numbers"), "svg", dpi=600, title="Estimated electron numbers")
+    assert drawn == (tmp_path / "electron_numbers.svg").read_bytes()
+    assert run.figure("map_bias", width=60).get_figwidth() == pytest.approx(60 / 25.4)
+    with pytest.raises(ConfigError, match="this run has no figure nothing; it has pixel_fits"):
+        run.figure("nothing")
 
 
 def test_what_is_missing_is_said(run, finished, tmp_path, monkeypatch):
@@ -152,9 +139,8 @@ def test_the_tutorial_runs(finished, tmp_path):
     )
     assert f"bias             {median:9.4f} DN" in text
     kinds = [kind for output in outputs for kind in output.get("data", {})]
-    assert kinds.count("image/png") == 2
-    assert any("data:image/png" in "".join(output.get("data", {}).get("text/html", "")) for output in outputs)
-    assert {"ensemble.pdf", "figures"} <= {path.name for path in tmp_path.iterdir()}
+    assert kinds.count("image/png") == 3
+    assert (tmp_path / "ensemble.pdf").exists()
     assert not any(output["output_type"] == "error" or output.get("name") == "stderr" for output in outputs)
 
 

@@ -14,7 +14,6 @@ RUN = """
 run: {store: run.zarr}
 input: {files: [stack/frames.npy], integration_time: 1.0}
 discrepancy: {replicates: 24, extended_replicates: 12, candidates: [CANDIDATES]}
-report: {figure_formats: [], dpi: 72}
 """
 RIVALS = "frame_noise, row_noise, readout_alternation"
 BROKEN = {

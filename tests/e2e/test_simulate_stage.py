@@ -131,9 +131,9 @@ def test_a_failed_run_goes_on_where_it_was(tmp_path, monkeypatch):
     assert len(written) == 6
 
 
-def test_tiles_and_regions_do_not_leave_frames_out(tmp_path):
+def test_regions_do_not_leave_frames_out(tmp_path):
     target = prepare(tmp_path)
-    assert simulated(target, tiles="0.0") == "complete"
+    assert simulated(target, roi=(0, 1, 0, 1)) == "complete"
     np.testing.assert_array_equal(frames_of(target), expected(target)[0])
 
 

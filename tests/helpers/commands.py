@@ -22,7 +22,6 @@ PCHEM = str(Path(sys.executable).with_name("pchem"))
 RUN = """
 run: {store: run.zarr, tile: 8}
 input: {files: [frames/*.tif], integration_time: 4.87, bit_depth: 14}
-report: {figure_formats: [svg], dpi: 100}
 """
 
 

@@ -50,10 +50,11 @@ def harmless(html: str) -> Page:
         for name, value in attributes.items():
             assert not name.startswith("on")
             if name in ("src", "srcset", "href", "data", "poster", "action", "background"):
-                assert str(value).startswith(("data:image/", "#")), (tag, name)
+                beside = (tag, value) == ("a", "discrepancy.html")
+                assert beside or str(value).startswith(("data:image/", "#")), (tag, name)
     assert "url(" not in page.style
     assert "@import" not in page.style
     ids = [a["id"] for _, a in page.tags if a.get("id")]
     assert len(ids) == len(set(ids))
-    assert {str(a["href"])[1:] for a in page.of("a")} <= set(ids)
+    assert {str(a["href"])[1:] for a in page.of("a") if a["href"] != "discrepancy.html"} <= set(ids)
     return page

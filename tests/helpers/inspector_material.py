@@ -15,7 +15,6 @@ from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.inspector import InspectorData, PixelSample
 from pchem_pipeline.report.pages.pictures import Drawn
 from pchem_pipeline.report.pages.report import render_report
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.report.inspector import inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import choose_inspected
@@ -67,11 +66,11 @@ def inspected(store: RunStore, data: ReportData) -> ReportData:
 def page_without_pictures(data: ReportData) -> str:
     """Return the page with a dot for every figure: fast."""
 
-    def dots(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
+    def dots(figures: Sequence[Figure]) -> dict[str, Drawn]:
         dot = Drawn("data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA=", 10, 10)
         return {figure.name: dot for figure in figures}
 
-    return render_report(data, ReportSettings(figure_formats=()), dots).html
+    return render_report(data, dots)["report.html"]
 
 
 def make_run(

@@ -42,7 +42,6 @@ from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.effects.framework.compose import model_words
-from pchem_pipeline.frames.formats.map_files import read_image
 from pchem_pipeline.run.compilation import announced
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
@@ -184,13 +183,11 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
             f"{overlap} of {known.sum()} pixels have a read noise above {PEAKS_OVERLAP_E} e-: their most "
             "probable electron number is often wrong; use expected_number"
         )
-    prior_map = _prior_map(wanted.prior, sensor.shape) if numbers else None
     job = Job(
         target.store,
         frames,
         wanted.kinds,
         wanted.prior,
-        prior_map,
         limits=limits,
         modes=modes,
         depth=_chunks(frames.shape)[0],
@@ -207,11 +204,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         "run_digest": digest,
         "model": "PCD" if version is None else model_words(version.effects),
         "frames": frames.quick_identity()["files"],
-        "settings": {
-            **settings,
-            "kinds": list(wanted.kinds),
-            "prior": wanted.prior if prior_map is None else _digest(prior_map),
-        },
+        "settings": {**settings, "kinds": list(wanted.kinds)},
     }
     return _Made(job, content, remarks, calibration, frames)
 
@@ -222,33 +215,6 @@ def _modes(run: RunStore, wanted: ApplySettings, shape: tuple[int, int]) -> Comm
     if version is None or not wanted.remove:
         return CommonModes()
     return CommonModes.of_model(version.effects, shape)
-
-
-def _digest(values: Any) -> str:
-    import hashlib
-
-    return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()[:16]
-
-
-def _prior_map(prior: str, shape: tuple[int, int]) -> Any:
-    """Return the map that a prior stands for; None where it is a word.
-
-    Raises:
-        ConfigError: it is none of what it can be.
-    """
-    if prior in ("frames", "flat", "run"):
-        return None
-    try:
-        value = float(prior)
-    except ValueError:
-        found = read_image(Path(prior))
-        if found.shape != shape:
-            raise ConfigError(f"--prior {prior}: shape {found.shape}, but the sensor has {shape}") from None
-    else:
-        found = np.full(shape, value)
-    if not (np.isnan(found) | (found >= 0.0)).all():
-        raise ConfigError(f"--prior {prior}: give frames, flat, run, an exposure of 0 or more e-, or a file")
-    return found
 
 
 # -- the output ------------------------------------------------------------------------------------

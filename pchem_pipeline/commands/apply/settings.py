@@ -28,7 +28,7 @@ class ApplySettings:
     Attributes:
         kinds: any of `KINDS`.
         prior: exposure that the electron numbers are expected to have: ``frames`` (estimated from these
-            frames), ``flat`` (none), ``run`` (of the characterisation), a number (e-), or a file with a map.
+            frames), ``flat`` (none) or ``run`` (of the characterisation).
         remove: take the common modes that the model of the run names from the frames.
         format: one of `FORMATS`.
         dataset: which frames inside an HDF5, zarr or FITS file; None: as the run has it.
@@ -84,8 +84,7 @@ class Job:
         run: store of the characterisation.
         source: the frames.
         kinds: what is wanted.
-        prior: as in `ApplySettings`; a file stands as its map in ``prior_map``.
-        prior_map: exposure of each pixel (y, x), e-.
+        prior: as in `ApplySettings`.
         pool: what the exposures of these frames have in common, where they are the prior.
         limits: first and last code of the ADC, DN; None: not known.
         modes: offsets that are taken from the frames; none: the frames as they come.
@@ -106,7 +105,6 @@ class Job:
     source: FrameSource
     kinds: tuple[str, ...]
     prior: str = "frames"
-    prior_map: Any = None
     pool: ExposurePool | None = None
     limits: tuple[int, int] | None = None
     modes: CommonModes = field(default_factory=CommonModes)

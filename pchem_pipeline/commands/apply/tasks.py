@@ -237,9 +237,7 @@ def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -
 
     ends = output.read("applied_parts/range", (_WHOLE, rows, _WHOLE)) - job.lift * job.parts
     prior, signal = None, calibration.quanta_exposure
-    if job.prior_map is not None:
-        prior = signal = job.prior_map[rows]
-    elif job.pool is not None:
+    if job.pool is not None:
         priors = job.pool.priors(
             output.read("applied_parts/prior", (rows, _WHOLE)), read_stderr(calibration) ** 2
         )

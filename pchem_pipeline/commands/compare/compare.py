@@ -40,8 +40,8 @@ from pchem_pipeline.report.style.wording import count, measured, p_value_text, s
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run, with_maps
-from pchem_pipeline.stages.report.report import draw_by_workers, drawing_workers
-from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.stages.report.report import draw_and_say
+from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
 #: The maps that are compared.
@@ -68,7 +68,6 @@ def compare_runs(
     *,
     tolerance: float = 1e-12,
     history: HistorySettings = _BY_DATE,
-    workers: int | None = None,
     progress: ProgressMode = "auto",
 ) -> list[Path]:
     """Compare runs with the first of them and write ``compare.html``, ``compare.json`` and ``history.csv``.
@@ -77,8 +76,7 @@ def compare_runs(
         paths: stores, or the YAML files that made them; two or more.
         folder: where to write; made if needed.
         tolerance: relative difference that counts as rounding, where the frames are the same.
-        history: labels of the runs, what they are drawn against, and when a pixel counts as moved.
-        workers: processes that draw; None: as the first run's section ``compute`` says.
+        history: labels of the runs, and when a pixel counts as moved.
         progress: auto | on | off.
 
     Returns:
@@ -91,13 +89,8 @@ def compare_runs(
     """
     reporter = Reporter(progress)
     found = comparison_of(paths, tolerance, reporter, history)
-    draw = draw_by_workers(drawing_workers(workers, find_run(paths[0]).config.compute), reporter, "figures")
-    page, numbers = render_comparison(found, draw)
+    page, numbers = render_comparison(found, draw_and_say(reporter, "figures"))
     files = {COMPARE_PAGE: page, COMPARE_JSON: numbers, HISTORY_CSV: history_csv(found.history)}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(error, folder) from error
     for name, text in files.items():
         write_atomic(folder / name, text.encode())
     if found.changed:
@@ -132,7 +125,7 @@ def comparison_of(
     sides = list(zip(runs, targets, stores, states, strict=True))
     pairs = [_pair(sides[0], side, tolerance, history.rate, reporter) for side in sides[1:]]
     rows = history_rows(runs, stores, pairs, history, states)
-    return Comparison(runs, pairs, tolerance, rows, history.axis, history.rate)
+    return Comparison(runs, pairs, tolerance, rows, bool(history.labels), history.rate)
 
 
 def _letters(n: int) -> list[str]:

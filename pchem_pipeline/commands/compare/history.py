@@ -19,7 +19,7 @@ from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
 from pchem_pipeline.model.fit.status import FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import GOOD, hot_pixels
-from pchem_pipeline.report.comparison import Against, HistoryRow, Pair, RunFacts
+from pchem_pipeline.report.comparison import HistoryRow, Pair, RunFacts
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.files import read_json
@@ -36,20 +36,13 @@ class HistorySettings:
     """What a history shows.
 
     Attributes:
-        labels: of the runs, in their order, such as setpoints; none: what they are drawn against.
-        against: date, temperature, or the number that a label begins with; None: label where there
-            are labels, else date.
+        labels: of the runs, in their order, such as setpoints, which they are drawn against by the numbers
+            that these begin with; none: the dates.
         rate: false-discovery rate at which a pixel counts as moved since the first run.
     """
 
     labels: Sequence[str] = ()
-    against: Against | None = None
     rate: float = 0.01
-
-    @property
-    def axis(self) -> Against:
-        """What the runs are drawn against."""
-        return self.against or ("label" if self.labels else "date")
 
 
 def history_rows(
@@ -69,35 +62,25 @@ def history_rows(
         states: of the pixels of each run.
 
     Raises:
-        ConfigError: there are labels, but not one for each run; or the frames of a run state no
-            temperature, which is asked for.
+        ConfigError: there are labels, but not one for each run.
     """
-    labels, against = wanted.labels, wanted.axis
+    labels = wanted.labels
     if labels and len(labels) != len(runs):
         raise ConfigError(
             f"--label: {len(labels)} labels for {len(runs)} runs; give one per run, in the same order"
         )
-    if not labels and against == "label":
-        raise ConfigError("--against label: no labels; give --label once per run")
-    cameras = [SensorInfo.read(store).camera for store in stores]
-    silent = [run.name for run, camera in zip(runs, cameras, strict=True) if camera.temperature is None]
-    if against == "temperature" and silent:
-        raise ConfigError(
-            f"--against temperature: the frames of {', '.join(silent)} state none; give --label with the "
-            "temperatures"
-        )
     rows = []
     for i, (run, store) in enumerate(zip(runs, stores, strict=True)):
         moved, any_moved, compared = _moved(pairs[i - 1], states[0], states[i]) if i else ({}, 0, 0)
-        date, temperature = _date(store, cameras[i]), cameras[i].temperature
-        warmth = "" if temperature is None else f"{temperature:.4g} °C"
-        label = labels[i] if labels else warmth if against == "temperature" else date
+        camera = SensorInfo.read(store).camera
+        date = _date(store, camera)
+        label = labels[i] if labels else date
         rows.append(
             HistoryRow(
                 label,
                 date,
-                temperature,
-                {"date": _days(date), "temperature": _number(warmth), "label": _number(label)}[against],
+                camera.temperature,
+                _number(label) if labels else _days(date),
                 run,
                 int(states[i].hot.sum()),
                 pairs[i - 1].hot_new if i else (),

@@ -11,17 +11,16 @@ import io
 import re
 import textwrap
 import warnings
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import matplotlib as mpl
 import numpy as np
 import PIL.Image
-from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import Colormap, ListedColormap, to_hex, to_rgb
+from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure as MatplotlibFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -49,7 +48,7 @@ from pchem_pipeline.report.charts.chart import (
     height_of,
     tick_rows,
 )
-from pchem_pipeline.report.style.palette import CYCLE, DARK, LIGHT, MAP_COLOURS, Palette
+from pchem_pipeline.report.style.palette import LIGHT, MAP_COLOURS
 
 _STYLE: Any = {
     "axes.axisbelow": True,
@@ -64,7 +63,6 @@ _STYLE: Any = {
     "figure.constrained_layout.w_pad": 0.03,
     "font.family": "DejaVu Sans",
     "font.size": 7.5,
-    "image.cmap": MAP_COLOURS,
     "legend.fontsize": 7.0,
     "legend.frameon": False,
     "legend.handlelength": 1.6,
@@ -72,7 +70,6 @@ _STYLE: Any = {
     "mathtext.fontset": "dejavusans",
     "patch.linewidth": 0.5,
     "pdf.fonttype": 42,
-    "svg.fonttype": "path",
     "svg.hashsalt": "pchem",
     "xtick.labelsize": 7.0,
     "xtick.major.width": 0.6,
@@ -96,20 +93,13 @@ class Look:
 
     Attributes:
         width_mm: width; panels stand side by side on a page, one above the other on a column.
-        palette: colours.
-        sheet: parameters of matplotlib that prevail over the style of this package.
+        svg_text: whether text of SVG stays text; else it becomes outlines.
         dpi: dots per inch that images are drawn for at most.
     """
 
     width_mm: float = COLUMN_MM
-    palette: Palette = LIGHT
-    sheet: Mapping[str, Any] = field(default_factory=dict)
+    svg_text: bool = False
     dpi: int = 300
-
-    @classmethod
-    def of_sheet(cls, width_mm: float, sheet: Mapping[str, Any], dpi: int = 300) -> Look:
-        """Return the look that a user's style sheet asks for."""
-        return cls(width_mm, palette_of(sheet), sheet, dpi)
 
     @property
     def wide(self) -> bool:
@@ -126,8 +116,7 @@ class Look:
 
     def parameters(self) -> Any:
         """Return the parameters of matplotlib that make this look."""
-        colours = {**self.palette.parameters(), "axes.prop_cycle": cycler(color=self.palette.cycle)}
-        return {**_STYLE, **colours, **self.sheet}
+        return {**_STYLE, **LIGHT.parameters(), "svg.fonttype": "none" if self.svg_text else "path"}
 
 
 class Drawing(MatplotlibFigure):
@@ -143,25 +132,6 @@ class Drawing(MatplotlibFigure):
     def _repr_png_(self) -> bytes:
         """Return the figure as a notebook shows it."""
         return drawing_bytes(self, "png", dpi=150)
-
-
-def palette_of(sheet: Mapping[str, Any]) -> Palette:
-    """Return the palette of a matplotlib style sheet: its paper and text, its cycle of colours.
-
-    Args:
-        sheet: name to value; what it does not say is that of ``LIGHT``, of ``DARK`` where its paper is dark.
-    """
-    paper = sheet.get("axes.facecolor", sheet.get("figure.facecolor", LIGHT.paper))
-    red, green, blue = to_rgb(paper)
-    base = DARK if 0.3 * red + 0.59 * green + 0.11 * blue < 0.5 else LIGHT
-    names = {"text.color": ("ink", "faint"), "axes.edgecolor": ("edge",)}
-    found = {name: to_hex(sheet[key]) for key, names_ in names.items() if key in sheet for name in names_} | (
-        {"paper": to_hex(paper)} if base is DARK or paper != LIGHT.paper else {}
-    )
-    cycle = sheet["axes.prop_cycle"].by_key().get("color", []) if "axes.prop_cycle" in sheet else []
-    if cycle:
-        found |= {name: to_hex(cycle[i % len(cycle)]) for i, name in enumerate(CYCLE[:-1])}
-    return replace(base, **found)
 
 
 @contextlib.contextmanager
@@ -265,7 +235,7 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
     The layout is then fixed, so that saving in several formats does not compute it again.
 
     Args:
-        look: width and colours.
+        look: width and resolution.
         chart: what is drawn.
     """
     with _in(look):
@@ -323,7 +293,7 @@ def _keys(chart: Chart, look: Look) -> dict[str, Handle]:
     """Return what the legend shows of colours that have a meaning, by this in lines that fit."""
     return {
         textwrap.fill(text, int(_LETTERS * look.width_mm)): Patch(
-            facecolor=colour_of(colour, look.palette), edgecolor="#888888"
+            facecolor=colour_of(colour), edgecolor="#888888"
         )
         for colour, text in chart.keys
     }
@@ -364,14 +334,14 @@ def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, *, last: boo
     else:
         axes.tick_params(labelbottom=False)
     if panel.note:
-        _note(axes, panel.note, panel.corner, look.palette)
+        _note(axes, panel.note, panel.corner)
     if panel.legend:
         axes.legend(list(handles.values()), list(handles), loc=cast(Any, panel.legend), ncols=panel.columns)
         return {}
     return handles
 
 
-def _note(axes: Axes, text: str, corner: str, colours: Palette) -> None:
+def _note(axes: Axes, text: str, corner: str) -> None:
     """Write a small note into a corner of the axes."""
     vertical, horizontal = corner.split()
     axes.text(
@@ -382,8 +352,8 @@ def _note(axes: Axes, text: str, corner: str, colours: Palette) -> None:
         ha="right" if horizontal == "right" else "left",
         va="top" if vertical == "upper" else "bottom",
         fontsize=6.5,
-        color=colours.faint,
-        bbox={"facecolor": colours.paper, "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
+        color=LIGHT.faint,
+        bbox={"facecolor": LIGHT.paper, "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
     )
 
 
@@ -411,25 +381,24 @@ def _end(axes: Axes, name: str, axis: Axis) -> None:
         getattr(axes, f"set_{name}lim")(*ends)
 
 
-def _style(mark: Mark, colours: Palette) -> dict[str, Any]:
+def _style(mark: Mark) -> dict[str, Any]:
     return {
-        "color": colour_of(mark.colour, colours),
+        "color": colour_of(mark.colour),
         "linewidth": mark.width,
         "linestyle": _DASHES.get(mark.dash, mark.dash),
         "alpha": None if mark.alpha == 1.0 else mark.alpha,
     }
 
 
-def colour_of(name: str, colours: Palette) -> str:
-    """Return the colour of that name in a palette; others are colours already."""
-    return str(getattr(colours, name, name))
+def colour_of(name: str) -> str:
+    """Return the colour of that name in the palette; others are colours already."""
+    return str(getattr(LIGHT, name, name))
 
 
 def _draw_mark(axes: Axes, mark: Mark, look: Look, order: int) -> Handle:
     """Draw a mark over those before it and return what a legend shows of it."""
-    colours = look.palette
     style: dict[str, Any] = {
-        **_style(mark, colours),
+        **_style(mark),
         "label": mark.label or None,
         "zorder": 1.0 + 0.01 * order,
     }
@@ -462,7 +431,7 @@ def _draw_mark(axes: Axes, mark: Mark, look: Look, order: int) -> Handle:
             # many points would make a vector file large
             style |= {"linestyle": "none", "marker": mark.mark, "rasterized": mark.y.size > _MOST_POINTS}
             if mark.face:
-                style |= {"markerfacecolor": colour_of(mark.face, colours), "markeredgewidth": 0.8}
+                style |= {"markerfacecolor": colour_of(mark.face), "markeredgewidth": 0.8}
             if mark.error is None:
                 [points] = axes.plot(mark.x, mark.y, markersize=mark.size, **style)
                 return points
@@ -493,9 +462,9 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
     beside = axes.get_subplotspec()
     columns = 1 if beside is None else beside.get_topmost_subplotspec().get_gridspec().ncols
     values, x, y = mark.shown(inches(look.width_mm) * look.dpi / columns)
-    colours = _colours(mark, look).with_extremes(bad=colour_of(mark.none, look.palette))
+    colours = _colours(mark).with_extremes(bad=colour_of(mark.none))
     low, high = mark.ends
-    axes.set_facecolor(colour_of(mark.none, look.palette))
+    axes.set_facecolor(colour_of(mark.none))
     # a vector file keeps the pixels as they are, but for more of them than it can show
     kept = "none" if max(mark.values.shape) <= _MOST_KEPT else "nearest"
     image = axes.imshow(
@@ -512,9 +481,8 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
         bar.set_label(mark.unit)
 
 
-def _colours(mark: Image, look: Look) -> Colormap:
+def _colours(mark: Image) -> Colormap:
     """Return the colours of a map."""
     if isinstance(mark.scale, str):
-        name = colour_of(mark.scale, look.palette) or str(mpl.rcParams["image.cmap"])
-        return mpl.colormaps[name].resampled(SHADES)
-    return ListedColormap([colour_of(each, look.palette) for each in mark.scale])
+        return mpl.colormaps[colour_of(mark.scale) or MAP_COLOURS].resampled(SHADES)
+    return ListedColormap([colour_of(each) for each in mark.scale])

@@ -21,7 +21,7 @@ from pchem_pipeline.report.charts.chart import (
     Span,
     Stack,
 )
-from pchem_pipeline.report.comparison import Against, HistoryRow, Pair, RunFacts
+from pchem_pipeline.report.comparison import HistoryRow, Pair, RunFacts
 from pchem_pipeline.report.figures.ensemble import HALVES
 from pchem_pipeline.report.figures.figure import DataTable, Figure, pull_stack, sensor_stack
 from pchem_pipeline.report.style.palette import DIVERGING
@@ -216,21 +216,20 @@ _SHOWN = ("quanta_exposure", "charge_rate", "dark_current", "conversion_gain", "
 _LETTERS, _MOST_TICKS = 48, 12
 #: Days of a history that is drawn against time.
 _SHORTEST = 0.04
-_AXES = {"date": "days since the first", "temperature": "sensor temperature, °C", "label": "label"}
 
 
-def history_figures(rows: Sequence[HistoryRow], against: Against) -> Iterator[Figure]:
-    """Return the medians of the maps of each run; none for fewer than two runs."""
+def history_figures(rows: Sequence[HistoryRow], labelled: bool) -> Iterator[Figure]:
+    """Return the medians of the maps of each run, by labels or dates; none for fewer than two runs."""
     shown = [name for name in _SHOWN if all(name in row.run.summary for row in rows)]
     if len(rows) < 2 or not shown:
         return
     places = np.array([row.place for row in rows])
     ordered = bool(np.isfinite(places).all() and np.unique(places).size > 1)
-    by_date = ordered and against == "date"
+    by_date = ordered and not labelled
     if by_date and np.ptp(places) < _SHORTEST:  # runs within an hour are drawn in their order
         ordered = by_date = False
     at = places - (places.min() if by_date else 0.0) if ordered else np.arange(len(rows), dtype=np.float64)
-    axis = _AXES[against] if ordered else "run"
+    axis = "days since the first" if by_date else "label" if ordered else "run"
     columns: dict[str, object] = {
         "run": [row.run.name for row in rows],
         "label": [row.label for row in rows],

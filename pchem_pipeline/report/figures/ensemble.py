@@ -25,7 +25,6 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.figures.pixels import shown_bins
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import power_of_ten, scientific, short
 
 FloatArray = NDArray[np.float64]
@@ -61,7 +60,7 @@ _SYMBOLS = {"mu": "μ", "sigma": "σ", "sigma2": "σ²"}
 _HIGHLIGHTED = ("none", "g", "H, g", "g, μ, σ²", "H, g, μ, σ²")
 
 
-def ensemble_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
+def ensemble_figures(data: ReportData) -> Iterator[Figure]:
     """Return the ensemble histograms with their predictions."""
     tables = ensemble_tables(data.ensemble)
     if not tables:
@@ -85,7 +84,7 @@ def ensemble_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     )
 
 
-def electron_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
+def electron_figures(data: ReportData) -> Iterator[Figure]:
     """Return the estimated electron numbers against their prediction."""
     arrays = data.ensemble
     if "electron_mass" not in arrays:
@@ -107,7 +106,7 @@ def electron_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
     )
 
 
-def component_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
+def component_figures(data: ReportData) -> Iterator[Figure]:
     """Return the widths of the components of the ensemble (Appendix B)."""
     variance = data.ensemble.get("component_variance")
     if variance is None or not np.isfinite(variance).any():

@@ -97,7 +97,7 @@ class Figure:
 
     Attributes:
         name: name of its files.
-        section: id of the section that shows it; empty for one that only ``pchem figures`` draws.
+        section: id of the section that shows it.
         title: heading on the page.
         caption: what is drawn and how to read it.
         alt: what a reader who does not see it should know, with the numbers.

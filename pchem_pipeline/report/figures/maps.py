@@ -1,10 +1,10 @@
-"""Figures of the sensor: maps with their histograms (Appendix C), the read noise, and the fit status."""
+"""Figures of the sensor: maps with their histograms (Appendix C), and the fit status."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,8 @@ from pchem_pipeline.report.charts.chart import (
     Mark,
     Panel,
     Points,
-    Span,
     Stack,
     Steps,
-    Words,
     y_window,
 )
 from pchem_pipeline.report.data import FEW_CHANNELS, LINE_MAPS, MAP_NAMES, ReportData
@@ -34,11 +32,13 @@ from pchem_pipeline.report.figures.figure import (
     is_strip,
     place_of,
 )
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import DisplayRange, histogram_edges, map_colours, robust_range
 from pchem_pipeline.report.style.wording import count, measured, percent, plain, short, stored_unit, symbol
 
 FloatArray = NDArray[np.float64]
+
+#: Bins of the histogram of a map at most; of a line of channels half as many.
+_MOST_BINS = 128
 
 #: Colours of the reasons of a fit status: a good fit, each reason in its order, not fitted yet.
 _STATUS_COLOURS = (
@@ -70,15 +70,15 @@ _CAPTIONS = {
 DRAWN_MAPS = (*MAP_NAMES, *LINE_MAPS)
 
 
-def map_figures(data: ReportData, settings: ReportSettings) -> list[Figure]:
+def map_figures(data: ReportData) -> list[Figure]:
     """Return a figure of each map of Appendix C, and of the line of several exposures, that has values."""
-    return [_map(data, name, settings) for name in DRAWN_MAPS if data.has_values(name)]
+    return [_map(data, name) for name in DRAWN_MAPS if data.has_values(name)]
 
 
-def _map(data: ReportData, name: str, settings: ReportSettings) -> Figure:
+def _map(data: ReportData, name: str) -> Figure:
     values, known = data.maps[name], data.ordered(name)
     strip = is_strip(values.shape)
-    tables = map_tables(values, name, data.maps.get(f"{name}_stderr"), settings.histogram_bins, known)
+    tables = map_tables(values, name, data.maps.get(f"{name}_stderr"), known)
     return Figure(
         f"map_{name}",
         "summary" if name == "read_noise_e" else "maps",
@@ -86,7 +86,7 @@ def _map(data: ReportData, name: str, settings: ReportSettings) -> Figure:
         _CAPTIONS[name],
         _map_alt(data, name, "Values of the channels" if strip else "Histogram and map"),
         tables,
-        map_chart(tables, name, settings.map_stretch, known),
+        map_chart(tables, name, known),
     )
 
 
@@ -103,27 +103,7 @@ def _map_alt(data: ReportData, name: str, what: str) -> str:
     )
 
 
-def read_noise_figures(data: ReportData, settings: ReportSettings) -> Iterator[Figure]:
-    """Return the histogram of the read noise; a line of few channels is shown with the maps."""
-    if not data.has_values("read_noise_e") or data.few_channels:
-        return
-    known = data.ordered("read_noise_e")
-    below = percent(known.n_below(0.4), known.size)
-    bins = histogram_table(known, "read_noise_e", settings.histogram_bins)
-    yield Figure(
-        "read_noise_histogram",
-        "",
-        "Read noise of the pixels",
-        "Read noise, quantisation included. Blue line: median; shaded: 5 to 95 % of the pixels. "
-        f"{below} of the {data.noun}s with a value are below 0.4 e⁻.",
-        _map_alt(data, "read_noise_e", "Histogram")
-        + f" {below} of the {data.noun}s with a value are below 0.4 e⁻.",
-        (bins,),
-        read_noise_chart(known, bins),
-    )
-
-
-def status_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
+def status_figures(data: ReportData) -> Iterator[Figure]:
     """Return the map of the fit status."""
     status = data.fit.get("fit_status")
     if status is None:
@@ -145,11 +125,7 @@ def status_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
 
 
 def map_tables(
-    values: NDArray[Any],
-    name: str,
-    stderr: NDArray[Any] | None,
-    bins: int,
-    known: Ordered | None = None,
+    values: NDArray[Any], name: str, stderr: NDArray[Any] | None, known: Ordered
 ) -> tuple[DataTable, ...]:
     """Return a map with its standard errors, and its histogram where one is drawn.
 
@@ -157,41 +133,25 @@ def map_tables(
         values: map (y, x), NaN where there is no value.
         name: name of the map in the store, e.g. ``"dark_current"``.
         stderr: standard errors (y, x).
-        bins: largest number of bins.
-        known: the values in their order; None: they are sorted.
+        known: the values in their order.
     """
     unit = stored_unit(name)
     columns = {name: values} if stderr is None else {name: values, "standard error": stderr}
     table = DataTable(columns, dict.fromkeys(columns, unit))
-    known = known or Ordered.of(values)
     if not is_strip(values.shape):
-        return table, histogram_table(known, name, bins, "histogram")
-    many = known.size >= FEW_CHANNELS
-    return (table, histogram_table(known, name, min(bins, 64), "histogram")) if many else (table,)
+        return table, _histogram_table(known, name, _MOST_BINS)
+    return (table, _histogram_table(known, name, _MOST_BINS // 2)) if known.size >= FEW_CHANNELS else (table,)
 
 
-def histogram_table(values: NDArray[Any] | Ordered, name: str, most: int, part: str = "") -> DataTable:
-    """Return the histogram of a map as it is drawn: pixels in each bin, and its ends.
-
-    Args:
-        values: any shape; values that are not finite, or off the axis, are left out.
-        name: name of the map in the store.
-        most: largest number of bins.
-        part: of the figure.
-    """
-    known = Ordered.of(values)
+def _histogram_table(known: Ordered, name: str, most: int) -> DataTable:
+    """Return the histogram of a map as it is drawn: pixels in each of at most so many bins, and its ends."""
     edges = histogram_edges(known, robust_range(known), most=most)
     counts = known.histogram(edges)
     columns = {f"{name} from": edges[:-1], f"{name} to": edges[1:], "pixels": counts}
-    return DataTable(columns, dict.fromkeys(list(columns)[:2], stored_unit(name)), part)
+    return DataTable(columns, dict.fromkeys(list(columns)[:2], stored_unit(name)), "histogram")
 
 
-def map_chart(
-    tables: Sequence[DataTable],
-    name: str,
-    stretch: Literal["beta", "linear"] = "beta",
-    known: Ordered | None = None,
-) -> Chart:
+def map_chart(tables: Sequence[DataTable], name: str, known: Ordered) -> Chart:
     """Return the histogram of a map on top and the map below (Appendix C; fig:iD_map to fig:sigmaR_map).
 
     A sensor of one row or column (ready-made histograms) is drawn as points with error bars.
@@ -199,35 +159,31 @@ def map_chart(
     Args:
         tables: of :func:`map_tables`.
         name: name of the map in the store.
-        stretch: colours by rank (``beta``) or by value (``linear``).
-        known: the values in their order; None: they are sorted.
+        known: the values in their order.
     """
     full = tables[0][name]
     sign, words, unit = symbol(name)
     label = f"{words} {sign} ({unit})"
     if is_strip(full.shape):
         return _channels_chart(tables, full.ravel().astype(np.float64), label)
-    known = known or Ordered.of(full)
-    edges, bar = map_colours(known, stretch)
+    edges, bar = map_colours(known)
     keys = (("no_value", f"no value: {count(known.n_missing, 'pixel')}"),) if known.n_missing else ()
     image = Image(full, *place_of(full.shape), edges=edges, bar=bar, unit=f"{sign} ({unit})")
     return Chart((_histogram_stack(known, tables[1], label), image_stack(image)), keys=keys)
 
 
-def _histogram_stack(
-    known: Ordered, bins: DataTable, label: str, *marks: Mark, height_mm: float = 34.0, note: str = ""
-) -> Stack:
-    """Return the histogram of a map with its median, and other marks over it."""
+def _histogram_stack(known: Ordered, bins: DataTable, label: str, height_mm: float = 34.0) -> Stack:
+    """Return the histogram of a map with its median."""
     shown = robust_range(known)
     left, right, counts = (bins[name] for name in bins.columns)
     x = Axis(label, shown.low, shown.high, log=shown.logarithmic)
     edges = np.append(left, right[-1])
     outline = Steps(edges, counts, filled=True, colour="bars", label="pixels", listed=False)
     median = (Level(known.median, "x", width=1.0, label="median", listed=False),) if known.size else ()
-    words = note or shown.remark() if known.size else "no pixel has a value"
+    words = shown.remark() if known.size else "no pixel has a value"
     # room for the words above the bars
     high = (1.3 if words else 1.05) * max(float(counts.max()), 1.0)
-    panel = Panel(Axis("pixels", 0.0, high), (outline, *median, *marks), note=words)
+    panel = Panel(Axis("pixels", 0.0, high), (outline, *median), note=words)
     return Stack((panel,), x, height_mm=height_mm)
 
 
@@ -258,7 +214,7 @@ def _channels_chart(tables: Sequence[DataTable], values: FloatArray, label: str)
     stack = Stack((Panel(y, marks, note=remark),), channel_axis(values.size), height_mm=52.0)
     if not many:
         return Chart((stack,))
-    return Chart((_histogram_stack(Ordered.of(values), tables[1], label, height_mm=40.0), stack))
+    return Chart((_histogram_stack(Ordered.of(values), tables[1], label, 40.0), stack))
 
 
 def _padded(shown: DisplayRange) -> tuple[float, float]:
@@ -266,32 +222,6 @@ def _padded(shown: DisplayRange) -> tuple[float, float]:
         return shown.low / 1.1, shown.high * 1.1
     margin = 0.06 * (shown.high - shown.low)
     return shown.low - margin, shown.high + margin
-
-
-def read_noise_chart(values: NDArray[Any] | Ordered, bins: DataTable) -> Chart:
-    """Return the histogram of the read noise with its median marked (fig:sigma_r_dist).
-
-    Args:
-        values: map of sigma_e-, e-, NaN where there is no value, or its values in their order.
-        bins: its histogram, of :func:`histogram_table`.
-    """
-    sign, words, unit = symbol("read_noise_e")
-    known = Ordered.of(values)
-    shown, note = robust_range(known), ""
-    marks: list[Mark] = []
-    if known.size:
-        note = "; ".join(filter(None, (f"median {short(known.median)} {unit}", shown.remark())))
-    if known.size > 1 and not shown.logarithmic:
-        low, high = known.quantiles([0.05, 0.95]).tolist()
-        marks += [
-            Span(low, high, "x", colour="sky", alpha=0.18),
-            Words(low, 0.76, "5–95 %", "left", colour="faint"),
-        ]
-    if known.size and shown.low < 0.5 < shown.high:
-        limit = Level(0.5, "x", colour="vermilion", width=0.9, dash=":")
-        marks += [limit, Words(0.5, 0.03, " 0.5 e⁻", "left", colour="vermilion")]
-    stack = _histogram_stack(known, bins, f"{words} {sign} ({unit})", *marks, height_mm=56.0, note=note)
-    return Chart((stack,))
 
 
 def status_counts(fit_status: NDArray[Any], words: Mapping[int, str]) -> list[tuple[int, str, int]]:

@@ -26,7 +26,6 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure, row_stack
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import short
 
 #: Method to the hue, or colour, of its line, and its marker.
@@ -49,7 +48,7 @@ _OTHER: tuple[str, Shape] = ("#666666", "h")
 _RANGE = (0.03, 60.0)  # %
 
 
-def method_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
+def method_figures(data: ReportData) -> Iterator[Figure]:
     """Return the figure of the comparison, where one was made."""
     result = data.methods
     if result is None:

@@ -1,4 +1,4 @@
-"""Figures of single pixels: the cells of the electron number, and histograms with their fits."""
+"""Histograms of single pixels with their fits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.law.pcd import pcd, thresholds
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
     PAGE_MM,
@@ -24,68 +25,20 @@ from pchem_pipeline.report.charts.chart import (
     Stack,
     Steps,
     Sticks,
-    Words,
 )
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.wording import cut, measured, plain, short, stored_unit, symbol
+from pchem_pipeline.report.style.wording import cut, measured, plain, stored_unit, symbol
 
 FloatArray = NDArray[np.float64]
 
-#: The example of the paper, PCD(1.8, 1, 0, 0.33^2), in units of e- (fig:optimal_quantization).
-PAPER_EXAMPLE: Mapping[str, float] = {
-    "quanta_exposure": 1.8,
-    "conversion_gain": 1.0,
-    "bias": 0.0,
-    "read_noise_dn": 0.33,
-}
-
 #: Letters of a line of the status.
 _STATUS_LETTERS = 52
-#: Cells whose number is written.
-_MOST_NUMBERS = 18
-
 _LETTERS = "abcdefghijklmnop"
 _TITLE_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 
 
-def cell_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
-    """Return the cells of the electron number, for the paper's example and for a pixel of the run."""
-    example = cell_tables(PAPER_EXAMPLE)
-    yield Figure(
-        "cluster_edges_example",
-        "",
-        "Example: H = 1.8 e⁻, read noise 0.33 e⁻",
-        "The example of Hendrickson et al. (2023): density of a PCD with H = 1.8 e⁻ and a read noise of "
-        "0.33 e⁻ (line), and the limits between the most probable electron numbers (dashed).",
-        "Density of a PCD with peaks at 0, 1, 2, … electrons and the first four cell edges at "
-        f"{_edges_text(PAPER_EXAMPLE)} e⁻.",
-        example,
-        cells_chart(example),
-    )
-    pixel = next((pixel for pixel in data.pixels if has_fit(pixel.parameters)), None)
-    if pixel is None:
-        return
-    tables = cell_tables(pixel.parameters, pixel)
-    yield Figure(
-        "cluster_edges_pixel",
-        "cells",
-        f"{pixel.place.capitalize()} of this run",
-        "Histogram of the pixel (gray), its fitted density (line), and the limits between the most probable "
-        "electron numbers (dashed).",
-        f"Histogram and density of {pixel.place}; first cell edges at {_edges_text(pixel.parameters)} DN.",
-        tables,
-        cells_chart(tables),
-    )
-
-
-def _edges_text(parameters: Mapping[str, float]) -> str:
-    edges = thresholds(*_theta(parameters), 4)
-    return ", ".join(short(float(edge), 4) for edge in edges if np.isfinite(edge))
-
-
-def pixel_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
+def pixel_figures(data: ReportData) -> Iterator[Figure]:
     """Return the histograms of the shown pixels with their fits."""
     if not data.pixels:
         return
@@ -113,31 +66,6 @@ def _value_text(pixel: PixelFit, name: str) -> str:
     return measured(pixel.parameters.get(name, nan), pixel.stderr.get(name, nan), symbol(name)[2])
 
 
-def cell_tables(parameters: Mapping[str, float], pixel: PixelFit | None = None) -> tuple[DataTable, ...]:
-    """Return a density, the edges between the cells of its electron numbers, and the pixel's histogram.
-
-    Args:
-        parameters: the four parameters of the PCD, e.g. ``PAPER_EXAMPLE``; none are known where the fit
-            failed, and then there is no density.
-        pixel: whose histogram is drawn behind; None for an example without data, in e-.
-    """
-    unit = "e-" if pixel is None else "DN"
-    x = values = edges = np.empty(0)
-    if has_fit(parameters):
-        theta = _theta(parameters)
-        low, high, last = cell_range(*theta)
-        x = np.linspace(low, high, 1200)
-        values = pcd(x, *theta)
-        edges = thresholds(*theta, last + 1)
-        edges = edges[edges < high]
-    density = DataTable({"signal": x, "density": values}, {"signal": unit, "density": f"1/{unit}"})
-    between = DataTable({"below k": np.arange(1, edges.size + 1), "edge": edges}, {"edge": unit}, "edges")
-    if pixel is None:
-        return density, between
-    frames = {"dn": _codes(pixel), "frames": pixel.counts}
-    return density, between, DataTable(frames, {"dn": "DN"}, "histogram")
-
-
 def _fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
     """Return the histograms of pixels with what their fits expect, and their parameters."""
     parts = [_pixel_columns(pixel) for pixel in pixels]
@@ -148,7 +76,7 @@ def _fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
         "x": [pixel.x for pixel in pixels],
         "shown as": [pixel.label for pixel in pixels],
     }
-    for name in (*PAPER_EXAMPLE, "read_noise_e"):
+    for name in (*PARAMETERS, "read_noise_e"):
         units |= dict.fromkeys((name, f"{name} standard error"), stored_unit(name))
         facts[name] = [pixel.parameters.get(name, np.nan) for pixel in pixels]
         facts[f"{name} standard error"] = [pixel.stderr.get(name, np.nan) for pixel in pixels]
@@ -185,7 +113,7 @@ def _density(pixel: PixelFit, dn: NDArray[np.int64]) -> FloatArray:
 
 def has_fit(parameters: Mapping[str, float]) -> bool:
     """Tell whether the four parameters of the PCD are all known and describe a density."""
-    values = [parameters.get(name, float("nan")) for name in PAPER_EXAMPLE]
+    values = [parameters.get(name, float("nan")) for name in PARAMETERS]
     return bool(np.all(np.isfinite(values))) and values[1] > 0 and values[3] > 0 and values[0] >= 0
 
 
@@ -196,55 +124,6 @@ def _theta(parameters: Mapping[str, float]) -> tuple[float, float, float, float]
         parameters["bias"],
         parameters["read_noise_dn"],
     )
-
-
-def cells_chart(tables: Sequence[DataTable]) -> Chart:
-    """Return the chart of a PCD with the optimal edges between electron numbers (eq. demarg_K_eqn).
-
-    Args:
-        tables: of :func:`cell_tables`.
-    """
-    density, between, *histogram = tables
-    x, edges = density["signal"], between["edge"]
-    if x.size == 0:
-        return Chart((), empty="no fitted pixel to show")
-    low, high, unit = float(x[0]), float(x[-1]), density.units["signal"].replace("e-", "e⁻")
-    frames = [bars for table in histogram for bars in _frames(table, low, high)]
-    curve = Line(x, density["density"], colour="ink", label="fitted density" if histogram else "PCD")
-    top = 1.28 * max(float(np.max(each)) for each in (curve.y, *(bars.values for bars in frames)))
-    ends = np.full(edges.size, 0.86 * top)
-    dashed = Sticks(edges, ends, colour="blue", dash="--", width=0.9, label="limit between numbers k")
-    cells = np.concatenate([[low], edges, [high]])
-    every = max(1, int(np.ceil(len(cells) / _MOST_NUMBERS)))
-    words = [
-        Words((cells[k] + cells[k + 1]) / 2, 0.87, f"k = {k}" if k == 0 else str(k))
-        for k in range(0, len(cells) - 1, every)
-    ]
-    panel = Panel(Axis(f"density (1/{unit})", 0.0, top), (*frames, curve, dashed, *words))
-    return Chart((Stack((panel,), Axis(f"signal ({unit})", low, high), height_mm=55.0),), legend=(3, 3))
-
-
-def _frames(table: DataTable, low: float, high: float) -> list[Steps]:
-    """Return the bars of a histogram between two signals; others would only make the files large."""
-    dn, frames = table["dn"], table["frames"]
-    if not frames.sum() > 0:
-        return []
-    first = int(np.clip(np.floor(low) - dn[0], 0, dn.size - 1))
-    last = int(np.clip(np.ceil(high) - dn[0], first, dn.size - 1))
-    return [_bars(frames, int(dn[0]), slice(first, last + 1))]
-
-
-def cell_range(exposure: float, gain: float, bias: float, sigma: float) -> tuple[float, float, int]:
-    """Return the signals between which cells are drawn (DN), and the last electron number among them.
-
-    Args:
-        exposure: H, e-.
-        gain: g, e-/DN.
-        bias: mu, DN.
-        sigma: read noise, DN.
-    """
-    last = int(np.ceil(exposure + 3.0 * np.sqrt(max(exposure, 0.3)))) + 1
-    return bias - 4.0 * sigma, bias + last / gain + 4.0 * sigma, last
 
 
 def _bars(counts: NDArray[Any], origin: int, where: slice) -> Steps:

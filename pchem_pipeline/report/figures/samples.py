@@ -13,7 +13,6 @@ from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.report.charts.chart import Axis, Chart, Level, Line, Mark, Panel, Points, Stack
 from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import measured, short, symbol
 
@@ -24,7 +23,7 @@ AXES = {
 }
 
 
-def exposure_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
+def exposure_figures(data: ReportData) -> Iterator[Figure]:
     """Return the exposures on their line, where samples lie on one."""
     samples = data.samples
     if samples is None or samples.against not in AXES:
@@ -55,7 +54,7 @@ def slope_of(data: ReportData) -> str | None:
     return next((name for name in AXES[data.samples.against][2] if data.has_values(name)), None)
 
 
-def transfer_figures(data: ReportData, _: ReportSettings) -> Iterator[Figure]:
+def transfer_figures(data: ReportData) -> Iterator[Figure]:
     """Return variance against mean of the samples, with the curve of the fit."""
     samples = data.samples
     if samples is None or not data.has_values("conversion_gain"):

@@ -6,15 +6,14 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from pchem_pipeline.report.comparison import ArrayRow, Comparison, HistoryRow, Pair, Setting
+from pchem_pipeline.base.plain import plain
+from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import Finding, Section, render_page
 from pchem_pipeline.report.pages.pictures import DrawAll, draw_here
-from pchem_pipeline.report.pages.report_json import json_value
 from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import (
     count,
     cut,
@@ -31,7 +30,6 @@ COMPARE_PAGE, COMPARE_JSON = "compare.html", "compare.json"
 #: Version of the layout of ``compare.json``.
 COMPARE_VERSION = 1
 
-_SETTINGS = ReportSettings(figure_formats=(), dpi=200)
 #: At most so many sentences on what changed are shown; the JSON has all.
 _MOST_WORDS = 12
 #: Of more runs than so many no maps are drawn pair by pair, and of the ensembles the last ones.
@@ -92,9 +90,9 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
     many = len(found.pairs) > _MOST_DRAWN
     maps = {pair.other.label: [] if many else difference_figures(pair) for pair in found.pairs}
     whole = list(ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]]))
-    times = list(history_figures(found.history, found.against))
+    times = list(history_figures(found.history, found.labelled))
     every = [*whole, *times, *(each for figures in maps.values() for each in figures)]
-    drawn = (draw or draw_here)(every, _SETTINGS)
+    drawn = (draw or draw_here)(every)
 
     sections = [
         Section(id="verdict", title="Result", verdict=_finding(found.changed, sentence_of(found))),
@@ -119,7 +117,7 @@ def _pair_section(pair: Pair, found: Comparison, figures: Sequence[Figure]) -> S
     words = (*pair.changes[:_MOST_WORDS], *((f"And {more} more; see compare.json.",) if more > 0 else ()))
     # of a single pair it is said above
     sentence = _pair_sentence(pair, found.tolerance) if len(found.pairs) > 1 else ""
-    tables = pair_tables(pair, found.tolerance)
+    tables = pair_tables(pair)
     return Section(
         id=f"pair-{pair.other.label}",
         title=f"{pair.other.title} against {pair.one.title}",
@@ -131,7 +129,7 @@ def _pair_section(pair: Pair, found: Comparison, figures: Sequence[Figure]) -> S
 
 
 def _numbers(found: Comparison) -> dict[str, Any]:
-    numbers: dict[str, Any] = json_value(
+    numbers: dict[str, Any] = plain(
         {
             "compare_version": COMPARE_VERSION,
             "changed": found.changed,
@@ -180,13 +178,6 @@ def _pair_numbers(pair: Pair) -> dict[str, Any]:
 
 
 _GRADES = ("good fit", "use with caution", "no value")
-_STATES = {
-    "identical": "bit-identical",
-    "equal": "equal within rounding",
-    "changed": "changed",
-    "lost": "missing",
-    "new": "new",
-}
 
 
 def history_table(found: Comparison) -> Table:
@@ -255,14 +246,13 @@ def run_table(found: Comparison) -> Table:
     return Table("runs", "Runs", "", ("", *(run.title for run in runs)), tuple(rows))
 
 
-def pair_tables(pair: Pair, tolerance: float) -> list[Table]:
+def pair_tables(pair: Pair) -> list[Table]:
     """Return the tables of a run against the first one; empty ones are left out."""
     tables = (
         _map_table(pair),
         _transitions(pair),
         _settings(pair),
         _versions(pair),
-        _arrays(pair, tolerance),
     )
     return [table for table in tables if table.rows]
 
@@ -329,34 +319,3 @@ def _versions(pair: Pair) -> Table:
 
 def _both(each: Setting) -> tuple[str, str, str]:
     return each.name, cut(each.one, 80), cut(each.other, 80)
-
-
-def _arrays(pair: Pair, tolerance: float) -> Table:
-    order = {"changed": 0, "lost": 1, "new": 2, "equal": 3, "identical": 4}
-    rows = sorted(pair.arrays, key=lambda row: order[row.state])
-    return Table(
-        f"arrays-{pair.other.label}",
-        "Every array of the results",
-        f"Rounding is a difference below {tolerance:g} of the largest value of the array. The digests of all "
-        "values (SHA-256) are in compare.json in full.",
-        ("array", "state", "values", "differ", "beyond rounding", "largest difference", "SHA-256"),
-        tuple(_array_cells(row) for row in rows),
-    )
-
-
-def _array_cells(row: ArrayRow) -> tuple[str, ...]:
-    state = row.why or _STATES[row.state]
-    if not row.counts:
-        state += "; no result, not counted"
-    digests = dict.fromkeys(digest[:12] for digest in row.sha256 if digest)
-    if row.state in ("lost", "new"):
-        return row.name, state, "", "", "", "", ""
-    return (
-        row.name,
-        state,
-        f"{row.n_values:,}",
-        f"{row.n_different:,}",
-        f"{row.n_beyond:,}",
-        short(row.largest) if row.largest else "0",
-        ", ".join(digests),
-    )

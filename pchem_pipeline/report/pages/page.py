@@ -241,7 +241,6 @@ class Section:
         first: tables above the figures.
         figures: between these and the others.
         tables: tables below the figures.
-        parts: sections within it, of the kind that shows them.
         kind: of a section of its own kind: the template ``section_<kind>.html.j2`` shows it, as ``section``.
         content: what that template shows.
         folded: whether it is closed until somebody opens it.
@@ -256,7 +255,6 @@ class Section:
     first: Sequence[Table] = ()
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
-    parts: Sequence[Section] = ()
     kind: str = ""
     content: Any = None
     folded: bool = False
@@ -274,8 +272,7 @@ def render_page(
         scripts: further ones that its template holds.
         content: what its template shows.
     """
-    parts = [part for section in sections for part in (section, *section.parts)]
-    figures = [figure for part in parts for figure in part.figures]
+    figures = [figure for section in sections for figure in section.figures]
     charts = {figure.name: figure.chart for figure in figures if not figure.chart.still}
     scripted = bool(charts or scripts)  # the inspector draws charts, too
     always = (text_of("page.js"), *((chart_script(),) if scripted else ()))

@@ -1,4 +1,4 @@
-"""The report: one HTML file without network access, ``report.json`` and the files of the figures.
+"""The report: one HTML file without network access, and ``report.json``.
 
 The sections of the page are in one list, from top to bottom. A further one of figures and tables is a row in
 :data:`OPEN` or :data:`FOLDED`; figures and tables name its id. One of another kind is a maker in :data:`PAGE`
@@ -9,11 +9,9 @@ What a paper would say of the run, and cite, is at the end.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
-
-import numpy as np
 
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
@@ -34,9 +32,7 @@ from pchem_pipeline.report.pages.summary import (
     sentence,
 )
 from pchem_pipeline.report.pages.tables import Table, method_tables, provenance_tables, result_tables
-from pchem_pipeline.report.settings import ReportSettings
-from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import count, measured, percent, symbol
+from pchem_pipeline.report.style.wording import symbol
 
 #: (id, heading, introduction, parts that may be missing) of the sections that show figures; the first ones
 #: are open.
@@ -68,13 +64,6 @@ FOLDED: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
         (),
     ),
     (
-        "cells",
-        "From signal to electron number",
-        "The limits between electron numbers are not half-way between the peaks, since small and large "
-        "numbers are not equally likely.",
-        (),
-    ),
-    (
         "ensemble",
         "The sensor as a whole",
         "If the model holds, the parameters of the pixels predict the ensemble.",
@@ -102,17 +91,14 @@ FOLDED: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
     ("plan", "How many frames are enough?", "", ()),
 )
 
-#: How to read the figures of the section ``maps``, by how they are drawn.
-MAP_READING: dict[str, str] = {
-    "beta": (
-        "Rank-based colours (histogram-equalised); labels at minimum, median ± 1 sigma and maximum. "
-        "Blue line: median."
-    ),
-    "linear": ("Linear colours from the 1st to the 99th percentile, clipped beyond. Blue line: median."),
-    "channels": (
-        "Points: channels with their standard errors; crosses at the bottom: channels without a value."
-    ),
-}
+#: How to read the figures of the section ``maps``: images, or lines of channels.
+_READ_IMAGES = (
+    "Rank-based colours (histogram-equalised); labels at minimum, median ± 1 sigma and maximum. "
+    "Blue line: median."
+)
+_READ_CHANNELS = (
+    "Points: channels with their standard errors; crosses at the bottom: channels without a value."
+)
 
 #: Sections that only a run of several samples has.
 _OF_SAMPLES = ("exposures", "photon-transfer")
@@ -125,19 +111,15 @@ class Material:
 
     Attributes:
         data: what the run found.
-        settings: section ``report``.
         figures: all of the page; each names its section.
         tables: all tables of results; each names its section.
         verdict: on what the model is missing, or None where nobody looked.
-        parts: of its evidence.
     """
 
     data: ReportData
-    settings: ReportSettings
     figures: list[Figure]
     tables: list[Table]
     verdict: Finding | None = None
-    parts: Sequence[Section] = ()
 
     def figures_of(self, section: str) -> list[Figure]:
         """Return the figures of a section, by its id."""
@@ -199,8 +181,7 @@ def _part(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material: Ma
             return None  # a joint fit has less to show
         missing = ["no data in this run."]
     if id_ == "maps":
-        reading = "channels" if min(data.shape) < 2 else material.settings.map_stretch
-        intro = MAP_READING[reading]
+        intro = _READ_CHANNELS if min(data.shape) < 2 else _READ_IMAGES
     if id_ == "exposures" and data.samples is not None:
         words = AXES.get(data.samples.against)
         slope = slope_of(data)
@@ -217,13 +198,13 @@ def _discrepancy(material: Material) -> Section:
     content = {
         "found": look is not None and bool(look.found),
         "command": f"pchem discrepancy {material.data.typed_run}",
+        "page": DISCREPANCY_PAGE,
     }
     return Section(
         id="discrepancy",
         title="What the model is missing",
         verdict=material.verdict,
         tables=material.tables_of("discrepancy"),
-        parts=material.parts,
         kind="discrepancy",
         content=content,
     )
@@ -264,46 +245,26 @@ PAGE: tuple[Maker, ...] = (
 )
 
 
-@dataclass(frozen=True)
-class RenderedReport:
-    """The files of a report.
-
-    Attributes:
-        html: the page.
-        json: the numbers.
-        figures: file name to content, for the folder ``figures``.
-        pages: further pages, by file name.
-    """
-
-    html: str
-    json: str
-    figures: dict[str, bytes] = field(default_factory=dict)
-    pages: dict[str, str] = field(default_factory=dict)
-
-
-def render_report(
-    data: ReportData, settings: ReportSettings | None = None, draw: DrawAll | None = None
-) -> RenderedReport:
-    """Draw everything and return the files of the report; nothing is written.
+def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, str]:
+    """Draw everything and return the files of the report by name; nothing is written.
 
     Args:
         data: what the run found.
-        settings: section ``report``; None for the defaults.
         draw: draws all figures at once, for example by several workers; None: one after the other, here.
     """
-    settings = settings or ReportSettings()
-    every, others = report_figures(data, settings), discrepancy_figures(data.discrepancy)
-    shown = [figure for figure in every if figure.section]
-    drawn = (draw or draw_here)([*(every if settings.figure_formats else shown), *others], settings)
-    figures = {name: content for each in drawn.values() for name, content in each.files.items()}
+    shown, others = report_figures(data), discrepancy_figures(data.discrepancy)
+    drawn = (draw or draw_here)([*shown, *others])
     verdict = None if data.discrepancy is None else finding(data.discrepancy)
-    parts = [] if data.discrepancy is None else evidence(data.discrepancy, others)
     makers = (result_tables, method_tables, emva_tables, provenance_tables)
     tables = [table for make in makers for table in make(data)]
-    sections = page_sections(Material(data, settings, shown, tables, verdict, parts))
-    pages = {} if verdict is None else {DISCREPANCY_PAGE: _discrepancy_page(data, verdict, parts, drawn)}
-    numbers, inspector = report_json(data), embedded(data)
-    page = render_page(
+    sections = page_sections(Material(data, shown, tables, verdict))
+    files = {}
+    if data.discrepancy is not None and verdict is not None:
+        parts = evidence(data.discrepancy, others)
+        files[DISCREPANCY_PAGE] = _discrepancy_page(data, verdict, parts, drawn)
+    inspector = embedded(data)
+    files["report.json"] = report_json(data)
+    files["report.html"] = render_page(
         "report.html.j2",
         sections,
         drawn,
@@ -312,7 +273,7 @@ def render_report(
         data=data,
         inspector=inspector,
     )
-    return RenderedReport(page, numbers, figures, pages)
+    return files
 
 
 def _discrepancy_page(
@@ -325,116 +286,36 @@ def _discrepancy_page(
     return render_page("discrepancy.html.j2", sections, drawn, title=data.title, about=about)
 
 
-@dataclass(frozen=True)
-class Paper:
-    """A paper: key, how the text names it, and its BibTeX."""
-
-    key: str
-    short: str
-    bibtex: str
-
-
-_VERIFICATION = Paper(
-    "Hendrickson2023",
-    "Hendrickson et al. 2023, arXiv:2302.14654",
-    """@article{Hendrickson2023,
+_VERIFICATION = """@article{Hendrickson2023,
   author  = {Hendrickson, Aaron and Haefner, David P. and Shade, Nicholas R. and Fossum, Eric R.},
   title   = {Experimental Verification of {PCH-EM} Algorithm for Characterizing {DSERN} Image Sensors},
   journal = {arXiv preprint arXiv:2302.14654},
   year    = {2023}
-}""",
-)
-_SEVERAL = Paper(
-    "Hendrickson2024",
-    "Hendrickson et al. 2024, arXiv:2403.04498",
-    """@article{Hendrickson2024,
+}"""
+_SEVERAL = """@article{Hendrickson2024,
   author  = {Hendrickson, Aaron J. and Haefner, David P. and Chan, Stanley H. and Shade, Nicholas R. and
              Fossum, Eric R.},
   title   = {{PCH-EM}: A Solution to Information Loss in the Photon Transfer Method},
   journal = {arXiv preprint arXiv:2403.04498},
   year    = {2024}
-}""",
-)
+}"""
 
 
-@dataclass(frozen=True)
-class Citation:
-    """A paragraph of methods and the entries of a bibliography."""
-
-    text: str
-    bibtex: str
-
-
-def citation(data: ReportData) -> Citation:
-    """Return what a paper would say of this run, its numbers filled in."""
+def citation(data: ReportData) -> dict[str, str]:
+    """Return what a paper would say of this run (``text``) and cite (``bibtex``)."""
     versions = data.run.get("versions")
     known: Mapping[str, str] = versions if isinstance(versions, Mapping) else {}
     version = known.get("pchem-pipeline") or metadata.version("pchem-pipeline")
-    papers = [_VERIFICATION, *([_SEVERAL] if data.samples is not None else [])]
-    sentences = [_data_sentence(data), _method_sentence(data, papers), _result_sentence(data), _quality(data)]
     libraries = ", ".join(f"{name} {known[name]}" for name in ("numpy", "numba") if name in known)
-    used = f" with {libraries}" if libraries else ""
-    sentences.append(f"The analysis was made with pchem_pipeline {version}{used}.")
-    digest = data.run.get("digest of the input")
-    if digest:
-        sentences.append(f"Digest of the input: {digest}.")
+    text = (
+        f"{sentence(data)} Estimates and standard errors are those of maximum likelihood (PCH-EM), made with "
+        f"pchem_pipeline {version}{f' with {libraries}' if libraries else ''}."
+    )
+    if digest := data.run.get("digest of the input"):
+        text += f" Digest of the input: {digest}."
     software = f"""@software{{pchem_pipeline,
   title   = {{pchem\\_pipeline}},
   version = {{{version}}}
 }}"""
-    return Citation(" ".join(filter(None, sentences)), "\n\n".join([*(p.bibtex for p in papers), software]))
-
-
-def _data_sentence(data: ReportData) -> str:
-    if data.shape[0] == 1:
-        return f"The histograms of {count(data.shape[1], 'channel')} were analysed one by one."
-    frames = f"{count(data.n_frames, 'frame')} of " if data.n_frames else ""
-    time = f" at an integration time of {data.integration_time:g} s" if data.integration_time else ""
-    if data.samples is not None:
-        several = count(len(data.samples.samples), "sample")
-        return (
-            f"{several} of {data.shape[0]} × {data.shape[1]} pixels were analysed together, pixel by pixel."
-        )
-    return f"{frames}{data.shape[0]} × {data.shape[1]} pixels{time} were analysed pixel by pixel."
-
-
-def _method_sentence(data: ReportData, papers: list[Paper]) -> str:
-    model = f"the model {data.run['model']}" if "model" in data.run else "the photon counting distribution"
-    text = (
-        "Quanta exposure H, conversion gain g, bias μ and read noise σ of each were estimated by maximum "
-        f"likelihood under {model} (PCH-EM; {'; '.join(paper.short for paper in papers)})"
-    )
-    return f"{text}, with standard errors from the information of the likelihood."
-
-
-def _result_sentence(data: ReportData) -> str:
-    pixels, flagged = pixel_counts(data), int(data.flagged.sum())
-    if pixels.fitted == 0:
-        return f"No {data.noun} could be fitted."
-    counts = f"{pixels.fitted:,} of {count(pixels.total, data.noun)} have a value"
-    if flagged:
-        share = percent(flagged, pixels.fitted)
-        counts += f"; {flagged:,} of them ({share}) are flagged: the data do not fix their electron number"
-    if data.mostly_flagged:
-        return f"{counts}; no medians can be given."
-    parts = []
-    for name in ("read_noise_e", "conversion_gain", "charge_rate", "dark_current"):
-        if data.has_median(name):
-            summary = data.summary(name)
-            _, words, unit = symbol(name)
-            value = measured(summary.median, summary.median_stderr, unit)
-            parts.append(
-                f"{words} {value} (robust spread between {data.noun}s {summary.robust_sd:.2g} {unit})"
-            )
-    left = "the others" if flagged else f"the {data.noun}s"
-    return f"{counts}. Medians over {left}: {'; '.join(parts)}."
-
-
-def _quality(data: ReportData) -> str:
-    p = finite(data.fit.get("goodness_p", np.empty(0)))
-    if not p.size:
-        return ""
-    return (
-        f"{percent(int((p < 1e-3).sum()), p.size)} of the fits fail the chi-square test (p < 0.001; "
-        "0.10 % expected)."
-    )
+    papers = [_VERIFICATION, *([] if data.samples is None else [_SEVERAL]), software]
+    return {"text": text, "bibtex": "\n\n".join(papers)}

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.base.plain import plain
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import status_counts
 from pchem_pipeline.report.data import ReportData
@@ -36,7 +35,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
     """
     facts, remarks = dict(data.ensemble_facts), flags(data)
     rmse = dict(facts.pop("rmse", {}))
-    numbers: dict[str, Any] = json_value(
+    numbers: dict[str, Any] = plain(
         {
             "report_version": REPORT_VERSION,
             "title": data.title,
@@ -179,20 +178,3 @@ def _discrepancy(data: ReportData) -> dict[str, Any] | None:
         return None
     found = data.discrepancy.found
     return {"verdict": found.verdict, "sentence": found.sentence, "effects": found.effects}
-
-
-def json_value(value: Any) -> Any:
-    """Turn numpy scalars and arrays, tuples and odd objects into what JSON knows; NaN into None."""
-    if isinstance(value, Mapping):
-        return {str(key): json_value(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return json_value(value.tolist())
-    if isinstance(value, np.generic):
-        return json_value(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int | bool):
-        return value
-    if isinstance(value, Sequence):
-        return [json_value(item) for item in value]
-    return str(value)

@@ -14,8 +14,7 @@ from pchem_pipeline.model.maps.maps import summarise
 from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.figures.ensemble import bias_remark
 from pchem_pipeline.report.figures.maps import status_counts
-from pchem_pipeline.report.figures.methods import crossing_text, gain_rmse, percent_text
-from pchem_pipeline.report.figures.plan import frames_text, target_text
+from pchem_pipeline.report.figures.methods import crossing_text, percent_text
 from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.figures.trust import noise_shares
 from pchem_pipeline.report.pages.summary import check_title
@@ -484,16 +483,16 @@ def _plan(data: ReportData) -> Table | None:
         unit, scale = ("e⁻", 1.0) if row["name"] == "bias" else ("%", 100.0)
         rows.append(
             {
-                "precision": target_text(row["target"]),
-                "frames needed": frames_text(row["frames"]),
+                "precision": row["target"].replace("_e to", " (e⁻) to").replace("_", " ").replace("e-", "e⁻"),
+                "frames needed": f"{row['frames']:,.0f}" if math.isfinite(row["frames"]) else "none suffice",
                 "this run's": "" if reached is None else f"{short(scale * reached, 2)} {unit}",
             }
         )
-    exposure, noise = plan["mark"]
     return Table.of(
         "plan-table",
         "Frames for a precision",
-        f"Cramer-Rao bound for the median pixel (H = {short(exposure)} e⁻, read noise {short(noise)} e⁻). "
+        f"Cramer-Rao bound for the median pixel (H = {short(plan['exposure'])} e⁻, read noise "
+        f"{short(plan['read_noise'])} e⁻). "
         "Best exposure, other sensors, several samples, check by simulation: pchem plan.",
         rows,
         "plan",
@@ -624,15 +623,7 @@ def methods_text(result: Mapping[str, Any]) -> str:
             f"{row[0]:<34}" + (f"  {row[1]}" if len(row) == 2 else "".join(f"{c:>12}" for c in row[1:]))
         )
     if result["study"]:
-        at = result["study_at"]
-        lines += [
-            "",
-            f"simulated, H = {at['quanta_exposure']:.3g} e-, {at['n_frames']:,} frames for every method, "
-            f"{at['n_pixels']} pixels at each read noise: rmse of g in %",
-            *_study_lines(result["study"]),
-            "",
-            crossing_text(result["study"]),
-        ]
+        lines += ["", crossing_text(result["study"])]
     return "\n".join(lines)
 
 
@@ -675,18 +666,6 @@ def method_rows(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 def _ratio(value: float | None, bound: float | None) -> str:
     return "-" if value is None or not bound else f"{value / bound:.2f}"
-
-
-def _study_lines(study: Sequence[Mapping[str, Any]]) -> list[str]:
-    titles = {name: method["title"] for name, method in study[0]["methods"].items()}
-    lines = [f"{'read noise, e-':<34}" + "".join(f"{point['read_noise_e']:>9g}" for point in study)]
-    for name, title in titles.items():
-        cells = [percent_text(gain_rmse(point, name)) for point in study]
-        lines.append(f"{title:<34}" + "".join(f"{cell:>9}" for cell in cells))
-    for name in ("one sample", "a dark and a bright sample"):
-        cells = [percent_text(point["bounds"][name]) for point in study]
-        lines.append(f"{'bound, ' + name:<34}" + "".join(f"{cell:>9}" for cell in cells))
-    return lines
 
 
 def method_tables(data: ReportData) -> list[Table]:

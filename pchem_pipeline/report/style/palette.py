@@ -20,8 +20,6 @@ _SHADES = (
     "440154471164482071472e7c443b843f488939558c34618d2f6c8e2a768e26818e228b8d"
     "1f958b1fa08824aa832fb47c40bd7256c66770cf578bd646a8db34c5e021e2e418fde725"
 )
-#: Hues in the order in which lines without a colour of their own take them.
-CYCLE = ("blue", "vermilion", "green", "orange", "sky", "purple", "yellow", "ink")
 
 
 @dataclass(frozen=True)
@@ -59,11 +57,6 @@ class Palette:
     no_value: str = "#D9D9D9"
     mark: str = "#F0E442"
     from_paper: str = "viridis_r"
-
-    @property
-    def cycle(self) -> tuple[str, ...]:
-        """Colours of lines, in their order."""
-        return tuple(getattr(self, name) for name in CYCLE)
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters of matplotlib that hold colours."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,26 +58,22 @@ def finite(values: NDArray[Any]) -> FloatArray:
     return flat[np.isfinite(flat)]
 
 
-def robust_range(
-    values: NDArray[Any] | Ordered, *, tail: float = 0.01, allow_log: bool = True
-) -> DisplayRange:
+def robust_range(values: NDArray[Any] | Ordered) -> DisplayRange:
     """Choose the range of an axis from the bulk of the values.
 
-    The range between the quantiles ``tail`` and ``1 - tail``, widened by 0.3 of it on each side (on a
+    The range between the 1st and the 99th percentile, widened by 0.3 of it on each side (on a
     logarithmic axis by 0.3 of its decades), and cut to the values that occur. Where that leaves out
     only a thin margin, all values are drawn.
 
     Args:
         values: any shape; NaN and infinities are counted, not drawn.
-        tail: quantile at which each tail begins.
-        allow_log: whether a logarithmic axis may be chosen.
     """
     known = Ordered.of(values)
     if known.size == 0:
         return DisplayRange(0.0, 1.0, 0, 0, known.n_missing, False)
     smallest, largest = float(known.values[0]), float(known.values[-1])
-    bulk_low, bulk_high = known.quantiles([tail, 1.0 - tail]).tolist()
-    logarithmic = allow_log and bulk_low > 0 and bulk_high / bulk_low > DECADES
+    bulk_low, bulk_high = known.quantiles([0.01, 0.99]).tolist()
+    logarithmic = bulk_low > 0 and bulk_high / bulk_low > DECADES
     if logarithmic:
         low, high = np.exp(_widened(np.log(bulk_low), np.log(bulk_high)))
         smallest = max(smallest, float(np.finfo(np.float64).tiny))
@@ -97,7 +93,7 @@ def _widened(low: float, high: float) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def histogram_edges(values: NDArray[Any] | Ordered, shown: DisplayRange, *, most: int = 128) -> FloatArray:
+def histogram_edges(values: NDArray[Any] | Ordered, shown: DisplayRange, most: int) -> FloatArray:
     """Return 6 to ``most`` bins over the drawn range, by the rule of Freedman and Diaconis.
 
     Args:
@@ -125,16 +121,15 @@ Bar = tuple[tuple[float, str], ...]
 _LEVELS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
 
 
-def map_colours(known: Ordered, stretch: Literal["beta", "linear"] = "beta") -> tuple[FloatArray, Bar]:
+def map_colours(known: Ordered) -> tuple[FloatArray, Bar]:
     """Return the values between the colours of a map, and places and texts of the bar of its colours.
 
-    ``beta``: the level of a colour is the Beta(2,2) quantile of the value's rank, so that the levels 0, 1/4,
-    1/2, 3/4, 1 are the minimum, the 15.6, 50 and 84.4 % quantiles and the maximum (Hendrickson et al. 2023,
-    Appendix C). ``linear`` runs from the 1st to the 99th percentile; values beyond have the end colours.
+    The level of a colour is the Beta(2,2) quantile of the value's rank, so that the levels 0, 1/4, 1/2, 3/4,
+    1 are the minimum, the 15.6, 50 and 84.4 % quantiles and the maximum (Hendrickson et al. 2023, Appendix
+    C).
 
     Args:
         known: the values.
-        stretch: which of the two.
     """
     if known.size == 0:
         return np.zeros(SHADES - 1), ()
@@ -142,15 +137,9 @@ def map_colours(known: Ordered, stretch: Literal["beta", "linear"] = "beta") -> 
     if lowest == known.values[-1]:
         middle = np.where(np.arange(SHADES - 1) < SHADES // 2, lowest, np.inf)
         return middle, ((0.5, short(lowest)),)
-    if stretch == "beta":
-        edges = display_edges(known, np.arange(1, SHADES) / SHADES)
-        texts = _labels(known.quantiles(_LEVELS**2 * (3.0 - 2.0 * _LEVELS)))
-        return edges, tuple(zip(_LEVELS.tolist(), texts, strict=True))
-    low, high = known.quantiles([0.01, 0.99]).tolist()
-    high = high if high > low else low + 1.0
-    signs = ["≤ ", "", "", "", "≥ "]
-    texts = [sign + text for sign, text in zip(signs, _labels(low + _LEVELS * (high - low)), strict=True)]
-    return np.linspace(low, high, SHADES + 1)[1:-1], tuple(zip(_LEVELS.tolist(), texts, strict=True))
+    edges = display_edges(known, np.arange(1, SHADES) / SHADES)
+    texts = _labels(known.quantiles(_LEVELS**2 * (3.0 - 2.0 * _LEVELS)))
+    return edges, tuple(zip(_LEVELS.tolist(), texts, strict=True))
 
 
 def _labels(physical: FloatArray) -> list[str]:

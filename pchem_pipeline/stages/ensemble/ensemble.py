@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.stream import FrameStream
@@ -39,7 +40,6 @@ from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, 
 from pchem_pipeline.stages.fit.code_sums import on_axis
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_effects, fitted_satellites
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of, uncounted_frames
-from pchem_pipeline.store.files import without_nan
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
@@ -482,7 +482,7 @@ def _write_result(
         found["model"] = model_words(job.effects)
     for name, values in arrays.items():
         store.write_array(f"ensemble/{name}", values)
-    store.set_attributes("ensemble", without_nan(found | facts))
+    store.set_attributes("ensemble", plain(found | facts))
 
 
 def _true_pixels(

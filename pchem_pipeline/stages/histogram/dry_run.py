@@ -1,20 +1,19 @@
-"""What a run is going to read, write and hold, and how long that takes: said before it starts."""
+"""What a run is going to read, write and hold: said before it starts."""
 
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.config.memory import allowed_bytes, band_bytes, worker_count
 from pchem_pipeline.frames.histogram_files import is_histogram_input
-from pchem_pipeline.model.histogram.count import HistogramAccumulator, choose_bins, most_bins, pixels_by_range
-from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
+from pchem_pipeline.model.histogram.count import most_bins
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+from pchem_pipeline.stages.histogram.histogram import bins_of
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.store.tiles import tile_grid, tile_shape
 
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.frames.reader import FrameReader
 
 #: the program with what the later stages hold, and that for each pixel
 _REPORT_BYTES, _REPORT_PIXEL_BYTES = 400 << 20, 400
@@ -31,11 +29,6 @@ _REPORT_BYTES, _REPORT_PIXEL_BYTES = 400 << 20, 400
 _STORED_PIXEL, _STORED_SERIES = 420, 0.5
 #: the copied frames are so much smaller than the frames
 _COPY_RATIO = 1.77
-#: CPU seconds for each pixel of ensemble and report, and for what does not depend on them
-_REST_SECONDS, _REST_PIXEL_SECONDS = 6.0, 6e-5
-_FIT_SAMPLE = 256
-#: Seconds to count a sample and to fit a pixel, where the kernels are still to be compiled: a guess
-_USUAL_SPEEDS = (4e-9, 2e-4)
 
 
 @dataclass(frozen=True)
@@ -54,7 +47,6 @@ class Plan:
         written_bytes: into the store, about.
         held_bytes: largest resident memory of the process.
         allowed_bytes: memory that it may take.
-        seconds: about, with nothing else running on the machine.
     """
 
     shape: tuple[int, int, int]
@@ -68,7 +60,6 @@ class Plan:
     written_bytes: int
     held_bytes: int
     allowed_bytes: int
-    seconds: float
 
     def words(self) -> list[str]:
         """Return the plan as ``--dry-run`` prints it."""
@@ -82,7 +73,6 @@ class Plan:
             f"{self.read_bytes / 1e9:.3g} GB in all; writes about {self.written_bytes / 1e9:.2g} GB",
             f"plan: needs at most {self.held_bytes / 2**20:.0f} MiB of memory, for any number of frames; "
             f"{self.allowed_bytes / 2**20:.0f} MiB allowed",
-            f"plan: about {max(self.seconds, 1):.0f} s on an idle machine",
         ]
 
 
@@ -113,7 +103,9 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     n, ny, nx = frames.shape
     workers = worker_count(config)
     size = sum(file_size(path) for path in input_paths(config.input, base_dir))
-    bins, reading, sample = _first_frames(config, frames)
+    limit = most_bins(config.histogram.max_bins, frames.dtype)
+    rows = min(ny, math.lcm(ROW_GROUP, min(frames.rows_per_read, ny)))
+    bins = bins_of(frames, config.histogram.window_frames, limit, rows)
     whole = single_pass_bytes(config, frames.shape, frames.dtype, bins)
     allowed = allowed_bytes(config, workers)
     single_pass = whole <= allowed
@@ -123,10 +115,6 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     ensemble = n if config.ensemble.frames == "all" else min(config.ensemble.frames, n)
     again = ensemble / n + (0 if single_pass else 1 + first)
     copies = config.input.mode == "copy"
-    counting, fitting = _speeds(config, sample, bins, n)
-    samples = n * ny * nx
-    seconds = max(samples * reading, samples * (reading + counting) / workers)
-    seconds += (fitting * ny * nx + _REST_SECONDS + _REST_PIXEL_SECONDS * ny * nx) / workers
     return Plan(
         shape=frames.shape,
         bins=bins,
@@ -139,7 +127,6 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
         written_bytes=_written(config, frames.shape, frames.dtype),
         held_bytes=max(whole if single_pass else bands, report),
         allowed_bytes=allowed,
-        seconds=seconds * (1.5 if copies else 1.0),
     )
 
 
@@ -152,45 +139,3 @@ def _written(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any
     if config.input.mode == "copy":
         total += math.prod(shape) * dtype.itemsize / _COPY_RATIO
     return round(total)
-
-
-def _first_frames(config: RunConfig, frames: FrameReader) -> tuple[int, float, NDArray[Any]]:
-    """Return the bins of the sensor, the seconds to read a sample, and the first frames of some rows."""
-    n, ny, nx = frames.shape
-    window = min(config.histogram.window_frames, n)
-    limit = most_bins(config.histogram.max_bins, frames.dtype)
-    ranges = np.zeros(limit + 2, np.int64)
-    spent = 0.0
-    step = min(ny, math.lcm(ROW_GROUP, min(frames.rows_per_read, ny)))
-    for y0 in range(0, ny, step):
-        start = time.perf_counter()
-        block = frames.read(0, window, y0, min(y0 + step, ny))
-        spent += time.perf_counter() - start
-        ranges += pixels_by_range(block, limit)
-    return choose_bins(ranges, limit), spent / (window * ny * nx), block[:, :ROW_GROUP]
-
-
-def _speeds(config: RunConfig, frames: NDArray[Any], bins: int, n_frames: int) -> tuple[float, float]:
-    """Return the seconds to count a sample, and to fit a pixel, both on one processor, tried on some rows."""
-    from pchem_pipeline.base.kernel import is_compiled
-    from pchem_pipeline.model.fit.api import fit_histograms
-    from pchem_pipeline.model.fit.tile_numba import fit_tile
-
-    if not is_compiled(fit_tile):
-        return _USUAL_SPEEDS
-    shape = (frames.shape[1], frames.shape[2])
-    histograms = HistogramAccumulator(shape, bins, n_frames)
-    summaries = SummaryAccumulator(shape, config.histogram.block_length(n_frames))
-    for _ in range(2):  # the first time loads the compiled loops
-        start = time.perf_counter()
-        histograms.add(frames)
-        summaries.add(frames)
-        line_sums(frames)
-        counting = (time.perf_counter() - start) / frames.size
-    rows = histograms.finish()
-    flat = {name: getattr(rows, name).ravel()[:_FIT_SAMPLE] for name in ("origin", "under", "over")}
-    counts = rows.counts.reshape(-1, bins)[:_FIT_SAMPLE]
-    fit_histograms(counts[:1], **{name: values[:1] for name, values in flat.items()}, settings=config.fit)
-    start = time.perf_counter()
-    fit_histograms(counts, **flat, settings=config.fit)
-    return counting, (time.perf_counter() - start) / counts.shape[0]

@@ -118,8 +118,7 @@ def _is_wanted(context: StageContext) -> bool:
     options, config = context.options, context.config
     records = context.store.records
     return (
-        options.tiles is None
-        and options.roi is None
+        options.roi is None
         and all(records.read(name) is None for name in PREPARED)
         and not is_histogram_input(config.input, context.base_dir)
         and identity_is_new(context)

@@ -1,4 +1,4 @@
-"""Stage ``report``: report.html, report.json and the figures, from what the other stages stored."""
+"""Stage ``report``: report.html and report.json, from what the other stages stored."""
 
 from __future__ import annotations
 
@@ -14,26 +14,17 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.compute.environment import available_workers
-from pchem_pipeline.compute.executor import (
-    Beside,
-    Executor,
-    PoolExecutor,
-    SerialExecutor,
-    beside,
-    can_start_processes,
-    map_all,
-)
+from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.maps.ordered import median_of
-from pchem_pipeline.planning.frames import contour_data, frames_needed, precision
+from pchem_pipeline.planning.frames import frames_needed, precision
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import parse_target
 from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
-from pchem_pipeline.report.figures.catalogue import FIGURE_NAMES
 from pchem_pipeline.report.figures.ensemble import case_name
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
@@ -42,7 +33,6 @@ from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.pictures import DrawAll, Drawn, draw_figure
 from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.pages.summary import check_sentence
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
@@ -66,7 +56,6 @@ from pchem_pipeline.store.run_store import RunStore, stored_config
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.report.pages.pictures import DrawAll
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.store.records import StageRecord
 
@@ -78,9 +67,8 @@ _FEW_CHANNELS = 12
 _SOME_MASSES = 300
 #: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 940 MiB in all.
 _PIXEL_BYTES = 300
-#: Precisions whose frames the report tells, at the median pixel; those of the figure, and its points an axis.
+#: Precisions whose frames the report tells, at the median pixel.
 _TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
-_DRAWN, _FINE = _TARGETS[:2], 14
 
 
 def run(context: StageContext) -> None:
@@ -101,8 +89,7 @@ def run(context: StageContext) -> None:
         _write,
         config=context.config,
         stages=_stage_rows(context),
-        # in this process: another would spend more on its imports than on its share of the figures
-        draw=draw_by_workers(1, context.reporter, context.stage),
+        draw=draw_and_say(context.reporter, context.stage),
     )
     done = context.run_units([WHOLE], task, unit_name="report", unit_bytes=ny * nx * _PIXEL_BYTES)
     for text in done.get(WHOLE.key, {}).get("warnings", ()):
@@ -115,28 +102,17 @@ def _write(
     *,
     config: RunConfig,
     stages: list[dict[str, Any]],
-    draw: DrawAll | None,
+    draw: DrawAll,
 ) -> dict[str, Any]:
-    """Gather, draw and write; files of figures that this run does not have any more are removed."""
-    with beside(drawing_workers(None, config.compute)) as hand:
+    """Gather, draw and write."""
+    with beside(_workers(config.compute)) as hand:
         data = gather(store, config, stages, hand)
-        rendered = render_report(data, config.report, draw)
-    for name, content in rendered.figures.items():
-        store.write_file(f"figures/{name}", content)
-    for old in (store.path / "figures").glob("*.*"):
-        if old.name not in rendered.figures and old.stem in FIGURE_NAMES:
-            old.unlink(missing_ok=True)
-    for name, page in rendered.pages.items():
-        store.write_file(name, page.encode())
-    if not rendered.pages:
+        files = render_report(data, draw)
+    for name, text in files.items():
+        store.write_file(name, text.encode())
+    if DISCREPANCY_PAGE not in files:
         (store.path / DISCREPANCY_PAGE).unlink(missing_ok=True)
-    store.write_file("report.json", rendered.json.encode())
-    store.write_file("report.html", rendered.html.encode())
-    return {
-        "figures": len(rendered.figures),
-        "html_bytes": len(rendered.html.encode()),
-        "warnings": _warnings(data),
-    }
+    return {"warnings": _warnings(data)}
 
 
 def _warnings(data: ReportData) -> list[str]:
@@ -167,7 +143,7 @@ def gather(
     Raises:
         StoreError: maps or histograms are missing.
     """
-    threads = drawing_workers(None, config.compute)
+    threads = _workers(config.compute)
     run = read_run(store, threads)
     # two ways of about the same length: single pixels and packed maps, the quick look and figures and tables
     pixels = hand(functools.partial(_of_pixels, store, run, config))
@@ -325,14 +301,7 @@ def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict
         for target in map(parse_target, _TARGETS)
     ]
     reached = {} if n_frames is None else precision(point, n_frames)
-    mark = (exposure, noise)
-    return {"rows": rows, "reached": reached, "n_frames": n_frames, "mark": mark, "contours": _contours()}
-
-
-@functools.cache
-def _contours() -> dict[str, Any]:
-    """Return the frames over exposure and read noise; relative targets look alike for every sensor."""
-    return contour_data([parse_target(text) for text in _DRAWN], 0.01, fine=_FINE)
+    return {"rows": rows, "reached": reached, "exposure": exposure, "read_noise": noise}
 
 
 def _samples(run: StoredRun, config: RunConfig) -> Samples | None:
@@ -432,40 +401,26 @@ _PARTS = {
 }
 
 
-def drawing_executor(workers: int, n_figures: int) -> Executor:
-    """Return who draws: processes, since drawing shares its settings within one; or this one alone."""
-    count = min(workers, available_workers(), n_figures)
-    several = count > 1 and can_start_processes()
-    return PoolExecutor(count, processes=True) if several else SerialExecutor()
-
-
-def drawing_workers(wanted: int | None, settings: ComputeSettings) -> int:
-    """Return how many may work on a report at a time: as asked for, else as the section ``compute`` says."""
-    if wanted is not None:
-        return wanted
+def _workers(settings: ComputeSettings) -> int:
+    """Return how many may work on a report at a time."""
     workers = available_workers() if settings.workers == "auto" else settings.workers
     if settings.max_memory is not None:
         workers = min(workers, max(1, ((settings.max_memory << 20) - BASE_BYTES) // SECOND_PROGRAM_BYTES))
     return workers
 
 
-def draw_by_workers(workers: int, reporter: Reporter, label: str) -> DrawAll:
-    """Return a function that draws figures with up to so many processes.
+def draw_and_say(reporter: Reporter, label: str) -> DrawAll:
+    """Return a function that draws figures in this process, under a bar with this label.
 
-    It raises the first error of a figure once the others are drawn.
-
-    Args:
-        workers: of the run.
-        reporter: hears of each figure.
-        label: of the bar.
+    Others would spend more on their imports than on their share of the figures.
     """
 
-    def draw(figures: Sequence[Figure], settings: ReportSettings) -> Mapping[str, Drawn]:
-        drawn: dict[str, Drawn] = {}
-        task = functools.partial(draw_figure, settings=settings)
-        executor = drawing_executor(workers, len(figures))
+    def draw(figures: Sequence[Figure]) -> dict[str, Drawn]:
+        drawn = {}
         with reporter.progress(label, len(figures), "figure") as advance:
-            map_all(executor, task, figures, lambda each, value: drawn.update({each.name: value}), advance)
+            for figure in figures:
+                drawn[figure.name] = draw_figure(figure)
+                advance()
         return drawn
 
     return draw

@@ -43,7 +43,7 @@ def invoke(*arguments):
 
 @pytest.mark.parametrize("name", ["simulate", "histogram", "fit", "maps", "ensemble", "report", "electrons"])
 def test_a_stage_command_runs_its_stage(calls, name):
-    options = ["--force", "--tiles", "0.0", "--roi", "0:8,8:16", "--workers", "3", "--backend", "serial"]
+    options = ["--force", "--roi", "0:8,8:16", "--workers", "3", "--backend", "serial"]
     result = invoke(
         name,
         "run.zarr",
@@ -60,7 +60,7 @@ def test_a_stage_command_runs_its_stage(calls, name):
     [(target, stages, command)] = calls
     assert stages == [name]
     assert target.config == parse_config(CONFIG)
-    expected = Options(force=True, dry_run=False, tiles="0.0", roi=(0, 8, 8, 16))
+    expected = Options(force=True, dry_run=False, roi=(0, 8, 8, 16))
     assert command == Command(expected, 3, "serial", "off", True, Path("l.json"), 900)
 
 
@@ -211,7 +211,6 @@ def test_a_full_disk_behind_stdout_is_one_line():
         ("demo", "--output", "s3://lab/x"),
         ("twin", "run.zarr", "--output", "s3://lab/twin.yaml"),
         ("plan", "--read-noise", "0.3", "--json", "s3://lab/plan.json"),
-        ("plan", "--read-noise", "0.3", "--figure", "s3://lab/plan.svg"),
         ("run", "run.yaml", "--log-json", "s3://lab/log.jsonl"),
     ],
 )
@@ -226,11 +225,3 @@ def test_what_is_written_beside_a_store_lies_on_this_machine(arguments, tmp_path
 def test_simulated_frames_lie_on_this_machine():
     with pytest.raises(ConfigError, match=r"^s3://lab/frames: only stores"):
         parse_config("simulate: {output: 's3://lab/frames'}")
-
-
-@pytest.mark.parametrize("text", ["", "7", "0.0,", "0.a"])
-def test_what_is_no_list_of_tiles_is_told_before_anything_is_read(calls, text):
-    for command in (("fit", "run.zarr"), ("run", "a.tif")):
-        with pytest.raises(ConfigError, match=r"^--tiles: .* is not a tile; write iy.ix, such as 0.3"):
-            invoke(*command, "--tiles", text)
-    assert calls == []

@@ -274,3 +274,8 @@ def test_no_setting_is_called_what_yaml_takes_for_true_or_false() -> None:
     for kind in (RunConfig, *effect_classes().values()):
         for name in names(kind, set()):
             assert yaml.safe_load(name) == name, (kind, name)
+
+
+def test_keys_of_earlier_versions_are_read_and_do_nothing():
+    text = "input: {files: [a.npy]}\nreport: {figure_formats: [svg], dpi: 72, map_stretch: linear}\n"
+    assert parse_config(text) == parse_config("input: {files: [a.npy]}\n")

@@ -200,27 +200,24 @@ def test_an_undivided_stage_starts_again_when_upstream_grew(make):
 def test_tiles_redo_a_part_only_with_force(make):
     execute("fit", make())
     CALLS.clear()
-    execute("fit", make(tiles="0.0,2.3"))
+    execute("fit", make(roi=(0, 3, 0, 9)))
     assert CALLS == []
-    execute("fit", make(tiles="0.0,2.3", force=True))
-    assert CALLS == ["0.0", "2.3"]
     execute("fit", make(roi=(0, 3, 0, 9), force=True))
-    assert CALLS[2:] == ["0.0", "0.1"]
+    assert CALLS == ["0.0", "0.1"]
     execute("fit", make(force=True))
-    assert len(CALLS) == 4 + 12
+    assert len(CALLS) == 2 + 12
 
 
 def test_tiles_of_a_new_stage_leave_it_partial(make):
-    assert execute("fit", make(tiles="0.0")).words() == "partial 1 of 12"
+    assert execute("fit", make(roi=(0, 1, 0, 1))).words() == "partial 1 of 12"
     assert execute("fit", make()).state == "complete"
 
 
-def test_unknown_tiles_are_refused_even_where_nothing_is_to_be_done(make):
+def test_regions_outside_are_refused_even_where_nothing_is_to_be_done(make):
     assert execute("fit", make()).state == "complete"
-    for wrong in ({"tiles": "9.9"}, {"roi": (0, 9, 90, 99)}):
-        with pytest.raises(ConfigError):
-            execute("fit", make(**wrong))
-    assert execute("fit", make(tiles="0.0")).state == "complete"
+    with pytest.raises(ConfigError):
+        execute("fit", make(roi=(0, 9, 90, 99)))
+    assert execute("fit", make(roi=(0, 1, 0, 1))).state == "complete"
 
 
 def test_changes_of_the_input_are_said_in_words():

@@ -118,7 +118,7 @@ def test_reference_copies_nothing(tmp_path: Path) -> None:
 
 def test_tiles_of_the_command_line_do_not_cut_the_input(tmp_path: Path) -> None:
     write_stack(tmp_path / "cam")
-    context = make_context(tmp_path, options=Options(tiles="0.0"))
+    context = make_context(tmp_path, options=Options(roi=(0, 1, 0, 1)))
     assert run(context).state == "complete"
     np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
 

@@ -11,7 +11,7 @@ import pytest
 import pchem_pipeline
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.store import disk
-from pchem_pipeline.store.files import checked, whole_file, without_nan, write_atomic
+from pchem_pipeline.store.files import checked, whole_file, write_atomic
 
 
 def _fail(*_: object, **__: object) -> None:
@@ -118,10 +118,3 @@ def test_no_other_module_puts_files_in_their_place():
 def test_a_record_that_is_no_object_is_damaged(data):
     with pytest.raises(StoreError, match=r"^a\.json is damaged \(.*\); run it again$"):
         checked(data, Path("a.json"), "run it again")
-
-
-def test_json_has_no_nan():
-    assert without_nan({"a": [1, float("nan"), (2.5, float("inf"))], "b": "x"}) == {
-        "a": [1, None, [2.5, None]],
-        "b": "x",
-    }

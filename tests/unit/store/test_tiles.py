@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.store.tiles import MAX_BINS, Tile, parse_tiles, roi_tiles, tile_grid, tile_shape
+from pchem_pipeline.store.tiles import MAX_BINS, Tile, roi_tiles, tile_grid, tile_shape
 
 
 @given(ny=st.integers(1, 200), nx=st.integers(1, 200), size=st.sampled_from([8, 16, 64]))
@@ -54,18 +54,6 @@ def test_tile_is_named_like_its_chunk():
     tile = tile_grid((100, 130), 64)[-1]
     assert (tile.key, tile.shape) == ("1.2", (36, 2))
     assert tile.region == (slice(64, 100), slice(128, 130))
-
-
-def test_tiles_are_chosen_by_name_and_by_range():
-    grid = tile_grid((256, 256), 64)
-    assert [t.key for t in parse_tiles("2.1, 0.3", grid)] == ["0.3", "2.1"]
-    assert [t.key for t in parse_tiles("0:2.1:3", grid)] == ["0.1", "0.2", "1.1", "1.2"]
-
-
-@pytest.mark.parametrize("text", ["", "3", "a.b", "0.4", "4.0", "0:9999999999.0", "2:2.0"])
-def test_wrong_tiles_are_refused(text):
-    with pytest.raises(ConfigError, match="--tiles"):
-        parse_tiles(text, tile_grid((256, 256), 64))
 
 
 def test_roi_chooses_the_tiles_that_it_touches():

@@ -37,13 +37,12 @@ from pchem_pipeline.report.charts.chart import (
     y_window,
 )
 from pchem_pipeline.report.charts.on_page import page_chart, rounded
-from pchem_pipeline.report.charts.on_paper import Look, draw_chart
+from pchem_pipeline.report.charts.on_paper import Look, draw_chart, drawing_bytes
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector import json_for_html
 from pchem_pipeline.report.pages.pictures import draw_figure
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.report.style.palette import DIVERGING, LIGHT, MAP_COLOURS, shades
 from pchem_pipeline.report.style.wording import symbol, without_formulas
 
@@ -58,7 +57,7 @@ def charts() -> dict[str, Figure]:
         stability=stability_figures(sums_of(frames)),
         discrepancy=discrepancy_data("named"),
     )
-    return {each.name: each for each in run_figures(data, ReportSettings())}
+    return {each.name: each for each in run_figures(data)}
 
 
 def every_mark(label: str = "a") -> Chart:
@@ -104,28 +103,24 @@ def test_the_page_has_the_numbers_that_paper_shows(charts: dict[str, Figure]) ->
                     assert np.all(np.abs(x - mark.x) <= x_error)
                     np.testing.assert_array_equal(np.isnan(y), ~np.isfinite(mark.y))
                     assert np.all((np.abs(y - mark.y) <= y_error) | np.isnan(y))
-    axes = charts["rounding"].draw(Look()).axes[0]
-    lines = {line.get_label(): line.get_ydata() for line in axes.lines}
-    [read_noise] = [
-        mark for mark in charts["rounding"].chart.stacks[0].panels[0].marks if mark.label == "read noise"
-    ]
-    assert isinstance(read_noise, Line)
-    np.testing.assert_array_equal(lines["read noise"], read_noise.y)
+    axes = charts["frame_means"].draw(Look()).axes[0]
+    [mean] = [mark for mark in charts["frame_means"].chart.stacks[0].panels[0].marks if mark.label == "mean"]
+    assert isinstance(mean, Line)
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), mean.y)
 
 
 def test_pictures_are_whole(charts: dict[str, Figure]) -> None:
-    for number, figure in enumerate(charts.values()):
-        formats = ("svg",) if number % 8 == 0 else ()
-        drawn = draw_figure(figure, ReportSettings(figure_formats=formats))
+    for figure in charts.values():
+        drawn = draw_figure(figure)
         svg = unquote(drawn.source.partition(",")[2])
         words = " ".join("".join(ElementTree.fromstring(svg).itertext()).split())
         for stack_ in figure.chart.stacks:
             if (figure.width_mm > COLUMN_MM or not stack_.wide) and "$" not in stack_.x.label:
                 assert " ".join(stack_.x.label.split()) in words
         assert 0 < drawn.height < 4 * drawn.width
-        # the file of it has outlines in place of text
-        assert all(len(svg) < len(drawn.files[f"{figure.name}.{each}"]) < 400_000 for each in formats)
-    assert draw_figure(figure, ReportSettings()).source == drawn.source
+        # a file of it has outlines in place of text
+        assert len(svg) < len(drawing_bytes(figure.draw(Look(figure.width_mm)), "svg"))
+    assert draw_figure(figure).source == drawn.source
 
 
 def test_every_mark_is_drawn_everywhere() -> None:
@@ -193,7 +188,7 @@ def test_hostile_words_stay_words() -> None:
     assert "<" not in text
     assert json.loads(text)["stacks"][0]["title"].startswith("</script><script>")
     figure = Figure("a", "", HOSTILE, HOSTILE, HOSTILE, (), chart)
-    source = draw_figure(figure, ReportSettings()).source
+    source = draw_figure(figure).source
     assert not set(source) & set("<>&\"'")
     root = ElementTree.fromstring(unquote(source.partition(",")[2]))
     assert "</script><script>alert(1)" in "".join(root.itertext())

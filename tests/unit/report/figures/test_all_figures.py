@@ -13,13 +13,13 @@ from PIL import Image
 
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
-from pchem_pipeline.report.charts.chart import COLUMN_MM, PAGE_MM, Words
+from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.report.charts.chart import COLUMN_MM, PAGE_MM, Chart
 from pchem_pipeline.report.charts.on_paper import (
     Drawing,
     Look,
     draw_chart,
     drawing_bytes,
-    palette_of,
     small_png,
 )
 from pchem_pipeline.report.data import PixelFit
@@ -31,22 +31,8 @@ from pchem_pipeline.report.figures.ensemble import (
     ensemble_tables,
 )
 from pchem_pipeline.report.figures.figure import DataTable, csv_text
-from pchem_pipeline.report.figures.maps import (
-    histogram_table,
-    map_chart,
-    map_tables,
-    read_noise_chart,
-    status_chart,
-    status_counts,
-)
-from pchem_pipeline.report.figures.pixels import (
-    PAPER_EXAMPLE,
-    cell_tables,
-    cells_chart,
-    pixels_chart,
-    shown_bins,
-)
-from pchem_pipeline.report.figures.plan import frames_chart
+from pchem_pipeline.report.figures.maps import map_chart, map_tables, status_chart, status_counts
+from pchem_pipeline.report.figures.pixels import pixels_chart, shown_bins
 from pchem_pipeline.report.figures.stability import (
     frame_table,
     line_spectra,
@@ -55,8 +41,6 @@ from pchem_pipeline.report.figures.stability import (
     profile_table,
     stability_figures,
 )
-from pchem_pipeline.report.style.palette import DARK, LIGHT
-from pchem_pipeline.report.style.wording import power_of_ten
 
 LOOK = Look()
 WORDS = {int(bit): text for bit, text in MEANINGS.items()}
@@ -84,31 +68,6 @@ NAN_PIXEL = PixelFit(
     status="fewer than 3 occupied bins; one Gaussian fits as well: the conversion gain is not identified",
 )  # fmt: skip
 EMPTY_PIXEL = replace(NAN_PIXEL, counts=np.zeros(4, dtype=np.uint16))
-
-
-def test_cluster_edges_of_the_paper_lie_at_the_optimal_thresholds() -> None:
-    figure = draw_chart(LOOK, cells_chart(cell_tables(PAPER_EXAMPLE)))
-    lines = figure.axes[0].collections[0].get_segments()
-    edges = np.array([segment[0, 0] for segment in lines])
-    k = np.arange(edges.size)
-    np.testing.assert_allclose(edges, k + 0.5 + 0.33**2 * np.log((k + 1) / 1.8))
-    assert "signal (e⁻)" in texts(figure)
-    drawn(figure)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {},
-        {"quanta_exposure": 0.01},
-        {"quanta_exposure": 60.0},
-        {"quanta_exposure": 0.0},
-        {"bias": float("nan")},
-    ],
-)
-def test_cluster_edges_of_odd_pixels(pixel: PixelFit, change: dict[str, float]) -> None:
-    odd = replace(pixel, parameters={**pixel.parameters, **change})
-    drawn(draw_chart(LOOK, cells_chart(cell_tables(odd.parameters, odd))))
 
 
 @pytest.mark.parametrize("width", [COLUMN_MM, PAGE_MM])
@@ -176,12 +135,9 @@ def _map(kind: str) -> np.ndarray:
     return values
 
 
-def bias(values: np.ndarray) -> Drawing:
-    return draw_chart(LOOK, map_chart(map_tables(values, "bias", None, 128), "bias"))
-
-
-def read_noise(values: np.ndarray) -> Drawing:
-    return draw_chart(LOOK, read_noise_chart(values, histogram_table(values, "read_noise_e", 128)))
+def chart_of(values: np.ndarray, name: str = "bias", stderr: np.ndarray | None = None) -> Chart:
+    known = Ordered.of(values)
+    return map_chart(map_tables(values, name, stderr, known), name, known)
 
 
 KINDS = (
@@ -194,18 +150,15 @@ KINDS = (
 @pytest.mark.parametrize("kind", KINDS)
 def test_maps_of_all_kinds(kind: str) -> None:
     values = _map(kind)
-    for stretch in ("beta", "linear") if kind in ("hot", "empty", "constant") else ("beta",):
-        tables = map_tables(values, "dark_current", np.abs(values) / 100, 128)
-        figure = draw_chart(LOOK, map_chart(tables, "dark_current", stretch))
-        assert "(e⁻/px/s)" in texts(figure)
-        drawn(figure)
-    drawn(read_noise(values))
+    figure = draw_chart(LOOK, chart_of(values, "dark_current", np.abs(values) / 100))
+    assert "(e⁻/px/s)" in texts(figure)
+    drawn(figure)
 
 
 def test_a_map_of_more_pixels_than_an_image_can_show_has_every_odd_th_of_them() -> None:
     values = np.random.default_rng(3).normal(100.0, 4.0, (90, 1300))
     values[7, 9] = np.nan  # is not drawn, and counted all the same
-    chart = map_chart(map_tables(values, "bias", None, 128), "bias")
+    chart = chart_of(values)
     figure = draw_chart(Look(dpi=100), chart)  # 346 dots across
     axes = figure.axes[1]
     assert axes.images[0].get_array().shape == (30, 434)
@@ -214,14 +167,6 @@ def test_a_map_of_more_pixels_than_an_image_can_show_has_every_odd_th_of_them() 
     assert axes.images[0].get_extent() == pytest.approx([-0.5, 3 * 434 - 0.5, 89.5, -0.5])
     assert "no value: 1 pixel" in texts(figure)
     assert draw_chart(Look(dpi=600), chart).axes[1].images[0].get_array().shape == values.shape
-
-
-def test_the_median_of_the_read_noise_is_marked() -> None:
-    values = _map("plain") * 0.15
-    figure = read_noise(values)
-    positions = [line.get_xdata()[0] for line in figure.axes[0].lines]
-    assert np.median(values) in positions
-    assert f"median {np.median(values):.3f} e⁻" in texts(figure)
 
 
 @pytest.mark.parametrize("shape", [(12, 20), (1, 9), (8, 8), (60, 2)])
@@ -316,14 +261,14 @@ def test_component_widths(arrays: dict[str, np.ndarray], width: float) -> None:
 def test_drawing_leaves_the_users_settings_alone(pixel: PixelFit) -> None:
     with mpl.rc_context({"font.size": 31.0, "axes.facecolor": "red"}):
         before = dict(mpl.rcParams)
-        figure = draw_chart(LOOK, cells_chart(cell_tables(pixel.parameters)))
+        figure = draw_chart(LOOK, pixels_chart([pixel]))
         drawing_bytes(figure, "svg")
         assert dict(mpl.rcParams) == before
         assert figure.axes[0].get_facecolor() != (1.0, 0.0, 0.0, 1.0)
 
 
 def test_a_palette_does_not_change_a_map_visibly() -> None:
-    full = drawing_bytes(bias(_map("holes")), "png", dpi=150)
+    full = drawing_bytes(draw_chart(LOOK, chart_of(_map("holes"))), "png", dpi=150)
     few = small_png(full)
     assert len(few) < len(full)
     before, after = (
@@ -331,41 +276,6 @@ def test_a_palette_does_not_change_a_map_visibly() -> None:
     )
     assert np.abs(before - after).mean() < 1.0
     assert np.abs(before - after).max() < 32
-
-
-def test_dark_paper_has_light_ink() -> None:
-    """Same lines, other colours: nothing is drawn dark on dark."""
-    light, dark = (
-        draw_chart(Look(palette=each), cells_chart(cell_tables(PAPER_EXAMPLE))) for each in (LIGHT, DARK)
-    )
-    assert texts(light) == texts(dark)
-    np.testing.assert_array_equal(light.axes[0].lines[0].get_data(), dark.axes[0].lines[0].get_data())
-    with Image.open(io.BytesIO(drawing_bytes(dark, "png", dpi=50))) as image:
-        assert np.asarray(image.convert("L")).mean() < 60
-    assert dark.axes[0].lines[0].get_color() == DARK.ink
-    assert palette_of(mpl.style.library["dark_background"]).ink == "#ffffff"
-    assert palette_of({}) == LIGHT
-
-
-def test_labels_of_contours_lie_on_them_and_none_is_cut() -> None:
-    """On the drawn axes these contours are straight lines, from corner to corner."""
-    noise, exposure = np.meshgrid(np.linspace(0.1, 1.1, 41), np.logspace(-1.0, 1.0, 41), indexing="ij")
-    frames = 10.0 ** (2.0 + 4.0 * noise - 2.0 * np.log10(exposure))
-    columns = {"read_noise_e": noise, "quanta_exposure": exposure, "frames for bias to 1 %": frames}
-    (stack,) = frames_chart(
-        DataTable({name: values.ravel() for name, values in columns.items()}), None
-    ).stacks
-    (panel,) = stack.panels
-    labels = [mark for mark in panel.marks if isinstance(mark, Words)]
-    assert len(labels) > 3
-    powers = {power_of_ten(power): power for power in range(9)}
-    for label in labels:
-        across, up = float(label.x), float(label.up)
-        assert 0.04 < (across + 1.0) / 2.0 < 0.96
-        assert 0.0 < up < 0.96
-        there = 2.0 + 4.0 * (0.1 + up * 1.0) - 2.0 * across
-        # the words stand on the line: a tenth of the picture is 0.4 decades
-        assert there == pytest.approx(powers[label.text], abs=0.2)
 
 
 N, NY, NX = 400, 40, 48

@@ -110,7 +110,7 @@ def test_runs_in_their_order_are_told_by_label_or_letter(
         HistoryRow(label, "", None, np.nan, RunFacts(letter, "r.zarr", (8, 8), 9, "", summary=summary))
         for letter, label in zip("AB", labels, strict=True)
     ]
-    (figure,) = history_figures(rows, "label")
+    (figure,) = history_figures(rows, labelled=True)
     axis = figure.draw(Look()).axes[-1].xaxis
     assert list(zip(axis.get_ticklocs(), [t.get_text() for t in axis.get_ticklabels()], strict=True)) == ticks
 

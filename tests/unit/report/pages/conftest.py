@@ -7,14 +7,13 @@ import pytest
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages import report as report_module
 from pchem_pipeline.report.pages.pictures import Drawn
-from pchem_pipeline.report.settings import ReportSettings
 
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Texts without pictures: fast."""
 
-    def dots(figures: Sequence[Figure], settings: ReportSettings) -> dict[str, Drawn]:
+    def dots(figures: Sequence[Figure]) -> dict[str, Drawn]:
         return {figure.name: Drawn("data:image/png;base64,AA==", 10, 10) for figure in figures}
 
     monkeypatch.setattr(report_module, "draw_here", dots)

@@ -284,7 +284,7 @@ def test_tiles_come_in_any_order_and_the_axes_follow(
     finished: StageContext, prepared: Path, tmp_path: Path
 ) -> None:
     fresh_copy(prepared, tmp_path)
-    some = make_context(tmp_path, frames=250, options=Options(tiles="0.0,0.1,0.2"))
+    some = make_context(tmp_path, frames=250, options=Options(roi=(0, 16, 0, NX)))
     write_fit(some)
     assert execute("ensemble", some).state == "partial"
     facts = some.store.attributes("ensemble")

@@ -150,7 +150,7 @@ def test_tasks_can_go_to_threads_and_other_processes(tmp_path, frames, expected,
 
 
 def test_tiles_then_the_rest(tmp_path, frames, expected):
-    part = make_context(tmp_path, frames, options=Options(tiles="1.0"))
+    part = make_context(tmp_path, frames, options=Options(roi=(64, 128, 0, 1)))
     state = execute("histogram", part)
     assert (state.state, state.done, state.total) == ("partial", 1, 3)
     assert not part.store.has("summary/frame_mean")

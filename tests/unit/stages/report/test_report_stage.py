@@ -7,27 +7,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.inspector_material import page_without_pictures
-from helpers.report_material import report_data
 from helpers.written_fit import write_fit
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.compute.executor import SerialExecutor, beside
+from pchem_pipeline.compute.executor import beside
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.report.figures.catalogue import DISCREPANCY_FIGURES, FIGURE_NAMES, report_figures
-from pchem_pipeline.report.pages.pictures import Drawn, draw_figure
-from pchem_pipeline.report.pages.report import RenderedReport
+from pchem_pipeline.report.figures.catalogue import report_figures
 from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import flags
-from pchem_pipeline.report.settings import ReportSettings
 from pchem_pipeline.run.fingerprint import status
-from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.report import report
 from pchem_pipeline.stages.report.pixels import choose_pixels
-from pchem_pipeline.stages.report.report import draw_by_workers, drawing_executor, gather
+from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.run_store import RunStore
 
@@ -39,7 +34,7 @@ def make_context(folder: Path, settings: dict[str, object] | None = None, **run:
         {
             "run": {"tile": 8, **run},
             "simulate": {"shape": [NY, NX], "n_frames": FRAMES, "format": "npy"},
-            "report": {"figure_formats": [], "dpi": 72, **(settings or {})},
+            "report": settings or {},
         }
     )
     return StageContext(config, folder, RunStore.create(folder / "run.zarr"))
@@ -70,26 +65,13 @@ def folder(base: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write without drawing: fast."""
-    monkeypatch.setattr(
-        report, "render_report", lambda data, settings, draw: RenderedReport("page", "{}", {"new.svg": b"x"})
-    )
+    monkeypatch.setattr(report, "render_report", lambda data, draw: {"report.html": "page"})
 
 
 def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
-    context = make_context(folder, {"figure_formats": ["svg"]}, title="My <sensor>")
+    context = make_context(folder, title="My <sensor>")
     assert execute("report", context).state == "complete"
     store = folder / "run.zarr"
-    of_others = {
-        "exposures",
-        "photon_transfer",
-        "map_charge_per_level",
-        "map_spurious_charge",
-        "map_dark_signal",
-    }
-    of_others |= {"map_dark_current"}
-    of_others |= {"methods_gain_error", *(name for _, name in DISCREPANCY_FIGURES)}
-    names = {f"{name}.svg" for name in set(FIGURE_NAMES) - of_others}
-    assert {path.name for path in (store / "figures").iterdir()} == names
     numbers = json.loads((store / "report.json").read_text())
     median = float(np.nanmedian(context.store.read("maps/read_noise_e")))
     assert numbers["summary"]["read_noise_e"]["median"] == pytest.approx(median)
@@ -115,20 +97,10 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_settings_of_the_report_make_only_it_stale(folder: Path) -> None:
     execute("report", make_context(folder))
-    changed = make_context(folder, {"map_stretch": "linear"})
+    changed = make_context(folder, {"pixels": [[0, 1]]})
     state = status(STAGES["report"], changed)
     assert state.state == "stale"
-    assert "report.map_stretch beta -> linear" in state.why
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_figures_that_are_no_longer_made_are_removed_and_others_kept(folder: Path) -> None:
-    figures = folder / "run.zarr" / "figures"
-    figures.mkdir()
-    (figures / "ensemble.png").write_bytes(b"old")
-    (figures / "mine.png").write_bytes(b"mine")
-    execute("report", make_context(folder))
-    assert {path.name for path in figures.iterdir()} == {"mine.png", "new.svg"}
+    assert "report.pixels [] -> [[0, 1]]" in state.why
 
 
 def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder: Path) -> None:
@@ -162,7 +134,7 @@ def test_figures_alone_pack_no_maps(folder: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(report, "read_maps", fail)
     context = make_context(folder)
     data = gather(context.store, context.config, [])
-    assert report_figures(data, ReportSettings())
+    assert report_figures(data)
     with pytest.raises(AssertionError, match="packed"):
         data.inspector()  # type: ignore[misc]
 
@@ -201,7 +173,7 @@ def test_pixels_of_unfinished_tiles_are_not_called_good(folder: Path) -> None:
 def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(exhibit: object, settings: object) -> None:
+    def fail(figure: object) -> None:
         raise MemoryError("no room to draw")
 
     monkeypatch.setattr("pchem_pipeline.stages.report.report.draw_figure", fail)
@@ -236,23 +208,3 @@ def test_few_or_no_pixels_to_choose_from() -> None:
     words = np.array([[2, 2], [8, 2]], dtype=np.uint16)
     assert choose_pixels(nan, nan, words) == [("no fit", 0, 0), ("no fit", 1, 0)]
     assert {(y, x) for _, y, x in choose_pixels(one, one, np.zeros((2, 2), np.uint16))} == {(0, 0), (1, 0)}
-
-
-QUICK = ReportSettings(figure_formats=("png",), dpi=72)
-
-
-def test_figures_are_the_same_whoever_draws_them() -> None:
-    shown = [
-        each
-        for each in report_figures(report_data((12, 16)), QUICK)
-        if each.name in ("fit_status", "component_widths")
-    ]
-    here = {figure.name: draw_figure(figure, QUICK) for figure in shown}
-    reporter = Reporter("off", quiet=True)
-    assert draw_by_workers(2, reporter, "report")(shown, QUICK) == here
-    assert all(isinstance(drawn, Drawn) and drawn.files for drawn in here.values())
-
-
-def test_one_worker_draws_here() -> None:
-    assert isinstance(drawing_executor(1, 9), SerialExecutor)
-    assert isinstance(drawing_executor(8, 1), SerialExecutor)
