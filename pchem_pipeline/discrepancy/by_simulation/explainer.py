@@ -28,14 +28,14 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     refit_maps,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
-from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, chosen, compare
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     HistogramLikelihood,
     PixelLikelihood,
     identifiable_from_histograms,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials
+from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, chosen
+from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, compare
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import (
@@ -218,19 +218,19 @@ class FrameExplainer(Explainer[Explanation]):
         """
         self.work.forget(self.given)
         refitter, settings = self._refitter(), self.prepared.settings
-        trials = Trials(refitter, HistogramLikelihood(self._likelihood))
+        sets = Search(refitter, HistogramLikelihood(self._likelihood))
         own, measured = (explanation.hypotheses, explanation.choice), self._measured(refitter)
-        compare(trials, *own, lambda best: self._left_by(best, refitter), measured, settings.max_rounds)
-        if trials.limit is not None and not trials.complete:
+        compare(sets, *own, lambda best: self._left_by(best, refitter), measured, settings.max_rounds)
+        if sets.limit is not None and not sets.complete:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
             tried = self.work.effort.tried
-            self.limit = EffortSpentError(trials.limit.doing, (t for t in tags if t not in tried)).words()
+            self.limit = EffortSpentError(sets.limit.doing, (t for t in tags if t not in tried)).words()
         # what was found is not lost for the little that is left to do: no limit
-        trials.refitter = refitter = replace(refitter, allow=lambda _: None)
+        sets.refitter = refitter = replace(refitter, allow=lambda _: None)
         told = disagrees(null, self.prepared.z, settings.significance)
         doubtful: tuple[Comparison, Refitted] | None = None
         for _ in range(_MOST_JUDGED):
-            found = chosen(trials, explanation.hypotheses)
+            found = chosen(sets, explanation.hypotheses)
             if found is None:
                 break
             added = refitter.sharpened(found.chosen, settings.extended_replicates)
@@ -239,9 +239,9 @@ class FrameExplainer(Explainer[Explanation]):
                 return self._put(found, added, explanation, certain=True)
             if told and doubtful is None and not kept and refitter.passes_goodness_of_fit(found.chosen):
                 doubtful = found, added
-            trials.tried.remove(found.chosen)
+            sets.rejected.append(found.chosen)
             if 0 < len(kept) < len(added.hypotheses):
-                trials.refit(kept, proven=True)
+                sets.at_best_fit(kept)
         return None if doubtful is None else self._put(*doubtful, explanation, certain=False)
 
     def _closes(self, added: Refitted) -> bool:

@@ -10,10 +10,10 @@ import pytest
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers, may_be_tuned, tuned
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, choose
-from pchem_pipeline.discrepancy.by_simulation.sets.comparison import chosen, compare
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials
+from pchem_pipeline.discrepancy.by_simulation.sets.rivals import chosen
+from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, compare
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -116,9 +116,9 @@ def test_an_effect_that_wrong_numbers_of_another_brought_in_is_not_kept() -> Non
     shifts = (world.parts[0] - world.null.mean, world.parts[1] - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     assert {h.tag for h in choice.best} == {"dark_current_rts", "row_noise"}
-    trials = Trials(world.refitter(), HistogramLikelihood())
-    compare(trials, hypotheses, choice)
-    found = chosen(trials, hypotheses)
+    search = Search(world.refitter(), HistogramLikelihood())
+    compare(search, hypotheses, choice)
+    found = chosen(search, hypotheses)
     assert found is not None
     assert found.chosen.tags == {"dark_current_rts"}
 
@@ -163,8 +163,8 @@ def test_what_an_effect_of_another_package_raises_ends_no_search(strange: type[D
     shifts = (world.parts[0] - world.null.mean, world.parts[1] - world.null.mean)
     choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
     refitter = world.refitter()
-    trials = Trials(refitter, HistogramLikelihood())
-    compare(trials, hypotheses, choice)
-    assert "dark_current_rts" in trials.best.tags
+    search = Search(refitter, HistogramLikelihood())
+    compare(search, hypotheses, choice)
+    assert "dark_current_rts" in search.best.tags
     assert refitter.defects
     assert all("dark_current_rts" in failed for failed in refitter.defects)
