@@ -219,17 +219,15 @@ class HistogramLikelihood:
         pixels = self.of([h.effect for h in hypotheses], number)
         return tuple(hypotheses) if pixels is None else pixels.begun(hypotheses)
 
-    def behind(
-        self, one: Sequence[Effect], other: Sequence[Effect], number: int = MANY_PIXELS
-    ) -> tuple[float, float] | None:
-        """Return how far a set is behind another by so many pixels; see `PixelLikelihood.behind`.
+    def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
+        """Return how far a set is behind another by many pixels; see `PixelLikelihood.behind`.
 
         None also where they differ in what no law of a sample holds.
         """
         tags = {e.tag for e in one} ^ {e.tag for e in other}
         if not all(identifiable_from_histograms(e) for e in (*one, *other) if e.tag in tags):
             return None
-        pixels = self.of((*one, *other), number)
+        pixels = self.of((*one, *other), MANY_PIXELS)
         return None if pixels is None else pixels.behind(one, other)
 
 

@@ -39,7 +39,7 @@ _SPLITS = 2  # train and test frames, whose mean is explained
 #: Replicates at each strength on the way.
 FEW = 6
 ENOUGH = 12  # replicates that tell a scatter
-_MOST_STEPS = 5
+_MOST_STEPS = 5  # corrections of strengths
 _STEPS_OF_EXPENSIVE = 2
 #: Standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
 #: than a single one would by chance.
@@ -242,7 +242,6 @@ class Refitter:
         target: mean of the statistics of train and test frames, shape (m,).
         events: see :class:`~pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints.Noise`.
         present: effects that the model has besides.
-        steps: corrections of the strengths, at most.
         allow: hears which effects are simulated next, and raises an error where the work is at its limit.
         defects: effects that failed, and why; more come to them.
     """
@@ -252,7 +251,6 @@ class Refitter:
     target: FloatArray
     events: FloatArray
     present: tuple[Effect, ...] = ()
-    steps: int = _MOST_STEPS
     allow: Callable[[str], None] = lambda _: None
     defects: dict[str, str] = field(default_factory=dict)
 
@@ -277,7 +275,7 @@ class Refitter:
             EffortSpentError: the work is at its limit.
         """
         best = way.best
-        most = min(self.steps, _STEPS_OF_EXPENSIVE) if is_expensive(best.effects) else self.steps
+        most = _STEPS_OF_EXPENSIVE if is_expensive(best.effects) else _MOST_STEPS
         # after a step that brings so little the next ones bring less
         if best.settled or way.gained < NO_DIFFERENCE or way.taken_so_far >= most:
             return False

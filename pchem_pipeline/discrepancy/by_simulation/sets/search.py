@@ -23,7 +23,6 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR,
     FAR_SHARE_OF_PART,
     PRICE_OF_MORE,
-    Choice,
     Hypothesis,
     firsts,
     fit_set,
@@ -330,8 +329,8 @@ class Search:
 def compare(
     search: Search,
     hypotheses: Sequence[Hypothesis],
-    choice: Choice,
-    beside: Callable[[Refitted], Choice] = lambda _: Choice(),
+    sets: Sequence[tuple[Hypothesis, ...]],
+    beside: Callable[[Refitted], Sequence[tuple[Hypothesis, ...]]] = lambda _: (),
     measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]] = lambda _: (),
     rounds: int = 3,
 ) -> None:
@@ -340,16 +339,15 @@ def compare(
     Args:
         search: out: all that was tried.
         hypotheses: all, the likeliest first.
-        choice: how their sets compare by fingerprints.
-        beside: compares new hypotheses by what they do beside a refitted set.
+        sets: of them, the likeliest by their fingerprints first.
+        beside: returns sets of new hypotheses by what they do beside a refitted set, the likeliest first.
         measured: measures what effects leave, and yields them with it at their best fit.
         rounds: of sets, at most.
     """
     beside = functools.cache(beside)
-    if choice.tried:
-        search.compare((h,) for h in _singles(hypotheses, choice))
-    together = _of_different_effects(one.at_fit() for one in choice.tried if len(one.hypotheses) > 1)
-    search.compare(together[:_MOST_SETS])
+    if sets:
+        search.compare((h,) for h in _singles(hypotheses, sets[0]))
+    search.compare(_of_different_effects(one for one in sets if len(one) > 1)[:_MOST_SETS])
     for _ in range(rounds):
         before = search.best
         search.measure(measured)
@@ -360,18 +358,20 @@ def compare(
             return
 
 
-def _singles(hypotheses: Sequence[Hypothesis], choice: Choice) -> list[Hypothesis]:
+def _singles(hypotheses: Sequence[Hypothesis], best: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return hypotheses to be tried alone: those of the best set, and the likeliest of all."""
-    chosen = firsts(choice.best)
+    chosen = firsts(best)
     for hypothesis in firsts(hypotheses):
-        same = sum(h.tag == hypothesis.tag for h in chosen)
+        same = [h for h in chosen if h.tag == hypothesis.tag]
         most = 1 if type(hypothesis.effect).random_realisation else MOST_STARTS
-        if same < most and len(chosen) < _MOST_SINGLES and hypothesis not in chosen:
+        if len(same) < most and len(chosen) < _MOST_SINGLES and not any(alike(hypothesis, h) for h in same):
             chosen.append(hypothesis)
     return chosen
 
 
-def _grown(search: Search, beside: Callable[[Refitted], Choice]) -> list[tuple[Hypothesis, ...]]:
+def _grown(
+    search: Search, beside: Callable[[Refitted], Sequence[tuple[Hypothesis, ...]]]
+) -> list[tuple[Hypothesis, ...]]:
     """Return sets that hold one of the best so far and what stands out beside it.
 
     One that is strong hides or distorts what the frames show of the others.
@@ -383,17 +383,11 @@ def _grown(search: Search, beside: Callable[[Refitted], Choice]) -> list[tuple[H
         # what a set has besides is in vain where a part of it is better, and a part of a better set has grown
         if near and not any(one.tags <= other.tags or other.tags <= one.tags for other in seeds):
             seeds.append(one)
-    choices = [(one.hypotheses, beside(one)) for one in seeds[:_MOST_SEEDS]]
     grown: list[tuple[Hypothesis, ...]] = []
-    for size, most in _MOST_GROWN.items():
-        found = [
-            (each.penalised_log_likelihood, (*own, *each.at_fit()))
-            for own, choice in choices
-            for each in choice.tried
-            if len(each.hypotheses) == size
-        ]
-        found.sort(key=lambda item: item[0], reverse=True)
-        grown += _of_different_effects([members for _, members in found])[:most]
+    for one in seeds[:_MOST_SEEDS]:
+        others = _of_different_effects(beside(one))
+        for size, most in _MOST_GROWN.items():
+            grown += [(*one.hypotheses, *each) for each in others if len(each) == size][:most]
     return grown
 
 

@@ -18,12 +18,11 @@ from pchem_pipeline.discrepancy.by_simulation.additions import (
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
-    Choice,
     Hypothesis,
-    choose,
-    score_set,
+    likeliest_sets,
 )
-from pchem_pipeline.discrepancy.by_simulation.explainer import Explanation, FrameExplainer
+from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened
+from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
@@ -100,25 +99,25 @@ class World:
     def refitter(self) -> Refitter:
         return Refitter(self.draw, self.null, self.z.both, np.zeros(M))
 
-    def choice(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> Choice:
-        shifts = (self.z.train - self.null.mean - mean, self.z.test - self.null.mean - mean)
-        return choose(hypotheses, shifts, self.refitter().noise(self.null.covariance, 40))
+    def likely(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> list[tuple[Hypothesis, ...]]:
+        noise = self.refitter().noise(self.null.covariance, 40)
+        return likeliest_sets(hypotheses, self.z.both - self.null.mean - mean, noise)
 
     def compare(
         self, *hypotheses: Hypothesis, beside: Sequence[Hypothesis] = (), **how: Any
     ) -> Comparison | None:
-        grown = (lambda one: self.choice(*beside, mean=one.mean)) if beside else (lambda _: Choice())
-        return self.best_of(hypotheses, self.choice(*hypotheses), beside=grown, **how)
+        grown = (lambda one: self.likely(*beside, mean=one.mean)) if beside else (lambda _: [])
+        return self.best_of(hypotheses, self.likely(*hypotheses), beside=grown, **how)
 
     def best_of(
         self,
         hypotheses: Sequence[Hypothesis],
-        choice: Choice,
+        sets: list[tuple[Hypothesis, ...]],
         likelihood: HistogramLikelihood | None = None,
         **how: Any,
     ) -> Comparison | None:
         search = Search(self.refitter(), likelihood or HistogramLikelihood())
-        compare(search, hypotheses, choice, **how)
+        compare(search, hypotheses, sets, **how)
         search.refitter = replace(search.refitter, allow=lambda _: None)
         return chosen(search, hypotheses)
 
@@ -282,9 +281,7 @@ def likelihood_of(behind: Callable[[str, str], tuple[float, float] | None]) -> H
     """Return a likelihood that says so of the first effects of two sets."""
 
     class Told(HistogramLikelihood):
-        def behind(
-            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
-        ) -> tuple[float, float] | None:
+        def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
             return behind(one[0].tag, other[0].tag)
 
     return Told()
@@ -330,7 +327,7 @@ def seeds(refitter: Refitter, *tried: Refitted) -> list[frozenset[str]]:
     """Return the sets, of those that were tried, beside which others are asked for."""
     asked: list[frozenset[str]] = []
     search = Search(refitter, HistogramLikelihood(), [Trial.of(one) for one in tried])
-    _grown(search, lambda one: asked.append(one.tags) or Choice())  # type: ignore[func-returns-value]
+    _grown(search, lambda one: asked.append(one.tags) or [])  # type: ignore[func-returns-value]
     return asked
 
 
@@ -349,10 +346,7 @@ def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -
     true = effect("row_noise", 0.3), effect("frame_noise", 0.3), effect("interpixel_capacitance", 0.1)
     world = World(true)
     row, frame, drift = (hypothesis(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift"))
-    shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
-    noise = world.refitter().noise(world.null.covariance, 40)
-    choice = Choice((score_set([row, frame, drift], shifts, noise),), 100.0)
-    found = world.best_of([row, frame, drift], choice)
+    found = world.best_of([row, frame, drift], [(row, frame, drift)])
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
@@ -542,12 +536,10 @@ def add(
     prepared = Prepared(settings, "frames", unused, unused, world.null, z, work.effort, {})
     search = FrameExplainer(prepared, unused, work, unused, judge, ())
     monkeypatch.setattr(search, "_refitter", lambda: world.refitter())
-    monkeypatch.setattr(search, "_left_by", lambda *_: Choice())
+    monkeypatch.setattr(search, "_left_by", lambda *_: [])
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
     monkeypatch.setattr(search, "_measured", lambda _: lambda kept: ())
-    shifts = (z.train - world.null.mean, z.test - world.null.mean)
-    choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
-    return search, search.add(Explanation(hypotheses, choice), world.null)
+    return search, search.add(Screened(hypotheses, world.likely(*hypotheses), 0.0), world.null)
 
 
 def test_slopes_beyond_all_that_an_effect_does_do_not_lift_the_floor() -> None:
