@@ -1,8 +1,8 @@
 """Effects are told apart in frames by simulation: what each would do to many statistics, refit included.
 
 The frames are split in three; effects are estimated and compared on the first two parts, and the gap that
-remains is measured on the third. That one has no part in finding or fitting anything; what it does not show at
-all is not named.
+remains is measured on the third. That one has no part in finding or fitting anything; what it does not show
+at all is not named.
 """
 
 from __future__ import annotations

@@ -178,18 +178,16 @@ def _try_placebo(
         search.trials.append(trial)
 
 
-def own_signature(own: FloatArray, others: FloatArray, left: FloatArray, noise: FloatArray) -> bool:
-    """Tell whether an effect has statistics of its own: left by the others, untouched by them, and explained.
+def own_statistics(own: FloatArray, others: FloatArray, noise: FloatArray) -> NDArray[np.bool_]:
+    """Return which statistics an effect moves, and others leave alone, (m,).
 
     Args:
         own: what the effect does, shape (m,).
         others: what the others do, shape (e, m).
-        left: what their best fit leaves, in its errors, shape (m,).
         noise: standard deviations of the statistics with the others, shape (m,).
     """
     touched = np.abs(others).max(axis=0, initial=0.0)
-    mine = (np.abs(own) > CLEAR * noise) & (touched < _UNTOUCHED * np.abs(own))
-    return bool(np.any(mine & (np.abs(left) > CERTAIN) & (left * own > 0.0)))
+    return np.asarray((np.abs(own) > CLEAR * noise) & (touched < _UNTOUCHED * np.abs(own)))
 
 
 def _all_seen(search: Search, one: Refitted) -> bool:
@@ -201,13 +199,19 @@ def _all_seen(search: Search, one: Refitted) -> bool:
         # the same effect in two places: without it nothing is left to compare with
         return len(one.hypotheses) == 1
     refitter, complete = search.refitter, search.refitter.passes_goodness_of_fit(one)
+    # without it the others would be fitted stronger, not weaker: what they touch now is none of its own
+    noise = refitter.scatter(refitter.null.covariance, len(one.vectors))
+    apart = (own_statistics(part, np.delete(one.parts, i, axis=0), noise) for i, part in enumerate(one.parts))
+    if not complete and not all(own.any() for own in apart):
+        return False
     for hypothesis in one.hypotheses:
         others = search.at_best_fit([h for h in one.hypotheses if h is not hypothesis])
         if others is None:
             return False
         part = hypothesis.fingerprint
         noise = refitter.scatter(others.covariance, len(others.vectors))
-        seen = own_signature(part, others.parts, others.rest, noise)
+        left = (np.abs(others.rest) > CERTAIN) & (others.rest * part > 0.0)
+        seen = bool((own_statistics(part, others.parts, noise) & left).any())
         if not seen and not (complete and _seen_beside(refitter, part, others)):
             return False
     return True
