@@ -80,11 +80,12 @@ def recovered_strength(
         seed: of the first stack; those of the others follow.
 
     Raises:
-        ConfigError: the effect has no strength.
+        ConfigError: the effect has no strength, or depends on rows or frames that it does not declare.
         InputError: the frames are too few, or not as described.
     """
     if not effect.strength:
         raise ConfigError(f"effect {effect.tag!r} has no strength; name the field that scales it")
+    _check_reach(effect, shape, seed)
     found = np.full(stacks, np.nan)
     for i in range(stacks):
         frames = _simulated(effect, n_frames, shape, seed + i) if camera is None else camera(seed + i)
@@ -93,6 +94,24 @@ def recovered_strength(
         if hypotheses:
             found[i] = getattr(hypotheses[0], effect.strength)
     return RecoveredStrength(float(getattr(effect, effect.strength)), found)
+
+
+def _check_reach(effect: Effect, shape: tuple[int, int], seed: int) -> None:
+    """Raise an error where single rows or later frames are not what they are in the whole: bands differ."""
+    settings = SimulateSettings(shape=shape, n_frames=_BLOCK, seed=seed, effects=(effect,))
+    truth, middle, later = draw_truth(settings), shape[0] // 2, _BLOCK // 2
+    whole = simulate_block(truth, settings, (0, _BLOCK), electron_frames=0)[0]
+    band = simulate_block(truth, settings, (0, _BLOCK), (middle, shape[0]), electron_frames=0)[0]
+    block = simulate_block(truth, settings, (later, _BLOCK), electron_frames=0)[0]
+    for same, what, declared in (
+        (np.array_equal(whole[:, middle:], band), "rows", "reach_rows"),
+        (np.array_equal(whole[later:], block), "frames", "reach_frames"),
+    ):
+        if not same:
+            raise ConfigError(
+                f"effect {effect.tag!r}: `apply` gets a band of rows and a block of frames, and needs {what} "
+                f"outside of it; set `{declared}` to how many"
+            )
 
 
 def _simulated(

@@ -57,3 +57,25 @@ def test_frames_of_another_simulator_are_taken():
 def test_an_effect_without_a_strength_is_refused():
     with pytest.raises(ConfigError, match="'clipping' has no strength"):
         recovered_strength(Clipping(high=900.0))
+
+
+class RowBefore(ColumnNoise):
+    """Adds a share of the row before, without saying so."""
+
+    def apply(self, values, context):
+        """Return each row with what the one before it in the array has."""
+        return values + 0.5 * np.roll(values, 1, axis=1)
+
+
+class FrameBefore(ColumnNoise):
+    """Adds a share of the frame before, without saying so."""
+
+    def apply(self, values, context):
+        """Return each frame with what the one before it in the array has."""
+        return values + 0.5 * np.roll(values, 1, axis=0)
+
+
+@pytest.mark.parametrize(("effect", "declared"), [(RowBefore, "reach_rows"), (FrameBefore, "reach_frames")])
+def test_an_effect_that_reads_more_than_it_declares_is_refused(effect, declared):
+    with pytest.raises(ConfigError, match=f"set `{declared}` to how many"):
+        recovered_strength(effect(column_noise_dn=1.0), **STACKS)
