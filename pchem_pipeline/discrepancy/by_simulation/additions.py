@@ -25,8 +25,8 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
-from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, Contender, unrelated
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, lesser
+from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, Contender, unrelated
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import NullModel, misfits
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS

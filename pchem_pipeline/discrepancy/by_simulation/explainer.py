@@ -1,8 +1,8 @@
 """Effects are told apart in frames by simulation: what each would do to many statistics, refit included.
 
-The frames are split in three; effects are estimated on the first two parts, compared by cross-validation
-between them, and the gap that remains is measured on the third. That one has no part in finding or fitting
-anything; what it does not show at all is not named.
+The frames are split in three; effects are estimated and compared on the first two parts, and the gap that
+remains is measured on the third. That one has no part in finding or fitting anything; what it does not show
+at all is not named.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.additions import Extension
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper, candidate_classes, serial
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Choice, Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screening, noise_of_splits
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened, Screening, noise_of_splits
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained
@@ -28,14 +28,14 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     refit_maps,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
-from pchem_pipeline.discrepancy.by_simulation.sets.comparison import Comparison, chosen, compare
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     HistogramLikelihood,
     PixelLikelihood,
     identifiable_from_histograms,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials
+from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, chosen
+from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, compare
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import (
@@ -117,16 +117,8 @@ def find_discrepancies(
     return search(FrameExplainer.begin(observed, settings, classes, tuple(model), mapper), tell)
 
 
-@dataclass(frozen=True)
-class Explanation:
-    """All hypotheses, and how their sets compare."""
-
-    hypotheses: tuple[Hypothesis, ...]
-    choice: Choice
-
-
 @dataclass
-class FrameExplainer(Explainer[Explanation]):
+class FrameExplainer(Explainer[Screened]):
     """Tells effects apart in frames.
 
     Attributes:
@@ -202,14 +194,14 @@ class FrameExplainer(Explainer[Explanation]):
         """Tell whether some statistic deviates so far that a candidate may explain it with others."""
         return suspicious(null, self.prepared.z)
 
-    def explain(self, null: NullModel, disagreed: bool) -> Explanation | None:
-        """Simulate what candidates would do, and choose the set that best predicts held-out frames."""
+    def explain(self, null: NullModel, disagreed: bool) -> Screened | None:
+        """Simulate what candidates would do; None where data agree and no set predicts held-out frames."""
         self.work.effort.check("the candidates were compared")
-        hypotheses, choice = self.screening.of(self.given, null)
+        screened = self.screening.of(self.given, null)
         self.work.effort.leave_for_fits()
-        return Explanation(hypotheses, choice) if disagreed or choice.advantage > CONVINCING else None
+        return screened if disagreed or screened.gain > CONVINCING else None
 
-    def add(self, explanation: Explanation, null: NullModel) -> NullModel | None:
+    def add(self, explanation: Screened, null: NullModel) -> NullModel | None:
         """Put the effects of the best refitted set into the model; None where none is established.
 
         Asked of the strengths as the data give them, and of the final frames. Where that fails, what is left
@@ -218,19 +210,19 @@ class FrameExplainer(Explainer[Explanation]):
         """
         self.work.forget(self.given)
         refitter, settings = self._refitter(), self.prepared.settings
-        trials = Trials(refitter, HistogramLikelihood(self._likelihood))
-        own, measured = (explanation.hypotheses, explanation.choice), self._measured(refitter)
-        compare(trials, *own, lambda best: self._left_by(best, refitter), measured, settings.max_rounds)
-        if trials.limit is not None and not trials.complete:
+        sets = Search(refitter, HistogramLikelihood(self._likelihood))
+        own, measured = (explanation.hypotheses, explanation.sets), self._measured(refitter)
+        compare(sets, *own, lambda best: self._left_by(best, refitter), measured, settings.max_rounds)
+        if sets.limit is not None and not sets.complete:
             tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
             tried = self.work.effort.tried
-            self.limit = EffortSpentError(trials.limit.doing, (t for t in tags if t not in tried)).words()
+            self.limit = EffortSpentError(sets.limit.doing, (t for t in tags if t not in tried)).words()
         # what was found is not lost for the little that is left to do: no limit
-        trials.refitter = refitter = replace(refitter, allow=lambda _: None)
+        sets.refitter = refitter = replace(refitter, allow=lambda _: None)
         told = disagrees(null, self.prepared.z, settings.significance)
         doubtful: tuple[Comparison, Refitted] | None = None
         for _ in range(_MOST_JUDGED):
-            found = chosen(trials, explanation.hypotheses)
+            found = chosen(sets, explanation.hypotheses)
             if found is None:
                 break
             added = refitter.sharpened(found.chosen, settings.extended_replicates)
@@ -239,9 +231,9 @@ class FrameExplainer(Explainer[Explanation]):
                 return self._put(found, added, explanation, certain=True)
             if told and doubtful is None and not kept and refitter.passes_goodness_of_fit(found.chosen):
                 doubtful = found, added
-            trials.tried.remove(found.chosen)
+            sets.rejected.append(found.chosen)
             if 0 < len(kept) < len(added.hypotheses):
-                trials.refit(kept, proven=True)
+                sets.at_best_fit(kept)
         return None if doubtful is None else self._put(*doubtful, explanation, certain=False)
 
     def _closes(self, added: Refitted) -> bool:
@@ -251,9 +243,7 @@ class FrameExplainer(Explainer[Explanation]):
             return after.at_floor or after.value < _CLEARLY_LESS * before.value
         return not self.accept.widens(added)
 
-    def _put(
-        self, found: Comparison, added: Refitted, explanation: Explanation, *, certain: bool
-    ) -> NullModel:
+    def _put(self, found: Comparison, added: Refitted, explanation: Screened, *, certain: bool) -> NullModel:
         own = self.accept, found, added, explanation.hypotheses, certain
         self.extension = Extension.of(self.work, self.given, *own)
         return self.extension.last
@@ -283,8 +273,8 @@ class FrameExplainer(Explainer[Explanation]):
         events = np.asarray(noise_of_splits(first, 2, data.settings.model_error).events)
         return Refitter(draw, first, data.z.both, events, present, allow=allow, defects=data.defects)
 
-    def _left_by(self, best: Refitted, refitter: Refitter) -> Choice:
-        """Compare what candidates would do beside a refitted set: what that hid stands out there."""
+    def _left_by(self, best: Refitted, refitter: Refitter) -> list[tuple[Hypothesis, ...]]:
+        """Return what is likely beside a refitted set: what that hid stands out there."""
         null = NullModel.from_replicates(self.prepared.first.names, best.vectors, self.prepared.first)
         null = null.shifted(np.expm1(best.change) @ best.slopes)
         return self.screening.beside(refitter.model(best.effects), null, best.slopes)

@@ -14,8 +14,9 @@ from pchem_pipeline.discrepancy.by_simulation.additions import without_better_re
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
-    choose,
     fit_set,
+    held_out_gain,
+    likeliest_sets,
     meets_itself,
     seconds,
     tolerance,
@@ -174,16 +175,18 @@ def test_factors_and_their_errors_are_those_of_least_squares() -> None:
     assert np.all(np.abs(pulls_.std(axis=0) - 1) < 5 / np.sqrt(800))
 
 
-def test_the_right_one_of_three_is_named() -> None:
+def test_the_right_one_of_three_is_the_likeliest() -> None:
     rng = np.random.default_rng(15)
     prints = {tag: rng.normal(size=40) for tag in ("row_noise", "frame_noise", "exposure_drift")}
     hypotheses = [_hypothesis(tag, print_) for tag, print_ in prints.items()]
-    noise = Noise(UNIT, 0.1)
-    shifts = tuple(3.0 * prints["frame_noise"] + rng.normal(size=40) for _ in range(2))
-    choice = choose(hypotheses, (shifts[0], shifts[1]), noise)
-    assert {h.tag for h in choice.best} == {"frame_noise"}
-    others = [one for one in choice.tried if "frame_noise" not in one.tags]
-    assert all(one.score < choice.tried[0].score - 5.0 for one in others)
+    noise = Noise(UNIT.times(0.5), 0.1)
+    shift = 3.0 * prints["frame_noise"] + rng.normal(size=40) / np.sqrt(2.0)
+    sets = likeliest_sets(hypotheses, shift, noise)
+    assert {h.tag for h in sets[0]} == {"frame_noise"}
+    best = fit_set(sets[0], shift, noise).log_score(shift, noise)
+    for other in ("row_noise", "exposure_drift"):
+        fit = fit_set([_hypothesis(other, prints[other])], shift, noise)
+        assert fit.log_score(shift, noise) < best - 5.0
 
 
 def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_sensor() -> None:
@@ -197,30 +200,29 @@ def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_senso
     hypotheses = [_hypothesis("row_noise", left + right + rng.normal(size=40)), *placed]
     hypotheses += seconds(hypotheses)
     assert [h.tag for h in hypotheses] == ["row_noise", "row_noise", "row_noise", "row_noise 2"]
-    shifts = tuple(3.0 * left + 2.0 * right + rng.normal(size=40) for _ in range(2))
-    choice = choose(hypotheses, (shifts[0], shifts[1]), Noise(UNIT, 0.05))
-    assert [h.effect.region for h in choice.best] == regions
-    assert all(not meets_itself(one.hypotheses) for one in choice.tried)
-    assert all("row_noise" in one.tags for one in choice.tried)  # none is a second one alone
-    keys = {h.effect.key for h in choice.best}
-    assert len(keys) == 2
+    shift = 3.0 * left + 2.0 * right + rng.normal(size=40) / np.sqrt(2.0)
+    sets = likeliest_sets(hypotheses, shift, Noise(UNIT.times(0.5), 0.05))
+    assert [h.effect.region for h in sets[0]] == regions
+    assert all(not meets_itself(one) for one in sets)
+    assert all("row_noise" in {h.tag for h in one} for one in sets)  # none is a second one alone
+    assert len({h.effect.key for h in sets[0]}) == 2
 
 
-def test_nothing_is_chosen_where_nothing_is() -> None:
+def test_nothing_predicts_held_out_samples_where_nothing_is() -> None:
     rng = np.random.default_rng(18)
-    hypotheses = [
-        _hypothesis("row_noise", rng.normal(size=40)),
-        _hypothesis("frame_noise", rng.normal(size=40)),
-    ]
-    chosen = [
-        choose(
-            hypotheses,
-            (rng.normal(size=40), rng.normal(size=40)),
-            Noise(UNIT, 0.1),
-        )
-        for _ in range(50)
-    ]
-    assert sum(choice.advantage > 0.0 for choice in chosen) <= 2
+    gains = {}
+    for size in (0.0, 2.0):
+        prints = rng.normal(size=(50, 40))
+        gains[size] = [
+            held_out_gain(
+                [_hypothesis("row_noise", each)],
+                (size * each + rng.normal(size=40), size * each + rng.normal(size=40)),
+                Noise(UNIT, 0.1),
+            )
+            for each in prints
+        ]
+    assert np.sum(np.array(gains[0.0]) > 0.0) <= 1
+    assert np.min(gains[2.0]) > 10.0
 
 
 def test_the_details_of_an_exact_count_show_nowhere_else() -> None:

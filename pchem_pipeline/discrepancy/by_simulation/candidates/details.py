@@ -62,11 +62,6 @@ class _Detail:
     slope: FloatArray
 
 
-def has_numbers(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> bool:
-    """Tell whether effects have numbers that are tuned by simulation."""
-    return bool(_numbers(refitter, hypotheses))
-
-
 def may_be_tuned(refitter: Refitter, one: Refitted) -> bool:
     """Tell whether what a set leaves lies where effects move it whose numbers are not known."""
     places = sorted({place for place, _ in _numbers(refitter, one.hypotheses)})

@@ -5,8 +5,8 @@ science attributes warming (Hasselmann 1997; Allen and Tett 1999): ``y = sum_e c
 >= 0``. The noise has the covariance of the null replicates, and a relative error of each fingerprint on top,
 since the details of a real effect are never those of the library.
 
-Every set of up to three candidates is fitted on one split and scored on the other, both ways round; the
-scores, less a price for every effect, say which sets are worth a refit of the pixels.
+Sets of up to three candidates are compared by their likelihood, less a price for every effect: the best are
+worth a refit of the pixels.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LEAK = 0.1
 LARGEST_DECREASE, _LARGEST_INCREASE = 0.75, 3.0
 PRICE_OF_MORE = 6.0  # nats for every further one
 _LARGEST_SET = 3
-_SHORTLIST = 9
+_SHORTLIST = (4, 3, 2)  # hypotheses that are taken alone, beside the best one, and beside the best two
 #: Nats behind from which on a fingerprint is no rival of a right set, and share of what there is to explain,
 #: in addition, for a set that leaves something.
 FAR, FAR_SHARE_OF_PART = 40.0, 0.5
@@ -122,6 +122,10 @@ class SetFit:
         """Tell whether all strengths are what the data ask for, to ``close`` or half a standard error."""
         return bool(np.all(np.abs(self.factors - 1.0) < np.maximum(close, self.stderr / 2.0)))
 
+    def at_best(self) -> tuple[Hypothesis, ...]:
+        """Return the set at the fitted strengths."""
+        return tuple(h.times(float(c)) for h, c in zip(self.hypotheses, self.factors, strict=True))
+
     def log_score(self, shift: FloatArray, noise: Noise) -> float:
         """Return the Gaussian log density of a shift of statistics, up to a constant, nats."""
         parts = self.parts
@@ -198,73 +202,17 @@ def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -
     return SetFit(tuple(hypotheses), factors, stderr, np.asarray(counted.any(axis=1)))
 
 
-@dataclass(frozen=True)
-class ScoredSet:
-    """A set of effects and how well it predicts.
+def held_out_gain(
+    members: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
+) -> float:
+    """Return how much better a set, fitted to each split, predicts the other one than no effect, nats.
 
-    Attributes:
-        fits: of the first and the second split.
-        score: held-out log score of both directions, nats, relative to no effect.
+    Less the price of its effects: none is there unless something speaks for it.
     """
-
-    fits: tuple[SetFit, SetFit]
-    score: float
-
-    @property
-    def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """The set."""
-        return self.fits[0].hypotheses
-
-    @property
-    def tags(self) -> frozenset[str]:
-        """Their tags."""
-        return frozenset(h.tag for h in self.hypotheses)
-
-    def at_fit(self) -> tuple[Hypothesis, ...]:
-        """Return the set at the strengths fitted to both splits."""
-        factors = np.sqrt(self.fits[0].factors * self.fits[1].factors)
-        factors = np.where(factors > 0.0, factors, 1.0)
-        return tuple(h.times(float(c)) for h, c in zip(self.hypotheses, factors, strict=True))
-
-    @property
-    def penalised_log_likelihood(self) -> float:
-        """Score less the price of its effects, nats: none is there unless something speaks for it."""
-        return self.score - PRICE - PRICE_OF_MORE * (len(self.hypotheses) - 1)
-
-
-@dataclass(frozen=True)
-class Choice:
-    """How sets of effects compare by their fingerprints.
-
-    Attributes:
-        tried: all that improve on no effect at all, the best first.
-        advantage: held-out log score of the best one over no effect, less its price, nats; 0: there is none.
-    """
-
-    tried: tuple[ScoredSet, ...] = ()
-    advantage: float = 0.0
-
-    @property
-    def best(self) -> tuple[Hypothesis, ...]:
-        """The best set; empty if none improves."""
-        return self.tried[0].hypotheses if self.tried else ()
-
-
-def score_set(
-    hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
-) -> ScoredSet:
-    """Fit a set on each split and score it on the other.
-
-    Of effects that an exact count asks for, both splits have the strength of their mean: an event proves
-    itself, and need not come again.
-    """
-    first, second = (fit_set(hypotheses, shift, noise) for shift in shifts)
-    if (first.certain | second.certain).any():
-        mean = fit_set(hypotheses, (shifts[0] + shifts[1]) / 2.0, noise)
-        first, second = (
-            replace(fit, factors=np.where(mean.certain, mean.factors, fit.factors)) for fit in (first, second)
-        )
-    return ScoredSet((first, second), first.log_score(shifts[1], noise) + second.log_score(shifts[0], noise))
+    predicted = (fit_set(members, shift, noise) for shift in shifts)
+    scores = (fit.log_score(shift, noise) for fit, shift in zip(predicted, reversed(shifts), strict=True))
+    without = sum(log_density(shift, noise.covariance) for shift in shifts)
+    return sum(scores) - without - PRICE - PRICE_OF_MORE * (len(members) - 1)
 
 
 def share_place(effects: Iterable[Effect]) -> bool:
@@ -300,79 +248,63 @@ def firsts(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     return [h for h in hypotheses if (h.effect.tag, h.number - 1) not in tags]
 
 
-def choose(hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise) -> Choice:
-    """Compare all sets of up to three of the most promising hypotheses.
+def likeliest_sets(
+    hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise
+) -> list[tuple[Hypothesis, ...]]:
+    """Return sets of up to three effects at their best strengths, those of the largest likelihood first.
+
+    Less the price of their effects, and only those that are likelier than no effect. Each effect is there by
+    more than its error, and seen among the others.
 
     Args:
         hypotheses: candidates; several may be of one effect.
-        shifts: measured statistics minus null mean of the two splits, shape (m,) each.
-        noise: covariance of a shift.
+        shift: measured statistics minus null mean, shape (m,).
+        noise: covariance of the shift.
     """
-    shortlist, alone = _shortlist(hypotheses, shifts, noise), set(firsts(hypotheses))
-    sets = []
+    shortlist, alone = _shortlist(hypotheses, shift, noise), set(firsts(hypotheses))
+    found: list[tuple[float, tuple[Hypothesis, ...]]] = []
     for size in range(1, _LARGEST_SET + 1):
         for members in itertools.combinations(shortlist, size):
             once = len({h.tag for h in members}) == size and not meets_itself(members)
             if once and alone.issuperset(firsts(members)) and not share_place(h.effect for h in members):
-                scored = score_set(members, shifts, noise)
-                if _all_needed(scored, shifts, noise):
-                    sets.append(scored)
-    base = sum(log_density(shift, noise.covariance) for shift in shifts)
-    sets = [s for s in sets if s.penalised_log_likelihood > base]
-    sets.sort(key=lambda s: s.penalised_log_likelihood, reverse=True)
-    return Choice(tuple(sets), sets[0].penalised_log_likelihood - base if sets else 0.0)
+                fit = fit_set(members, shift, noise)
+                if _all_needed(fit, shift, noise):
+                    found.append((fit.log_score(shift, noise) - PRICE_OF_MORE * (size - 1), fit.at_best()))
+    least = log_density(shift, noise.covariance) + PRICE
+    likely = sorted((one for one in found if one[0] > least), key=lambda one: -one[0])
+    return [members for _, members in likely]
 
 
-def _shortlist(
-    hypotheses: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
-) -> list[Hypothesis]:
-    """Return the hypotheses that do best alone, and those that do best with the best ones."""
-    chosen: list[Hypothesis] = []
-    alone = firsts(hypotheses)
+def _shortlist(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
+    """Return the hypotheses that do best alone, and those that do best beside the best ones."""
+    alone, chosen, best = firsts(hypotheses), list[Hypothesis](), list[Hypothesis]()
 
-    def take(count: int, others: Sequence[Hypothesis]) -> None:
-        scored = []
-        for hypothesis in alone:
-            if hypothesis in chosen or hypothesis.tag in {h.tag for h in others}:
-                continue
-            scored.append((score_set([*others, hypothesis], shifts, noise).score, hypothesis))
-        scored.sort(key=lambda pair: pair[0], reverse=True)
-        chosen.extend(h for _, h in scored[:count])
+    def score(one: Hypothesis) -> float:
+        return fit_set([*best, one], shift, noise).log_score(shift, noise)
 
-    take(4, ())
-    if chosen:
-        best = chosen[0]
-        take(3, (best,))
-        second = max(
-            (h for h in chosen if h.tag != best.tag),
-            key=lambda h: score_set([best, h], shifts, noise).score,
-            default=None,
-        )
-        if second is not None:
-            take(_SHORTLIST - len(chosen), (best, second))
+    for most in _SHORTLIST:
+        used = {h.tag for h in best}
+        left = [h for h in alone if h.tag not in used and h not in chosen]
+        chosen += sorted(left, key=score, reverse=True)[:most]
+        beside = [h for h in chosen if h.tag not in used]
+        best += [max(beside, key=score)] if beside else []
     # an effect that does well in one region may do so in others at once
     kept = {h.effect.tag for h in chosen if h.effect.region is not None}
     return chosen + [h for h in hypotheses if h.effect.tag in kept and h not in alone]
 
 
-def _all_needed(scored: ScoredSet, shifts: tuple[FloatArray, FloatArray], noise: Noise) -> bool:
-    """Tell whether every effect of the set is there by more than its error, and seen among the others.
+def _all_needed(fit: SetFit, shift: FloatArray, noise: Noise) -> bool:
+    """Test whether every effect of a set is there by more than its error, and seen among the others.
 
     Seen means: some statistic deviates, in the direction of the effect, from what the others make of it.
     Where a strong effect moves a statistic, a weak one is lost in the details of the strong one; and
     one without a statistic of its own only helps out where others fit badly.
     """
-    first, second = scored.fits
-    factor = (first.factors + second.factors) / 2.0
-    error = np.hypot(first.stderr, second.stderr) / 2.0
-    there = factor > POSSIBLE * error
-    if not np.all(there | first.certain | second.certain):
+    parts = fit.parts
+    if not np.all((fit.factors > POSSIBLE * fit.stderr) | fit.certain):
         return False
-    parts = (first.parts + second.parts) / 2.0
-    shift = (shifts[0] + shifts[1]) / 2.0
-    both = replace(noise, covariance=noise.covariance.times(0.5))
     return len(parts) == 1 or all(
-        seen_among(part, np.delete(parts, member, axis=0), shift, both) for member, part in enumerate(parts)
+        seen_among(part, np.delete(parts, member, axis=0), shift, noise) for member, part in enumerate(parts)
     )
 
 

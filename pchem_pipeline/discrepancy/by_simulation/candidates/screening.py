@@ -14,10 +14,10 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import (
     placebo_for,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
-    Choice,
     Hypothesis,
     Noise,
-    choose,
+    held_out_gain,
+    likeliest_sets,
     seconds,
     share_place,
 )
@@ -38,6 +38,21 @@ def noise_of_splits(null: NullModel, splits: int, model_error: float) -> Noise:
     """Return the noise of the mean of so many splits less the mean of the replicates."""
     covariance = null.covariance.times(1.0 / splits + 1.0 / null.n_replicates)
     return Noise(covariance, model_error, null.events / splits)
+
+
+@dataclass(frozen=True)
+class Screened:
+    """What the candidates would do beside a model.
+
+    Attributes:
+        hypotheses: all, the likeliest first.
+        sets: of them, the likeliest first.
+        gain: by which the first of these predicts held-out frames better than none, less its price, nats.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    sets: list[tuple[Hypothesis, ...]]
+    gain: float
 
 
 @dataclass(frozen=True)
@@ -62,7 +77,7 @@ class Screening:
     model_error: float
     defects: dict[str, str] = field(default_factory=dict)
 
-    def of(self, model: tuple[Effect, ...], null: NullModel) -> tuple[tuple[Hypothesis, ...], Choice]:
+    def of(self, model: tuple[Effect, ...], null: NullModel) -> Screened:
         """Ask what they would do beside a model: everywhere and in the parts, split by split.
 
         Args:
@@ -70,7 +85,7 @@ class Screening:
             null: of that model.
 
         Returns:
-            All hypotheses, the likeliest first, and how their sets compare.
+            What they would do.
         """
         simulator = self._simulator(model, null, "0")
         evidence = (self.observed.plain, *self.observed.parts[:2])
@@ -93,10 +108,16 @@ class Screening:
         # what they do to pixels that are led astray says little about them: others do not go before them
         hypotheses.sort(key=lambda h: all(h.effect is not each for each in suggested))
         hypotheses += seconds(hypotheses)
-        return tuple(hypotheses), self._compared(hypotheses, null)
+        sets = likeliest_sets(hypotheses, shift, noise)
+        shifts = self.z.train - null.mean, self.z.test - null.mean
+        of_split = noise_of_splits(null, 1, self.model_error)
+        gain = held_out_gain(sets[0], shifts, of_split) if sets else 0.0
+        return Screened(tuple(hypotheses), sets, gain)
 
-    def beside(self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray) -> Choice:
-        """Ask the same beside a set that was refitted: what is worth a refit, as the whole shows it.
+    def beside(
+        self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray
+    ) -> list[tuple[Hypothesis, ...]]:
+        """Return sets that are likely beside one that was refitted, the likeliest first.
 
         Args:
             model: effects, the set among them.
@@ -106,23 +127,15 @@ class Screening:
         simulator = self._simulator(model, null, "/".join(["0", *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
         hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses)])
-        return self._compared(hypotheses, null, _DOUBT * slopes)
+        noise = noise_of_splits(null, 2, self.model_error)
+        doubtful = replace(noise, covariance=noise.covariance.with_modes(_DOUBT * slopes))
+        return likeliest_sets(hypotheses, self.z.both - null.mean, doubtful)
 
     def _placebo(self, model: tuple[Effect, ...], guesses: Sequence[Effect]) -> list[Effect]:
         """Return an effect that the model does not have and for which nothing speaks."""
         have = {effect.tag for effect in model}
         others = {tag: kind for tag, kind in self.classes.items() if tag not in have}
         return placebo_for(guesses, others, self.defects)
-
-    def _compared(
-        self, hypotheses: Sequence[Hypothesis], null: NullModel, doubt: FloatArray | None = None
-    ) -> Choice:
-        """Compare sets on the splits; ``doubt`` are modes of scatter beside chance, (k, m)."""
-        noise = noise_of_splits(null, 1, self.model_error)
-        if doubt is not None:
-            noise = replace(noise, covariance=noise.covariance.with_modes(doubt))
-        shifts = (self.z.train - null.mean, self.z.test - null.mean)
-        return choose(hypotheses, shifts, noise)
 
     def _simulator(self, model: tuple[Effect, ...], null: NullModel, purpose: str) -> ReplicateSimulator:
         return ReplicateSimulator(

@@ -145,12 +145,6 @@ class PixelLikelihood:
         likely = {member.tag: member.effect for member in fit.members}
         return tuple(_at(h, likely[h.tag]) if h.tag in likely else h for h in hypotheses)
 
-    def rise(self, effects: Sequence[Effect]) -> float | None:
-        """Return by how much effects raise the likelihood at their likeliest numbers, nats; None: no fit."""
-        fit = self._fit_once(effects, ())
-        known = None if fit is None else self._without.get(self._sets.present)
-        return None if fit is None or known is None else float(fit.fit.log_likelihood.sum()) - known
-
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
         """Return how far a set is behind another in likelihood, nats, and the standard error (Vuong 1989).
 
@@ -225,33 +219,15 @@ class HistogramLikelihood:
         pixels = self.of([h.effect for h in hypotheses], number)
         return tuple(hypotheses) if pixels is None else pixels.begun(hypotheses)
 
-    def ranked(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Return hypotheses, those that have a law of the samples in the order of their likelihood.
-
-        What lies far from all peaks raises the likelihood under any law that has something there; statistics
-        that count such samples do not tell how far they lie, and the likelihood does.
-        """
-        places = [i for i, h in enumerate(hypotheses) if _has_law(h.effect)]
-        pixels = self.of([hypotheses[i].effect for i in places], FEW_PIXELS) if len(places) > 1 else None
-        if pixels is None:
-            return list(hypotheses)
-        rises = {i: rise for i in places if (rise := pixels.rise([hypotheses[i].effect])) is not None}
-        found = list(hypotheses)
-        for place, i in zip(sorted(rises), sorted(rises, key=lambda i: -rises[i]), strict=True):
-            found[place] = hypotheses[i]
-        return found
-
-    def behind(
-        self, one: Sequence[Effect], other: Sequence[Effect], number: int = MANY_PIXELS
-    ) -> tuple[float, float] | None:
-        """Return how far a set is behind another by so many pixels; see `PixelLikelihood.behind`.
+    def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
+        """Return how far a set is behind another by many pixels; see `PixelLikelihood.behind`.
 
         None also where they differ in what no law of a sample holds.
         """
         tags = {e.tag for e in one} ^ {e.tag for e in other}
         if not all(identifiable_from_histograms(e) for e in (*one, *other) if e.tag in tags):
             return None
-        pixels = self.of((*one, *other), number)
+        pixels = self.of((*one, *other), MANY_PIXELS)
         return None if pixels is None else pixels.behind(one, other)
 
 
@@ -399,13 +375,6 @@ def _multistart(sets: SetComparison, fitted: FittedSet) -> FittedSet:
         return fitted
     other = sets.fit(fitted.members, start)
     return max(fitted, other, key=lambda one: float(one.fit.log_likelihood.sum()))
-
-
-def _has_law(effect: Effect) -> bool:
-    """Tell whether a law of a sample, if only a rough one, has an effect that its histograms show first."""
-    return identifiable_from_histograms(effect) or (
-        effect.everywhere and type(effect).rough_law and leads_in_histograms(type(effect))
-    )
 
 
 def identifiable_from_histograms(effect: Effect) -> bool:

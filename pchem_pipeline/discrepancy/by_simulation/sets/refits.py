@@ -39,7 +39,7 @@ _SPLITS = 2  # train and test frames, whose mean is explained
 #: Replicates at each strength on the way.
 FEW = 6
 ENOUGH = 12  # replicates that tell a scatter
-_MOST_STEPS = 5
+_MOST_STEPS = 5  # corrections of strengths
 _STEPS_OF_EXPENSIVE = 2
 #: Standard errors of its strength that an effect must have: the best of some hundred guesses reaches more
 #: than a single one would by chance.
@@ -51,17 +51,7 @@ _TRIAL = 0.3  # step of the logarithm of a factor by which a slope is measured
 _STRONG = 10.0  # standard deviations by which an effect moves a statistic where its slope is
 _LARGEST_SHARE = 0.9  # of a factor that a correction takes away
 _FINE_ERROR = 0.03  # relative error of what a set does to the statistics at its best fit
-# nats by which a set must promise to come near the best one, beside a tenth of what that explains or several
-# times what its next step promises to gain
-_REACH, _REACH_SHARE, _MISJUDGED = 30.0, 0.1, 5.0
-_SLIGHT = (
-    0.15  # of what a set leaves beyond chance, gained by a step that leaves it behind another set: in vain
-)
 _LITTLE = 0.03  # of what there is to explain, nats, that the details of effects may leave
-# nats, and share of what there is to explain, that a set must promise to leave for it not to be all there is;
-# the logarithm of a factor up to which its promise is believed
-_SHORT, _SHORT_SHARE, _BELIEVED = 100.0, 0.05, 0.75
-
 #: Most that the logarithm of the factor of a strength changes in one step.
 LARGEST_STEP = float(np.log(4.0))
 _FURTHER = 2  # steps beyond one that explains less, where the data go on asking for the same
@@ -89,7 +79,6 @@ class Refitted:
         score: log density of the rest, nats.
         promise: the same where the strengths are changed as the data ask for, if all goes in proportion.
         chance: the same of a rest that chance leaves.
-        short: the strengths were not brought to their best, at which much would be left, too.
         tuned: other numbers of the effects were brought to theirs.
     """
 
@@ -104,7 +93,6 @@ class Refitted:
     score: float
     promise: float
     chance: float
-    short: bool = False
     tuned: bool = False
 
     @property
@@ -125,7 +113,7 @@ class Refitted:
     @property
     def price(self) -> float:
         """Nats beyond those of one effect with a name; each part that is measured costs as two of these."""
-        return PRICE_OF_MORE * (sum(max(1, 2 * effect.measured_parts) for effect in self.effects) - 1)
+        return price(self.effects)
 
     @property
     def penalised_log_likelihood(self) -> float:
@@ -194,22 +182,19 @@ class Steps(DampedSteps[Refitted]):
         step: that led there, logarithms of factors, shape (e,).
         gained: by the last step to something better, nats.
         further: steps that were gone on after one that explains less.
+        taken_so_far: steps in all.
     """
 
     now: Refitted = field(kw_only=True)
     step: FloatArray = field(kw_only=True)
     gained: float = np.inf
     further: int = 0
+    taken_so_far: int = 0
 
     @classmethod
     def begin(cls, one: Refitted) -> Steps:
         """Begin at the guessed strengths."""
         return cls(one, one.score, now=one, step=one.change)
-
-    @property
-    def kept_its_promise(self) -> bool:
-        """Whether the last step did about what it promised; else the next one's promise says little."""
-        return self.length <= 1.0
 
     def ahead(self) -> tuple[Refitted, FloatArray]:
         """Return from where the next step is to be, and the step."""
@@ -221,7 +206,7 @@ class Steps(DampedSteps[Refitted]):
 
     def taken(self, step: FloatArray, now: Refitted | None) -> bool:
         """Take note of where a step led (None: nowhere), and tell whether there is another one to try."""
-        self.step, before = step, self.score
+        self.step, before, self.taken_so_far = step, self.score, self.taken_so_far + 1
         if now is not None and not now.score > before and self._goes_on(now):
             self.now, self.further = now, self.further + 1
             return True
@@ -257,7 +242,6 @@ class Refitter:
         target: mean of the statistics of train and test frames, shape (m,).
         events: see :class:`~pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints.Noise`.
         present: effects that the model has besides.
-        steps: corrections of the strengths, at most.
         allow: hears which effects are simulated next, and raises an error where the work is at its limit.
         defects: effects that failed, and why; more come to them.
     """
@@ -267,75 +251,58 @@ class Refitter:
     target: FloatArray
     events: FloatArray
     present: tuple[Effect, ...] = ()
-    steps: int = _MOST_STEPS
     allow: Callable[[str], None] = lambda _: None
     defects: dict[str, str] = field(default_factory=dict)
 
-    def refined(
-        self,
-        hypotheses: Sequence[Hypothesis],
-        rival: float = -np.inf,
-        replicates: int = FEW,
-        *,
-        whole: bool = False,
-    ) -> Refitted:
-        """Return a set at the strengths that explain the data best, or the best that was simulated.
+    def begin(self, hypotheses: Sequence[Hypothesis], replicates: int = FEW) -> Steps:
+        """Simulate a set at its guessed strengths.
 
         Args:
             hypotheses: effects with guessed strengths and what they do there.
-            rival: score of another set: where there is no hope to come near it, this one is given up.
             replicates: at each strength.
-            whole: only a set that explains the data is of interest, see ``short`` of :class:`Refitted`.
 
         Raises:
-            NotFittedError: hardly a pixel can be fitted with the set at its guessed strengths.
+            NotFittedError: hardly a pixel can be fitted with the set.
+            EffortSpentError: the work is at its limit.
         """
-        self.allow(words := " + ".join(h.tag for h in hypotheses))
-        way = Steps.begin(self.simulated(tuple(hypotheses), None, replicates))
-        expensive = is_expensive(h.effect for h in hypotheses)
-        for step_number in range(self.steps):
-            best = way.best
-            # after a step that brings so little the next ones bring less
-            if best.settled or way.gained < NO_DIFFERENCE:
-                break
-            if way.kept_its_promise and self._hopeless(best, way.gained, rival):
-                break
-            if whole and self._explains_a_part(best):
-                return replace(best, short=True)
-            if expensive and (step_number >= _STEPS_OF_EXPENSIVE or (step_number and best.score < rival)):
-                break
-            start, step = way.ahead()
-            moved = _moved(start.hypotheses, step)
-            if moved is None:
-                break
-            try:
-                self.allow(words)
-                now = self.simulated(moved, start, replicates)
-            except EffortSpentError:
-                break  # what was simulated is not lost
-            except NotFittedError:
-                now = None  # a step too far
-            if not way.taken(step, now):
-                break
+        self.allow(" + ".join(h.tag for h in hypotheses))
+        return Steps.begin(self.simulated(tuple(hypotheses), None, replicates))
+
+    def step(self, way: Steps) -> bool:
+        """Simulate a set a step nearer to its best strengths; return whether another step may pay.
+
+        Raises:
+            EffortSpentError: the work is at its limit.
+        """
+        best = way.best
+        most = _STEPS_OF_EXPENSIVE if is_expensive(best.effects) else _MOST_STEPS
+        # after a step that brings so little the next ones bring less
+        if best.settled or way.gained < NO_DIFFERENCE or way.taken_so_far >= most:
+            return False
+        start, step = way.ahead()
+        moved = _moved(start.hypotheses, step)
+        if moved is None:
+            return False
+        self.allow(best.words)
+        try:
+            now = self.simulated(moved, start, len(best.vectors))
+        except NotFittedError:
+            now = None  # a step too far
+        return way.taken(step, now)
+
+    def refined(self, hypotheses: Sequence[Hypothesis], replicates: int = FEW) -> Refitted:
+        """Return a set at the strengths that explain the data best, or as near as the work allows.
+
+        Raises:
+            NotFittedError, EffortSpentError: see `begin`.
+        """
+        way = self.begin(hypotheses, replicates)
+        try:
+            while self.step(way):
+                pass
+        except EffortSpentError:
+            pass  # what was simulated is not lost
         return way.best
-
-    def _hopeless(self, one: Refitted, gained: float, rival: float) -> bool:
-        """Tell whether a set will not come near another one: it promises less, or its steps gain too little.
-
-        Steps towards a maximum gain less and less.
-        """
-        near = rival - _REACH
-        slight = min(_SLIGHT * (one.chance - one.promise), _REACH)
-        if one.promise < rival and one.promise - one.score < slight:
-            return True
-        more = min(_REACH_SHARE * (rival - self.nothing), _MISJUDGED * (one.promise - one.score))
-        return one.promise + more < near or one.score + gained < near
-
-    def _explains_a_part(self, one: Refitted) -> bool:
-        """Tell whether a set not at its best strengths will leave far more than chance at these, too."""
-        known = bool(np.all(np.abs(one.change) < _BELIEVED))
-        left = _SHORT + _SHORT_SHARE * (one.chance - self.nothing)
-        return known and not one.settled and one.promise < one.chance - left
 
     def model(self, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
         """Return the model with effects."""
@@ -537,6 +504,11 @@ class Refitter:
         ratio = np.maximum(vectors.std(axis=0, ddof=1) / null.std, 1.0)
         ratio[~null.moved_by(vectors)] = 1.0
         return null.covariance.scaled(ratio)
+
+
+def price(effects: Iterable[Effect]) -> float:
+    """Return the price of effects beyond that of one with a name, nats; a measured part costs as two."""
+    return PRICE_OF_MORE * (sum(max(1, 2 * effect.measured_parts) for effect in effects) - 1)
 
 
 def is_expensive(effects: Iterable[Effect]) -> bool:

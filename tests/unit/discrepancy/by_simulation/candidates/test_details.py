@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.details import has_numbers, may_be_tuned, tuned
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, choose
-from pchem_pipeline.discrepancy.by_simulation.sets.comparison import chosen, compare
+from pchem_pipeline.discrepancy.by_simulation.candidates.details import may_be_tuned, tuned
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, likeliest_sets
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials
+from pchem_pipeline.discrepancy.by_simulation.sets.rivals import chosen
+from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, compare
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -62,6 +62,11 @@ class World:
     def refitter(self) -> Refitter:
         return Refitter(self.draw, self.null, (self.parts[0] + self.parts[1]) / 2.0, np.zeros(M))
 
+    def likely(self, hypotheses: list[Hypothesis]) -> list[tuple[Hypothesis, ...]]:
+        refitter = self.refitter()
+        shift, noise = refitter.target - self.null.mean, refitter.noise(self.null.covariance, 40)
+        return likeliest_sets(hypotheses, shift, noise)
+
     def refined(self, effect: Effect) -> Refitted:
         return self.refitter().refined([Hypothesis(effect, statistics([effect]))])
 
@@ -89,13 +94,6 @@ def test_what_is_left_where_the_effect_moves_nothing_is_no_reason_to_tune() -> N
     assert not may_be_tuned(world.refitter(), world.refined(TRUE))
 
 
-def test_effects_without_such_numbers_stay_as_they_are() -> None:
-    noise = Hypothesis(RowNoise(row_noise_dn=1.0), UNIT[1])
-    refitter = World([TRUE]).refitter()
-    assert not has_numbers(refitter, [noise])
-    assert has_numbers(refitter, [noise, Hypothesis(BLINKING, UNIT[0])])
-
-
 def test_nothing_is_simulated_at_the_limit() -> None:
     world = World([TRUE])
     begun = world.refined(BLINKING)
@@ -113,12 +111,11 @@ def test_an_effect_that_wrong_numbers_of_another_brought_in_is_not_kept() -> Non
     """Row noise explains what blinking leaves at the guessed numbers; at its own it leaves nothing."""
     world = World([TRUE])
     hypotheses = [Hypothesis(e, statistics([e])) for e in (BLINKING, RowNoise(row_noise_dn=0.6))]
-    shifts = (world.parts[0] - world.null.mean, world.parts[1] - world.null.mean)
-    choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
-    assert {h.tag for h in choice.best} == {"dark_current_rts", "row_noise"}
-    trials = Trials(world.refitter(), HistogramLikelihood())
-    compare(trials, hypotheses, choice)
-    found = chosen(trials, hypotheses)
+    sets = world.likely(hypotheses)
+    assert {h.tag for h in sets[0]} == {"dark_current_rts", "row_noise"}
+    search = Search(world.refitter(), HistogramLikelihood())
+    compare(search, hypotheses, sets)
+    found = chosen(search, hypotheses)
     assert found is not None
     assert found.chosen.tags == {"dark_current_rts"}
 
@@ -160,11 +157,10 @@ def test_what_an_effect_of_another_package_raises_ends_no_search(strange: type[D
     world = World([TRUE])
     guessed = strange.model_validate(BLINKING.model_dump())
     hypotheses = [Hypothesis(e, statistics([e])) for e in (guessed, RowNoise(row_noise_dn=0.6))]
-    shifts = (world.parts[0] - world.null.mean, world.parts[1] - world.null.mean)
-    choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
+    sets = world.likely(hypotheses)
     refitter = world.refitter()
-    trials = Trials(refitter, HistogramLikelihood())
-    compare(trials, hypotheses, choice)
-    assert "dark_current_rts" in trials.best.tags
+    search = Search(refitter, HistogramLikelihood())
+    compare(search, hypotheses, sets)
+    assert "dark_current_rts" in search.best.tags
     assert refitter.defects
     assert all("dark_current_rts" in failed for failed in refitter.defects)

@@ -18,24 +18,16 @@ from pchem_pipeline.discrepancy.by_simulation.additions import (
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
-    Choice,
     Hypothesis,
-    choose,
-    score_set,
+    likeliest_sets,
 )
-from pchem_pipeline.discrepancy.by_simulation.explainer import Explanation, FrameExplainer
+from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened
+from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
-from pchem_pipeline.discrepancy.by_simulation.sets.comparison import (
-    Comparison,
-    _all_seen,
-    _far_behind,
-    _grown,
-    chosen,
-    compare,
-)
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.trials import Trials
+from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, chosen
+from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, Trial, _grown, compare
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
@@ -107,27 +99,27 @@ class World:
     def refitter(self) -> Refitter:
         return Refitter(self.draw, self.null, self.z.both, np.zeros(M))
 
-    def choice(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> Choice:
-        shifts = (self.z.train - self.null.mean - mean, self.z.test - self.null.mean - mean)
-        return choose(hypotheses, shifts, self.refitter().noise(self.null.covariance, 40))
+    def likely(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> list[tuple[Hypothesis, ...]]:
+        noise = self.refitter().noise(self.null.covariance, 40)
+        return likeliest_sets(hypotheses, self.z.both - self.null.mean - mean, noise)
 
     def compare(
         self, *hypotheses: Hypothesis, beside: Sequence[Hypothesis] = (), **how: Any
     ) -> Comparison | None:
-        grown = (lambda one: self.choice(*beside, mean=one.mean)) if beside else (lambda _: Choice())
-        return self.best_of(hypotheses, self.choice(*hypotheses), beside=grown, **how)
+        grown = (lambda one: self.likely(*beside, mean=one.mean)) if beside else (lambda _: [])
+        return self.best_of(hypotheses, self.likely(*hypotheses), beside=grown, **how)
 
     def best_of(
         self,
         hypotheses: Sequence[Hypothesis],
-        choice: Choice,
+        sets: list[tuple[Hypothesis, ...]],
         likelihood: HistogramLikelihood | None = None,
         **how: Any,
     ) -> Comparison | None:
-        trials = Trials(self.refitter(), likelihood or HistogramLikelihood())
-        compare(trials, hypotheses, choice, **how)
-        trials.refitter = replace(trials.refitter, allow=lambda _: None)
-        return chosen(trials, hypotheses)
+        search = Search(self.refitter(), likelihood or HistogramLikelihood())
+        compare(search, hypotheses, sets, **how)
+        search.refitter = replace(search.refitter, allow=lambda _: None)
+        return chosen(search, hypotheses)
 
     def chosen(self, *hypotheses: Hypothesis, **how: Any) -> frozenset[str] | None:
         """Return the tags of the chosen set; None where none holds."""
@@ -240,24 +232,6 @@ def test_an_expensive_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatc
     assert not found.settled
 
 
-def test_an_effect_that_explains_a_part_only_is_not_tuned_to_the_end_unless_it_is_the_best() -> None:
-    """Row noise beside frame noise: whatever its strength, much is left."""
-    world = World([effect("row_noise", 0.2), effect("frame_noise", 0.12)])
-    guess = hypothesis("row_noise", 0.14)
-    refitter = world.refitter()
-    short = refitter.refined([guess], whole=True)
-    assert short.short
-    assert world.drawn == 6
-    full = refitter.refined([guess])
-    assert not full.short
-    assert world.drawn > 12
-    assert full.score > short.score
-    # where there is no other, it is
-    found = world.compare(guess)
-    assert not found.chosen.short
-    assert found.chosen.score >= full.score - 0.5
-
-
 @pytest.mark.parametrize("paid", [1, 2, 3])
 def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> None:
     world, asked = World([effect("row_noise", 1.2)]), []
@@ -274,31 +248,15 @@ def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> No
     assert found.score < whole.score
 
 
-@pytest.mark.parametrize(("share", "refits"), [(0.0, 0), (0.4, 3)])
-def test_others_are_not_refitted_where_no_strength_of_theirs_makes_what_an_effect_does(
-    monkeypatch: pytest.MonkeyPatch, share: float, refits: int
-) -> None:
-    """Where each moves the statistic of the next one a little, only a refit tells by how much."""
-    tags = ("row_noise", "frame_noise", "exposure_drift")
-    for place, tag in enumerate(tags):
-        form = 40.0 * np.eye(M)[place] + 40.0 * share * np.eye(M)[(place + 1) % 3]
-        monkeypatch.setitem(TRUTH, tag, (form, 1.0))
-    world = World([effect(tag, 0.1) for tag in tags])
-    one = world.refitter().refined([hypothesis(tag) for tag in tags])
-    asked: list[str] = []
-    plain = world.refitter()
-    monkeypatch.setattr(world, "refitter", lambda: replace(plain, allow=asked.append))
-    assert _all_seen(world.refitter(), one, [])
-    assert len({words for words in asked if words.count("+") == 1}) == refits
-
-
 def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> None:
     world = World([effect("row_noise", 0.5), effect("frame_noise", 0.3)])
     known = world.refitter().refined([hypothesis("row_noise"), hypothesis("frame_noise")])
     drift = hypothesis("exposure_drift")
 
     def begun(members: Sequence[Hypothesis], *tried: Refitted) -> tuple[Hypothesis, ...]:
-        return Trials(world.refitter(), HistogramLikelihood(), list(tried)).begun(members)
+        return Search(world.refitter(), HistogramLikelihood(), [Trial.of(one) for one in tried])._started(
+            members
+        )
 
     first, second = begun([hypothesis("row_noise"), drift], known)
     assert (first.effect, second) == (hypothesis("row_noise").effect, drift)  # one in common is not enough
@@ -323,9 +281,7 @@ def likelihood_of(behind: Callable[[str, str], tuple[float, float] | None]) -> H
     """Return a likelihood that says so of the first effects of two sets."""
 
     class Told(HistogramLikelihood):
-        def behind(
-            self, one: Sequence[Effect], other: Sequence[Effect], number: int = 0
-        ) -> tuple[float, float] | None:
+        def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
             return behind(one[0].tag, other[0].tag)
 
     return Told()
@@ -350,27 +306,12 @@ def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
     )
     assert plain.chosen.tags == open_.chosen.tags == {"row_noise"}
     assert found.chosen.tags == {"frame_noise"}
-    # once whether its refit is in vain
-    assert asked == [("frame_noise", "row_noise")] * 2 + [("row_noise", "frame_noise")]
+    assert asked == [("frame_noise", "row_noise"), ("row_noise", "frame_noise")]
     first, second = found.rivals_of("frame_noise")
     assert (first.hypothesis.tag, second.hypothesis.tag) == ("frame_noise", "row_noise")
     assert (second.score, second.stderr) == (-12.0, 4.0)
     assert second.probability == pytest.approx(stats.norm.cdf(-3.0), rel=0.01)
     assert open_.rivals_of("row_noise")[1].probability > 0.1
-
-
-@pytest.mark.parametrize(
-    ("answer", "refitted"), [((-900.0, 20.0), False), ((-900.0, 250.0), True), (None, True)]
-)
-def test_what_the_histograms_rule_out_is_not_refitted(
-    answer: tuple[float, float] | None, refitted: bool
-) -> None:
-    """A look-alike's fingerprint may promise all; its refits cost what a second effect would need."""
-    world = World([effect("row_noise", 0.5)])
-    twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
-    found = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(lambda *_: answer))
-    assert found.chosen.tags == {"row_noise"}
-    assert ({"frame_noise"} in [one.tags for one in found.tried]) == refitted
 
 
 def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
@@ -382,36 +323,12 @@ def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
     assert grown.chosen.tags == {"row_noise", "frame_noise"}
 
 
-@pytest.mark.parametrize(
-    ("behind", "explained", "far"),
-    [(39.0, 0.0, False), (41.0, 0.0, True), (60.0, 1000.0, False), (95.0, 1000.0, True)],
-)
-def test_fewer_effects_beside_a_set_are_far_behind_by_more_than_their_fingerprints_may_err(
-    behind: float, explained: float, far: bool
-) -> None:
-    best, one = (SimpleNamespace(penalised_log_likelihood=explained - off) for off in (0.0, behind))
-    choice: Any = SimpleNamespace(tried=[best], advantage=explained)
-    assert _far_behind(one, choice) is far  # type: ignore[arg-type]
-
-
 def seeds(refitter: Refitter, *tried: Refitted) -> list[frozenset[str]]:
     """Return the sets, of those that were tried, beside which others are asked for."""
     asked: list[frozenset[str]] = []
-    trials = Trials(refitter, HistogramLikelihood(), list(tried))
-    _grown(trials, lambda one: asked.append(one.tags) or Choice())  # type: ignore[func-returns-value]
+    search = Search(refitter, HistogramLikelihood(), [Trial.of(one) for one in tried])
+    _grown(search, lambda one: asked.append(one.tags) or [])  # type: ignore[func-returns-value]
     return asked
-
-
-def test_what_is_proven_is_refitted_whatever_its_fingerprints_promise(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Of three effects that left nothing two were proven, and not refitted: 'unexplained'."""
-    trials = Trials(World([effect("row_noise", 0.3)]).refitter(), HistogramLikelihood())
-    monkeypatch.setattr(Trials, "_worth_it", lambda *_: False)
-    trials.refit([hypothesis("row_noise", 0.3)])
-    assert not trials.tried
-    trials.refit([hypothesis("row_noise", 0.3)], proven=True)
-    assert [one.tags for one in trials.tried] == [{"row_noise"}]
 
 
 def test_a_part_of_a_better_set_is_not_grown_again() -> None:
@@ -429,10 +346,7 @@ def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -
     true = effect("row_noise", 0.3), effect("frame_noise", 0.3), effect("interpixel_capacitance", 0.1)
     world = World(true)
     row, frame, drift = (hypothesis(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift"))
-    shifts = (world.z.train - world.null.mean, world.z.test - world.null.mean)
-    noise = world.refitter().noise(world.null.covariance, 40)
-    choice = Choice((score_set([row, frame, drift], shifts, noise),), 100.0)
-    found = world.best_of([row, frame, drift], choice)
+    found = world.best_of([row, frame, drift], [(row, frame, drift)])
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
@@ -468,10 +382,10 @@ def test_a_description_that_leaves_nothing_keeps_no_named_effect_from_its_refit(
     # as near as row noise by its fingerprint, which leaves what frame noise does
     other = replace(hypothesis("row_noise", 0.3), effect=effect("exposure_drift", 0.3))
     for first, refits in ((described, 1), (named, 0)):
-        trials = Trials(refitter, HistogramLikelihood(), [first])
-        assert trials.complete
-        trials.refit([other])
-        assert len(trials.tried) == 1 + refits
+        search = Search(refitter, HistogramLikelihood(), [Trial.of(first)])
+        assert search.complete
+        search.compare([[other]])
+        assert sum(one.tags == {"exposure_drift"} for one in search.tried) == refits
 
 
 @pytest.mark.parametrize("second", ["columns=0:8", "columns=16:24"])
@@ -570,13 +484,13 @@ def test_a_set_is_fitted_again_with_the_kind_of_an_effect_that_does_better() -> 
     row, frame, other = (
         hypothesis("row_noise"), hypothesis("frame_noise"), hypothesis("frame_noise").effect
     )  # fmt: skip
-    trials = Trials(world.refitter(), HistogramLikelihood())
+    search = Search(world.refitter(), HistogramLikelihood())
     for members in ((row,), (frame,), (row, frame), (row, frame)):
-        trials.refit(members)
-    assert len(trials.tried) == 3
+        search.add(members)
+    assert len(search.trials) == 3
     elsewhere = Hypothesis(other.at_place(Region(rows=((1, 2),))), frame.fingerprint)
-    trials.refit((row, elsewhere))
-    assert len(trials.tried) == 4
+    search.add((row, elsewhere))
+    assert len(search.trials) == 4
 
 
 def test_a_simulated_stack_is_known_by_all_that_makes_it_under_a_name_that_a_file_can_have() -> None:
@@ -622,12 +536,10 @@ def add(
     prepared = Prepared(settings, "frames", unused, unused, world.null, z, work.effort, {})
     search = FrameExplainer(prepared, unused, work, unused, judge, ())
     monkeypatch.setattr(search, "_refitter", lambda: world.refitter())
-    monkeypatch.setattr(search, "_left_by", lambda *_: Choice())
+    monkeypatch.setattr(search, "_left_by", lambda *_: [])
     monkeypatch.setattr(search, "_likelihood", lambda *_: None)
     monkeypatch.setattr(search, "_measured", lambda _: lambda kept: ())
-    shifts = (z.train - world.null.mean, z.test - world.null.mean)
-    choice = choose(hypotheses, shifts, world.refitter().noise(world.null.covariance, 40))
-    return search, search.add(Explanation(hypotheses, choice), world.null)
+    return search, search.add(Screened(hypotheses, world.likely(*hypotheses), 0.0), world.null)
 
 
 def test_slopes_beyond_all_that_an_effect_does_do_not_lift_the_floor() -> None:

@@ -1,0 +1,234 @@
+"""Which of the sets that were tried is in the data, and what could stand in the place of each effect.
+
+One effect that leaves nothing beyond chance after its best fit is all there is; of a set of several, each
+must be seen: by a statistic that the others at their best fit leave, and that it explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    FAR,
+    Hypothesis,
+    fit_set,
+    seen_among,
+    share_place,
+)
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_expensive
+from pchem_pipeline.discrepancy.by_simulation.sets.search import LOOSE, Search, Trial
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
+
+FloatArray = NDArray[np.float64]
+
+_UNTOUCHED = 0.5  # of what an effect does to a statistic, the most by which others may move one of its own
+
+
+@dataclass(frozen=True)
+class Contender:
+    """An effect that could stand in the place of a chosen one.
+
+    Attributes:
+        hypothesis: of the rival.
+        score: log score of the best set with it in that place, relative to the chosen set, nats.
+        stderr: of that score: how far the two predictions lie apart, nats.
+        probability: among all that could stand there.
+    """
+
+    hypothesis: Hypothesis
+    score: float
+    stderr: float
+    probability: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Sets at their best fit.
+
+    Attributes:
+        chosen: the best.
+        tried: all, the best first.
+        by_histograms: by their tags, how far other sets are behind the chosen one by the likelihood of the
+            pixels' histograms, nats, and the error of that.
+    """
+
+    chosen: Refitted
+    tried: tuple[Refitted, ...]
+    by_histograms: Mapping[frozenset[str], tuple[float, float]] = field(default_factory=dict)
+
+    def rivals_of(self, tag: str) -> tuple[Contender, ...]:
+        """Return what could stand in the place of an effect of the chosen set, itself first."""
+        others = self.chosen.tags - {tag}
+        found: dict[str, Contender] = {}
+        for one in self.tried:
+            new = one.tags - others
+            if not others <= one.tags or len(new) != 1 or new & found.keys():
+                continue
+            [name] = new
+            hypothesis = next(h for h in one.hypotheses if h.tag == name)
+            if name != tag and hypothesis.effect.tag == tag.partition(" ")[0]:
+                continue  # the same effect elsewhere
+            if name != tag and type(hypothesis.effect).empirical:
+                continue  # what has no name is no rival of a name
+            if one.tags in self.by_histograms:
+                behind, error = self.by_histograms[one.tags]
+                # neither need be the very law of the samples
+                probability = float(special.ndtr(behind / max(error, 1e-9)))
+            else:
+                behind = one.penalised_log_likelihood - self.chosen.penalised_log_likelihood
+                error = _apart(one, self.chosen)
+                probability = float(np.exp(min(behind, 0.0)))
+            found[name] = Contender(hypothesis, behind, error, probability)
+        total = sum(c.probability for c in found.values())
+        shared = [replace(c, probability=c.probability / total) for c in found.values()]
+        return tuple(sorted(shared, key=lambda c: (-c.probability, -c.score)))
+
+
+def chosen(search: Search, hypotheses: Sequence[Hypothesis]) -> Comparison | None:
+    """Choose among the sets that were tried, and fit placebos in the place of its effects; None: none holds.
+
+    The best of which each effect is seen, or where the statistics tell two sets badly apart the one by which
+    the histograms of the pixels are likelier.
+    """
+    best = _best_seen(search)
+    if best is None:
+        return None
+    by_histograms = _by_histograms(best, search.ranked, search.likelihood)
+    other = max(search.ranked, key=lambda one: by_histograms.get(one.tags, (0.0, 0.0))[0])
+    if by_histograms.get(other.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(search, other):
+        best, by_histograms = other, _by_histograms(other, search.ranked, search.likelihood)
+    for member in best.hypotheses:
+        if not type(member.effect).empirical:
+            _try_placebo(search, hypotheses, best, member)
+    return Comparison(best, tuple(search.ranked), by_histograms)
+
+
+def _best_seen(search: Search) -> Refitted | None:
+    """Return the best set of which each effect is seen; those that may yet be it are fitted to the end."""
+    while True:
+        found = next((one for one in search.ranked if _all_seen(search, one)), None)
+        if found is None:
+            return None
+        reach = found.penalised_log_likelihood
+        short = [trial for trial in search.trials if trial.way and not trial.ended and trial.promise >= reach]
+        if not short:
+            return found
+        for trial in short:
+            search.settle(trial)
+
+
+def _by_histograms(
+    chosen: Refitted, tried: Sequence[Refitted], likelihood: HistogramLikelihood
+) -> dict[frozenset[str], tuple[float, float]]:
+    """Ask about the sets nearly as good as the chosen one that have another effect in the place of one."""
+    found: dict[frozenset[str], tuple[float, float]] = {}
+    for one in tried:
+        swapped = len(one.tags - chosen.tags) == len(chosen.tags - one.tags) == 1
+        near = abs(one.penalised_log_likelihood - chosen.penalised_log_likelihood) < FAR
+        if swapped and near and one.tags not in found:
+            answer = likelihood.behind(one.effects, chosen.effects)
+            if answer is not None:
+                found[one.tags] = answer
+    return found
+
+
+def unrelated(one: Effect, other: Effect) -> bool:
+    """Tell whether neither of two effects is known to be confused with the other."""
+    known = other.tag in type(one).separate or one.tag in type(other).separate
+    return not known and one.tag != other.tag
+
+
+def _try_placebo(
+    search: Search, hypotheses: Sequence[Hypothesis], chosen: Refitted, member: Hypothesis
+) -> None:
+    """Try the best unrelated effect in the place of a member, unless there is one.
+
+    Of all that have nothing to do with it, the one whose fingerprint would explain most: one that cannot
+    close anything, whatever its strength, proves nothing about the name. At that strength: it is not to win.
+    """
+    refitter, others = search.refitter, [h for h in chosen.hypotheses if h.tag != member.tag]
+    kept = {h.tag for h in others}
+    pool = [
+        h
+        for h in hypotheses
+        if h.tag not in chosen.tags
+        and unrelated(h.effect, member.effect)
+        and not is_expensive([h.effect])
+        and not share_place(other.effect for other in (*others, h))
+    ]
+    if any(one.tags == kept | {h.tag} for one in search.tried for h in pool):
+        return
+    noise = refitter.noise(refitter.null.covariance, refitter.null.n_replicates)
+    shift = refitter.target - refitter.null.mean
+    fits = [fit_set([*others, h], shift, noise) for h in pool]
+    closing = [(fit.log_score(shift, noise), i) for i, fit in enumerate(fits) if fit.factors[-1] > 0.0]
+    if closing:
+        score, index = max(closing)
+        best = pool[index].times(float(fits[index].factors[-1]))
+        trial = Trial((*others, best), score)
+        search.advance(trial)
+        trial.ended = True
+        search.trials.append(trial)
+
+
+def own_statistics(own: FloatArray, others: FloatArray, noise: FloatArray) -> NDArray[np.bool_]:
+    """Return which statistics an effect moves, and others leave alone, (m,).
+
+    Args:
+        own: what the effect does, shape (m,).
+        others: what the others do, shape (e, m).
+        noise: standard deviations of the statistics with the others, shape (m,).
+    """
+    touched = np.abs(others).max(axis=0, initial=0.0)
+    return np.asarray((np.abs(own) > CLEAR * noise) & (touched < _UNTOUCHED * np.abs(own)))
+
+
+def _all_seen(search: Search, one: Refitted) -> bool:
+    """Test whether each effect of a set has a signature of its own beside the best fit of the others.
+
+    Or, of a set that leaves nothing, whether it is seen beside them.
+    """
+    if len(one.tags) == 1:
+        # the same effect in two places: without it nothing is left to compare with
+        return len(one.hypotheses) == 1
+    refitter, complete = search.refitter, search.refitter.passes_goodness_of_fit(one)
+    # without it the others would be fitted stronger, not weaker: what they touch now is none of its own
+    noise = refitter.scatter(refitter.null.covariance, len(one.vectors))
+    apart = (own_statistics(part, np.delete(one.parts, i, axis=0), noise) for i, part in enumerate(one.parts))
+    if not complete and not all(own.any() for own in apart):
+        return False
+    for hypothesis in one.hypotheses:
+        others = search.at_best_fit([h for h in one.hypotheses if h is not hypothesis])
+        if others is None:
+            return False
+        part = hypothesis.fingerprint
+        noise = refitter.scatter(others.covariance, len(others.vectors))
+        left = (np.abs(others.rest) > CERTAIN) & (others.rest * part > 0.0)
+        seen = bool((own_statistics(part, others.parts, noise) & left).any())
+        if not seen and not (complete and _seen_beside(refitter, part, others)):
+            return False
+    return True
+
+
+def _seen_beside(refitter: Refitter, part: FloatArray, others: Refitted) -> bool:
+    """Tell whether others leave a statistic that an effect moves, by more than their details may be wrong.
+
+    Where a set leaves nothing at all, its effects may move the same statistics: those that merely mimic
+    something else mend each other, and do not do so everywhere.
+    """
+    noise = replace(refitter.noise(others.covariance, len(others.vectors)), model_error=LOOSE)
+    shift = refitter.target - others.mean + others.parts.sum(axis=0)
+    return seen_among(part, others.parts, shift, noise)
+
+
+def _apart(first: Refitted, second: Refitted) -> float:
+    """Return how far two predictions lie apart, in standard deviations of the statistics."""
+    covariance = first.covariance.plus(second.covariance.own).with_modes(second.covariance.common)
+    return float(np.linalg.norm(covariance.times(0.5).white(first.mean - second.mean)))

@@ -1,0 +1,417 @@
+"""The search for the effects that explain frames: the most promising set is simulated one step further.
+
+A set of effects is a trial. Its promise is the log score that it may come to: by its fingerprints before it
+was simulated (:mod:`pchem_pipeline.discrepancy.by_simulation.candidates`), by its slopes afterwards. A trial
+is open while its promise, and what that may be wrong by, reaches the best one. Of the open trials those with
+the fewest effects go first, of these the most promising.
+
+Forward selection: where the best set leaves something, sets with what stands out beside it are trials, and so
+is what is measured without a name. Backward elimination: so is the best set without each of its effects.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from pchem_pipeline.discrepancy.by_simulation.candidates.details import may_be_tuned, tuned
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    FAR,
+    FAR_SHARE_OF_PART,
+    PRICE_OF_MORE,
+    Hypothesis,
+    firsts,
+    fit_set,
+    meets_itself,
+    share_place,
+)
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
+from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
+    MOST_STARTS,
+    HistogramLikelihood,
+    note_defect,
+)
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import (
+    ESTABLISHED,
+    Refitted,
+    Refitter,
+    Steps,
+    is_expensive,
+    price,
+)
+from pchem_pipeline.discrepancy.effort import EffortSpentError
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.arithmetic.significance import CERTAIN
+
+#: Relative error of a fingerprint before its refit.
+LOOSE = 0.1
+#: What sets are sorted by.
+PENALISED = operator.attrgetter("penalised_log_likelihood")
+_MOST_SINGLES, _MOST_SETS = 7, 3  # hypotheses that are tried alone, sets that fingerprints propose
+_MISJUDGED = 5.0  # times the gain that the next step promises, that all further ones may bring
+# nats, and share of what there is to explain, that an effect alone must promise to leave for it not to be all
+# there is; the logarithm of a factor up to which its promise is believed
+_SHORT, _SHORT_SHARE, _BELIEVED = 100.0, 0.05, 0.75
+_FAR_SHARE = 0.25  # of what there is to explain, beside `FAR`, for a set that leaves nothing
+_HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
+# sets beside which others are asked for, share of what the best one explains by which one may be behind it,
+# and how many of these sets are tried, by how many effects they have besides
+_MOST_SEEDS, _REACH_SHARE = 2, 0.05
+_MOST_GROWN = {1: 2, 2: 1}
+
+
+@dataclass(eq=False)
+class Trial:
+    """A set of effects, as far as it was simulated.
+
+    Attributes:
+        members: the effects as proposed.
+        foreseen: log score that their fingerprints promise, nats.
+        way: to its best strengths, as far as it was gone; None: not simulated.
+        ended: whether no further step pays.
+    """
+
+    members: tuple[Hypothesis, ...]
+    foreseen: float
+    way: Steps | None = None
+    ended: bool = False
+
+    @classmethod
+    def of(cls, one: Refitted) -> Trial:
+        """Return a set that is at its best fit already."""
+        return cls(one.hypotheses, one.score, Steps.begin(one), ended=True)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects."""
+        return tuple(h.effect for h in self.members)
+
+    @property
+    def promise(self) -> float:
+        """Log score that it may come to, less the price of its effects, nats."""
+        if self.way is None:
+            return self.foreseen - price(self.effects)
+        best = self.way.best
+        return (best.score if self.ended else max(best.promise, best.score)) - best.price
+
+
+@dataclass
+class Search:
+    """Sets of effects that are tried.
+
+    Attributes:
+        refitter: simulates them.
+        likelihood: of the pixels' histograms, which brings a set near its best.
+        trials: all of them.
+        limit: what was next when the budget was used; None: it is not.
+        rejected: sets that are not established.
+    """
+
+    refitter: Refitter
+    likelihood: HistogramLikelihood
+    trials: list[Trial] = field(default_factory=list)
+    limit: EffortSpentError | None = None
+    rejected: list[Refitted] = field(default_factory=list)
+    _tuned: set[frozenset[str]] = field(default_factory=set, repr=False)
+
+    @property
+    def tried(self) -> list[Refitted]:
+        """All sets that were simulated, each at the best strengths so far."""
+        return [trial.way.best for trial in self.trials if trial.way is not None]
+
+    @property
+    def ranked(self) -> list[Refitted]:
+        """Those that are not rejected, the best first."""
+        return self.refitter.ranked(one for one in self.tried if one not in self.rejected)
+
+    @property
+    def best(self) -> Refitted | None:
+        """The best so far."""
+        return next(iter(self.ranked), None)
+
+    @property
+    def complete(self) -> bool:
+        """Whether that leaves nothing."""
+        best = self.best
+        return best is not None and self.refitter.passes_goodness_of_fit(best)
+
+    def add(self, members: Sequence[Hypothesis]) -> None:
+        """Propose a set, unless it is one that was proposed before, or its effects exclude each other."""
+        if share_place(h.effect for h in members) or meets_itself(members):
+            return
+        if not any(same_kinds(members, trial.members) for trial in self.trials):
+            self.trials.append(Trial(tuple(members), self._foreseen(members)[1]))
+
+    def compare(self, sets: Iterable[Sequence[Hypothesis]]) -> None:
+        """Simulate sets, the most promising one a step further each time, until none is open.
+
+        Then the best one without some of its effects, and with other numbers.
+        """
+        for members in sets:
+            self.add(members)
+        while self.limit is None and (left := [trial for trial in self.trials if self._is_open(trial)]):
+            fewest = min(len(trial.members) for trial in left)
+            # what is expensive comes last: it may be beaten by then
+            self.advance(
+                max(
+                    (trial for trial in left if len(trial.members) == fewest),
+                    key=lambda trial: (not is_expensive(trial.effects), trial.promise),
+                )
+            )
+        self.eliminate()
+        self.tune()
+
+    def advance(self, trial: Trial) -> None:
+        """Simulate a trial a step further."""
+        try:
+            if trial.way is None:
+                begun = self._started(trial.members)
+                trial.way = self.refitter.begin(self.likelihood.begun(begun))
+            else:
+                trial.ended = not self.refitter.step(trial.way)
+        except EffortSpentError as spent:
+            self.limit, trial.ended = spent, True
+        except NotFittedError:
+            trial.ended = True
+        # whatever a stranger's effect raises must not stop the others
+        except Exception as error:
+            note_defect(self.refitter.defects, " + ".join(h.tag for h in trial.members), error)
+            trial.ended = True
+
+    def settle(self, trial: Trial) -> Refitted | None:
+        """Simulate a trial to its best strengths; None where it cannot be fitted."""
+        while not trial.ended:
+            self.advance(trial)
+        return None if trial.way is None else trial.way.best
+
+    def at_best_fit(self, members: Sequence[Hypothesis]) -> Refitted | None:
+        """Return a set of some effects at its best fit, at numbers of its own where these were tuned."""
+        tags = {h.tag for h in members}
+        tuned = next(
+            (
+                one
+                for one in sorted(self.tried, key=PENALISED, reverse=True)
+                if one.tuned and one.tags == tags
+            ),
+            None,
+        )
+        if tuned is not None:
+            return tuned
+        self.add(members)
+        trial = next((each for each in self.trials if same_kinds(members, each.members)), None)
+        return None if trial is None else self.settle(trial)
+
+    def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]]) -> None:
+        """Measure what is left without effects, then beside the best set; at the limit some is left out.
+
+        Unless that leaves nothing at no higher price than that of one measured part beside the same effects.
+        """
+        kept = () if self.best is None else self.best.hypotheses
+        for beside in dict.fromkeys(((), kept)):
+            best = self.best
+            if best is not None and self.complete and best.price <= PRICE_OF_MORE * (len(beside) + 1):
+                return
+            try:
+                for one in measured(beside):
+                    self.trials += [] if one in self.tried else [Trial.of(one)]
+                    if best is not None and one.score < best.score - FAR:
+                        break  # those that promise less come next
+            except EffortSpentError as spent:
+                self.limit = self.limit or spent
+
+    def tune(self) -> None:
+        """Tune the numbers of the best set where it leaves something, then of those as good until then."""
+        gained = 0.0
+        while (best := self.best) is not None and not self.complete:
+            near = best.penalised_log_likelihood - gained
+            close = [
+                one
+                for one in self.tried
+                if one.penalised_log_likelihood >= near
+                and one.tags not in self._tuned
+                and may_be_tuned(self.refitter, one)
+            ]
+            if not close:
+                return
+            one = max(close, key=PENALISED)
+            self._tuned.add(one.tags)
+            try:
+                better = tuned(self.refitter, one)
+            except (EffortSpentError, NotFittedError):
+                continue
+            except Exception as error:  # of a stranger's effect, as above
+                note_defect(self.refitter.defects, one.words, error)
+                continue
+            if better is not one:
+                self.trials.append(Trial.of(better))
+                gained = max(gained, better.score - one.score)
+
+    def eliminate(self) -> None:
+        """Try the best set without each of its effects, the weakest first, as long as that is better.
+
+        Where it leaves something, only without those of which its best fit leaves no more than their error.
+        """
+        best, scale = self.best, self.refitter.null.std
+        if best is None or len(best.hypotheses) < 2 or self.limit is not None:
+            return
+        for weakest in sorted(best.hypotheses, key=lambda h: float(np.sum((h.fingerprint / scale) ** 2))):
+            if self.complete or weakest.tag in vanished(best):
+                self.at_best_fit([h for h in best.hypotheses if h is not weakest])
+                self.tune()
+                if self.best is not best:
+                    return self.eliminate()
+
+    def _is_open(self, trial: Trial) -> bool:
+        """Test whether a trial may come to more than the best one."""
+        best = self.best
+        if trial.ended or best is None:
+            return not trial.ended
+        explained = best.score - self.refitter.nothing
+        named = self.complete and not any(type(effect).empirical for effect in best.effects)
+        if named and price(trial.effects) > best.price:
+            return False
+        if trial.way is None:
+            if named and self._is_blind(trial.members):
+                return False
+            share = _FAR_SHARE if named and len(trial.members) >= len(best.hypotheses) else FAR_SHARE_OF_PART
+            doubt = FAR + share * explained
+        else:
+            if len(trial.members) == 1 and self._explains_a_part(trial.way.best):
+                return False
+            doubt = _MISJUDGED * (trial.promise - trial.way.best.penalised_log_likelihood)
+        return trial.promise + doubt >= best.penalised_log_likelihood
+
+    def _explains_a_part(self, one: Refitted) -> bool:
+        """Test whether an effect not at its best strength will leave far more than chance at that, too."""
+        known = bool(np.all(np.abs(one.change) < _BELIEVED))
+        left = _SHORT + _SHORT_SHARE * (one.chance - self.refitter.nothing)
+        return known and one.promise < one.chance - left
+
+    def _foreseen(self, members: Sequence[Hypothesis]) -> tuple[np.ndarray, float]:
+        """Return what fingerprints at their best strengths leave where they move nothing, and the log score.
+
+        In errors, of statistics of which they move less than a share.
+        """
+        refitter = self.refitter
+        shift = refitter.target - refitter.null.mean
+        noise = replace(
+            refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=LOOSE
+        )
+        fit = fit_set(members, shift, noise)
+        left = np.abs(shift - fit.parts.sum(axis=0)) / np.sqrt(noise.of(fit.parts).variances)
+        moved = np.abs(fit.parts).max(axis=0)
+        return np.where(moved < _HARDLY * np.abs(shift), left, 0.0), fit.log_score(shift, noise)
+
+    def _is_blind(self, members: Sequence[Hypothesis]) -> bool:
+        """Test whether a statistic stands out that a set hardly moves: a refit does not change that."""
+        return bool((self._foreseen(members)[0] > CERTAIN).any())
+
+    def _started(self, members: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+        """Return effects as the best trials have them that are a part of the set, or differ in one effect.
+
+        A strong effect alone is nearer to its strength in the set than its fingerprint can tell.
+        """
+        if len(members) == 1:
+            return tuple(members)
+        tags, common = {h.tag for h in members}, max(2, len(members) - 1)
+        own: dict[str, Hypothesis] = {}
+        for one in sorted(self.tried, key=PENALISED, reverse=True):
+            if one.tags < tags or (one.tags != tags and len(one.tags & tags) >= common):
+                own = {h.tag: h for h in one.hypotheses} | own
+        known = tuple(own.get(h.tag, h) for h in members)
+        return tuple(members) if meets_itself(known) else known
+
+
+def compare(
+    search: Search,
+    hypotheses: Sequence[Hypothesis],
+    sets: Sequence[tuple[Hypothesis, ...]],
+    beside: Callable[[Refitted], Sequence[tuple[Hypothesis, ...]]] = lambda _: (),
+    measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]] = lambda _: (),
+    rounds: int = 3,
+) -> None:
+    """Try single effects, then sets with one effect more or fewer, as long as the best one becomes better.
+
+    Args:
+        search: out: all that was tried.
+        hypotheses: all, the likeliest first.
+        sets: of them, the likeliest by their fingerprints first.
+        beside: returns sets of new hypotheses by what they do beside a refitted set, the likeliest first.
+        measured: measures what effects leave, and yields them with it at their best fit.
+        rounds: of sets, at most.
+    """
+    beside = functools.cache(beside)
+    if sets:
+        search.compare((h,) for h in _singles(hypotheses, sets[0]))
+    search.compare(_of_different_effects(one for one in sets if len(one) > 1)[:_MOST_SETS])
+    for _ in range(rounds):
+        before = search.best
+        search.measure(measured)
+        if search.best is None or search.complete or search.limit:
+            return
+        search.compare(_grown(search, beside))
+        if search.best is before:
+            return
+
+
+def _singles(hypotheses: Sequence[Hypothesis], best: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return hypotheses to be tried alone: those of the best set, and the likeliest of all."""
+    chosen = firsts(best)
+    for hypothesis in firsts(hypotheses):
+        same = [h for h in chosen if h.tag == hypothesis.tag]
+        most = 1 if type(hypothesis.effect).random_realisation else MOST_STARTS
+        if len(same) < most and len(chosen) < _MOST_SINGLES and not any(alike(hypothesis, h) for h in same):
+            chosen.append(hypothesis)
+    return chosen
+
+
+def _grown(
+    search: Search, beside: Callable[[Refitted], Sequence[tuple[Hypothesis, ...]]]
+) -> list[tuple[Hypothesis, ...]]:
+    """Return sets that hold one of the best so far and what stands out beside it.
+
+    One that is strong hides or distorts what the frames show of the others.
+    """
+    seeds: list[Refitted] = []
+    for one in sorted(search.tried, key=PENALISED, reverse=True):
+        best = seeds[0] if seeds else one
+        near = one.score >= best.score - _REACH_SHARE * (best.score - search.refitter.nothing)
+        # what a set has besides is in vain where a part of it is better, and a part of a better set has grown
+        if near and not any(one.tags <= other.tags or other.tags <= one.tags for other in seeds):
+            seeds.append(one)
+    grown: list[tuple[Hypothesis, ...]] = []
+    for one in seeds[:_MOST_SEEDS]:
+        others = _of_different_effects(beside(one))
+        for size, most in _MOST_GROWN.items():
+            grown += [(*one.hypotheses, *each) for each in others if len(each) == size][:most]
+    return grown
+
+
+def _of_different_effects(sets: Iterable[tuple[Hypothesis, ...]]) -> list[tuple[Hypothesis, ...]]:
+    """Return sets without those of the same effects as one before."""
+    found: dict[frozenset[str], tuple[Hypothesis, ...]] = {}
+    for members in sets:
+        found.setdefault(frozenset(h.tag for h in members), members)
+    return list(found.values())
+
+
+def vanished(one: Refitted) -> set[str]:
+    """Return the tags of the effects of a set of which its best fit leaves no more than their error."""
+    gone = np.exp(one.change) < ESTABLISHED * one.stderr
+    return {h.tag for h, is_gone in zip(one.hypotheses, gone, strict=True) if is_gone and h.effect.strength}
+
+
+def alike(one: Hypothesis, other: Hypothesis) -> bool:
+    """Test whether two hypotheses differ in nothing but the strength of their effect."""
+    without = {one.effect.strength}
+    return one.effect.model_dump(exclude=without) == other.effect.model_dump(exclude=without)
+
+
+def same_kinds(one: Sequence[Hypothesis], other: Sequence[Hypothesis]) -> bool:
+    """Test whether two sets differ in the strengths of their effects only."""
+    own = {h.tag: h for h in one}
+    return own.keys() == {h.tag for h in other} and all(alike(own[h.tag], h) for h in other)
