@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
+from pchem_pipeline.discrepancy.observe.pairs import cell_edges
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.discrepancy.scan import Suspect, scan_map
@@ -53,7 +54,7 @@ class CellMap:
     @classmethod
     def empty(cls, shape: tuple[int, int]) -> CellMap:
         """Begin with no pixel of a sensor of some rows and columns."""
-        rows, columns = (np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in shape)
+        rows, columns = (cell_edges(n, _CELLS) for n in shape)
         size = rows.size - 1, columns.size - 1
         return cls(rows, columns, np.zeros(size), np.zeros(size))
 
@@ -126,7 +127,7 @@ def _place(name: str, cells: CellMap, significance: float) -> Suspect | None:
     )
     if not places:
         return None
-    inside = places[0].region.mask((usable.shape[0], usable.shape[1]))
+    inside = places[0].region.mask(usable.shape)
     if not (usable[inside].any() and usable[~inside].any()):
         return None
     means = [float(cells.sums[part].sum() / cells.counts[part].sum()) for part in (inside, ~inside)]

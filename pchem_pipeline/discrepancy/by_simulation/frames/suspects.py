@@ -42,7 +42,7 @@ from pchem_pipeline.discrepancy.scan_pairs import (
 )
 from pchem_pipeline.discrepancy.where import frame_series, pixel_maps, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
-from pchem_pipeline.effects.framework.region import Region, When
+from pchem_pipeline.effects.framework.region import When
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
@@ -76,7 +76,8 @@ def suspected_parts(evidence: Evidence, frames: NDArray[np.unsignedinteger[Any]]
     regions = [*_regions(evidence), *_regions_of_rare(evidence), *shared]
     # one that touches another, as a tap does, must be nearly as clear: else it is the edge of that
     places = [
-        Part(each.region) for each in _apart(regions, lambda one: _mask(one.region, usable), binary_dilation)
+        Part(each.region)
+        for each in _apart(regions, lambda one: one.region.mask(usable.shape), binary_dilation)
     ]
     # of what all outside share, too, but not with those inside, a second tap say, no map shows anything
     rest = shared_elsewhere(samples, shared[0]) if shared else None
@@ -133,10 +134,6 @@ def _apart(
     return chosen
 
 
-def _mask(region: Region, usable: BoolArray) -> BoolArray:
-    return region.mask((usable.shape[0], usable.shape[1]))
-
-
 def _is_part(inside: BoolArray, every: BoolArray, fewest: int) -> bool:
     """Return whether some pixels or frames are enough to be looked at by themselves, and not nearly all."""
     return bool(fewest <= (inside & every).sum() <= LARGEST * every.sum())
@@ -150,7 +147,7 @@ def _among(frames: IntArray, when: When) -> bool:
 def _frames_of_places(shared: Sequence[Shared], samples: Samples, time: TimeSeries) -> Iterator[Part]:
     """Yield places in those frames only in which their pixels share noise."""
     for each in shared:
-        inside = samples.usable & _mask(each.region, samples.usable)
+        inside = samples.usable & each.region.mask(samples.usable.shape)
         energy = samples.energies(each.channel, each.mode, inside)
         values = (energy - np.median(energy)) / max(robust_sd(energy), 1e-300)
         for one in scan_series(values, time.frames, most=1, shortest=FEWEST_FRAMES):
@@ -178,7 +175,7 @@ def _regions(evidence: Evidence) -> Iterator[Suspect]:
     shapes, log_maps = _Shapes(evidence), float(np.log(len(pixel_maps(evidence))))
     for suspects in suspected_regions(evidence, _SIGNIFICANCE_OF_GUESSES).values():
         for one in suspects:
-            mask = usable & _mask(one.region, usable)
+            mask = usable & one.region.mask(usable.shape)
             if not one.only_there or one.family == "pixels" or not _is_part(mask, usable, FEWEST_PIXELS):
                 continue
             z = shapes.z(mask)
@@ -213,7 +210,7 @@ def _regions_of_rare(evidence: Evidence) -> Iterator[Suspect]:
     usable, limit = evidence.maps.usable, SIGNIFICANCE / N_SETS
     for rare in rare_samples(evidence):
         for one in scan_event_map(rare.seen, rare.expected, usable, significance=limit):
-            if one.only_there and _is_part(_mask(one.region, usable), usable, FEWEST_PIXELS):
+            if one.only_there and _is_part(one.region.mask(usable.shape), usable, FEWEST_PIXELS):
                 yield one
 
 
