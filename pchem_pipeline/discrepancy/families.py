@@ -4,14 +4,13 @@ What is seen in a place is a sum over it: of the values of a map, of events, or 
 of its pixels. A :class:`Contrast` says how far such a sum is from the share of the whole that its count asks
 for (pixels, events by chance, pairs). Sums over bands and rectangles come from cumulative tables, in which
 pairs have an axis twice; these boxes are of cells, and around the ends of the best one the scan goes on with
-finer cells, down to single lines. The probability of a place is the union bound over all of its family, of
-boxes over those of all lines.
+finer cells, down to single lines. The probability of a place is the union bound over all of its family.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import FAR
-from pchem_pipeline.discrepancy.observe.pairs import cell_edges
 from pchem_pipeline.model.arithmetic.significance import PRICE
 
 FloatArray = NDArray[np.float64]
@@ -114,6 +112,11 @@ def best_place(families: Sequence[Place | None], better: float = PRICE) -> Place
 # -- sums and what they are by chance -------------------------------------------------------------
 
 
+def cell_edges(n: int, most: int) -> IntArray:
+    """Return the edges of cells of about as many of n lines each, ``most`` of them or one for each line."""
+    return np.unique(np.linspace(0, n, min(n, most) + 1).astype(np.int64))
+
+
 def cumulative(table: FloatArray) -> FloatArray:
     """Return the sums before each index of all axes."""
     for axis in range(table.ndim):
@@ -198,7 +201,7 @@ class Contrast:
         return self.null(*(np.bincount(phase, each, period).astype(np.float64) for each in lines))
 
 
-def normal(total: float, number: float, variance: float, fewest: float) -> Null:
+def normal(total: float, number: float, variance: float, fewest: float, one_sided: bool = False) -> Null:
     """Return the null of normal sums with a mean and a variance in proportion to their count.
 
     Args:
@@ -206,6 +209,7 @@ def normal(total: float, number: float, variance: float, fewest: float) -> Null:
         number: their count.
         variance: of a sum, by its count.
         fewest: count of a place, and of all outside of it.
+        one_sided: only sums that are too large count.
     """
 
     def deviations(sums: FloatArray, counts: FloatArray) -> FloatArray:
@@ -213,7 +217,8 @@ def normal(total: float, number: float, variance: float, fewest: float) -> Null:
             z = sums - counts * (total / number)
             z /= np.sqrt(variance * counts * (1.0 - counts / number))
         # sums over discs are whole numbers but for rounding
-        return np.where((counts > fewest - 0.5) & (counts < number - fewest + 0.5), z, 0.0)
+        z = np.where((counts > fewest - 0.5) & (counts < number - fewest + 0.5), z, 0.0)
+        return np.maximum(z, 0.0) if one_sided else z
 
     return deviations
 
@@ -281,10 +286,7 @@ def _log_p_range(z: float, n: int, shortest: float) -> float:
 
 
 def box(contrast: Contrast, family: str) -> Place | None:
-    """Return the best band of rows or columns, or rectangle, that ends with cells; None without any.
-
-    Its probability counts all boxes of lines, whatever the cells.
-    """
+    """Return the best band of rows or columns, or rectangle, that ends with cells; None without any."""
     edges, free = contrast.edges, BOXES[family]
     rows, columns = (_ranges(each.size, ends) for each, ends in zip(edges, free, strict=True))
     z, mask = 0.0, np.zeros(contrast.shape, np.bool_)
@@ -297,8 +299,13 @@ def box(contrast: Contrast, family: str) -> Place | None:
             z, mask[:] = float(found[row, column]), False
             within = edges[0][some[:, row]], edges[1][columns[:, column]]
             mask[slice(*within[0]), slice(*within[1])] = True
-    places = math.prod(n**2 / 2 for n, ends in zip(contrast.shape, free, strict=True) if ends)
+    places = _number_of_boxes((each.size - 1 for each in edges), family)
     return Place(family, mask, z, math.log(2.0 * places), edges) if z else None
+
+
+def _number_of_boxes(lines: Iterable[int], family: str) -> float:
+    """Return how many boxes of a family some rows and columns have, about."""
+    return math.prod(n**2 / 2 for n, free in zip(lines, BOXES[family], strict=True) if free)
 
 
 def _largest(z: FloatArray) -> tuple[Any, ...]:
@@ -315,6 +322,8 @@ def _ranges(edges: int, free: bool) -> IntArray:
 def with_sharp_ends(place: Place, at: Callable[[Edges], Contrast]) -> Place:
     """Return a box that ends with cells with ends among finer and finer ones around them, other places as is.
 
+    All boxes that were looked at are counted.
+
     Args:
         place: the best of its family.
         at: returns the contrast by cells of other edges.
@@ -329,7 +338,8 @@ def with_sharp_ends(place: Place, at: Callable[[Edges], Contrast]) -> Place:
         )
         if all(np.isin(finer, each).all() for finer, each in zip((rows, columns), place.edges, strict=True)):
             break
-        place = box(at((rows, columns)), place.family) or place
+        sharper = box(at((rows, columns)), place.family) or place
+        place = replace(sharper, log_places=float(np.logaddexp(place.log_places, sharper.log_places)))
     return place
 
 
@@ -344,7 +354,7 @@ def _finer(edges: IntArray, inside: IntArray) -> IntArray:
 
 
 def box_of_map(contrast: Contrast, family: str, shortest: int | None = None) -> Place | None:
-    """Return the best band of rows or columns, or rectangle, to a line.
+    """Return the best band of rows or columns, or rectangle, to a line; all of them are counted.
 
     Args:
         contrast: of a map.
@@ -360,7 +370,7 @@ def box_of_map(contrast: Contrast, family: str, shortest: int | None = None) -> 
         return None
     place = with_sharp_ends(place, contrast.at)
     if shortest is None:
-        return place
+        return replace(place, log_places=math.log(2.0 * _number_of_boxes(contrast.shape, family)))
     log_p = _log_p_range(place.z, contrast.shape[1], shortest)
     return replace(place, log_places=log_p - float(special.log_ndtr(-abs(place.z))))
 

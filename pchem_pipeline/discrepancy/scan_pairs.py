@@ -16,27 +16,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.families import (
-    BOXES,
-    Contrast,
-    Edges,
-    Place,
-    Ranges,
-    box,
-    box_sums,
-    cumulative,
-    every_nth,
-    normal,
-    with_sharp_ends,
-)
+from pchem_pipeline.discrepancy.families import BOXES, Edges, Place, box, box_sums, every_nth, with_sharp_ends
 from pchem_pipeline.discrepancy.observe.laws import chi_square
-from pchem_pipeline.discrepancy.observe.pairs import AXES, PERIOD, Pairs, Samples, energies, pairs_of
+from pchem_pipeline.discrepancy.observe.pairs import (
+    FEWEST_PIXELS,
+    LARGEST,
+    MODES,
+    PairContrast,
+    Samples,
+    energies,
+    pairs_of,
+)
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.region import Region, Taps
@@ -45,14 +41,12 @@ from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-#: Pixels of a place, its share of the sensor at most, and the mean outside over that inside at most.
-FEWEST_PIXELS, LARGEST = 16, 0.6
-_CONTRAST = 0.4
+_CONTRAST = 0.4  # mean outside of a place over that inside, at most
 #: Guesses that are held against the scatter of the frames, the most significant first.
 _MEASURED = 8
-#: Families of places (boxes, lines at a period along either axis, scattered lines), modes and channels; half
-#: of them, since places count to one side only.
-_LOOKS = (len(BOXES) + 3) * len(AXES) * len(CHANNELS) / 2.0
+#: Families of places (boxes, and two of lines at a period and scattered lines), modes and channels; half of
+#: them, since places count to one side only.
+_LOG_LOOKS = math.log((len(BOXES) + 2) * len(MODES) * len(CHANNELS) / 2.0)
 _LINE_BY_CHANCE = 1e-4  # probability of a line that stands out by itself, among all
 
 
@@ -75,49 +69,6 @@ class _Guess(NamedTuple):
     place: Place
     channel: int
     mode: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class PairContrast(Contrast):
-    """Sums of products of pairs, more than those of all ask for.
-
-    Attributes:
-        area: pixels that count, cumulative over the cells, (y, x).
-        by_number: sums and counts by the numbers of their lines, see :class:`Pairs`.
-    """
-
-    area: FloatArray
-    by_number: tuple[FloatArray, FloatArray]
-
-    @classmethod
-    def of(cls, pairs: Pairs, usable: BoolArray) -> Self:
-        """Take the sums of some pixels (y, x); pairs are counted twice, which doubles the variance."""
-        null = normal(float(pairs.sums.sum()), float(pairs.counts.sum()), 2.0, 1.0)
-
-        def more(sums: FloatArray, counts: FloatArray) -> FloatArray:
-            return np.maximum(null(sums, counts), 0.0)
-
-        edges = pairs.rows, pairs.columns
-        return cls(
-            edges,
-            cumulative(pairs.sums),
-            cumulative(pairs.counts),
-            more,
-            AXES[pairs.mode],
-            area=cumulative(usable.astype(np.float64))[np.ix_(*edges)],
-            by_number=pairs.by_number,
-        )
-
-    def boxes(self, rows: Ranges, columns: Ranges) -> FloatArray:
-        """Return the deviations of all boxes of some ranges of cells, 0 where one is too small or large."""
-        size = box_sums(self.area, (1, 1), rows, columns)
-        some = (size >= FEWEST_PIXELS) & (size <= LARGEST * self.area[-1, -1])
-        return np.where(some, super().boxes(rows, columns), 0.0)
-
-    def phases(self, axis: int, period: int) -> FloatArray:
-        """Return the deviations of every n-th row or column, by their numbers modulo the period."""
-        parts = (each[axis].reshape(PERIOD // period, period, -1, period) for each in self.by_number)
-        return self.null(*(part.sum(axis=(0, 2)).diagonal() for part in parts))
 
 
 def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: int = 2) -> list[Shared]:
@@ -150,7 +101,7 @@ def shared_elsewhere(samples: Samples, place: Shared, *, significance: float = S
     if rest.usable.sum() <= 2 * FEWEST_PIXELS:
         return None
     pairs = pairs_of(rest)[place.channel][place.mode]
-    z = float(pairs.sums.sum()) / math.sqrt(max(2.0 * float(pairs.counts.sum()), 1.0))
+    z = float(pairs.sums.flat[-1]) / math.sqrt(max(2.0 * float(pairs.counts.flat[-1]), 1.0))
     return Region.of_mask(rest.usable) if special.log_ndtr(-z) <= math.log(significance) else None
 
 
@@ -158,14 +109,14 @@ def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
     """Return the place of the smallest probability that holds against the scatter of the frames, too."""
     # the tables of pairs are large, and what is guessed from them is all that is kept
     guesses = [
-        _Guess(replace(place, log_places=place.log_places + math.log(_LOOKS)), channel, pairs.mode)
+        _Guess(place, channel, mode)
         for channel, modes in enumerate(pairs_of(samples))
-        for pairs in modes.values()
-        for place in _places(pairs, samples.usable)
+        for mode, contrast in modes.items()
+        for place in _places(contrast, mode, samples.usable)
         if place is not None
     ]
     for guess in sorted(guesses, key=lambda each: each.place.log_p)[:_MEASURED]:
-        if guess.place.log_p > log_limit:
+        if guess.place.log_p > log_limit - _LOG_LOOKS:
             break
         shared = _measured(samples, guess)
         if _holds(shared, log_limit):
@@ -200,7 +151,7 @@ def _measured(samples: Samples, guess: _Guess) -> Shared:
     return Shared(
         family=place.family,
         z=z,
-        log_p=min(0.0, float(special.log_ndtr(-z)) + place.log_places),
+        log_p=min(0.0, float(special.log_ndtr(-z)) + place.log_places + _LOG_LOOKS),
         inside=float(energy.sum()) / (n * own),
         outside=(float(total.sum()) - float(energy.sum())) / max(n * (every - own), 1.0),
         region=_region(place),
@@ -222,7 +173,7 @@ def _with_ends(samples: Samples, guess: _Guess) -> _Guess:
     """Return a box with its ends among finer cells, each scanned with another pass over the frames."""
 
     def at(edges: Edges) -> PairContrast:
-        return PairContrast.of(pairs_of(samples, edges)[guess.channel][guess.mode], samples.usable)
+        return pairs_of(samples, edges)[guess.channel][guess.mode]
 
     place = with_sharp_ends(guess.place, at)
     if place is guess.place:
@@ -232,20 +183,19 @@ def _with_ends(samples: Samples, guess: _Guess) -> _Guess:
     rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
     mask = np.zeros_like(inside)
     mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
-    return guess._replace(place=replace(place, mask=mask, log_places=guess.place.log_places))
+    return guess._replace(place=replace(place, mask=mask))
 
 
 # -- families -----------------------------------------------------------------------------------
 
 
-def _places(pairs: Pairs, usable: BoolArray) -> Iterator[Place | None]:
+def _places(contrast: PairContrast, mode: str, usable: BoolArray) -> Iterator[Place | None]:
     """Yield the best place of each family."""
-    contrast = PairContrast.of(pairs, usable)
     if contrast.counts.flat[-1] > 0:
         yield from (box(contrast, family) for family in BOXES)
         yield from (every_nth(contrast, axis) for axis in (1, 0))
-        if pairs.mode != "frame":
-            yield _scattered(contrast, 0 if pairs.mode == "row" else 1, usable)
+        if mode != "frame":
+            yield _scattered(contrast, 0 if mode == "row" else 1, usable)
 
 
 def _scattered(contrast: PairContrast, axis: int, usable: BoolArray) -> Place | None:

@@ -17,6 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.families import (
+    Contrast,
+    Edges,
+    Ranges,
+    box_sums,
+    cell_edges,
+    cumulative,
+    normal,
+)
 from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, code_ranges, pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
@@ -29,6 +38,10 @@ BoolArray = NDArray[np.bool_]
 
 #: What pixels share: their row, their column, or only the frame (neither row nor column).
 MODES = ("row", "column", "frame")
+#: Axes of the tables of each that are rows, and columns.
+_AXES = {"row": (1, 2), "column": (2, 1), "frame": (2, 2)}
+#: Pixels of a place, and its share of the sensor at most.
+FEWEST_PIXELS, LARGEST = 16, 0.6
 #: Lines are told apart by their number modulo this.
 PERIOD = 32
 #: Cells along an edge of the sensor, for lines; half as many for frames.
@@ -68,11 +81,6 @@ class FrameBlocks:
                 yield frames[some if chosen is None else chosen[some]]
 
         return cls(n_frames, blocks)
-
-
-def cell_edges(n: int, most: int) -> IntArray:
-    """Return the edges of cells of about as many of n lines each, ``most`` of them or one for each line."""
-    return np.unique(np.linspace(0, n, min(n, most) + 1).astype(np.int64))
 
 
 def laws_of_frames(frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> PixelLaws:
@@ -164,33 +172,34 @@ def energies(u: Float32Array, mode: str) -> FloatArray:
     return np.asarray((of_rows if mode == "row" else of_columns) - own) / 2.0
 
 
-#: Axes of the tables of a mode that are rows, and columns.
-AXES = {"row": (1, 2), "column": (2, 1), "frame": (2, 2)}
+@dataclass(frozen=True, kw_only=True)
+class PairContrast(Contrast):
+    """Sums of products of pairs of pixels that share a row (column, frame), over boxes of the sensor.
 
-
-@dataclass(frozen=True)
-class Pairs:
-    """Sums of products of pairs of pixels that share a row (column, frame), by cells of the sensor.
-
-    Of a row by the cells of either pixel across it; pairs are counted twice, as (a, b) and (b, a).
+    Pairs are counted twice, as (a, b) and (b, a). Only sums that are too large count.
 
     Attributes:
-        mode: what the pixels share.
-        sums, counts: of rows (y, x, x), of columns (y, y, x), of frames (y, y, x, x).
+        area: pixels that count, cumulative over the cells, (y, x).
         by_number: sums and counts of all by the numbers modulo :data:`PERIOD` of their rows and of their
             columns, (2, PERIOD, PERIOD); 0 for lines that the pixels share.
-        rows, columns: edges of the cells, pixels.
     """
 
-    mode: str
-    sums: FloatArray
-    counts: FloatArray
+    area: FloatArray
     by_number: tuple[FloatArray, FloatArray]
-    rows: IntArray
-    columns: IntArray
+
+    def boxes(self, rows: Ranges, columns: Ranges) -> FloatArray:
+        """Return the deviations of all boxes of some ranges of cells, 0 where one is too small or large."""
+        size = box_sums(self.area, (1, 1), rows, columns)
+        some = (size >= FEWEST_PIXELS) & (size <= LARGEST * self.area[-1, -1])
+        return np.where(some, super().boxes(rows, columns), 0.0)
+
+    def phases(self, axis: int, period: int) -> FloatArray:
+        """Return the deviations of every n-th row or column, by their numbers modulo the period."""
+        parts = (each[axis].reshape(PERIOD // period, period, -1, period) for each in self.by_number)
+        return self.null(*(part.sum(axis=(0, 2)).diagonal() for part in parts))
 
 
-def pairs_of(samples: Samples, edges: tuple[IntArray, IntArray] | None = None) -> list[dict[str, Pairs]]:
+def pairs_of(samples: Samples, edges: Edges | None = None) -> list[dict[str, PairContrast]]:
     """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share.
 
     Args:
@@ -200,25 +209,29 @@ def pairs_of(samples: Samples, edges: tuple[IntArray, IntArray] | None = None) -
     if edges is None:
         rows, columns = (cell_edges(n, _CELLS) for n in samples.usable.shape)
         edges = rows, columns
-    counted, gathered = _Gathered(*edges), [_Gathered(*edges) for _ in CHANNELS]
+    counted, gathered = _Gathered(edges), [_Gathered(edges) for _ in CHANNELS]
     counted.add(samples.usable[None].astype(np.float32))
     for chunk in samples.chunks():
         for each, u in zip(gathered, chunk, strict=True):
             each.add(u)
-    n, counts = samples.n_frames, counted.tables()
-    found = []
+    n = samples.n_frames
+    counts = {mode: (cumulative(n * table), n * rest) for mode, (table, rest) in counted.tables().items()}
+    area = cumulative(samples.usable.astype(np.float64))
+    found: list[dict[str, PairContrast]] = []
     for each in gathered:
-        tables = each.tables()
-        found.append({
-            mode: Pairs(
-                mode,
-                tables[mode][0],
-                n * counts[mode][0],
-                (tables[mode][1], n * counts[mode][1]),
-                *each.edges(mode),
+        found.append({})
+        for mode, (table, by_number) in each.tables().items():
+            cells, (number, number_by) = each.edges(mode), counts[mode]
+            found[-1][mode] = PairContrast(
+                edges=cells,
+                sums=cumulative(table),
+                counts=number,
+                # that pairs are counted twice doubles the variance of a sum
+                null=normal(float(table.sum()), float(number.flat[-1]), 2.0, 1.0, one_sided=True),
+                axes=_AXES[mode],
+                area=area[np.ix_(*cells)],
+                by_number=(by_number, number_by),
             )
-            for mode in MODES
-        })  # fmt: skip
     return found
 
 
@@ -240,7 +253,7 @@ class _Gathered:
         squares: of all pixels, (y', x').
     """
 
-    def __init__(self, *cells: IntArray) -> None:
+    def __init__(self, cells: Edges) -> None:
         """Begin with nothing, for cells of rows and columns with these edges."""
         self.cells = cells
         y, x = (each.size - 1 for each in cells)
@@ -250,10 +263,13 @@ class _Gathered:
         self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])
         self.frames = np.zeros((self.squares.size, self.squares.size))
 
-    def edges(self, mode: str) -> list[IntArray]:
+    def edges(self, mode: str) -> Edges:
         """Return the edges of the cells of rows and of columns, pixels."""
         strides = self.stride if mode == "frame" else (1, 1)
-        return [np.append(each[:-1:n], each[-1]) for each, n in zip(self.cells, strides, strict=True)]
+        rows, columns = (
+            np.append(each[:-1:n], each[-1]) for each, n in zip(self.cells, strides, strict=True)
+        )
+        return rows, columns
 
     def add(self, u: Float32Array) -> None:
         """Add frames (t, y, x)."""
@@ -280,7 +296,7 @@ class _Gathered:
             sums += folded.T @ folded - np.diag(_folded(each))
 
     def tables(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return the sums of each mode, and by numbers; see :class:`Pairs`.
+        """Return the sums of each mode by cells, (y, x, x), (y, y, x) or (y, y, x, x), and by numbers.
 
         Of frames those of pixels in different rows and columns.
         """

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.families import cell_edges
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
-from pchem_pipeline.discrepancy.observe.pairs import cell_edges
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.discrepancy.scan import Suspect, scan_map
@@ -58,13 +58,6 @@ class CellMap:
         size = rows.size - 1, columns.size - 1
         return cls(rows, columns, np.zeros(size), np.zeros(size))
 
-    @classmethod
-    def of(cls, values: FloatArray) -> CellMap:
-        """Sum a whole map, (y, x); NaN where a pixel has no value."""
-        cells = cls.empty((values.shape[0], values.shape[1]))
-        cells.add(values)
-        return cells
-
     def add(self, values: FloatArray, first: int = 0) -> None:
         """Add rows of the map from the row ``first`` on, (y, x)."""
         some = np.isfinite(values)
@@ -100,7 +93,8 @@ def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
     if sums.lengths.size >= MINIMUM_BLOCKS:
         with np.errstate(divide="ignore", invalid="ignore"):
             chi2 = (sums.lengths[:, None, None] * block_deviations(sums) ** 2).sum(axis=0) / v
-        found["spread"] = CellMap.of(chi_square(chi2, sums.lengths.size - 1.0))
+        found["spread"] = CellMap.empty(sums.shape)
+        found["spread"].add(chi_square(chi2, sums.lengths.size - 1.0))
     return found
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from helpers.standardised import samples_of
 
-from pchem_pipeline.discrepancy.families import box_sums, cumulative
-from pchem_pipeline.discrepancy.observe.pairs import AXES, PERIOD, pairs_of
+from pchem_pipeline.discrepancy.families import box_sums
+from pchem_pipeline.discrepancy.observe.pairs import PERIOD, pairs_of
 from pchem_pipeline.discrepancy.scan_pairs import scan_pairs, shared_elsewhere
 from pchem_pipeline.effects.framework.region import Region
 
@@ -34,12 +34,12 @@ def test_sums_of_cells_are_those_of_all_pairs(shape: tuple[int, int]) -> None:
         "frame": ~same_row & ~same_column,
     }
     for mode, pairs in pairs_of(samples)[0].items():
-        rows, columns = ((np.array([1]), np.array([2])), (np.array([2]), np.array([pairs.columns.size - 1])))
-        inside = (y >= pairs.rows[1]) & (y < pairs.rows[2])
-        inside &= (x >= pairs.columns[2]) & (x < pairs.columns[-1])
+        rows, columns = pairs.edges
+        box = np.array([[1], [rows.size - 2]]), np.array([[2], [columns.size - 1]])
+        inside = (y >= rows[1]) & (y < rows[-2]) & (x >= columns[2])
         for table, full in ((pairs.sums, products), (pairs.counts, counts)):
             expected = (full * shared[mode])[np.ix_(inside, inside)].sum()
-            [[found]] = box_sums(cumulative(table), AXES[mode], rows, columns)
+            [[found]] = box_sums(table, pairs.axes, *box)
             assert found == pytest.approx(expected, abs=1e-2)
         for axis, along in enumerate((y, x)):
             some = along % PERIOD == 3
