@@ -7,8 +7,8 @@ or what the frames' scatter gives where that is more; the sum of squares behind 
 Hilferty's root takes away. The probability is the union bound over the places of the family, the families,
 modes and channels.
 
-Boxes are of cells, each of several rows or columns of a large sensor. Around the ends of a box that stands
-out the same scan goes on with ever finer cells, down to single lines.
+Boxes are of cells, each of several rows or columns of a large sensor; each round of finer cells
+(:func:`.families.with_sharp_ends`) is another pass over the frames.
 """
 
 from __future__ import annotations
@@ -38,7 +38,6 @@ from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.region import Region, Taps
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
-FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _CONTRAST = 0.4  # mean outside of a place over that inside, at most

@@ -36,10 +36,9 @@ Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-#: What pixels share: their row, their column, or only the frame (neither row nor column).
-MODES = ("row", "column", "frame")
-#: Axes of the tables of each that are rows, and columns.
-_AXES = {"row": (1, 2), "column": (2, 1), "frame": (2, 2)}
+#: What pixels share: their row, their column, or only the frame (neither row nor column); and how many axes
+#: of a table of their pairs are rows, and columns.
+MODES = {"row": (1, 2), "column": (2, 1), "frame": (2, 2)}
 #: Pixels of a place, and its share of the sensor at most.
 FEWEST_PIXELS, LARGEST = 16, 0.6
 #: Lines are told apart by their number modulo this.
@@ -228,7 +227,7 @@ def pairs_of(samples: Samples, edges: Edges | None = None) -> list[dict[str, Pai
                 counts=number,
                 # that pairs are counted twice doubles the variance of a sum
                 null=normal(float(table.sum()), float(number.flat[-1]), 2.0, 1.0, one_sided=True),
-                axes=_AXES[mode],
+                axes=MODES[mode],
                 area=area[np.ix_(*cells)],
                 by_number=(by_number, number_by),
             )
