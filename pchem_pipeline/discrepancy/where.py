@@ -227,8 +227,6 @@ def _pixels(name: str, evidence: Evidence, maps: Mapping[str, FloatArray]) -> tu
     if parts[0] == "tail":
         seen = evidence.tail_low if parts[1] == "low" else evidence.tail_high
         values = np.where(seen > 0, FAR, 0.0)
-    elif name.startswith("time.block.") and evidence.time is not None:
-        values = _block_variance(evidence, evidence.time, parts[2])
     else:
         values = maps[map_of(name)]
     deviations = np.abs(np.where(evidence.maps.usable, values, 0.0)).ravel()
@@ -238,18 +236,6 @@ def _pixels(name: str, evidence: Evidence, maps: Mapping[str, FloatArray]) -> tu
     passed = np.flatnonzero(p[order] <= allowed)
     count = min(int(passed[-1]) + 1, _MOST_LISTED) if passed.size else 0
     return tuple((int(i) // values.shape[1], int(i) % values.shape[1]) for i in order[:count])
-
-
-def _block_variance(evidence: Evidence, time: TimeSeries, channel: str) -> FloatArray:
-    """Return by how many standard deviations the variance of each pixel's block means is too large."""
-    blocks, std = (
-        (time.block_charge, evidence.charge_std)
-        if channel == "charge"
-        else (time.block_readout, evidence.readout_std)
-    )
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = blocks.var(axis=0, ddof=1) * time.block_frames / std**2
-    return np.asarray((ratio - 1.0) * np.sqrt((len(blocks) - 1) / 2.0))
 
 
 def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:

@@ -17,6 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.families import (
+    Contrast,
+    Edges,
+    Ranges,
+    box_sums,
+    cell_edges,
+    cumulative,
+    normal,
+)
 from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, code_ranges, pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
@@ -27,8 +36,11 @@ Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-#: What pixels share: their row, their column, or only the frame (neither row nor column).
-MODES = ("row", "column", "frame")
+#: What pixels share: their row, their column, or only the frame (neither row nor column); and how many axes
+#: of a table of their pairs are rows, and columns.
+MODES = {"row": (1, 2), "column": (2, 1), "frame": (2, 2)}
+#: Pixels of a place, and its share of the sensor at most.
+FEWEST_PIXELS, LARGEST = 16, 0.6
 #: Lines are told apart by their number modulo this.
 PERIOD = 32
 #: Cells along an edge of the sensor, for lines; half as many for frames.
@@ -159,61 +171,34 @@ def energies(u: Float32Array, mode: str) -> FloatArray:
     return np.asarray((of_rows if mode == "row" else of_columns) - own) / 2.0
 
 
-@dataclass(frozen=True)
-class Pairs:
-    """Sums of products of pairs of pixels that share a row (column, frame), by cells of the sensor.
+@dataclass(frozen=True, kw_only=True)
+class PairContrast(Contrast):
+    """Sums of products of pairs of pixels that share a row (column, frame), over boxes of the sensor.
 
-    Cells lie across the line: groups of columns for rows. Pairs are counted twice, as (a, b) and (b, a).
+    Pairs are counted twice, as (a, b) and (b, a). Only sums that are too large count.
 
     Attributes:
-        sums, counts: over ranges of lines: of rows (columns) a to b - 1 the element b less a, shape
-            (lines + 1, across, across); of frames, cumulative over both rows, (y + 1, y + 1, x, x).
-        phases, phase_counts: the same by the column's (row's) number modulo :data:`PERIOD`, over all lines.
-        rows, columns: edges of the cells, pixels.
+        area: pixels that count, cumulative over the cells, (y, x).
+        by_number: sums and counts of all by the numbers modulo :data:`PERIOD` of their rows and of their
+            columns, (2, PERIOD, PERIOD); 0 for lines that the pixels share.
     """
 
-    mode: str
-    sums: FloatArray
-    counts: FloatArray
-    phases: tuple[FloatArray, ...]
-    phase_counts: tuple[FloatArray, ...]
-    rows: IntArray
-    columns: IntArray
+    area: FloatArray
+    by_number: tuple[FloatArray, FloatArray]
 
-    def boxes(self, table: FloatArray, first: IntArray, last: IntArray) -> FloatArray:
-        """Return ``sums`` (or ``counts``) over bands ``first`` to ``last - 1`` across the lines.
+    def boxes(self, rows: Ranges, columns: Ranges) -> FloatArray:
+        """Return the deviations of all boxes of some ranges of cells, 0 where one is too small or large."""
+        size = box_sums(self.area, (1, 1), rows, columns)
+        some = (size >= FEWEST_PIXELS) & (size <= LARGEST * self.area[-1, -1])
+        return np.where(some, super().boxes(rows, columns), 0.0)
 
-        Cumulative along the lines as the table is, the bands in the last axis.
-        """
-        total = np.pad(
-            np.cumsum(np.cumsum(table, axis=-2), axis=-1), [(0, 0)] * (table.ndim - 2) + [(1, 0)] * 2
-        )
-        corners = ((last, last), (first, last), (last, first), (first, first))
-        return np.asarray(
-            sum(s * total[..., i, j] for s, (i, j) in zip((1, -1, -1, 1), corners, strict=True))
-        )
-
-    def from_line(self, boxes: FloatArray, first: int) -> FloatArray:
-        """Return from :meth:`boxes` those of lines ``first`` to each later one, (later lines, bands)."""
-        if self.mode == "frame":
-            last = np.arange(first + 1, boxes.shape[0])
-            return np.asarray(
-                boxes[last, last] - boxes[first, last] - boxes[last, first] + boxes[first, first]
-            )
-        return np.asarray(boxes[first + 1 :] - boxes[first])
-
-    @property
-    def lines(self) -> IntArray:
-        """Edges of the cells along which lines are counted."""
-        return self.columns if self.mode == "column" else self.rows
-
-    @property
-    def across(self) -> IntArray:
-        """Edges of the cells across the lines."""
-        return self.rows if self.mode == "column" else self.columns
+    def phases(self, axis: int, period: int) -> FloatArray:
+        """Return the deviations of every n-th row or column, by their numbers modulo the period."""
+        parts = (each[axis].reshape(PERIOD // period, period, -1, period) for each in self.by_number)
+        return self.null(*(part.sum(axis=(0, 2)).diagonal() for part in parts))
 
 
-def pairs_of(samples: Samples, edges: tuple[IntArray, IntArray] | None = None) -> list[dict[str, Pairs]]:
+def pairs_of(samples: Samples, edges: Edges | None = None) -> list[dict[str, PairContrast]]:
     """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share.
 
     Args:
@@ -221,30 +206,31 @@ def pairs_of(samples: Samples, edges: tuple[IntArray, IntArray] | None = None) -
         edges: of the cells of rows and of columns, pixels; None: cells of equal size.
     """
     if edges is None:
-        rows, columns = (
-            np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in samples.usable.shape
-        )
+        rows, columns = (cell_edges(n, _CELLS) for n in samples.usable.shape)
         edges = rows, columns
-    counted, gathered = _Gathered(*edges), [_Gathered(*edges) for _ in CHANNELS]
+    counted, gathered = _Gathered(edges), [_Gathered(edges) for _ in CHANNELS]
     counted.add(samples.usable[None].astype(np.float32))
     for chunk in samples.chunks():
         for each, u in zip(gathered, chunk, strict=True):
             each.add(u)
-    n, counts = samples.n_frames, counted.tables()
-    found = []
+    n = samples.n_frames
+    counts = {mode: (cumulative(n * table), n * rest) for mode, (table, rest) in counted.tables().items()}
+    area = cumulative(samples.usable.astype(np.float64))
+    found: list[dict[str, PairContrast]] = []
     for each in gathered:
-        tables = each.tables()
-        found.append({
-            mode: Pairs(
-                mode,
-                tables[mode][0],
-                n * counts[mode][0],
-                tables[mode][1],
-                tuple(n * phases for phases in counts[mode][1]),
-                *each.edges(mode),
+        found.append({})
+        for mode, (table, by_number) in each.tables().items():
+            cells, (number, number_by) = each.edges(mode), counts[mode]
+            found[-1][mode] = PairContrast(
+                edges=cells,
+                sums=cumulative(table),
+                counts=number,
+                # that pairs are counted twice doubles the variance of a sum
+                null=normal(float(table.sum()), float(number.flat[-1]), 2.0, 1.0, one_sided=True),
+                axes=MODES[mode],
+                area=area[np.ix_(*cells)],
+                by_number=(by_number, number_by),
             )
-            for mode in MODES
-        })  # fmt: skip
     return found
 
 
@@ -255,107 +241,79 @@ def pairs_bytes(shape: tuple[int, int]) -> int:
     return _COPIES * 8 * (y * x * (y + x) + (v * u) ** 2)
 
 
-class _Lines:
-    """Sums of products of different pixels of a line, by cells across it.
-
-    Attributes:
-        lines, across: edges of the cells.
-        products: of the pixels of all lines of a cell, (line, across, across).
-        phases: of pixels of a line, and of a frame in different columns, by the column's number.
-    """
-
-    def __init__(self, lines: IntArray, across: IntArray) -> None:
-        """Begin with nothing."""
-        self.lines, self.across = lines, across
-        self.products = np.zeros((lines.size - 1, across.size - 1, across.size - 1))
-        self.phases = np.zeros((2, PERIOD, PERIOD))
-
-    def add(self, u: Float32Array, square: FloatArray) -> None:
-        """Add frames (t, line, across), with the sums of their squares (line, across)."""
-        cells = np.add.reduceat(u, self.across[:-1], axis=2)
-        own = _summed(square, (self.lines[:-1], self.across[:-1]))
-        for i, (first, last) in enumerate(pairwise(self.lines)):
-            part = cells[:, first:last].reshape(-1, cells.shape[2])
-            self.products[i] += part.T @ part - np.diag(own[i])
-        totals = u.sum(axis=1, dtype=np.float64)
-        for phases, values, squares in zip(
-            self.phases, (u, totals), (square.sum(axis=0), (totals**2).sum(axis=0)), strict=True
-        ):
-            folded = _folded(values).reshape(-1, PERIOD)
-            phases += folded.T @ folded - np.diag(_by_number(squares))
-
-
 class _Gathered:
     """Sums of products of different pixels of a row, of a column, and of all of a frame.
 
     Attributes:
-        rows, columns: of lines, with their cells; those of frames are every ``stride`` of these.
-        of_frames: products of all pixels, (y', x', y', x') in two axes.
+        cells: edges of the cells of rows and of columns; those of frames are every ``stride`` of these.
+        lines: products of the pixels of a row (y, x, x), and of a column (x, y, y).
+        by_number: of pixels of a row (column), and of a frame, by the numbers of their columns (rows).
+        frames: products of all pixels, (y' x', y' x').
         squares: of all pixels, (y', x').
     """
 
-    def __init__(self, rows: IntArray, columns: IntArray) -> None:
+    def __init__(self, cells: Edges) -> None:
         """Begin with nothing, for cells of rows and columns with these edges."""
-        self.rows, self.columns = _Lines(rows, columns), _Lines(columns, rows)
-        self.stride = tuple(2 if each.size - 1 > _CELLS // 2 else 1 for each in (rows, columns))
+        self.cells = cells
+        y, x = (each.size - 1 for each in cells)
+        self.stride = [2 if n > _CELLS // 2 else 1 for n in (y, x)]
+        self.lines = np.zeros((y, x, x)), np.zeros((x, y, y))
+        self.by_number = np.zeros((2, 2, PERIOD, PERIOD))
         self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])
-        self.of_frames = np.zeros((self.squares.size, self.squares.size))
+        self.frames = np.zeros((self.squares.size, self.squares.size))
 
-    def edges(self, mode: str) -> tuple[IntArray, IntArray]:
+    def edges(self, mode: str) -> Edges:
         """Return the edges of the cells of rows and of columns, pixels."""
-        whole = self.rows.lines, self.rows.across
-        if mode != "frame":
-            return whole
+        strides = self.stride if mode == "frame" else (1, 1)
         rows, columns = (
-            np.append(each[:-1:step], each[-1]) for each, step in zip(whole, self.stride, strict=True)
+            np.append(each[:-1:n], each[-1]) for each, n in zip(self.cells, strides, strict=True)
         )
         return rows, columns
 
     def add(self, u: Float32Array) -> None:
         """Add frames (t, y, x)."""
         square = np.einsum("tyx,tyx->yx", u, u, dtype=np.float64)
-        self.rows.add(u, square)
-        self.columns.add(u.transpose(0, 2, 1), square.T)
+        self._add_lines(0, u, square)
+        self._add_lines(1, u.transpose(0, 2, 1), square.T)
         rows, columns = (each[:-1] for each in self.edges("frame"))
         self.squares += _summed(square, (rows, columns))
         flat = np.add.reduceat(np.add.reduceat(u, rows, axis=1), columns, axis=2).reshape(u.shape[0], -1)
-        self.of_frames += flat.T @ flat
+        self.frames += flat.T @ flat
 
-    def tables(self) -> dict[str, tuple[FloatArray, tuple[FloatArray, ...]]]:
-        """Return the sums of each mode, cumulative along the lines, and by numbers; see :class:`Pairs`.
+    def _add_lines(self, axis: int, u: Float32Array, square: FloatArray) -> None:
+        """Add frames (t, line, across), with the sums of their squares (line, across)."""
+        lines, across = self.cells[axis], self.cells[1 - axis]
+        cells = np.add.reduceat(u, across[:-1], axis=2)
+        own = _summed(square, (lines[:-1], across[:-1]))
+        for i, (first, last) in enumerate(pairwise(lines)):
+            part = cells[:, first:last].reshape(-1, cells.shape[2])
+            self.lines[axis][i] += part.T @ part - np.diag(own[i])
+        totals = u.sum(axis=1, dtype=np.float64)
+        squares = square.sum(axis=0), (totals**2).sum(axis=0)
+        for sums, values, each in zip(self.by_number[axis], (u, totals), squares, strict=True):
+            folded = _folded(values).reshape(-1, PERIOD)
+            sums += folded.T @ folded - np.diag(_folded(each))
+
+    def tables(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Return the sums of each mode by cells, (y, x, x), (y, y, x) or (y, y, x, x), and by numbers.
 
         Of frames those of pixels in different rows and columns.
         """
-        of_rows, of_columns = self.rows.products, self.columns.products
-        by, bx = (
-            np.arange(0, size, step)
-            for size, step in zip((len(of_rows), len(of_columns)), self.stride, strict=True)
-        )
+        by, bx = (np.arange(0, len(each), n) for each, n in zip(self.lines, self.stride, strict=True))
         i, j = np.arange(by.size), np.arange(bx.size)
-        frames = self.of_frames.reshape(*2 * self.squares.shape).transpose(0, 2, 1, 3).copy()
-        frames[i, i] -= _summed(of_rows, (by, bx, bx))
-        frames[:, :, j, j] -= _summed(of_columns, (bx, by, by)).transpose(1, 2, 0)
+        frames = self.frames.reshape(*2 * self.squares.shape).transpose(0, 2, 1, 3).copy()
+        frames[i, i] -= _summed(self.lines[0], (by, bx, bx))
+        frames[:, :, j, j] -= _summed(self.lines[1], (bx, by, by)).transpose(1, 2, 0)
         for a in i:
             frames[a, a, j, j] -= self.squares[a]
-        both = self.rows.phases[1] - self.rows.phases[0], self.columns.phases[1] - self.columns.phases[0]
+        # rows by the number of their columns, columns by that of their rows
+        (of_rows, by_column), (of_columns, by_row) = self.by_number
+        none = np.zeros_like(of_rows)
         return {
-            "row": (_cumulative(of_rows, 1), (self.rows.phases[0],)),
-            "column": (_cumulative(of_columns, 1), (self.columns.phases[0],)),
-            "frame": (_cumulative(frames, 2), both),
+            "row": (self.lines[0], np.stack([none, of_rows])),
+            "column": (self.lines[1].transpose(1, 2, 0), np.stack([of_columns, none])),
+            "frame": (frames, np.stack([by_row - of_columns, by_column - of_rows])),
         }
-
-
-def _cumulative(table: FloatArray, axes: int) -> FloatArray:
-    """Return sums along the first axes, from nothing on."""
-    found = np.pad(table, [(1, 0)] * axes + [(0, 0)] * (table.ndim - axes))
-    for axis in range(axes):
-        found = found.cumsum(axis=axis)
-    return found
-
-
-def _by_number(values: FloatArray) -> FloatArray:
-    """Return sums of values of lines by the line's number modulo the period, (PERIOD,)."""
-    return np.bincount(np.arange(values.size) % PERIOD, values, PERIOD).astype(np.float64)
 
 
 def _summed(values: FloatArray, starts: tuple[IntArray, ...]) -> FloatArray:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.discrepancy.families import cell_edges
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.sums import StackSums
@@ -53,16 +54,9 @@ class CellMap:
     @classmethod
     def empty(cls, shape: tuple[int, int]) -> CellMap:
         """Begin with no pixel of a sensor of some rows and columns."""
-        rows, columns = (np.unique(np.linspace(0, n, min(n, _CELLS) + 1).astype(np.int64)) for n in shape)
+        rows, columns = (cell_edges(n, _CELLS) for n in shape)
         size = rows.size - 1, columns.size - 1
         return cls(rows, columns, np.zeros(size), np.zeros(size))
-
-    @classmethod
-    def of(cls, values: FloatArray) -> CellMap:
-        """Sum a whole map, (y, x); NaN where a pixel has no value."""
-        cells = cls.empty((values.shape[0], values.shape[1]))
-        cells.add(values)
-        return cells
 
     def add(self, values: FloatArray, first: int = 0) -> None:
         """Add rows of the map from the row ``first`` on, (y, x)."""
@@ -99,7 +93,8 @@ def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
     if sums.lengths.size >= MINIMUM_BLOCKS:
         with np.errstate(divide="ignore", invalid="ignore"):
             chi2 = (sums.lengths[:, None, None] * block_deviations(sums) ** 2).sum(axis=0) / v
-        found["spread"] = CellMap.of(chi_square(chi2, sums.lengths.size - 1.0))
+        found["spread"] = CellMap.empty(sums.shape)
+        found["spread"].add(chi_square(chi2, sums.lengths.size - 1.0))
     return found
 
 
@@ -126,7 +121,7 @@ def _place(name: str, cells: CellMap, significance: float) -> Suspect | None:
     )
     if not places:
         return None
-    inside = places[0].region.mask((usable.shape[0], usable.shape[1]))
+    inside = places[0].region.mask(usable.shape)
     if not (usable[inside].any() and usable[~inside].any()):
         return None
     means = [float(cells.sums[part].sum() / cells.counts[part].sum()) for part in (inside, ~inside)]

@@ -25,7 +25,7 @@ IntArray = NDArray[np.int64]
 _MOST_RUNS = 20_000
 
 
-def region_mask(region: Region, shape: tuple[int, int], rows: IntArray | None = None) -> BoolArray:
+def region_mask(region: Region, shape: tuple[int, ...], rows: IntArray | None = None) -> BoolArray:
     """Return which pixels of a sensor, or of a band of its rows, lie in a region, (y, x).
 
     Args:
@@ -52,7 +52,7 @@ def region_mask(region: Region, shape: tuple[int, int], rows: IntArray | None = 
     return np.asarray(inside)
 
 
-def _check(region: Region, shape: tuple[int, int]) -> None:
+def _check(region: Region, shape: tuple[int, ...]) -> None:
     """Refuse what lies beyond the sensor."""
     ends = {
         "rows": [last for _, last in region.rows] + [row + 1 for row, _, _ in region.pixels],

@@ -179,7 +179,7 @@ class Region(_Place):
 
         return cls.model_validate(simplest_region(mask))
 
-    def mask(self, shape: tuple[int, int], rows: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
+    def mask(self, shape: tuple[int, ...], rows: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
         """Return which pixels of a sensor, or of a band of its rows, lie in the region, (y, x).
 
         Args:

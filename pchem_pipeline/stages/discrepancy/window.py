@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
+from pchem_pipeline.discrepancy.families import box_sums, cumulative
 from pchem_pipeline.discrepancy.null import free_of_parameters
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.scan import Suspect, integral
+from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.effects.framework.effect import Effect
@@ -213,14 +214,8 @@ def _corner(
         np.unique(np.linspace(first, last - length, _TRIED).astype(np.int64))
         for first, last, length in ((y0, y1, size[0]), (x0, x1, size[1]))
     )
-    total = integral(place.astype(np.int64))
-    inside = (
-        total[np.ix_(ys + size[0], xs + size[1])]
-        - total[np.ix_(ys, xs + size[1])]
-        - total[np.ix_(ys + size[0], xs)]
-        + total[np.ix_(ys, xs)]
-    )
-    both = np.minimum(inside, size[0] * size[1] - inside).astype(np.float64)
+    inside = box_sums(cumulative(place.astype(np.float64)), (1, 1), (ys, ys + size[0]), (xs, xs + size[1]))
+    both = np.minimum(inside, size[0] * size[1] - inside)
     # of windows that hold as much of it the one nearest to the middle
     away = np.abs(ys - middle[0])[:, None] + np.abs(xs - middle[1])[None, :]
     row, column = np.unravel_index(int(np.argmax(both - 1e-6 * away)), both.shape)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pchem_pipeline.discrepancy.families import log_binomial_tails
 from pchem_pipeline.discrepancy.scan import (
     affected_share,
-    log_binomial_tail,
     scan_event_frames,
     scan_event_map,
     scan_map,
@@ -227,7 +227,7 @@ def test_events_have_no_place_by_chance_and_follow_the_share_of_each_pixel() -> 
 
 def test_a_binomial_tail_is_that_of_the_law() -> None:
     for k, n, share in ((3, 8, 0.09), (16, 16, 0.1), (1, 40, 0.5)):
-        assert log_binomial_tail(k, n, share) == pytest.approx(stats.binom.logsf(k - 1, n, share), rel=1e-9)
+        assert log_binomial_tails(k, n, share) == pytest.approx(stats.binom.logsf(k - 1, n, share), rel=1e-9)
 
 
 def test_a_range_of_frames_with_events_is_found() -> None:

@@ -12,6 +12,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.discrepancy.where import (
+    _pixels,
     frame_series,
     map_of,
     pixel_maps,
@@ -96,6 +97,17 @@ def test_maps_and_series_are_standard_normal_by_chance() -> None:
         z = values[np.isfinite(values)]
         assert abs(z.mean()) < 5.0 / np.sqrt(z.size) + 0.05, name
         assert 0.8 < z.std() < 1.2, name
+
+
+def test_pixels_whose_levels_wander_are_listed_and_no_others() -> None:
+    def moved(dn: Array) -> Array:
+        levels = 3.0 * np.random.default_rng(3).standard_normal((10, 2))
+        dn[:, [30, 40], [60, 7]] += np.repeat(levels, 50, axis=0)
+        return dn
+
+    evidence = seen(moved)
+    names = ("time.block.charge.cnt", "time.block.readout.cnt")
+    assert {p for name in names for p in _pixels(name, evidence, pixel_maps(evidence))} == {(30, 60), (40, 7)}
 
 
 def test_every_statistic_is_asked_of_a_map_or_series_that_exists() -> None:

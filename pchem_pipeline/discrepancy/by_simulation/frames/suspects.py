@@ -10,7 +10,7 @@ that were looked at.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -20,7 +20,7 @@ from scipy import special
 from scipy.ndimage import binary_dilation
 
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
-from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
+from pchem_pipeline.discrepancy.observe.pairs import FEWEST_PIXELS, LARGEST, FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.observe.rare import N_SETS, rare_samples
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
@@ -33,16 +33,10 @@ from pchem_pipeline.discrepancy.scan import (
     scan_series,
     sharpest_range,
 )
-from pchem_pipeline.discrepancy.scan_pairs import (
-    FEWEST_PIXELS,
-    LARGEST,
-    Shared,
-    scan_pairs,
-    shared_elsewhere,
-)
+from pchem_pipeline.discrepancy.scan_pairs import Shared, scan_pairs, shared_elsewhere
 from pchem_pipeline.discrepancy.where import frame_series, pixel_maps, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
-from pchem_pipeline.effects.framework.region import Region, When
+from pchem_pipeline.effects.framework.region import When
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
@@ -75,17 +69,14 @@ def suspected_parts(evidence: Evidence, frames: NDArray[np.unsignedinteger[Any]]
     shared = scan_pairs(samples, most=_MOST)
     regions = [*_regions(evidence), *_regions_of_rare(evidence), *shared]
     # one that touches another, as a tap does, must be nearly as clear: else it is the edge of that
-    places = [
-        Part(each.region) for each in _apart(regions, lambda one: _mask(one.region, usable), binary_dilation)
-    ]
+    masked = ((each, each.region.mask(usable.shape)) for each in regions)
+    places = [Part(each.region) for each in _apart(masked, binary_dilation)]
     # of what all outside share, too, but not with those inside, a second tap say, no map shows anything
     rest = shared_elsewhere(samples, shared[0]) if shared else None
     places += [] if rest is None or len(places) == _MOST else [Part(rest)]
     stretches = [*_stretches(evidence, time), *_stretches_of_rare(evidence, time)]
-    ranges = [
-        with_ends(Part(None, each.when), evidence)
-        for each in _apart(stretches, lambda one: one.when.frames(time.frames), np.asarray)
-    ]
+    chosen = _apart(((each, each.when.frames(time.frames)) for each in stretches), np.asarray)
+    ranges = [with_ends(Part(None, each.when), evidence) for each in chosen]
     crossings = [*_frames_of_places(shared, samples, time), *_places_of_frames(ranges, samples, frames, time)]
     if places and ranges and not crossings:
         crossings = [Part(places[0].region, ranges[0].when)]
@@ -108,33 +99,22 @@ def with_ends(part: Part, evidence: Evidence) -> Part:
     return Part(part.region, _with_unseen(when, time.frames))
 
 
-def _apart(
-    found: Sequence[_C], mask: Callable[[_C], BoolArray], grown: Callable[[BoolArray], BoolArray]
-) -> list[_C]:
+def _apart(found: Iterable[tuple[_C, BoolArray]], grown: Callable[[BoolArray], BoolArray]) -> list[_C]:
     """Return what stands out most and does not overlap.
 
     Args:
-        found: places or frames.
-        mask: returns the pixels or frames of one.
+        found: places or frames, and masks of their pixels or frames.
         grown: returns those that one which is far less clear than the first may not have.
     """
+    ordered = sorted(found, key=lambda one: -one[0].z)
     chosen: list[_C] = []
-    taken: BoolArray | None = None
-    found = sorted(found, key=lambda one: -one.z)
-    for each in found:
-        own = mask(each)
-        if taken is None:
-            chosen, taken = [each], own
-            continue
-        beside = taken if each.z > _AS_CLEAR * found[0].z else grown(taken)
+    taken = np.zeros_like(ordered[0][1]) if ordered else np.zeros(0, np.bool_)
+    for each, own in ordered:
+        beside = taken if each.z > _AS_CLEAR * ordered[0][0].z else grown(taken)
         if len(chosen) < _MOST and not (own & beside).any():
             chosen.append(each)
             taken = taken | own
     return chosen
-
-
-def _mask(region: Region, usable: BoolArray) -> BoolArray:
-    return region.mask((usable.shape[0], usable.shape[1]))
 
 
 def _is_part(inside: BoolArray, every: BoolArray, fewest: int) -> bool:
@@ -150,7 +130,7 @@ def _among(frames: IntArray, when: When) -> bool:
 def _frames_of_places(shared: Sequence[Shared], samples: Samples, time: TimeSeries) -> Iterator[Part]:
     """Yield places in those frames only in which their pixels share noise."""
     for each in shared:
-        inside = samples.usable & _mask(each.region, samples.usable)
+        inside = samples.usable & each.region.mask(samples.usable.shape)
         energy = samples.energies(each.channel, each.mode, inside)
         values = (energy - np.median(energy)) / max(robust_sd(energy), 1e-300)
         for one in scan_series(values, time.frames, most=1, shortest=FEWEST_FRAMES):
@@ -175,37 +155,38 @@ def _regions(evidence: Evidence) -> Iterator[Suspect]:
     and would never do to these what the data do.
     """
     usable = evidence.maps.usable
-    shapes, log_maps = _Shapes(evidence), float(np.log(len(pixel_maps(evidence))))
+    shapes, log_maps = _shapes(evidence), float(np.log(len(pixel_maps(evidence))))
     for suspects in suspected_regions(evidence, _SIGNIFICANCE_OF_GUESSES).values():
         for one in suspects:
-            mask = usable & _mask(one.region, usable)
+            mask = usable & one.region.mask(usable.shape)
             if not one.only_there or one.family == "pixels" or not _is_part(mask, usable, FEWEST_PIXELS):
                 continue
-            z = shapes.z(mask)
+            z = shapes(mask)
             together = float(special.log_ndtr(-z)) + one.log_places
             if min(one.log_p + log_maps, together) <= np.log(_SIGNIFICANCE_OF_MAPS):
                 yield replace(one, z=max(abs(one.z), z))
 
 
-class _Shapes:
-    """The maps of the shapes of the histograms, of which effects move several at once."""
+def _shapes(evidence: Evidence) -> Callable[[BoolArray], float]:
+    """Return a function of pixels (y, x) that says by how many standard deviations their means are off.
 
-    def __init__(self, evidence: Evidence):
-        self.usable = evidence.maps.usable
-        maps = [evidence.goodness, evidence.peaks, *evidence.scores.values()]
-        values = np.nan_to_num(np.array([each[self.usable] for each in maps], np.float64))
-        # means of places are nearly normal, single pixels less so
-        middle = np.median(values, axis=1, keepdims=True)
-        self.values = np.clip(values - middle, -FAR, FAR)
-        self.precision = np.linalg.pinv(np.atleast_2d(np.cov(self.values)), hermitian=True)
+    Of the maps of all shapes of histograms together, of which effects move several at once (Hotelling 1931).
+    """
+    usable = evidence.maps.usable
+    maps = [evidence.goodness, evidence.peaks, *evidence.scores.values()]
+    values = np.nan_to_num(np.array([each[usable] for each in maps], np.float64))
+    # means of places are nearly normal, single pixels less so
+    values = np.clip(values - np.median(values, axis=1, keepdims=True), -FAR, FAR)
+    precision = np.linalg.pinv(np.atleast_2d(np.cov(values)), hermitian=True)
 
-    def z(self, mask: BoolArray) -> float:
-        """Return by how many standard deviations the means of pixels, (y, x), are off (Hotelling 1931)."""
-        inside = mask[self.usable]
-        apart = self.values[:, inside].mean(axis=1) - self.values[:, ~inside].mean(axis=1)
+    def deviation(mask: BoolArray) -> float:
+        inside = mask[usable]
+        apart = values[:, inside].mean(axis=1) - values[:, ~inside].mean(axis=1)
         number = 1.0 / (1.0 / inside.sum() + 1.0 / (~inside).sum())
-        distance = number * float(apart @ self.precision @ apart)
-        return float(chi_square(np.array(distance), len(self.values)))
+        distance = number * float(apart @ precision @ apart)
+        return float(chi_square(np.array(distance), len(values)))
+
+    return deviation
 
 
 def _regions_of_rare(evidence: Evidence) -> Iterator[Suspect]:
@@ -213,7 +194,7 @@ def _regions_of_rare(evidence: Evidence) -> Iterator[Suspect]:
     usable, limit = evidence.maps.usable, SIGNIFICANCE / N_SETS
     for rare in rare_samples(evidence):
         for one in scan_event_map(rare.seen, rare.expected, usable, significance=limit):
-            if one.only_there and _is_part(_mask(one.region, usable), usable, FEWEST_PIXELS):
+            if one.only_there and _is_part(one.region.mask(usable.shape), usable, FEWEST_PIXELS):
                 yield one
 
 
@@ -242,7 +223,8 @@ def _stretches(evidence: Evidence, time: TimeSeries) -> Iterator[Stretch]:
             some = some and (one.inside > one.outside or name.startswith("frame."))
             # levels that alternate or beat are effects in all frames, which have names
             some = some and not (one.when.every and name.startswith("frame."))
-            if some and _follows(values, one.when.frames(time.frames)) * _TREND > _slope(values):
+            trend = _correlated(values, np.arange(values.size))
+            if some and _correlated(values, one.when.frames(time.frames)) * _TREND > trend:
                 yield replace(one, z=abs(one.z), when=_with_unseen(one.when, time.frames))
 
 
@@ -257,11 +239,6 @@ def _with_unseen(when: When, seen: IntArray) -> When:
     return when.model_copy(update={"range": ((first, last),)})
 
 
-def _follows(values: FloatArray, form: NDArray[Any]) -> float:
-    """Return by how many standard deviations a series goes with another one."""
+def _correlated(values: FloatArray, form: NDArray[Any]) -> float:
+    """Return by how many standard deviations a series is correlated with another one."""
     return float(abs(np.corrcoef(form, values)[0, 1]) * np.sqrt(values.size))
-
-
-def _slope(values: FloatArray) -> float:
-    """Return by how many standard deviations a series rises or falls along the run."""
-    return _follows(values, np.arange(values.size))
