@@ -22,6 +22,7 @@ from pchem_pipeline.report.figures.figure import Figure
 
 #: Makers of the figures of the report.
 REPORT_FIGURES: tuple[Callable[[ReportData], Iterable[Figure]], ...] = (
+    pixels.cell_figures,
     pixels.pixel_figures,
     samples.exposure_figures,
     samples.transfer_figures,

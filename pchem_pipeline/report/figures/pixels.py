@@ -1,4 +1,4 @@
-"""Histograms of single pixels with their fits."""
+"""Figures of single pixels: the cells of the electron number, and histograms with their fits."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.model.law.pcd import pcd
+from pchem_pipeline.model.law.pcd import pcd, thresholds
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
     PAGE_MM,
@@ -25,17 +25,41 @@ from pchem_pipeline.report.charts.chart import (
     Stack,
     Steps,
     Sticks,
+    Words,
 )
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.wording import cut, measured, plain, stored_unit, symbol
+from pchem_pipeline.report.style.wording import cut, measured, plain, short, stored_unit, symbol
 
 FloatArray = NDArray[np.float64]
 
 #: Letters of a line of the status.
 _STATUS_LETTERS = 52
 _LETTERS = "abcdefghijklmnop"
+#: Cells whose number is written.
+_MOST_NUMBERS = 18
 _TITLE_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
+
+
+def cell_figures(data: ReportData) -> Iterator[Figure]:
+    """Return the cells of the electron number of a pixel of the run (fig:optimal_quantization)."""
+    pixel = next((pixel for pixel in data.pixels if has_fit(pixel.parameters)), None)
+    if pixel is None:
+        return
+    tables = cell_tables(pixel.parameters, pixel)
+    edges = thresholds(*_theta(pixel.parameters), 4)
+    first = ", ".join(short(float(edge), 4) for edge in edges if np.isfinite(edge))
+    yield Figure(
+        "electron_cells",
+        "",
+        f"Limits between electron numbers, {pixel.place}",
+        "Histogram of the pixel (gray), its fitted density (line), and the limits between the most probable "
+        "electron numbers (dashed). They are not half-way between the peaks, since small and large numbers "
+        "are not equally likely.",
+        f"Histogram and density of {pixel.place}; first limits at {first} DN.",
+        tables,
+        cells_chart(tables),
+    )
 
 
 def pixel_figures(data: ReportData) -> Iterator[Figure]:
@@ -232,3 +256,63 @@ def _title(pixel: PixelFit, letter: str) -> str:
             f"status: {plain(pixel.status)}", _STATUS_LETTERS, max_lines=5, placeholder=" …"
         )
     return "\n".join(lines)
+
+
+def cell_tables(parameters: Mapping[str, float], pixel: PixelFit) -> tuple[DataTable, ...]:
+    """Return a density, the edges between the cells of its electron numbers, and the pixel's histogram.
+
+    Args:
+        parameters: the four parameters of the PCD.
+        pixel: whose histogram is drawn behind.
+    """
+    theta = _theta(parameters)
+    low, high, last = cell_range(*theta)
+    x = np.linspace(low, high, 1200)
+    edges = thresholds(*theta, last + 1)
+    edges = edges[edges < high]
+    density = DataTable({"signal": x, "density": pcd(x, *theta)}, {"signal": "DN", "density": "1/DN"})
+    between = DataTable({"below k": np.arange(1, edges.size + 1), "edge": edges}, {"edge": "DN"}, "edges")
+    return (
+        density,
+        between,
+        DataTable({"dn": _codes(pixel), "frames": pixel.counts}, {"dn": "DN"}, "histogram"),
+    )
+
+
+def cells_chart(tables: Sequence[DataTable]) -> Chart:
+    """Return the chart of a PCD with the optimal edges between electron numbers (eq. demarg_K_eqn).
+
+    Args:
+        tables: of :func:`cell_tables`.
+    """
+    density, between, histogram = tables
+    x, edges, dn = density["signal"], between["edge"], histogram["dn"]
+    low, high = float(x[0]), float(x[-1])
+    curve = Line(x, density["density"], colour="ink", label="fitted density")
+    first = int(np.clip(np.floor(low) - dn[0], 0, dn.size - 1))
+    last = int(np.clip(np.ceil(high) - dn[0], first, dn.size - 1))
+    bars = _bars(histogram["frames"], int(dn[0]), slice(first, last + 1))
+    top = 1.28 * max(float(np.max(curve.y)), float(np.max(bars.values)))
+    ends = np.full(edges.size, 0.86 * top)
+    dashed = Sticks(edges, ends, colour="blue", dash="--", width=0.9, label="limit between numbers k")
+    cells = np.concatenate([[low], edges, [high]])
+    every = max(1, int(np.ceil(len(cells) / _MOST_NUMBERS)))
+    words = [
+        Words((cells[k] + cells[k + 1]) / 2, 0.87, f"k = {k}" if k == 0 else str(k))
+        for k in range(0, len(cells) - 1, every)
+    ]
+    panel = Panel(Axis("density (1/DN)", 0.0, top), (bars, curve, dashed, *words))
+    return Chart((Stack((panel,), Axis("signal (DN)", low, high), height_mm=55.0),), legend=(3, 3))
+
+
+def cell_range(exposure: float, gain: float, bias: float, sigma: float) -> tuple[float, float, int]:
+    """Return the signals between which cells are drawn (DN), and the last electron number among them.
+
+    Args:
+        exposure: H, e-.
+        gain: g, e-/DN.
+        bias: mu, DN.
+        sigma: read noise, DN.
+    """
+    last = int(np.ceil(exposure + 3.0 * np.sqrt(max(exposure, 0.3)))) + 1
+    return bias - 4.0 * sigma, bias + last / gain + 4.0 * sigma, last
