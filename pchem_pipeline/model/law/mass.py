@@ -19,8 +19,8 @@ FloatArray = NDArray[np.float64]
 #: Mass of an occupied code, at least.
 LEAST_SEEN = 1e-60
 
-#: Pixels whose masses are held at a time.
-_AT_ONCE = 256
+#: Pixels whose masses are held at a time, and codes where pixels of the same number of codes come together.
+_AT_ONCE, _CODES_AT_ONCE = 256, 1 << 17
 # mass of a cell that tells nothing: a difference of two tails that are alike, whose slopes are left over
 _LEAST_TOLD = 1e-15
 
@@ -60,11 +60,12 @@ def parts_of_similar_width(
     if limits is not None:
         low, high = np.maximum(low, limits[0]), np.minimum(high, limits[1])
     width = high - low + 1
-    order = np.argsort(width, kind="stable")
+    order = np.argsort(-width, kind="stable")
     order = order[width[order] > 0]
-    for begin in range(0, order.size, _AT_ONCE):
-        some = order[begin : begin + _AT_ONCE]
-        yield some, low[some], int(width[some[-1]])
+    while order.size:
+        widest = int(width[order[0]])
+        some, order = np.split(order, [max(1, _CODES_AT_ONCE // widest)])
+        yield some, low[some], widest
 
 
 def sample_mass(
