@@ -65,39 +65,22 @@ class NucedAxis:
 
 
 @dataclass(frozen=True)
-class EnsembleSums:
-    """Sums over pixels of the predicted mass of each bin, and of its square.
+class AxisSums:
+    """Sums over pixels on the two axes, of predicted masses or of samples.
 
     Attributes:
-        raw: sum of the mass of each whole DN, shape (n_dn,).
-        raw_square: sum of its square.
-        nuced: sum of the mass in the bins of the NUCed axis, shape (n_bins,).
-        nuced_square: sum of its square.
+        raw: of what lies at each whole DN, shape (n_dn,).
+        raw_square: of its square.
+        nuced: of what lies in each bin of the NUCed axis, shape (n_bins,).
+        nuced_square: of its square.
+        nuced_sum: of the NUCed values, e-.
+        nuced_sum_square: of their squares, e-^2.
     """
 
     raw: FloatArray
     raw_square: FloatArray
     nuced: FloatArray
     nuced_square: FloatArray
-
-
-@dataclass(frozen=True)
-class Tally:
-    """The data of a set of pixels on the axes of the ensemble.
-
-    Attributes:
-        raw: samples at each DN, shape (n_dn,).
-        nuced: samples in each bin of the NUCed axis, shape (n_bins,).
-        outside: samples beyond the DN axis.
-        nuced_outside: samples beyond the NUCed axis.
-        nuced_sum: sum of the NUCed values of all samples, e-.
-        nuced_sum_square: sum of their squares, e-^2.
-    """
-
-    raw: IntArray
-    nuced: IntArray
-    outside: int
-    nuced_outside: int
     nuced_sum: float
     nuced_sum_square: float
 
@@ -132,7 +115,7 @@ def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None, 
 
 def mass_sums(
     mass: FloatArray, first: IntArray, start: IntArray, pixels: UsablePixels, dn: DnAxis, nuced: NucedAxis
-) -> tuple[EnsembleSums, FloatArray]:
+) -> AxisSums:
     """Sum the masses that any law gives to the codes of pixels, at the integer DN and sorted into NUCed bins.
 
     The mean over pixels of the raw masses is the ensemble (Hendrickson et al. 2023, eq. full_ensemble_dist),
@@ -147,14 +130,10 @@ def mass_sums(
         pixels: the n pixels.
         dn: axis of the raw prediction; it should hold all of the data.
         nuced: axis of the NUCed prediction.
-
-    Returns:
-        The sums, and those of the means of the NUCed value (e-) and of its square (e-^2), shape (2,).
     """
     end = np.minimum(start[1:], start[:-1] + dn.start + dn.size - first)
     codes = np.maximum(first, dn.start), start[:-1] + np.maximum(dn.start - first, 0), end
-    raw, bins, moments = _on_axes(mass[:, None], codes, np.ones((1, 1, 1)), pixels, dn, nuced)
-    return EnsembleSums(*raw, *bins), moments
+    return _on_axes(mass[:, None], codes, np.ones((1, 1, 1)), pixels, dn, nuced)
 
 
 def _on_axes(
@@ -164,13 +143,13 @@ def _on_axes(
     pixels: UsablePixels,
     dn: DnAxis,
     nuced: NucedAxis,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return sums and forms on the two axes, and the moments; see :func:`.ensemble_numba.add_to_axes`."""
+) -> AxisSums:
+    """Return sums, with forms in place of squares; see :func:`.ensemble_numba.add_to_axes`."""
     sums = raw, bins, moments = np.zeros((2, dn.size)), np.zeros((2, nuced.size + 2)), np.zeros(2)
     _, gain, bias, _ = pixels.maps
     axis, held = (float(nuced.width), nuced.start), np.zeros(values.shape[1])
     ensemble_numba.add_to_axes(values, codes, forms, gain, bias, dn.start, axis, *sums, held)
-    return raw, bins[:, 1:-1], moments
+    return AxisSums(*raw, *bins[:, 1:-1], *moments.tolist())
 
 
 def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatArray:
@@ -188,8 +167,8 @@ def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatA
     law = SampleLaw()
     for some, first, n_codes in parts_of_similar_width(law, pixels, (dn.start, dn.start + dn.size - 1)):
         codes = first[:, None] + np.arange(n_codes)
-        mass = sample_mass(law, pixels.of(some), codes, far_tails=False)
-        ensemble_numba.add_rows(mass, first - dn.start, share[some], out)
+        mass = share[some, None] * sample_mass(law, pixels.of(some), codes, far_tails=False)
+        out += np.bincount((codes - dn.start).ravel(), mass.ravel(), dn.size + n_codes)[: dn.size]
     return out
 
 
@@ -218,9 +197,9 @@ def curve_errors(
         part, begin = pixels.of(some), np.arange(some.size) * n_codes
         slopes = _mass_slopes(law.of(some), part, first, n_codes).swapaxes(1, 2).reshape(-1, 4)
         codes = first, begin, begin + np.minimum(n_codes, dn.start + dn.size - first)
-        on_axes = _on_axes(slopes, codes, known[some], part, dn, nuced)
-        raw += on_axes[0][1]
-        bins += on_axes[1][1]
+        sums = _on_axes(slopes, codes, known[some], part, dn, nuced)
+        raw += sums.raw_square
+        bins += sums.nuced_square
     return raw, bins
 
 
@@ -239,7 +218,7 @@ def tally(
     pixels: UsablePixels,
     dn: DnAxis,
     nuced: NucedAxis | None = None,
-) -> Tally:
+) -> AxisSums:
     """Sort the histograms of pixels onto the axes of the ensemble.
 
     Args:
@@ -250,17 +229,14 @@ def tally(
         nuced: axis of the NUCed histogram, or None for none.
 
     Returns:
-        The tally; what falls beyond an axis is counted, not lost in silence.
+        The samples, whole numbers; no squares.
     """
     rows = kernel_counts(counts)
     begin = np.arange(len(rows)) * rows.shape[1]
     codes = np.asarray(origin, np.int64), begin, begin + rows.shape[1]
-    axis = nuced or NucedAxis(1.0, 0, 0)
-    raw, bins, moments = _on_axes(rows.reshape(-1, 1), codes, np.zeros((1, 1, 1)), pixels, dn, axis)
-    samples, nuced_samples = (each[0].astype(np.int64) for each in (raw, bins))  # exact in floats
-    total = int(rows.sum(dtype=np.int64))
-    outside = total - int(samples.sum()), total - int(nuced_samples.sum())
-    return Tally(samples, nuced_samples, *outside, *moments.tolist())
+    return _on_axes(
+        rows.reshape(-1, 1), codes, np.zeros((1, 1, 1)), pixels, dn, nuced or NucedAxis(1.0, 0, 0)
+    )
 
 
 def electron_pmf(quanta_exposure: FloatArray, n_k: int, share: FloatArray | None = None) -> FloatArray:

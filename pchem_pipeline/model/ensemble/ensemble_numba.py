@@ -30,8 +30,8 @@ def add_to_axes(
 ) -> None:
     """Add values v of the codes of pixels, and quadratic forms v' C v, at whole DN and in NUCed bins.
 
-    A code lies at the NUCed value ``(x - mu) g`` and falls into one bin as a whole; those of a pixel that fall
-    into one bin follow each other, and the form is that of their sum.
+    A code lies at the NUCed value ``(x - mu) g`` and falls into one bin as a whole; those of a pixel in one
+    bin follow each other, and the form is that of their sum.
 
     Args:
         values: m for each code, one pixel after the other, shape (n_codes, m).
@@ -89,18 +89,3 @@ def _release(held: FloatArray, form: FloatArray, out: FloatArray) -> None:
     out[0] += held[0]
     out[1] += _form(held, form)
     held[:] = 0.0
-
-
-@kernel
-def add_rows(rows: FloatArray, first: IntArray, share: FloatArray, out: FloatArray) -> None:
-    """Add rows, each times its share, from a place on; what lies after the end of ``out`` is left out.
-
-    Args:
-        rows: shape (n, m).
-        first: place of the first value of each, shape (n,).
-        share: shape (n,).
-        out: in and out, the sums.
-    """
-    for p in range(first.size):
-        for i in range(min(rows.shape[1], out.size - first[p])):
-            out[first[p] + i] += share[p] * rows[p, i]
