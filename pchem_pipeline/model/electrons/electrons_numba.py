@@ -183,4 +183,4 @@ def count_numbers(
         place = start[p] + origin[p] - tables.first[p]
         for i in range(max(0, start[p] - place), min(counts.shape[1], start[p + 1] - place)):
             if number[place + i] != missing:
-                out[min(np.int64(number[place + i]), out.size - 1)] += np.int64(counts[p, i])
+                out[min(int(number[place + i]), out.size - 1)] += int(counts[p, i])

@@ -68,7 +68,7 @@ def moment_rows(
             "unit": unit,
             "predicted": predicted[name],
             "observed": observed.get(name),
-            "stderr": getattr(errors, name, None),
+            "stderr": errors.get(name),
         }
         for name, quantity, unit in _MOMENTS
         if extended or name != "effects"

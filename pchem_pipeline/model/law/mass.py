@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law import mass_numba
-from pchem_pipeline.model.law.cells_numba import EXACT, NEAR
+from pchem_pipeline.model.law.cells_numba import CORE, EXACT, NEAR
 from pchem_pipeline.model.law.inputs import pack, satellites_of
 from pchem_pipeline.model.law.parameters import Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
@@ -74,7 +74,7 @@ def sample_mass(
     codes: ArrayLike,
     *,
     satellites: tuple[ArrayLike, ArrayLike] | None = None,
-    far_tails: bool = True,
+    far_tails: bool | None = True,
 ) -> FloatArray:
     """Return the probability of each code in each pixel, exact to the ends of the tails.
 
@@ -84,7 +84,7 @@ def sample_mass(
         codes: successive whole DN, shape (n_codes,) for all pixels alike or (n, n_codes).
         satellites: ``satellite_amplitude_e`` and ``satellite_weight`` of the pixels; by default those of
             ``maps`` where it has any, else none.
-        far_tails: also what is below 1e-50, which takes several times as long.
+        far_tails: also what is below 1e-50, which takes several times as long; None: nor what is below 1e-17.
 
     Returns:
         P(x), shape (n, n_codes); NaN where a parameter is.
@@ -100,7 +100,7 @@ def sample_mass(
     out = np.full((n, wanted.shape[1]), np.nan)
     if out.size:
         first = np.array(np.broadcast_to(wanted[:, 0], (n,)))
-        stage = EXACT if far_tails else NEAR
+        stage = CORE if far_tails is None else EXACT if far_tails else NEAR
         none = np.empty((0, 4, out.shape[1]))
         mass_numba.mass_tile(
             first, columns, satellites_of(maps, satellites, n), pack([model], n), stage, out, none
