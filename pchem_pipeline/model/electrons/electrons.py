@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.electrons import electrons_numba
 from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR, CodeTables, PixelLaws, SampleNumbers
-from pchem_pipeline.model.ensemble.ensemble import sum_at
-from pchem_pipeline.model.law.inputs import pack, satellites_of
+from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
 from pchem_pipeline.model.law.mass import code_ranges
 from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -176,14 +175,10 @@ class NumberTables:
             origin: DN of bin 0, shape (n,).
             n_k: number of electron numbers, k = 0 .. n_k - 1.
         """
-        pixel, code = np.nonzero(counts)
-        n = counts[pixel, code].astype(np.int64)
-        place = self.start[pixel] + origin[pixel] + code - self.first[pixel]
-        known = (self.start[pixel] <= place) & (place < self.start[pixel + 1])
-        number, n = self.number[place[known]].astype(np.int64), n[known]
-        numbered = number != self.missing
-        out = sum_at(number[numbered], n[numbered], n_k).astype(np.int64)
-        return out, int(n[numbered].sum() - out.sum())
+        out = np.zeros(n_k + 1, np.int64)
+        first = np.asarray(origin, np.int64)
+        electrons_numba.count_numbers(kernel_counts(counts), first, self._tables, self.missing, out)
+        return out[:-1], int(out[-1])
 
     def outcomes(self, n_k: int) -> Outcomes:
         """Return the probability of each estimated number and of an error; of tables with all details.

@@ -163,3 +163,24 @@ def convert_frames(frames: NDArray[Any], tables: CodeTables, missing: int, out: 
                 out.probability[t, p] = np.float32(right[i] / mass[i] if sure else math.nan)
             if with_expected:
                 out.expected[t, p] = expected[i] if known else np.float32(math.nan)
+
+
+@kernel
+def count_numbers(
+    counts: NDArray[Any], origin: IntArray, tables: CodeTables, missing: int, out: IntArray
+) -> None:
+    """Count the samples of histograms by their electron number; those without one are left out.
+
+    Args:
+        counts: samples per bin, shape (n, n_bins).
+        origin: DN of bin 0, shape (n,).
+        tables: of the pixels.
+        missing: what stands for no number.
+        out: in and out, samples of each number; in the last place those of it and of larger ones.
+    """
+    start, number = tables.start, tables.number
+    for p in range(origin.size):
+        place = start[p] + origin[p] - tables.first[p]
+        for i in range(max(0, start[p] - place), min(counts.shape[1], start[p + 1] - place)):
+            if number[place + i] != missing:
+                out[min(int(number[place + i]), out.size - 1)] += int(counts[p, i])

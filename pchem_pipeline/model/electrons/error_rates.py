@@ -6,8 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr
-from scipy.stats import poisson
+from scipy.special import gammaln, ndtr, xlogy
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE
@@ -74,10 +73,8 @@ def errors_of_numbers(deciding: UsablePixels, data: UsablePixels) -> FloatArray:
         pixel = np.repeat(np.arange(part.size), np.diff(tables.start))
         code = np.arange(pixel.size) - tables.start[pixel] + tables.first[pixel]
         h, g, mu, sigma = (column[pixel] for column in data.of(some).maps)
-        off, sd = (
-            code - mu - tables.number / g,
-            np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, LEAST_VARIANCE)),
-        )
-        mass = poisson.pmf(tables.number, h) * (ndtr((off + 0.5) / sd) - ndtr((off - 0.5) / sd))
+        k = tables.number.astype(np.float64)
+        off, sd = code - mu - k / g, np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, LEAST_VARIANCE))
+        mass = np.exp(xlogy(k, h) - h - gammaln(k + 1.0)) * (ndtr((off + 0.5) / sd) - ndtr((off - 0.5) / sd))
         errors[part] = 1.0 - np.bincount(pixel, mass, part.size)
     return errors

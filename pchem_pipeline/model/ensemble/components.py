@@ -55,23 +55,6 @@ class EnsembleMoments:
 
 
 @dataclass(frozen=True)
-class MomentErrors:
-    """Standard errors of the sample moments from a finite number of frames, the pixels given.
-
-    Attributes:
-        mean: of the sample mean, DN.
-        variance: of the sample variance, DN^2.
-        nuced_mean: of the mean of the NUCed data, e-.
-        nuced_variance: of the variance of the NUCed data, e-^2.
-    """
-
-    mean: float
-    variance: float
-    nuced_mean: float
-    nuced_variance: float
-
-
-@dataclass(frozen=True)
 class Components:
     """Mean and width of the components ``E | K_e = k`` (Appendix B).
 
@@ -140,7 +123,7 @@ def predicted_moments(pixels: UsablePixels, weight: FloatArray | None = None) ->
     )
 
 
-def moment_errors(pixels: UsablePixels, n_frames: int | NDArray[np.integer[Any]]) -> MomentErrors:
+def moment_errors(pixels: UsablePixels, n_frames: int | NDArray[np.integer[Any]]) -> dict[str, float]:
     """Standard errors of the sample moments of the ensemble, the pixels given.
 
     A pixel's samples have variance v = sigma^2 + H/g^2, third central moment H/g^3 and fourth 3 v^2 + H/g^4.
@@ -152,17 +135,17 @@ def moment_errors(pixels: UsablePixels, n_frames: int | NDArray[np.integer[Any]]
         n_frames: frames of each pixel: a number, or shape (n,) where pixels differ and each counts the same.
 
     Returns:
-        Standard errors of mean and variance, raw and NUCed.
+        Standard errors of ``mean`` (DN), ``variance`` (DN^2), ``nuced_mean`` (e-), ``nuced_variance`` (e-^2).
     """
     exposure, gain, bias, sigma = pixels.maps
-    errors = []
+    errors: list[float] = []
     for step, offset, noise in ((1.0 / gain, bias, sigma), (1.0, 0.0, pixels.read_noise_e)):
         v = noise**2 + exposure * step**2
         centre = offset + exposure * step
         d = centre - centre.mean()
         of_square = 2 * v**2 + exposure * step**4 + 4 * d * exposure * step**3 + 4 * d**2 * v
         errors += [float(np.sqrt(np.mean(part / n_frames) / len(pixels))) for part in (v, of_square)]
-    return MomentErrors(*errors)
+    return dict(zip(("mean", "variance", "nuced_mean", "nuced_variance"), errors, strict=True))
 
 
 def component_widths(pixels: UsablePixels, n_k: int, weight: FloatArray | None = None) -> Components:

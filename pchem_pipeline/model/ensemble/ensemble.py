@@ -17,6 +17,8 @@ from scipy.special import gammaln
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
+from pchem_pipeline.model.ensemble import ensemble_numba
+from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.mass import parts_of_similar_width, sample_mass, sample_slopes
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -61,46 +63,24 @@ class NucedAxis:
         """Centres of the bins, e-, shape (size,)."""
         return np.arange(self.start, self.start + self.size, dtype=np.float64) * self.width
 
-    def places(self, value: FloatArray) -> IntArray:
-        """Return the number of the bin of each value, e-; -1 and ``size`` for what lies beyond."""
-        place = np.floor(value / self.width + 0.5) - self.start
-        return np.asarray(np.clip(place, -1, self.size), np.int64)
-
 
 @dataclass(frozen=True)
-class EnsembleSums:
-    """Sums over pixels of the predicted mass of each bin, and of its square.
+class AxisSums:
+    """Sums over pixels on the two axes, of predicted masses or of samples.
 
     Attributes:
-        raw: sum of the mass of each whole DN, shape (n_dn,).
-        raw_square: sum of its square.
-        nuced: sum of the mass in the bins of the NUCed axis, shape (n_bins,).
-        nuced_square: sum of its square.
+        raw: of what lies at each whole DN, shape (n_dn,).
+        raw_square: of its square.
+        nuced: of what lies in each bin of the NUCed axis, shape (n_bins,).
+        nuced_square: of its square.
+        nuced_sum: of the NUCed values, e-.
+        nuced_sum_square: of their squares, e-^2.
     """
 
     raw: FloatArray
     raw_square: FloatArray
     nuced: FloatArray
     nuced_square: FloatArray
-
-
-@dataclass(frozen=True)
-class Tally:
-    """The data of a set of pixels on the axes of the ensemble.
-
-    Attributes:
-        raw: samples at each DN, shape (n_dn,).
-        nuced: samples in each bin of the NUCed axis, shape (n_bins,).
-        outside: samples beyond the DN axis.
-        nuced_outside: samples beyond the NUCed axis.
-        nuced_sum: sum of the NUCed values of all samples, e-.
-        nuced_sum_square: sum of their squares, e-^2.
-    """
-
-    raw: IntArray
-    nuced: IntArray
-    outside: int
-    nuced_outside: int
     nuced_sum: float
     nuced_sum_square: float
 
@@ -135,7 +115,7 @@ def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None, 
 
 def mass_sums(
     mass: FloatArray, first: IntArray, start: IntArray, pixels: UsablePixels, dn: DnAxis, nuced: NucedAxis
-) -> tuple[EnsembleSums, FloatArray]:
+) -> AxisSums:
     """Sum the masses that any law gives to the codes of pixels, at the integer DN and sorted into NUCed bins.
 
     The mean over pixels of the raw masses is the ensemble (Hendrickson et al. 2023, eq. full_ensemble_dist),
@@ -150,29 +130,26 @@ def mass_sums(
         pixels: the n pixels.
         dn: axis of the raw prediction; it should hold all of the data.
         nuced: axis of the NUCed prediction.
-
-    Returns:
-        The sums, and those of the means of the NUCed value (e-) and of its square (e-^2), shape (2,).
     """
-    pixel = np.repeat(np.arange(first.size), np.diff(start))
-    codes = first[pixel] + np.arange(mass.size) - start[pixel]
-    inside = _inside(dn, codes)
-    pixel, codes, mass = pixel[inside], codes[inside], mass[inside]
-    value = (codes - pixels.bias[pixel]) * pixels.conversion_gain[pixel]
-    place = nuced.places(value)
-    # the codes of a pixel that fall into one bin follow each other
-    begin = np.flatnonzero((np.diff(pixel, prepend=-1) != 0) | (np.diff(place, prepend=-2) != 0))
-    in_bin = np.add.reduceat(mass, begin) if begin.size else mass
-    sums = (
-        sum_at(of, values, size)
-        for of, values, size in (
-            (codes - dn.start, mass, dn.size),
-            (codes - dn.start, mass**2, dn.size),
-            (place[begin], in_bin, nuced.size),
-            (place[begin], in_bin**2, nuced.size),
-        )
-    )
-    return EnsembleSums(*sums), np.array([mass @ value, mass @ value**2])
+    end = np.minimum(start[1:], start[:-1] + dn.start + dn.size - first)
+    codes = np.maximum(first, dn.start), start[:-1] + np.maximum(dn.start - first, 0), end
+    return _on_axes(mass[:, None], codes, np.ones((1, 1, 1)), pixels, dn, nuced)
+
+
+def _on_axes(
+    values: NDArray[Any],
+    codes: tuple[IntArray, IntArray, IntArray],
+    forms: FloatArray,
+    pixels: UsablePixels,
+    dn: DnAxis,
+    nuced: NucedAxis,
+) -> AxisSums:
+    """Return sums, with forms in place of squares; see :func:`.ensemble_numba.add_to_axes`."""
+    sums = raw, bins, moments = np.zeros((2, dn.size)), np.zeros((2, nuced.size + 2)), np.zeros(2)
+    _, gain, bias, _ = pixels.maps
+    axis, held = (float(nuced.width), nuced.start), np.zeros(values.shape[1])
+    ensemble_numba.add_to_axes(values, codes, forms, gain, bias, dn.start, axis, *sums, held)
+    return AxisSums(*raw, *bins[:, 1:-1], *moments.tolist())
 
 
 def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatArray:
@@ -190,8 +167,8 @@ def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatA
     law = SampleLaw()
     for some, first, n_codes in parts_of_similar_width(law, pixels, (dn.start, dn.start + dn.size - 1)):
         codes = first[:, None] + np.arange(n_codes)
-        mass = sample_mass(law, pixels.of(some), codes, far_tails=False)
-        out += sum_at(codes - dn.start, share[some, None] * mass, dn.size)
+        mass = share[some, None] * sample_mass(law, pixels.of(some), codes, far_tails=None)
+        out += np.bincount((codes - dn.start).ravel(), mass.ravel(), dn.size + n_codes)[: dn.size]
     return out
 
 
@@ -217,15 +194,12 @@ def curve_errors(
     raw, bins = np.zeros(dn.size), np.zeros(nuced.size)
     known = np.where(np.isfinite(covariance), covariance, 0.0)
     for some, first, n_codes in parts_of_similar_width(law, pixels, (dn.start, dn.start + dn.size - 1)):
-        part, codes = pixels.of(some), first[:, None] + np.arange(n_codes)
-        slopes = _mass_slopes(law.of(some), part, first, n_codes) * _inside(dn, codes)[:, None]
-        raw += sum_at(codes - dn.start, _variance(slopes, known[some]), dn.size)
-        room = nuced.size + 2  # one more at either end, for what lies beyond
-        place = nuced.places((codes - part.bias[:, None]) * part.conversion_gain[:, None])
-        place += 1 + room * np.arange(len(part))[:, None]
-        held = (np.bincount(place.ravel(), each.ravel(), len(part) * room) for each in slopes.swapaxes(0, 1))
-        in_bins = np.stack([each.reshape(-1, room)[:, 1:-1] for each in held], axis=1).astype(np.float64)
-        bins += _variance(in_bins, known[some]).sum(axis=0)
+        part, begin = pixels.of(some), np.arange(some.size) * n_codes
+        slopes = _mass_slopes(law.of(some), part, first, n_codes).swapaxes(1, 2).reshape(-1, 4)
+        codes = first, begin, begin + np.minimum(n_codes, dn.start + dn.size - first)
+        sums = _on_axes(slopes, codes, known[some], part, dn, nuced)
+        raw += sums.raw_square
+        bins += sums.nuced_square
     return raw, bins
 
 
@@ -238,28 +212,13 @@ def _mass_slopes(law: SampleLaw, pixels: UsablePixels, first: IntArray, n_codes:
     return np.asarray(slopes * np.stack(unit, axis=1)[:, :, None])
 
 
-def _variance(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return ``D' C D``, shape (n, m), of slopes (n, 4, m) and covariances (n, 4, 4)."""
-    return np.asarray(np.sum(slopes * (covariance @ slopes), axis=1))
-
-
-def _inside(dn: DnAxis, codes: IntArray) -> NDArray[np.bool_]:
-    return np.asarray((codes >= dn.start) & (codes < dn.start + dn.size))
-
-
-def sum_at(place: IntArray, values: NDArray[Any], size: int) -> FloatArray:
-    """Return the sums of the values at each place 0 ... size - 1; what lies beyond is left out."""
-    inside = (place >= 0) & (place < size)
-    return np.asarray(np.bincount(place[inside], values[inside], size), np.float64)
-
-
 def tally(
     counts: NDArray[np.integer[Any]],
     origin: NDArray[np.integer[Any]],
     pixels: UsablePixels,
     dn: DnAxis,
     nuced: NucedAxis | None = None,
-) -> Tally:
+) -> AxisSums:
     """Sort the histograms of pixels onto the axes of the ensemble.
 
     Args:
@@ -270,20 +229,14 @@ def tally(
         nuced: axis of the NUCed histogram, or None for none.
 
     Returns:
-        The tally; what falls beyond an axis is counted, not lost in silence.
+        The samples, whole numbers; no squares.
     """
-    pixel, place = np.nonzero(counts)
-    n = counts[pixel, place].astype(np.int64)
-    codes = np.asarray(origin, np.int64)[pixel] + place
-    value = (codes - pixels.bias[pixel]) * pixels.conversion_gain[pixel]
-    # whole numbers, exact in floats
-    raw = sum_at(codes - dn.start, n, dn.size).astype(np.int64)
-    bins = np.zeros(0, np.int64)
-    if nuced is not None:
-        bins = sum_at(nuced.places(value), n, nuced.size).astype(np.int64)
-    total = int(n.sum())
-    outside = total - int(raw.sum()), total - int(bins.sum())
-    return Tally(raw, bins, *outside, float(n @ value), float(n @ value**2))
+    rows = kernel_counts(counts)
+    begin = np.arange(len(rows)) * rows.shape[1]
+    codes = np.asarray(origin, np.int64), begin, begin + rows.shape[1]
+    return _on_axes(
+        rows.reshape(-1, 1), codes, np.zeros((1, 1, 1)), pixels, dn, nuced or NucedAxis(1.0, 0, 0)
+    )
 
 
 def electron_pmf(quanta_exposure: FloatArray, n_k: int, share: FloatArray | None = None) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -10,6 +10,20 @@ from numpy.typing import NDArray
 from pchem_pipeline.model.ensemble.components import EnsembleMoments, moment_errors, predicted_moments
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
 from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+
+#: Name, quantity and unit of each row; effects stand in that of an extended model only.
+_MOMENTS = (
+    ("mean", "mean of the raw ensemble", "DN"),
+    ("variance", "variance of the raw ensemble", "DN2"),
+    ("variance_of_bias", "of which variance of the bias", "DN2"),
+    ("variance_of_signal", "of which variance of H/g", "DN2"),
+    ("mean_read_variance", "of which read noise", "DN2"),
+    ("mean_shot_variance", "of which shot noise", "DN2"),
+    ("bias_signal_covariance", "of which twice the covariance of bias and H/g", "DN2"),
+    ("effects", "of which effects and limits of the codes", "DN2"),
+    ("nuced_mean", "mean of the NUCed ensemble", "e-"),
+    ("nuced_variance", "variance of the NUCed ensemble", "e-2"),
+)
 
 
 def moment_rows(
@@ -43,43 +57,22 @@ def moment_rows(
     nuced_mean, nuced_square = (
         float(totals.mean(name)[0] / share.sum()) for name in ("nuced_sum", "nuced_sum_square")
     )
-    rows: list[tuple[str, str, str, float, float | None, float | None]] = [
-        ("mean", "mean of the raw ensemble", "DN", expected.mean, mean, errors.mean),
-        ("variance", "variance of the raw ensemble", "DN2", expected.variance, variance, errors.variance),
-        ("variance_of_bias", "of which variance of the bias", "DN2", expected.variance_of_bias, None, None),
-        ("variance_of_signal", "of which variance of H/g", "DN2", expected.variance_of_signal, None, None),
-        ("mean_read_variance", "of which read noise", "DN2", expected.mean_read_variance, None, None),
-        ("mean_shot_variance", "of which shot noise", "DN2", expected.mean_shot_variance, None, None),
-        (
-            "bias_signal_covariance",
-            "of which twice the covariance of bias and H/g",
-            "DN2",
-            2.0 * expected.bias_signal_covariance,
-            None,
-            None,
-        ),
-        (
-            "nuced_mean",
-            "mean of the NUCed ensemble",
-            "e-",
-            expected.nuced_mean,
-            nuced_mean,
-            errors.nuced_mean,
-        ),
-        (
-            "nuced_variance",
-            "variance of the NUCed ensemble",
-            "e-2",
-            expected.nuced_variance,
-            nuced_square - nuced_mean**2,
-            errors.nuced_variance,
-        ),
+    observed = {"mean": mean, "variance": variance}
+    observed |= {"nuced_mean": nuced_mean, "nuced_variance": nuced_square - nuced_mean**2}
+    predicted = asdict(expected) | {"effects": expected.variance - plain_ones.variance}
+    predicted["bias_signal_covariance"] *= 2.0
+    return [
+        {
+            "name": name,
+            "quantity": quantity,
+            "unit": unit,
+            "predicted": predicted[name],
+            "observed": observed.get(name),
+            "stderr": errors.get(name),
+        }
+        for name, quantity, unit in _MOMENTS
+        if extended or name != "effects"
     ]
-    if extended:
-        added = expected.variance - plain_ones.variance
-        rows.insert(7, ("effects", "of which effects and limits of the codes", "DN2", added, None, None))
-    names = ("name", "quantity", "unit", "predicted", "observed", "stderr")
-    return [dict(zip(names, row, strict=True)) for row in rows]
 
 
 def _extended_moments(totals: EnsembleTotals, plain_ones: EnsembleMoments) -> EnsembleMoments:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.model.law import mass_numba
-from pchem_pipeline.model.law.cells_numba import EXACT, NEAR
+from pchem_pipeline.model.law.cells_numba import CORE, EXACT, NEAR
 from pchem_pipeline.model.law.inputs import pack, satellites_of
 from pchem_pipeline.model.law.parameters import Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
@@ -19,8 +19,8 @@ FloatArray = NDArray[np.float64]
 #: Mass of an occupied code, at least.
 LEAST_SEEN = 1e-60
 
-#: Pixels whose masses are held at a time.
-_AT_ONCE = 256
+#: Pixels whose masses are held at a time, and codes where pixels of the same number of codes come together.
+_AT_ONCE, _CODES_AT_ONCE = 256, 1 << 17
 # mass of a cell that tells nothing: a difference of two tails that are alike, whose slopes are left over
 _LEAST_TOLD = 1e-15
 
@@ -60,11 +60,12 @@ def parts_of_similar_width(
     if limits is not None:
         low, high = np.maximum(low, limits[0]), np.minimum(high, limits[1])
     width = high - low + 1
-    order = np.argsort(width, kind="stable")
+    order = np.argsort(-width, kind="stable")
     order = order[width[order] > 0]
-    for begin in range(0, order.size, _AT_ONCE):
-        some = order[begin : begin + _AT_ONCE]
-        yield some, low[some], int(width[some[-1]])
+    while order.size:
+        widest = int(width[order[0]])
+        some, order = np.split(order, [max(1, _CODES_AT_ONCE // widest)])
+        yield some, low[some], widest
 
 
 def sample_mass(
@@ -73,7 +74,7 @@ def sample_mass(
     codes: ArrayLike,
     *,
     satellites: tuple[ArrayLike, ArrayLike] | None = None,
-    far_tails: bool = True,
+    far_tails: bool | None = True,
 ) -> FloatArray:
     """Return the probability of each code in each pixel, exact to the ends of the tails.
 
@@ -83,7 +84,7 @@ def sample_mass(
         codes: successive whole DN, shape (n_codes,) for all pixels alike or (n, n_codes).
         satellites: ``satellite_amplitude_e`` and ``satellite_weight`` of the pixels; by default those of
             ``maps`` where it has any, else none.
-        far_tails: also what is below 1e-50, which takes several times as long.
+        far_tails: also what is below 1e-50, which takes several times as long; None: nor what is below 1e-17.
 
     Returns:
         P(x), shape (n, n_codes); NaN where a parameter is.
@@ -99,7 +100,7 @@ def sample_mass(
     out = np.full((n, wanted.shape[1]), np.nan)
     if out.size:
         first = np.array(np.broadcast_to(wanted[:, 0], (n,)))
-        stage = EXACT if far_tails else NEAR
+        stage = CORE if far_tails is None else EXACT if far_tails else NEAR
         none = np.empty((0, 4, out.shape[1]))
         mass_numba.mass_tile(
             first, columns, satellites_of(maps, satellites, n), pack([model], n), stage, out, none

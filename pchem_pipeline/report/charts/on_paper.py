@@ -155,7 +155,8 @@ def _lay_out(drawing: Drawing) -> None:
         return
     for spine in (each for axes in drawing.axes for each in axes.spines.values()):
         spine.set_in_layout(False)  # within the labels, but each would find all ticks of its axis once more
-    for _ in range(2):  # once more, now that maps, whose sides are in proportion, have their size
+    square = any(axes.get_aspect() != "auto" for axes in drawing.axes)
+    for _ in range(1 + square):  # once more, now that maps, whose sides are in proportion, have their size
         engine.execute(drawing)
     with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         drawing.set_layout_engine(None)

@@ -124,7 +124,7 @@ def ensemble_tile(
         sets = (of_group, n), (of_group if same else everything.of(group), n_all)
         tallies, parts = _group_sums(KnownPixels(part, law.of(group), own), part, *sets, axes)
         for name, tallied in tallies.items():
-            integers[axes.integers[name]] += tallied
+            integers[axes.integers[name]] += np.asarray(tallied, np.int64)  # floats are whole numbers
         for name, summed in parts.items():
             floats[axes.floats[name]] += summed
     return integers, floats
@@ -151,14 +151,14 @@ def _numbers(
 
 def _predicted(tables: NumberTables, pixels: UsablePixels, n: int, axes: EnsembleAxes) -> dict[str, Any]:
     """Return what the law predicts of pixels that have n samples each."""
-    sums, moments = mass_sums(tables.mass, tables.first, tables.start, pixels, axes.dn, axes.nuced)
+    sums = mass_sums(tables.mass, tables.first, tables.start, pixels, axes.dn, axes.nuced)
     return {
         "pcd": sums.raw,
         "pcd_variance": (sums.raw - sums.raw_square) / n,
         "nuced": sums.nuced,
         "nuced_variance": (sums.nuced - sums.nuced_square) / n,
-        "nuced_predicted_sum": moments[0],
-        "nuced_predicted_sum_square": moments[1],
+        "nuced_predicted_sum": sums.nuced_sum,
+        "nuced_predicted_sum_square": sums.nuced_sum_square,
     }
 
 
@@ -168,23 +168,22 @@ def _group_sums(
     chosen: tuple[PixelHistograms, int],
     everything: tuple[PixelHistograms, int],
     axes: EnsembleAxes,
-) -> tuple[dict[str, NDArray[np.int64] | int], dict[str, Any]]:
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the tallies and sums of pixels that have the same number of samples."""
     (histograms, n), (histograms_all, n_all) = chosen, everything
     data = data_all = tally(histograms.counts, histograms.origin, pixels, axes.dn, axes.nuced)
     if histograms_all is not histograms:
         data_all = tally(histograms_all.counts, histograms_all.origin, pixels, axes.dn)
     numbers, beyond, expected, tables = _numbers(known, histograms, axes)
-    outside = int(histograms.outside.sum())
-    tallies: dict[str, NDArray[np.int64] | int] = {
+    tallies: dict[str, Any] = {
         "counts": data.raw,
         "counts_all": data_all.raw,
         "nuced_counts": data.nuced,
         "electron_counts": numbers,
-        "outside": data.outside + outside,
-        "outside_all": data_all.outside + int(histograms_all.outside.sum()),
-        "nuced_outside": data.nuced_outside + outside,
-        "electrons_beyond": beyond + outside,
+        "outside": n * len(pixels) - data.raw.sum(),
+        "outside_all": n_all * len(pixels) - data_all.raw.sum(),
+        "nuced_outside": n * len(pixels) - data.nuced.sum(),
+        "electrons_beyond": beyond + int(histograms.outside.sum()),
     }
     parts: dict[str, Any] = {
         "share": data.raw / n,

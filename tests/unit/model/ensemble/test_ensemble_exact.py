@@ -68,12 +68,10 @@ def test_tally_is_that_of_the_samples() -> None:
     result = tally(counts.astype(np.uint16), origin, pixels, dn, axis)
     inside = (samples >= 90) & (samples < 130)
     np.testing.assert_array_equal(result.raw, np.bincount(samples[inside] - 90, minlength=40))
-    assert result.outside == np.count_nonzero(~inside)
     values = (samples - pixels.bias[:, None]) * pixels.conversion_gain[:, None]
     place = np.floor(values / 0.11 + 0.5).astype(int) + 3
     good = (place >= 0) & (place < 30)
     np.testing.assert_array_equal(result.nuced, np.bincount(place[good], minlength=30))
-    assert result.nuced_outside == np.count_nonzero(~good)
     assert result.nuced_sum == pytest.approx(values.sum(), rel=1e-12)
     assert result.nuced_sum_square == pytest.approx((values**2).sum(), rel=1e-12)
 
@@ -133,7 +131,7 @@ def test_masses_are_sorted_onto_both_axes(law: SampleLaw) -> None:
     axis = NucedAxis(0.1, -100, 400)
     known = KnownPixels(pixels, law)
     tables = number_tables(*known.codes(), known.exposure, known, detailed=True)
-    sums, moments = mass_sums(tables.mass, tables.first, tables.start, pixels, dn, axis)
+    sums = mass_sums(tables.mass, tables.first, tables.start, pixels, dn, axis)
     mass = sample_mass(law, pixels, dn.dn)
     np.testing.assert_allclose(sums.raw, mass.sum(axis=0), atol=1e-11)
     np.testing.assert_allclose(sums.raw_square, (mass**2).sum(axis=0), atol=1e-11)
@@ -144,4 +142,5 @@ def test_masses_are_sorted_onto_both_axes(law: SampleLaw) -> None:
     )
     np.testing.assert_allclose(sums.nuced, bins.sum(axis=0), atol=1e-11)
     np.testing.assert_allclose(sums.nuced_square, (bins**2).sum(axis=0), atol=1e-11)
+    moments = [sums.nuced_sum, sums.nuced_sum_square]
     np.testing.assert_allclose(moments, [(mass * values).sum(), (mass * values**2).sum()], rtol=1e-10)
