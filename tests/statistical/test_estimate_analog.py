@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 from helpers.small_sensors import drawn_truth, seen, taken
 
-from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
-from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
-from pchem_pipeline.effects.analog.gain_drift import GainDrift
-from pchem_pipeline.effects.analog.heavy_tailed_noise import HeavyTailedNoise
-from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
-from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
-from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
-from pchem_pipeline.effects.analog.rts_noise import RtsNoise
-from pchem_pipeline.effects.analog.signal_dependent_noise import SignalDependentNoise
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.effects.operators.couple import AnalogMemory, InterpixelCapacitance
+from pchem_pipeline.effects.operators.curve import Nonlinearity
+from pchem_pipeline.effects.operators.drifts import GainDrift
+from pchem_pipeline.effects.operators.noise import (
+    FlickerNoise,
+    HeavyTailedNoise,
+    NoiseSkew,
+    RtsNoise,
+    SignalDependentNoise,
+)
 
 CLASSES: tuple[type[Effect], ...] = (
     AnalogMemory, FlickerNoise, GainDrift, HeavyTailedNoise, InterpixelCapacitance, NoiseSkew,

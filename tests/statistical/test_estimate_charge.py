@@ -12,20 +12,20 @@ from helpers import small_sensors
 from helpers.small_sensors import a_sensor, drawn_truth, some_blocks, taken
 
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
-from pchem_pipeline.effects.charge.charge_diffusion import ChargeDiffusion
-from pchem_pipeline.effects.charge.charge_lag import ChargeLag
-from pchem_pipeline.effects.charge.cosmic_rays import CosmicRays
-from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
-from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
-from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_profile
-from pchem_pipeline.effects.estimators.fading_images import Fading
-from pchem_pipeline.effects.exposure import persistence
-from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
-from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
-from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
-from pchem_pipeline.effects.exposure.persistence import Persistence
+from pchem_pipeline.effects.estimators.spots import Fading
+from pchem_pipeline.effects.operators import light
+from pchem_pipeline.effects.operators.drifts import ExposureDrift, ExposureFlicker
+from pchem_pipeline.effects.operators.fate import (
+    BranchingCounts,
+    ChargeDiffusion,
+    ChargeLag,
+    OpticalCrosstalk,
+    OverdispersedCounts,
+    SpuriousCharge,
+)
+from pchem_pipeline.effects.operators.light import DarkCurrentRts, Persistence
+from pchem_pipeline.effects.operators.strike import CosmicRays
 
 CLASSES = (
     ExposureDrift,
@@ -141,7 +141,7 @@ def test_the_strength_is_found_to_a_factor_of_three(truth):
 
 def test_what_would_begin_brighter_than_any_scene_is_no_afterglow(monkeypatch):
     truth = Persistence(peak_e=0.5, decay_frames=600.0, centre_y=0.3, centre_x=0.6, radius=0.13)
-    monkeypatch.setattr(persistence, "fading_of", lambda *_: Fading(600.0, None, 0.5, scale=1e9))
+    monkeypatch.setattr(light, "fading_of", lambda *_: Fading(600.0, None, 0.5, scale=1e9))
     assert not Persistence.estimate(seen(truth))
 
 

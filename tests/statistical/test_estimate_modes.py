@@ -7,18 +7,20 @@ import numpy as np
 import pytest
 from helpers.small_sensors import context_of, drawn_truth, seen, some_blocks, taken
 
-from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
-from pchem_pipeline.effects.adc.adc_inl import AdcInl
-from pchem_pipeline.effects.adc.clipping import Clipping
-from pchem_pipeline.effects.analog.bias_drift import BiasDrift
-from pchem_pipeline.effects.analog.bias_jumps import BiasJumps
-from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
-from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
-from pchem_pipeline.effects.analog.shared_noise import ColumnNoise, FrameNoise, RowNoise
-from pchem_pipeline.effects.estimators.change_points import find_steps
+from pchem_pipeline.effects.estimators.series import find_steps
 from pchem_pipeline.effects.framework.effect import FEWEST_SHOWN, Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
-from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
+from pchem_pipeline.effects.operators.curve import AdcDnl, AdcInl, Clipping
+from pchem_pipeline.effects.operators.drifts import BiasDrift
+from pchem_pipeline.effects.operators.offsets import (
+    BiasJumps,
+    ColumnNoise,
+    FrameNoise,
+    PeriodicPickup,
+    ReadoutAlternation,
+    RowNoise,
+)
+from pchem_pipeline.effects.operators.replace import RepeatedFrames
 from pchem_pipeline.simulate.streams import KeyedStreams
 
 SHAPE, N_FRAMES = (24, 24), 2400

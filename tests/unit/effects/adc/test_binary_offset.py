@@ -5,8 +5,8 @@ import pytest
 from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.discrepancy.observe.digital.groups import BITS
-from pchem_pipeline.effects.adc.binary_offset import BinaryOffset
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.operators.couple import BinaryOffset
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 

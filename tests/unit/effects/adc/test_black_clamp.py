@@ -6,9 +6,9 @@ from helpers.small_sensors import drawn_truth, seen, taken
 from hidden.chain import hide
 
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
-from pchem_pipeline.effects.adc.black_clamp import BlackClamp
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.operators.couple import BlackClamp
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 

@@ -5,7 +5,7 @@ import pytest
 from helpers.small_sensors import context_of, seen
 from hidden.chain import hide
 
-from pchem_pipeline.effects.adc.gain_stitch import GainStitch
+from pchem_pipeline.effects.operators.curve import GainStitch
 
 
 def test_above_the_level_the_scale_has_another_slope():

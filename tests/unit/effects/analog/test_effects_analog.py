@@ -5,14 +5,12 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
-from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
-from pchem_pipeline.effects.analog.gain_drift import GainDrift
-from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
-from pchem_pipeline.effects.analog.rts_noise import RtsNoise
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.operators.couple import AnalogMemory, InterpixelCapacitance
+from pchem_pipeline.effects.operators.drifts import GainDrift
+from pchem_pipeline.effects.operators.noise import FlickerNoise, RtsNoise
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.simulate.streams import KeyedStreams
 

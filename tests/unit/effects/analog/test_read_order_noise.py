@@ -5,8 +5,7 @@ import pytest
 from helpers.small_sensors import context_of, drawn_truth, offsets, seen, taken
 from hidden.chain import hide
 
-from pchem_pipeline.effects.analog.read_order_noise import ReadOrderNoise
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
+from pchem_pipeline.effects.operators.offsets import ReadOrderNoise, RowNoise
 
 SHAPE = (16, 12)
 

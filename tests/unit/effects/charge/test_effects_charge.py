@@ -10,17 +10,19 @@ import pytest
 from helpers.small_sensors import a_sensor, electrons, exposures, simulated
 from scipy import stats
 
-from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
-from pchem_pipeline.effects.charge.charge_diffusion import ChargeDiffusion
-from pchem_pipeline.effects.charge.charge_lag import ChargeLag
-from pchem_pipeline.effects.charge.cosmic_rays import CosmicRays
-from pchem_pipeline.effects.charge.optical_crosstalk import OpticalCrosstalk
-from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
-from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
-from pchem_pipeline.effects.estimators.electrons import binomial_upper, further_uniform, regrouped
-from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
+from pchem_pipeline.effects.framework.draws import binomial_upper, further_uniform, regrouped
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.operators.drifts import ExposureDrift
+from pchem_pipeline.effects.operators.fate import (
+    BranchingCounts,
+    ChargeDiffusion,
+    ChargeLag,
+    OpticalCrosstalk,
+    OverdispersedCounts,
+    SpuriousCharge,
+)
+from pchem_pipeline.effects.operators.strike import CosmicRays
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 # -- laws of the electron number ---------------------------------------------------------------------

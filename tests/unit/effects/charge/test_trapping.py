@@ -6,7 +6,7 @@ from helpers.small_sensors import electrons
 from scipy import stats
 
 from pchem_pipeline.discrepancy.estimator_check import recovered_strength
-from pchem_pipeline.effects.charge.trapping import Trapping
+from pchem_pipeline.effects.operators.fate import Trapping
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 H, FRAMES, SHAPE = 2.0, 2000, (30, 30)

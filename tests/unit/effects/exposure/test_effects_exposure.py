@@ -8,10 +8,8 @@ import pytest
 from helpers.small_sensors import exposures
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile
-from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
-from pchem_pipeline.effects.exposure.exposure_drift import ExposureDrift
-from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker, _random
-from pchem_pipeline.effects.exposure.persistence import Persistence
+from pchem_pipeline.effects.operators.drifts import ExposureDrift, ExposureFlicker, _random
+from pchem_pipeline.effects.operators.light import DarkCurrentRts, Persistence
 
 
 @pytest.mark.parametrize(

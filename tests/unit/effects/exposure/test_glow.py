@@ -6,9 +6,7 @@ from helpers.small_sensors import context_of, drawn_truth, seen, taken
 from hidden.chain import hide
 
 from pchem_pipeline.effects.estimators.spots import best_spot
-from pchem_pipeline.effects.exposure.glow import Glow
-from pchem_pipeline.effects.exposure.persistence import Persistence
-from pchem_pipeline.effects.framework.spot import spot_image
+from pchem_pipeline.effects.operators.light import Glow, Persistence, spot_image
 
 SHAPE = (10, 14)
 

@@ -5,7 +5,7 @@ import pytest
 from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.readout.bit_errors import BitErrors
+from pchem_pipeline.effects.operators.replace import BitErrors
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.mass import sample_mass

@@ -5,9 +5,8 @@ import pytest
 from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines, own_lines
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
-from pchem_pipeline.effects.readout.misplaced_lines import MisplacedLines
-from pchem_pipeline.effects.readout.repeated_lines import RepeatedLines
+from pchem_pipeline.effects.operators.offsets import RowNoise
+from pchem_pipeline.effects.operators.replace import MisplacedLines, RepeatedLines
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 SHAPE, FRAMES = (9, 11), 300

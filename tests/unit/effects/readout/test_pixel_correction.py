@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
-from pchem_pipeline.effects.estimators.prediction import PREDICTORS, predicted
-from pchem_pipeline.effects.readout.pixel_correction import PixelCorrection
+from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted
+from pchem_pipeline.effects.operators.replace import PixelCorrection
 
 
 def predicted_by_hand(frame, y, x, predictor):

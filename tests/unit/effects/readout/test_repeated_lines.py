@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
-from pchem_pipeline.effects.readout.repeated_lines import RepeatedLines
+from pchem_pipeline.effects.operators.replace import RepeatedLines
 
 SHAPE, FRAMES = (9, 11), 300
 
