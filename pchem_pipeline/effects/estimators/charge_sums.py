@@ -187,8 +187,7 @@ def charlier_information(exposure: FloatArray, noise: FloatArray) -> FloatArray:
     i, u = _place(np.log(_EXPOSURES), np.log(np.maximum(exposure, 1e-9)))
     j, v = _place(np.log(_NOISES), np.log(np.maximum(noise, 1e-9)))
     upper = (1 - v) * table[i + 1, j] + v * table[i + 1, j + 1]
-    information: FloatArray = np.exp((1 - u) * ((1 - v) * table[i, j] + v * table[i, j + 1]) + u * upper)
-    return information
+    return np.asarray(np.exp((1 - u) * ((1 - v) * table[i, j] + v * table[i, j + 1]) + u * upper))
 
 
 def _place(nodes: FloatArray, values: FloatArray) -> tuple[IntArray, FloatArray]:

@@ -73,8 +73,7 @@ def settling(position: FloatArray, fraction: float) -> FloatArray:
     """
     whole = -np.expm1(-1.0 / fraction)
     mean = (1.0 - fraction * whole) / whole
-    profile: FloatArray = -np.expm1(-position / fraction) / whole - mean
-    return profile
+    return np.asarray(-np.expm1(-position / fraction) / whole - mean)
 
 
 def along_path(position: FloatArray, path: Sequence[float]) -> FloatArray:

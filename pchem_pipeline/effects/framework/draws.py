@@ -45,8 +45,7 @@ def _scrambled(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
     bits = bits + np.uint64(0x9E3779B97F4A7C15)
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    scrambled: NDArray[np.uint64] = bits ^ (bits >> np.uint64(31))
-    return scrambled
+    return np.asarray(bits ^ (bits >> np.uint64(31)))
 
 
 def binomial_upper(u: FloatArray, n: IntArray, p: FloatArray | float) -> IntArray:

@@ -429,7 +429,13 @@ class Clamp:
 
 
 def best_clamp(evidence: Evidence) -> Clamp | None:
-    """Return the clamp that explains the frames' offsets best; None if a noise of frames does as well."""
+    """Return the clamp that explains the frames' offsets best; None if a noise of frames does as well.
+
+    With s the mean deviation of the clamp's pixels in a frame before the clamp, and f the part that is taken
+    off, all samples move by ``-f s``, and the mean readout residual of the frame by alpha times that (alpha:
+    :mod:`pchem_pipeline.effects.estimators.common_modes`). What lines show, less the offset of their frame,
+    is theirs before the clamp, whatever else moves all pixels alike: so f is a regression on it.
+    """
     if evidence.time is None or evidence.maps.usable.sum() < 2:
         return None
     offset = evidence.time.frame_readout.astype(np.float64) / responsivity(evidence)

@@ -203,8 +203,7 @@ class AdcInl(Effect, tag="adc_inl"):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal at the ADC (frame, y, x), DN, bent; draws nothing."""
-        result: AnyArray = values + self._deviation(values)
-        return result
+        return np.asarray(values + self._deviation(values))
 
     def _deviation(self, values: AnyArray) -> FloatArray:
         if self.form == "curve":
@@ -341,8 +340,7 @@ class AdcDnl(Effect, tag="adc_dnl"):
         index = code - first
         lower, upper = (shift[i] if columns is None else shift[i, columns] for i in (index, index + 1))
         place = values - code
-        result: AnyArray = values + (place >= 0.5 + upper) - (place < -0.5 + lower)
-        return result
+        return np.asarray(values + (place >= 0.5 + upper) - (place < -0.5 + lower))
 
     def _shifts(self, first: int, last: int, context: EffectContext, columns: IntArray | None) -> FloatArray:
         """Return the shifts of the edges of codes ``first .. last``, DN: (codes,) or (codes, x)."""
@@ -557,8 +555,7 @@ class Clipping(Effect, tag="clipping"):
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal at the ADC (frame, y, x), DN, inside the limits; draws nothing."""
         # the limits are whole DN, so to limit before rounding is to limit after it
-        result: AnyArray = np.clip(values, self.low, self.high)
-        return result
+        return np.asarray(np.clip(values, self.low, self.high))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

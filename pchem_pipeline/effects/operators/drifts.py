@@ -246,8 +246,7 @@ class GainDrift(Drift, tag="gain_drift"):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the signal (frame, y, x), e-, scaled by the time profile of the gain."""
-        result: AnyArray = values * (1.0 + self.drift * self.in_frames(context))[:, None, None]
-        return result
+        return np.asarray(values * (1.0 + self.drift * self.in_frames(context))[:, None, None])
 
     @classmethod
     def series(cls, evidence: Evidence, time: TimeSeries) -> FloatArray:
@@ -328,8 +327,7 @@ class ExposureDrift(Drift, tag="exposure_drift"):
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the drifting exposure (frame, y, x), e-."""
         factor = np.maximum(1.0 + self.drift * self.in_frames(context), 0.0)
-        result: AnyArray = values * factor[:, None, None]
-        return result
+        return np.asarray(values * factor[:, None, None])
 
     @classmethod
     def series(cls, evidence: Evidence, time: TimeSeries) -> FloatArray:
@@ -446,8 +444,7 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
             # log-normal: never negative, mean exactly 1
             width = np.sqrt(np.log1p(self.rms**2))
             factor = np.exp(width * self._fluctuation(context) - 0.5 * width**2)
-        result: AnyArray = values * factor[:, None, None]
-        return result
+        return np.asarray(values * factor[:, None, None])
 
     def _fluctuation(self, context: EffectContext) -> FloatArray:
         """Return a normal number of mean 0 and variance 1 for each frame, shape (n,)."""
@@ -460,8 +457,7 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
         steps = context.random.generator().standard_normal(context.n_frames)
         steps[1:] *= np.sqrt(1.0 - kept**2)
         path = np.asarray(lfilter([1.0], [1.0, -kept], steps))
-        fluctuation: FloatArray = path[context.frames.clip(0, context.n_frames - 1)]
-        return fluctuation
+        return np.asarray(path[context.frames.clip(0, context.n_frames - 1)])
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -1,10 +1,4 @@
-"""What is measured and not understood: noise that samples share, by its measured spectrum.
-
-Where no known effect explains how samples vary together, it can still be told: a stationary Gaussian noise
-is its covariance by distance in frames, rows and columns, and no more (Wold 1938; Priestley 1981). It is
-drawn as a moving average of white noise whose weights are the Fourier transform of the root of the spectrum.
-A single line of the spectrum is drawn as a wave, what comes now and then as bursts. Nothing is said of why.
-"""
+"""Modulate offset, gain, light or read noise by a stationary noise, a wave or bursts that are measured."""
 
 from __future__ import annotations
 
@@ -270,6 +264,12 @@ def _lag_words(lag: Lag) -> str:
 
 class EmpiricalNoise(Effect, tag="empirical_noise"):
     """Noise with a measured correlation over frames, rows and columns, a wave, or bursts.
+
+    Where no known effect explains how samples vary together, it can still be told: a stationary Gaussian
+    noise is its covariance by distance in frames, rows and columns, and no more (Wold 1938; Priestley
+    1981). It is drawn as a moving average of white noise whose weights are the Fourier transform of the
+    root of the spectrum. A single line of the spectrum is drawn as a wave, what comes now and then as
+    bursts. Nothing is said of why.
 
     Signature: none of its own; it is measured where the data disagree with all that is known, and describes
     how samples vary together without a name for what makes them so.

@@ -60,8 +60,7 @@ class SpuriousCharge(Effect, tag="spurious_charge"):
         """Return electron numbers (frame, y, x), e-, spurious ones included."""
         if self.mean_e == 0:
             return values.copy()
-        result: AnyArray = values + context.random.poisson(np.full(values.shape, self.mean_e))
-        return result
+        return np.asarray(values + context.random.poisson(np.full(values.shape, self.mean_e)))
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with this charge on top of H, which is then the exposure without it."""
@@ -257,8 +256,7 @@ def _borel_beyond_one(branching: float) -> FloatArray:
         # P(n) = exp(-l n) (l n)^(n - 1) / n!
         mass *= branching * np.exp(-branching + (n - 1) * np.log1p(1.0 / n))
         n += 1
-    below: FloatArray = (np.cumsum(masses) / np.sum(masses))[:-1]
-    return below
+    return np.asarray((np.cumsum(masses) / np.sum(masses))[:-1])
 
 
 # nodes of a law of log-normal exposures, from so many times the variance of shot noise on
@@ -402,7 +400,7 @@ class Trapping(Effect, tag="trapping"):
     that has any with a chance c, whatever their number: the charge reaches it or does not (Massey et al.
     2010). Where it is full it gives the electron to a later sample, with a chance r in each. Its capacity
     makes it visible in frames of one exposure, other than a lag of electrons one by one
-    (:mod:`.charge_lag`).
+    (:class:`ChargeLag`).
 
     With the trap full or empty, s, sample t is ``K_t + s_t - s_{t+1}``. The trap is full in a share ``pi = a
     / (r + a)`` of the frames, ``a = c P(K >= 1)``, and its states of frames l apart are correlated by

@@ -284,8 +284,7 @@ class Persistence(Effect, tag="persistence"):
     def _image_at(self, y: FloatArray, x: FloatArray) -> FloatArray:
         """Return the image, relative to its largest value, at places 0..1 of the sensor."""
         grid = np.asarray(self.image)
-        values: FloatArray = _hats(y, grid.shape[0]) @ (grid / grid.max()) @ _hats(x, grid.shape[1]).T
-        return values
+        return np.asarray(_hats(y, grid.shape[0]) @ (grid / grid.max()) @ _hats(x, grid.shape[1]).T)
 
     def pattern(self, rows: IntArray, shape: tuple[int, int]) -> FloatArray:
         """Return the earlier image in some rows, relative to its largest value, shape (rows, columns)."""
@@ -299,8 +298,7 @@ class Persistence(Effect, tag="persistence"):
         if self.peak_e == 0:
             return values.copy()
         left = self._left(context.frames)
-        result: AnyArray = values + left[:, None, None] * self.pattern(context.rows, context.shape)
-        return result
+        return np.asarray(values + left[:, None, None] * self.pattern(context.rows, context.shape))
 
     def added_exposure(
         self, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps
@@ -460,8 +458,7 @@ class DarkCurrentRts(Effect, tag="dark_current_rts"):
         changes = np.cumsum(dwell.reshape(-1))
         # frames before the run are as the first one
         passed = np.searchsorted(changes, np.maximum(context.frames, 0), side="right")
-        added: FloatArray = step * ((passed % 2 == 0) == starts_high)
-        return added
+        return np.asarray(step * ((passed % 2 == 0) == starts_high))
 
     def added_exposure(
         self, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps

@@ -432,8 +432,7 @@ class RtsNoise(Effect, tag="rts_noise"):
             return result
 
         def uniform(draw: int) -> FloatArray:
-            found: FloatArray = context.random.uniform(("y", "x"), draw)[0, y, x]
-            return found
+            return np.asarray(context.random.uniform(("y", "x"), draw)[0, y, x])
 
         step = self._steps(uniform)
         if self.sampling == "single":
@@ -470,8 +469,7 @@ class RtsNoise(Effect, tag="rts_noise"):
         rank = np.floor((inside - (1.0 - self.probability)) / max(self.probability, 1e-300) * self._places())
         rank = rank.clip(-1, self._places() - 1)
         height = np.minimum(rank + 1.0, self._places() - rank) / self.samples
-        found: FloatArray = np.where(rank < 0, 0.0, np.sign(uniform - 0.5) * height)
-        return found
+        return np.asarray(np.where(rank < 0, 0.0, np.sign(uniform - 0.5) * height))
 
     def _places(self) -> int:
         """Return between how many successive samples a jump can fall."""

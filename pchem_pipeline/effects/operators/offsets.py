@@ -1,7 +1,4 @@
-"""Modulate the offset: one number, DN, that the samples of a frame, row, column, tap or part share.
-
-The disturbance sits behind the pixels' gains, so it is in DN.
-"""
+"""Modulate the offset: one number, DN, that the samples of a frame, row, column, tap or part share."""
 
 from __future__ import annotations
 
@@ -94,8 +91,7 @@ class OffsetEffect(Effect):
 
 def add_offset(values: AnyArray, offset_dn: ArrayLike, context: EffectContext) -> AnyArray:
     """Return the analog signal (frame, y, x), e-, with offsets in DN referred to the input."""
-    result: AnyArray = values + np.asarray(offset_dn) * context.truth["conversion_gain"]
-    return result
+    return np.asarray(values + np.asarray(offset_dn) * context.truth["conversion_gain"])
 
 
 def sine_values(count: int) -> FloatArray:
@@ -117,7 +113,9 @@ def quantile_means(values: FloatArray, count: int = 7) -> FloatArray:
 class SharedNoise(OffsetEffect):
     """Base of noise that the pixels of a frame, row or column share: an offset that is new in every frame.
 
-    The strength is its standard deviation.
+    A reference, ramp or supply that is sampled once for many pixels shifts them all: ``x += n_t`` with
+    ``n_t ~ N(0, s^2)``; the strength is s. A pixel's own histogram only broadens: its read noise becomes
+    ``(sigma^2 + s^2)^(1/2)`` DN. Offsets that do not change from frame to frame are part of the bias map.
 
     Attributes:
         shared_by: what has one offset.

@@ -180,13 +180,11 @@ _RARE = 1e-12
 
 
 class RepeatedFrames(Effect, tag="repeated_frames"):
-    """Frame t is, sample by sample, frame t - 1 as it was delivered (which may itself be a repeat).
+    """Frame t, or a part of its rows, is frame t - 1 as it was delivered (which may itself be a repeat).
 
     A frame buffer that is read again before the next frame is in it, or a driver that fills a gap, hands out
     the frame before once more: every sample is the same. In analog data that never happens by chance, so a
     single case is proof (an equality test without false alarms).
-
-    Or a part of its rows is, where frames are transferred in parts.
 
     Signature: pairs of successive frames that are equal everywhere; then also correlations at lag 1, in
     charge and readout alike. A pixel's own histogram does not change, only fewer of its samples count.

@@ -1,11 +1,4 @@
-"""Cosmic rays and radioactivity: straight tracks and round clouds of many electrons.
-
-A relativistic particle frees about 80 electrons per micrometre of silicon (Groom 2002, "Cosmic rays and
-other nonsense in astronomical CCD imagers"); muons at sea level come at one to two per square centimetre and
-minute. An alpha particle from the materials of the sensor stops in a few micrometres, and its charge
-spreads from there into a round cloud ("spots" among Groom's kinds). All are independent, Poisson many per
-frame; what one leaves in a pixel is Poisson about its share.
-"""
+"""Strikes: rare events that leave charge in several pixels, by cosmic rays and radioactivity."""
 
 from __future__ import annotations
 
@@ -68,6 +61,12 @@ class _Event(NamedTuple):
 
 class CosmicRays(Effect, tag="cosmic_rays"):
     """Tracks at random places and angles, straight and of exponentially distributed length, or round clouds.
+
+    A relativistic particle frees about 80 electrons per micrometre of silicon (Groom 2002, "Cosmic rays
+    and other nonsense in astronomical CCD imagers"); muons at sea level come at one to two per square
+    centimetre and minute. An alpha particle from the materials of the sensor stops in a few micrometres,
+    and its charge spreads from there into a round cloud ("spots" among Groom's kinds). All are
+    independent, Poisson many per frame; what one leaves in a pixel is Poisson about its share.
 
     Signature: few samples far above all that a pixel's law allows, next to each other in the same frame; the
     rest of the histogram as before.

@@ -1,4 +1,4 @@
-"""Effects of the pixel's analog chain: what their forward models do to samples, and what they refuse."""
+"""Noise of single pixels: the moments and levels of its forward models, and the law of a pixel."""
 
 from types import MappingProxyType
 
@@ -8,13 +8,9 @@ import pytest
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.operators.couple import AnalogMemory, InterpixelCapacitance
-from pchem_pipeline.effects.operators.drifts import GainDrift
 from pchem_pipeline.effects.operators.noise import FlickerNoise, RtsNoise
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.simulate.streams import KeyedStreams
-
-BOW = (-0.5, 0.5, -0.5)
 
 
 def analog(effect: Effect, shape=(500, 20, 30), *, charge=None, first=0, n_run=None, noise=0.3, seed=1):
@@ -40,69 +36,6 @@ def analog(effect: Effect, shape=(500, 20, 30), *, charge=None, first=0, n_run=N
 
 def within(seen, expected, stderr, widths: float = 5.0) -> None:
     assert abs(seen - expected) <= widths * stderr, (seen, expected, stderr)
-
-
-# -- moments ------------------------------------------------------------------------------------------------
-
-
-def test_capacitance_moves_charge_without_losing_any():
-    charge = np.zeros((3, 4, 5), int)
-    charge[0, 1, 2] = charge[1, 0, 0] = 10
-    effect = InterpixelCapacitance(coupling=0.02, anisotropy=0.5)
-    after, _, _, r = analog(effect, charge.shape, charge=charge)
-    seen = after - r
-    assert seen[0, 1, 1] == pytest.approx(0.3)
-    assert seen[0, 1, 3] == pytest.approx(0.3)
-    assert seen[0, 0, 2] == pytest.approx(0.1)
-    assert seen[0, 2, 2] == pytest.approx(0.1)
-    assert seen[0, 1, 2] == pytest.approx(9.2)
-    assert seen[1, 0, 0] == pytest.approx(9.6)  # a corner has two neighbours
-    np.testing.assert_allclose(seen.sum(axis=(1, 2)), charge.sum(axis=(1, 2)), atol=1e-12)
-    assert effect.halo() == 1
-
-
-def test_memory_is_of_the_frame_before():
-    effect = AnalogMemory(memory=-0.1)
-    after, before, k, _ = analog(effect, (6, 3, 4))
-    np.testing.assert_allclose(after[1:] - before[1:], -0.1 * k[:-1], atol=1e-12)
-    assert effect.history() == 1
-
-
-def test_memory_may_differ_from_pixel_to_pixel():
-    effect = AnalogMemory(memory=0.1, spread=0.5)
-    after, before, _, _ = analog(effect, (8, 60, 60), charge=np.full((8, 60, 60), 3))
-    memory = (after[1:] - before[1:]) / 3
-    np.testing.assert_allclose(
-        memory, np.broadcast_to(memory[0], memory.shape), atol=1e-12
-    )  # always the same
-    logs = np.log(memory[0] / 0.1)
-    within(logs.mean(), -(0.5**2) / 2, 0.5 / 60)
-    within(logs.std(), 0.5, 0.5 / 60 / np.sqrt(2))
-
-
-def test_memory_levels_off():
-    after, before, _, _ = analog(
-        AnalogMemory(memory=0.1, saturation_e=5.0), (6, 1, 1), charge=np.arange(6)[:, None, None] ** 3
-    )
-    left = (after - before)[1:, 0, 0]
-    np.testing.assert_allclose(left, 0.5 * (1 - np.exp(-(np.arange(5) ** 3) / 5)), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("effect", "profile"),
-    [
-        (GainDrift(drift=0.2), np.linspace(-0.5, 0.5, 101)),
-        (GainDrift(drift=0.2, shape="path", path=BOW), 0.5 - np.abs(np.linspace(-1, 1, 101))),
-    ],
-)
-def test_the_gain_follows_its_profile(effect, profile):
-    after, before, _, _ = analog(effect, (101, 2, 3))
-    np.testing.assert_allclose(after, before * (1 + 0.2 * profile)[:, None, None], rtol=1e-12)
-    early, before, _, _ = analog(effect, (5, 2, 3), first=-9, n_run=101)
-    np.testing.assert_allclose(early, before * (1 + 0.2 * profile[0]), rtol=1e-12)
-
-
-# -- long memory --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -135,9 +68,6 @@ def test_flicker_exchanges_noise_and_adds_none():
     expected = 0.3 * np.exp(-1 / 3)
     within(lagged.mean(), expected, lagged.std() / np.sqrt(lagged.size))
     assert lagged.mean() > 20 * lagged.std() / np.sqrt(lagged.size)
-
-
-# -- telegraph noise ----------------------------------------------------------------------------------------
 
 
 def test_traps_are_in_a_share_of_the_pixels():
@@ -219,8 +149,6 @@ def test_exponential_steps_have_the_mean_that_is_stated():
     within(steps[0].mean(), 2.0, 2.0 / 60)
     within(steps[0].std(), 2.0, 2.0 * np.sqrt(2) / 60 * 1.5)
 
-
-# -- the law of a pixel -------------------------------------------------------------------------------------
 
 MAPS = PixelMaps(
     np.array([1.5]), np.array([0.1]), np.array([100.0]), np.array([np.sqrt(9 + 1 / 12)]), np.array([True])

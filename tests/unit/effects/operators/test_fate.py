@@ -1,4 +1,4 @@
-"""Effects of the light and the charge: forward models against theory, at every tiling, and neutral at zero.
+"""Fates of electrons: forward models and laws against theory.
 
 Limits are five standard errors from theory; each test also shows that what it guards against is many more.
 """
@@ -10,8 +10,7 @@ import pytest
 from helpers.small_sensors import a_sensor, electrons, exposures, simulated
 from scipy import stats
 
-from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
-from pchem_pipeline.effects.framework.draws import binomial_upper, further_uniform, regrouped
+from pchem_pipeline.discrepancy.estimator_check import recovered_strength
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.operators.drifts import ExposureDrift
 from pchem_pipeline.effects.operators.fate import (
@@ -21,11 +20,9 @@ from pchem_pipeline.effects.operators.fate import (
     OpticalCrosstalk,
     OverdispersedCounts,
     SpuriousCharge,
+    Trapping,
 )
-from pchem_pipeline.effects.operators.strike import CosmicRays
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-# -- laws of the electron number ---------------------------------------------------------------------
 
 
 def goodness(k, mass):
@@ -158,98 +155,87 @@ def test_diffusion_moves_electrons_and_loses_none():
         assert abs(mean[place] - wanted) <= 5 * np.sqrt(wanted / 50)
 
 
-def test_tracks_come_at_their_rate_and_leave_their_electrons():
-    effect = CosmicRays(tracks_per_frame=0.4, length_um=6.0, electrons_per_um=50.0, pixel_pitch_um=3.0)
-    n = 2000
-    total = _electrons(effect, (50, 50), 0, n).sum(axis=(1, 2))
-    hit = total > 0
-    rate = 1 - np.exp(-0.4)
-    assert abs(hit.mean() - rate) < 5 * np.sqrt(rate * (1 - rate) / n) + 0.01
-    # an exponential length has E[l^2] = 2 E[l]^2; a track that crosses the edge loses half at the most
-    mean, edge = 0.4 * 6.0 * 50.0, 4 * 2.0 / 50 / np.pi
-    error = np.sqrt(0.4 * (2 * 300.0**2 + 300.0) / n)
-    assert abs(total.mean() - mean * (1 - edge)) < 5 * error + mean * edge
-    # the pixels of the first track touch each other
-    k = _electrons(CosmicRays(tracks_per_frame=0.01, length_um=60.0), (60, 60), 0, 400)
-    y, x = np.nonzero(k[np.flatnonzero(k.sum(axis=(1, 2)))[0]])
-    assert y.size > 3
-    steps = abs(y[:, None] - y) + abs(x[:, None] - x) + 99 * np.eye(y.size)
-    assert steps.min(axis=1).max() <= 2
+H, TRAP_FRAMES, TRAPS = 2.0, 2000, (30, 30)
 
 
-def test_clouds_of_particles_have_their_electrons_and_width():
-    effect = CosmicRays(tracks_per_frame=1e-2, cloud_share=1.0, cloud_electrons=9000.0, cloud_um=2.4)
-    frames = _electrons(effect, (60, 60), 0, 4000)
-    y, x = np.indices((60, 60))
-    inside, totals, variances = 0, [], []
-    for k in frames[frames.sum(axis=(1, 2)) > 0]:
-        cy, cx = (float((k * axis).sum() / k.sum()) for axis in (y, x))
-        if min(cy, cx) > 5 and max(cy, cx) < 54 and k[round(cy), round(cx)] > 500:
-            inside += 1
-            totals.append(k.sum())
-            variances.append((k * (x - cx) ** 2).sum() / k.sum())
-    assert inside > 10
-    assert abs(np.mean(totals) / 9000 - 1) < 5 / np.sqrt(9000 * inside) + 1e-3
-    # 0.8 pixels, and where in its pixel an electron is
-    assert abs(np.mean(variances) - 0.64 - 1 / 12) < 0.03
+TRAP = Trapping(capture=0.5, release=0.3)
 
 
-def _electrons(effect, shape, first, last):
-    truth = dataclasses.replace(a_sensor(shape), quanta_exposure=np.zeros(shape))
-    return simulated(truth, effect, n_frames=last, frames=(first, last))[1]
+def theory(exposure, capture, release):
+    """Return the chance m that a sample with electrons loses one, and P(K >= 2)."""
+    some = -np.expm1(-exposure)
+    return capture * release / (release + capture * some), some - exposure * np.exp(-exposure)
 
 
-# -- place in the fit --------------------------------------------------------------------------------
+def of_numpy(seed, capture=0.3, release=0.3, shape=(20, 20), n_frames=1500):
+    """Return frames of pixels with a trap each, frame by frame: 10 DN and 0.3 e- of noise an electron."""
+    rng = np.random.default_rng(seed)
+    full = rng.random(shape) < 0.5
+    frames = np.empty((n_frames, *shape), np.uint16)
+    for t in range(-60, n_frames):
+        k = rng.poisson(H, shape)
+        freed = full & (rng.random(shape) < release)
+        caught = ~full & (k > 0) & (rng.random(shape) < capture)
+        full = (full & ~freed) | caught
+        if t >= 0:
+            seen = k + freed - caught + 0.3 * rng.standard_normal(shape)
+            frames[t] = np.rint(100 + 10 * seen)
+    return frames
 
 
-def test_exposures_of_a_run_are_a_mixture_with_its_moments():
-    factors = 1.0 + 0.8 * np.random.default_rng(3).beta(0.5, 2.0, 1000)
-    factors /= factors.mean()
-    weights, nodes = exposure_nodes(factors)
-    for power in range(6):
-        assert weights @ nodes**power == pytest.approx(np.mean(factors**power), rel=1e-9)
-    assert exposure_nodes(np.ones(5))[1].tolist() == [1.0]
-    two = exposure_nodes(np.array([0.9, 1.1]))
-    assert np.allclose(two[1], [0.9, 1.1])
-    assert np.allclose(two[0], 0.5)
+def test_variance_and_covariances_in_time_are_those_of_theory():
+    k = electrons(H, TRAPS, TRAP_FRAMES, TRAP)
+    n, pixels = TRAP_FRAMES, TRAPS[0] * TRAPS[1]
+    m, several = theory(H, TRAP.capture, TRAP.release)
+    left = 1.0 - TRAP.release - TRAP.capture * -np.expm1(-H)
+    assert abs(k.mean() - H) < 5 * np.sqrt(H / k.size)  # no charge is lost
+    off = k - k.mean(axis=0)
+    error = np.sqrt(3.0) * H / np.sqrt(n * pixels)  # of a variance; of a product it is less
+    variance = (off**2).sum() / (n - 1) / pixels
+    assert abs(variance - H - 2 * m * several) < 5 * error
+    assert 2 * m * several > 20 * error
+    for lag in (1, 2, 3):
+        found = (off[lag:] * off[:-lag]).sum() / (n - lag) / pixels + variance / n
+        expected = -TRAP.release * TRAP.capture * several * left ** (lag - 1)
+        assert abs(found - expected) < 5 * error
+        assert lag > 1 or abs(expected) > 20 * error
 
 
-# -- tools -------------------------------------------------------------------------------------------
+def test_a_sample_has_the_law_of_the_fit():
+    """Each pixel's frames are correlated; one frame of a thousand pixels is not."""
+    k = electrons(H, (60, 60), 400, TRAP)[::40]  # the states of a trap forget in 40 frames
+    m, _ = theory(H, TRAP.capture, TRAP.release)
+    number = np.arange(12)
+    plain = stats.poisson.pmf(np.arange(-1, 14), H)
+    some, p, above, below = -np.expm1(-H), plain[1:13], plain[2:14], plain[0:12]
+    mass = p + m * some * (below - p) + m * (above - p * (number >= 1))
+    law = TRAP.sample_law(SampleLaw(), _maps(H))
+    assert law.law == "trapped"
+    assert np.ravel(law.dispersion)[0] == pytest.approx(m, rel=1e-12)
+    seen = np.bincount(k.ravel(), minlength=12)[:12]
+
+    def misfit(expected):
+        good = expected > 20
+        chi2 = float(((seen - expected)[good] ** 2 / expected[good]).sum())
+        return (chi2 - good.sum()) / np.sqrt(2.0 * good.sum())
+
+    assert abs(misfit(k.size * mass)) < 5
+    assert misfit(k.size * p) > 20
 
 
-@pytest.mark.parametrize(("n", "p"), [(1, 0.3), (7, 0.02), (40, 0.6), (20_000, 0.3)])
-def test_binomial_numbers_come_from_the_upper_end(n, p):
-    u = (np.arange(1000) + 0.5) / 1000
-    seen = binomial_upper(u, np.full(1000, n), p)
-    assert np.array_equal(seen, stats.binom.isf(u, n, p))
-    assert np.all(np.diff(seen) <= 0)
+def _maps(exposure):
+    from pchem_pipeline.effects.framework.evidence import PixelMaps
+
+    one = np.ones((1, 1))
+    return PixelMaps(exposure * one, 0.1 * one, 100.0 * one, 3.0 * one, one.astype(bool))
 
 
-def test_further_numbers_are_uniform_and_unrelated():
-    n = 200_000
-    u = np.random.default_rng(1).random(n) * 1e-3
-    more = [further_uniform(u, draw) for draw in (0, 1, 2)]
-    for a in more:
-        assert a.min() > 0
-        assert a.max() < 1
-        assert stats.kstest(a, "uniform").pvalue > 5.7e-7
-    for a, b in ((more[0], more[1]), (more[1], more[2]), (more[0], u)):
-        assert abs(np.corrcoef(a, b)[0, 1]) < 5 / np.sqrt(n)
-    assert np.array_equal(further_uniform(u, np.arange(n) % 3)[1::3], more[1][1::3])
+@pytest.mark.parametrize("camera", [None, of_numpy], ids=["package", "numpy"])
+def test_it_is_guessed_in_every_stack(camera):
+    found = recovered_strength(Trapping(capture=0.3, release=0.3), camera=camera)
+    assert found.n_guesses == 6
+    assert 1 / 3 < found.mean / 0.3 < 3
 
 
-# -- bad input ---------------------------------------------------------------------------------------
-
-
-def test_of_very_many_electrons_of_which_nearly_all_are_lost_the_few_are_left():
-    """The chance that none is lost is 0 in doubles, which is no reason for a warning."""
-    electrons, rng = np.full(2000, 900), np.random.default_rng(4)
-    left = regrouped(
-        electrons,
-        rng.random(2000),
-        1.0,
-        lambda index: (0.9, 0.0),
-        lambda u, index: np.zeros(u.size, np.int64),
-    )
-    assert abs(left.mean() - 90.0) < 4.0 * np.sqrt(900 * 0.09 / 2000)
-    assert left.var() == pytest.approx(81.0, rel=4.0 * np.sqrt(2.0 / 2000))
+def test_nothing_is_found_where_nothing_is():
+    assert recovered_strength(Trapping(capture=0.0)).n_guesses == 0
