@@ -67,10 +67,6 @@ def test_evidence_without_time_gives_no_hypothesis_on_time():
     assert block_charge(evidence) is None
     for cls in (ExposureDrift, Persistence, DarkCurrentRts, ExposureFlicker, OpticalCrosstalk, CosmicRays):
         assert len(cls.estimate(evidence)) == 0
-    unusable = dataclasses.replace(
-        seen(), maps=dataclasses.replace(evidence.maps, usable=np.zeros((24, 24), np.bool_))
-    )
-    assert all(len(cls.estimate(unusable)) == 0 for cls in CLASSES if cls is not CosmicRays)
 
 
 @pytest.mark.parametrize("drift", [0.1, -0.1])
@@ -228,16 +224,3 @@ def test_round_clouds_among_tracks_have_their_own_share_and_size():
         observe(frames_with([False] * lines, 1500), np.arange(1500), n_run=1500, block_frames=50)
     )
     assert alone.cloud_share < 0.02
-
-
-@pytest.mark.parametrize("shape", [(1, 30), (30, 1), (2, 5)])
-def test_a_sensor_of_few_pixels(shape):
-    hidden = (
-        ExposureDrift(drift=0.9),
-        DarkCurrentRts(fraction=0.5, step_e=0.5),
-        CosmicRays(tracks_per_frame=0.002),
-    )
-    evidence = small_sensors.seen(taken(a_sensor(shape), *hidden, n_frames=1000))
-    found = {cls: cls.estimate(evidence) for cls in CLASSES}
-    assert abs(found[ExposureDrift][0].drift - 0.9) < 0.3
-    assert all(len(hypotheses) <= 6 for hypotheses in found.values())

@@ -107,14 +107,6 @@ class Spot:
         return {"centre_y": self.centre[0], "centre_x": self.centre[1], "radius": self.radius}
 
 
-@dataclass(frozen=True)
-class Bursts:
-    """A spot that is bright in a share of the frames."""
-
-    spot: Spot
-    share: float
-
-
 def best_spot(
     amplitude: FloatArray,
     noise: FloatArray,
@@ -221,8 +213,8 @@ class _Lines:
         return np.concatenate([cells.sum(axis=-1), cells.sum(axis=-2)], axis=-1)
 
 
-def best_bursts(evidence: Evidence) -> Bursts | None:
-    """Return the spot whose light comes in some frames only; None where none stands out.
+def best_bursts(evidence: Evidence) -> tuple[Spot, float] | None:
+    """Return the spot whose light comes in some frames only, and their share; None if none stands out.
 
     A spot's light in a frame shows in its rows and columns. For each spot of a family the frames' light,
     less what all pixels have in proportion to H, has moments; those of the spot whose light is the least
@@ -247,7 +239,7 @@ def best_bursts(evidence: Evidence) -> Bursts | None:
     if share > _MOST or burst.sum() < _FEWEST_BURSTS:
         return None
     spot = _form(lines, burst, shape)
-    return None if spot is None else Bursts(spot, share)
+    return None if spot is None else (spot, share)
 
 
 def _lines(evidence: Evidence) -> _Lines | None:

@@ -124,7 +124,7 @@ class Replacement(NamedTuple):
 class Effect(Section):
     """Base of all effects.
 
-    A subclass is registered under the default of its ``tag`` and gives:
+    A subclass gives, and one of this package is registered by its tag behind the base:
 
     Attributes:
         tag: name in the YAML and in verdicts; a ``Literal`` with one value, which is the default.

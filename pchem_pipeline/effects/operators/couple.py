@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -316,6 +315,14 @@ def _pursued(seen: PreviousBits) -> FloatArray:
     return offsets
 
 
+_LEAST_CLAMP_GAIN = 9.0  # nats: some 500 overlapping ranges are tried
+_PRICE_OF_PLACE = 4.0  # nats that the choice of two ends brings by chance
+# of an offset, the share that is taken from the lines: all of a large noise of frames would be too much where
+# its response is not quite known
+_SURE = 0.9
+_MOST_LINES = 64  # groups of lines whose ranges are tried
+
+
 class BlackClamp(Effect, tag="black_clamp"):
     """A part of what the clamp's pixels deviate in a frame, in the mean, is taken from all of its pixels.
 
@@ -395,11 +402,46 @@ class BlackClamp(Effect, tag="black_clamp"):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
-        """Return the rows, columns or the whole frame whose content the frames' offsets follow best."""
-        found = best_clamp(evidence)
-        if found is None:
+        """Return the rows, columns or the whole frame whose content the frames' offsets follow best.
+
+        Nothing if a noise of frames explains them as well. With s the mean deviation of the clamp's pixels in
+        a frame before the clamp, and f the part that is taken off, all samples move by ``-f s``, and the mean
+        readout residual of the frame by alpha times that (alpha: `estimators/common_modes.py`). What lines
+        show, less the offset of their frame, is theirs before the clamp, whatever else moves all pixels
+        alike: so f is a regression on it.
+        """
+        if evidence.time is None or evidence.maps.usable.sum() < 2:
             return ()
-        return (cls(follow=found.follow, rows=found.rows, columns=found.columns, pixels=found.pixels),)
+        offset = evidence.time.frame_readout.astype(np.float64) / responsivity(evidence)
+        offset = offset - offset.mean()
+        seen = _SURE * offset
+        best: tuple[Self, ...] = ()
+        gain = _LEAST_CLAMP_GAIN
+        for axis in (1, 0):
+            content, count = _contents(evidence, axis)
+            group = np.arange(count.size) // -(-count.size // _MOST_LINES)
+            first = np.append(np.flatnonzero(np.diff(group, prepend=-1)), count.size)
+            # sums of all lines before each, less the offset of the frame
+            pixels = np.append(0.0, np.cumsum(count))[first]
+            before = np.pad(np.cumsum(content, axis=1), ((0, 0), (1, 0)))[:, first] - seen[:, None] * pixels
+            products, along = before.T @ before, before.T @ offset
+            a, b = np.triu_indices(first.size, 1)
+            square = np.maximum(products[a, a] + products[b, b] - 2.0 * products[a, b], 1e-12)
+            against = np.maximum(along[a] - along[b], 0.0)
+            share = np.minimum(against**2 / square / max(float(offset @ offset), 1e-300), 1.0 - 1e-9)
+            gains = -0.5 * offset.size * np.log1p(-share)
+            whole = pixels[b] - pixels[a] == pixels[-1]
+            # a part of the frame only where it explains more than the frame
+            gains[whole] += _PRICE_OF_PLACE
+            place = int(gains.argmax())
+            if gains[place] > gain:
+                number, span = pixels[b] - pixels[a], (int(first[a[place]]), int(first[b[place]]))
+                rows, columns = (span, None) if axis == 1 else (None, span)
+                where = (None, None) if whole[place] else (rows, columns)
+                follow = min(float(against[place] / square[place] * number[place]), 1.0)
+                gain = float(gains[place])
+                best = (cls(follow=follow, rows=where[0], columns=where[1], pixels=int(number[place])),)
+        return best
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the variance of the clamp's mean, its pixels taken to be like these."""
@@ -408,64 +450,6 @@ class BlackClamp(Effect, tag="black_clamp"):
         variance = maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2
         mean = float(np.nanmean(variance)) if np.isfinite(variance).any() else 0.0
         return model.with_variance(dn2=self.follow**2 * mean / self.pixels)
-
-
-_LEAST_CLAMP_GAIN = 9.0  # nats: some 500 overlapping ranges are tried
-_PRICE_OF_PLACE = 4.0  # nats that the choice of two ends brings by chance
-# of an offset, the share that is taken from the lines: all of a large noise of frames would be too much where
-# its response is not quite known
-_SURE = 0.9
-_MOST_LINES = 64  # groups of lines whose ranges are tried
-
-
-@dataclass(frozen=True)
-class Clamp:
-    """Part that is taken off, and the lines whose mean it is of (None: all), with the number of pixels."""
-
-    follow: float
-    rows: tuple[int, int] | None
-    columns: tuple[int, int] | None
-    pixels: int
-
-
-def best_clamp(evidence: Evidence) -> Clamp | None:
-    """Return the clamp that explains the frames' offsets best; None if a noise of frames does as well.
-
-    With s the mean deviation of the clamp's pixels in a frame before the clamp, and f the part that is taken
-    off, all samples move by ``-f s``, and the mean readout residual of the frame by alpha times that (alpha:
-    :mod:`pchem_pipeline.effects.estimators.common_modes`). What lines show, less the offset of their frame,
-    is theirs before the clamp, whatever else moves all pixels alike: so f is a regression on it.
-    """
-    if evidence.time is None or evidence.maps.usable.sum() < 2:
-        return None
-    offset = evidence.time.frame_readout.astype(np.float64) / responsivity(evidence)
-    offset = offset - offset.mean()
-    seen = _SURE * offset
-    best, gain = None, _LEAST_CLAMP_GAIN
-    for axis in (1, 0):
-        content, count = _contents(evidence, axis)
-        group = np.arange(count.size) // -(-count.size // _MOST_LINES)
-        first = np.append(np.flatnonzero(np.diff(group, prepend=-1)), count.size)
-        # sums of all lines before each, less the offset of the frame
-        pixels = np.append(0.0, np.cumsum(count))[first]
-        before = np.pad(np.cumsum(content, axis=1), ((0, 0), (1, 0)))[:, first] - seen[:, None] * pixels
-        products, along = before.T @ before, before.T @ offset
-        a, b = np.triu_indices(first.size, 1)
-        square = np.maximum(products[a, a] + products[b, b] - 2.0 * products[a, b], 1e-12)
-        against = np.maximum(along[a] - along[b], 0.0)
-        share = np.minimum(against**2 / square / max(float(offset @ offset), 1e-300), 1.0 - 1e-9)
-        gains = -0.5 * offset.size * np.log1p(-share)
-        whole = pixels[b] - pixels[a] == pixels[-1]
-        # a part of the frame only where it explains more than the frame
-        gains[whole] += _PRICE_OF_PLACE
-        place = int(gains.argmax())
-        if gains[place] > gain:
-            number, span = pixels[b] - pixels[a], (int(first[a[place]]), int(first[b[place]]))
-            rows, columns = (span, None) if axis == 1 else (None, span)
-            where = (None, None) if whole[place] else (rows, columns)
-            follow = min(float(against[place] / square[place] * number[place]), 1.0)
-            best, gain = Clamp(follow, *where, int(number[place])), float(gains[place])
-    return best
 
 
 def _contents(evidence: Evidence, axis: int) -> tuple[FloatArray, FloatArray]:

@@ -138,7 +138,7 @@ class Glow(Effect, tag="glow"):
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return a spot that bursts, from rows and columns, and one that grows, from block means."""
         bursts = best_bursts(evidence)
-        found = [] if bursts is None else [cls._of(bursts.spot, burst_share=bursts.share)]
+        found = [] if bursts is None else [cls._of(*bursts)]
         growing = _growing(evidence)
         return [*found, *([] if growing is None else [cls._of(growing)])]
 

@@ -235,7 +235,3 @@ def test_it_is_guessed_in_every_stack(camera):
     found = recovered_strength(Trapping(capture=0.3, release=0.3), camera=camera)
     assert found.n_guesses == 6
     assert 1 / 3 < found.mean / 0.3 < 3
-
-
-def test_nothing_is_found_where_nothing_is():
-    assert recovered_strength(Trapping(capture=0.0)).n_guesses == 0

@@ -1,10 +1,11 @@
-"""What estimators guess where nothing is, or a relative, and of frames without an order in time: nothing."""
+"""What estimators guess of nothing, of a relative, and of frames without an order in time or few pixels."""
 
 import functools
 from dataclasses import replace
 
+import numpy as np
 import pytest
-from helpers.small_sensors import drawn_truth, seen, taken
+from helpers.small_sensors import drawn_truth, make, seen, taken
 
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
@@ -32,6 +33,7 @@ SILENT = {
     "repeated_lines": ("row_noise", "interpixel_capacitance"),
 }
 IN_TIME = ("frame.", "time.", "space.")
+EVERY = effect_classes()
 
 
 @functools.cache
@@ -50,13 +52,14 @@ def test_nothing_is_guessed_of_a_relative(tag, hidden):
     assert list(effect_class(tag).estimate(evidence_of(hidden))) == []
 
 
-@pytest.mark.parametrize("tag", SILENT)
-@pytest.mark.parametrize("seed", [6, 7])
-def test_nothing_is_guessed_where_nothing_is(tag, seed):
-    assert list(effect_class(tag).estimate(evidence_of("", seed))) == []
+def test_nothing_is_guessed_where_nothing_is():
+    # some are guessed by chance in 2 to 5 % of stacks
+    fired = [tag for seed in range(10, 20) for tag in EVERY if EVERY[tag].estimate(evidence_of("", seed))]
+    assert len(fired) <= 12, fired
+    assert not set(fired) & SILENT.keys()
 
 
-@pytest.mark.parametrize("tag", effect_classes())
+@pytest.mark.parametrize("tag", EVERY)
 def test_samples_without_an_order_in_time_do_no_harm(tag):
     kind, evidence = effect_class(tag), evidence_of("row_noise")
     z = {name: value for name, value in evidence.z.items() if not name.startswith(IN_TIME)}
@@ -65,3 +68,20 @@ def test_samples_without_an_order_in_time_do_no_harm(tag):
     # what the histograms of pixels and the counts per code tell is told without it
     in_time = all(name.startswith(IN_TIME) for name in kind.signature)
     assert not guesses or not (tag in SILENT or in_time)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 1), (1, 30), (30, 1), (2, 5)])
+def test_few_pixels_do_no_harm(shape):
+    hidden = (make("exposure_drift", drift=0.9), make("dark_current_rts", fraction=0.5, step_e=0.5))
+    evidence = seen(taken(drawn_truth(shape), *hidden, n_frames=1000))
+    found = {tag: kind.estimate(evidence) for tag, kind in EVERY.items()}
+    assert all(len(guesses) <= 6 for guesses in found.values())
+    assert np.prod(shape) < 10 or abs(found["exposure_drift"][0].drift - 0.9) < 0.3
+
+
+def test_a_sensor_without_a_usable_pixel_does_no_harm():
+    evidence = evidence_of("exposure_flicker")
+    maps = replace(evidence.maps, usable=np.zeros_like(evidence.maps.usable))
+    # the counts per code and the tracks of particles are there without it
+    for tag in EVERY.keys() - {"cosmic_rays"}:
+        assert len(EVERY[tag].estimate(replace(evidence, maps=maps, z={}))) == 0, tag
