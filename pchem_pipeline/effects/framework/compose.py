@@ -253,15 +253,19 @@ def place_words(effect: Effect) -> str:
     return ", ".join(place.describe() for place in (effect.region, effect.when) if place is not None)
 
 
+def in_place(effect: Effect) -> str:
+    """Return the same behind " in ", for the end of a phrase; nothing where there is nothing to say."""
+    return "" if effect.everywhere else f" in {place_words(effect)}"
+
+
 def effect_words(effect: Effect) -> str:
     """Describe an effect, for example ``row_noise in columns 120 to 159, frames 0 to 99``."""
-    return effect.tag if effect.everywhere else f"{effect.tag} in {place_words(effect)}"
+    return f"{effect.tag}{in_place(effect)}"
 
 
 def title_words(effect: Effect) -> str:
     """Describe an effect by its title."""
-    title = type(effect).title or effect.tag
-    return title if effect.everywhere else f"{title} in {place_words(effect)}"
+    return f"{type(effect).title or effect.tag}{in_place(effect)}"
 
 
 def model_words(effects: Sequence[Effect]) -> str:

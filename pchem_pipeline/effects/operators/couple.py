@@ -13,7 +13,7 @@ from scipy import special
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.estimators.common_modes import responsivity
-from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.compose import in_place
 from pchem_pipeline.effects.framework.context import ALL_ROWS
 from pchem_pipeline.effects.framework.draws import OF_PIXEL
 from pchem_pipeline.effects.framework.effect import (
@@ -682,7 +682,6 @@ class EmpiricalResponse(Effect, tag="empirical_response"):
 
     def describe(self) -> str:
         """Return what is known of it."""
-        place = f" in {place_words(self)}" if place_words(self) else ""
         followed: dict[str, list[str]] = {}
         for term in sorted(self.terms, key=lambda term: -abs(term.weight)):
             only = f" in {Region(columns=(term.columns,)).describe()}" if term.columns else ""
@@ -691,7 +690,7 @@ class EmpiricalResponse(Effect, tag="empirical_response"):
             )
         told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:MOST_TOLD]]
         more = f", and {len(followed) - MOST_TOLD} more" if len(followed) > MOST_TOLD else ""
-        return f"samples{place} depend on the charge of other samples ({', '.join(told)}{more})"
+        return f"samples{in_place(self)} depend on the charge of other samples ({', '.join(told)}{more})"
 
 
 def _few(parts: Sequence[str]) -> str:

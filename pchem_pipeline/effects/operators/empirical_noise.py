@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
-from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.compose import in_place
 from pchem_pipeline.effects.framework.context import DIMS, Dim
 from pchem_pipeline.effects.framework.effect import MOST_TOLD, Dn, Effect, Plane
 from pchem_pipeline.effects.framework.region import Span
@@ -363,13 +363,12 @@ class EmpiricalNoise(Effect, tag="empirical_noise"):
 
     def describe(self) -> str:
         """Return what is known of it."""
-        place = f" in {place_words(self)}" if place_words(self) else ""
         of_all = len(self.modes) == 1 and self.modes[0].changes == "offset" and self.modes[0].burst is None
         parts = "; ".join(mode.describe(None if of_all else self.share_of(mode)) for mode in self.modes)
         if all(mode.changes == "offset" for mode in self.modes):
-            return f"samples share noise of {self.noise_dn:.2g} DN{place} ({parts})"
+            return f"samples share noise of {self.noise_dn:.2g} DN{in_place(self)} ({parts})"
         changed = dict.fromkeys(_CHANGED.get(mode.changes, "offset") for mode in self.modes)
-        return f"samples share a variation of the {' and the '.join(changed)}{place} ({parts})"
+        return f"samples share a variation of the {' and the '.join(changed)}{in_place(self)} ({parts})"
 
 
 class _Average(NamedTuple):

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
-from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.compose import in_place
 from pchem_pipeline.effects.framework.draws import OF_PIXEL, binomial_upper, regrouped, sent_to_neighbours
 from pchem_pipeline.effects.framework.effect import DEPTH, Effect, Electrons, Plane, Ratio
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
@@ -670,9 +670,8 @@ class EmpiricalElectrons(Effect, tag="empirical_electrons"):
 
     def describe(self) -> str:
         """Return what is known of it."""
-        place = f" in {place_words(self)}" if place_words(self) else ""
         told = [mode.describe(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
-        return f"electron numbers{place} are not independent ({'; '.join(told)})"
+        return f"electron numbers{in_place(self)} are not independent ({'; '.join(told)})"
 
 
 def _gone(electrons: IntArray, u: FloatArray, chance: float) -> IntArray:

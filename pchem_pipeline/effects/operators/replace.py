@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.estimators.common_modes import Multiple, multiple_of
-from pchem_pipeline.effects.framework.compose import place_words
+from pchem_pipeline.effects.framework.compose import in_place
 from pchem_pipeline.effects.framework.context import DIMS, Dim
 from pchem_pipeline.effects.framework.effect import (
     DEPTH,
@@ -753,21 +753,20 @@ class Empirical(Effect, tag="empirical"):
 
     def describe(self) -> str:
         """Return what is known of it."""
-        place = f" in {place_words(self)}" if place_words(self) else ""
         what = {
             "sample": "samples", "row": "rows", "column": "columns", "frame": "frames",
         }[self.together]  # fmt: skip
         if self.squares:
             rows, columns = (("even", "odd")[parity] for parity in self.squares)
             return (
-                f"{per_cent(self.share)} of the squares of 2 x 2 pixels{place}, from {rows} rows and "
-                f"{columns} columns on, equal the mean of their samples"
+                f"{per_cent(self.share)} of the squares of 2 x 2 pixels{in_place(self)}, from {rows} rows "
+                f"and {columns} columns on, equal the mean of their samples"
             )
         shares = self.shares()
         order = np.argsort(-shares)[:MOST_TOLD]
         told = [f"{per_cent(shares[i])} {self.moves[i].describe()}" for i in order]
         how = f" {self.moves[0].describe()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
-        return f"{per_cent(self.share)} of the {what}{place} are shifted{how}"
+        return f"{per_cent(self.share)} of the {what}{in_place(self)} are shifted{how}"
 
 
 def _averaged(values: IntArray, chosen: BoolArray) -> IntArray:

@@ -201,35 +201,6 @@ def test_variance_and_covariances_in_time_are_those_of_theory():
         assert lag > 1 or abs(expected) > 20 * error
 
 
-def test_a_sample_has_the_law_of_the_fit():
-    """Each pixel's frames are correlated; one frame of a thousand pixels is not."""
-    k = electrons(H, (60, 60), 400, TRAP)[::40]  # the states of a trap forget in 40 frames
-    m, _ = theory(H, TRAP.capture, TRAP.release)
-    number = np.arange(12)
-    plain = stats.poisson.pmf(np.arange(-1, 14), H)
-    some, p, above, below = -np.expm1(-H), plain[1:13], plain[2:14], plain[0:12]
-    mass = p + m * some * (below - p) + m * (above - p * (number >= 1))
-    law = TRAP.sample_law(SampleLaw(), _maps(H))
-    assert law.law == "trapped"
-    assert np.ravel(law.dispersion)[0] == pytest.approx(m, rel=1e-12)
-    seen = np.bincount(k.ravel(), minlength=12)[:12]
-
-    def misfit(expected):
-        good = expected > 20
-        chi2 = float(((seen - expected)[good] ** 2 / expected[good]).sum())
-        return (chi2 - good.sum()) / np.sqrt(2.0 * good.sum())
-
-    assert abs(misfit(k.size * mass)) < 5
-    assert misfit(k.size * p) > 20
-
-
-def _maps(exposure):
-    from pchem_pipeline.effects.framework.evidence import PixelMaps
-
-    one = np.ones((1, 1))
-    return PixelMaps(exposure * one, 0.1 * one, 100.0 * one, 3.0 * one, one.astype(bool))
-
-
 @pytest.mark.parametrize("camera", [None, of_numpy], ids=["package", "numpy"])
 def test_it_is_guessed_in_every_stack(camera):
     found = recovered_strength(Trapping(capture=0.3, release=0.3), camera=camera)
