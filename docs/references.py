@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import sys
 from collections.abc import Iterable, Iterator
 from enum import Enum
 from itertools import groupby
@@ -178,7 +177,7 @@ def _latex(symbol: str) -> str:
 
 def effects() -> str:
     """Return every effect of this package in the order of the signal chain: what it is, settings, rivals."""
-    from pchem_pipeline.effects.framework.plane import Plane
+    from pchem_pipeline.effects.framework.context import Plane
     from pchem_pipeline.effects.framework.registry import effect_classes
 
     own = [c for c in effect_classes().values() if c.__module__.startswith("pchem_pipeline.")]
@@ -208,9 +207,7 @@ def _effect(effect: type[Any]) -> Iterator[str]:
     tag = effect.model_fields["tag"].default
     yield f"### {tag}"
     yield ""
-    yield f"*{_escaped(effect.title)}*. {_prose(sys.modules[effect.__module__])}"
-    yield ""
-    yield _prose(effect)
+    yield f"*{_escaped(effect.title)}*. {_prose(effect)}"
     yield ""
     if effect.source:
         yield f"Source: {_escaped(effect.source)}."

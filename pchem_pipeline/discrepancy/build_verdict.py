@@ -38,8 +38,7 @@ from pchem_pipeline.discrepancy.verdict import (
     share_text,
     sigma_text,
 )
-from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import place_words, title_words
+from pchem_pipeline.effects.framework.compose import AddedExposure, place_words, title_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes

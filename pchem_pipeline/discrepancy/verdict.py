@@ -21,7 +21,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, Va
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.region import Region, When

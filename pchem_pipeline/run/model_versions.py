@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
-from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.store.files import read_record, write_record

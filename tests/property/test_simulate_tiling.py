@@ -8,8 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
-from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
+from pchem_pipeline.effects.operators.couple import AnalogMemory, InterpixelCapacitance
 from pchem_pipeline.simulate import chain
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth

@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 from helpers.small_sensors import drawn_truth, seen, taken
 
-from pchem_pipeline.effects.analog.analog_memory import AnalogMemory
-from pchem_pipeline.effects.analog.flicker_noise import FlickerNoise
-from pchem_pipeline.effects.analog.gain_drift import GainDrift
-from pchem_pipeline.effects.analog.heavy_tailed_noise import HeavyTailedNoise
-from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
-from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
-from pchem_pipeline.effects.analog.nonlinearity import Nonlinearity
-from pchem_pipeline.effects.analog.rts_noise import RtsNoise
-from pchem_pipeline.effects.analog.signal_dependent_noise import SignalDependentNoise
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.effects.operators.couple import AnalogMemory, InterpixelCapacitance
+from pchem_pipeline.effects.operators.curve import Nonlinearity
+from pchem_pipeline.effects.operators.drifts import GainDrift
+from pchem_pipeline.effects.operators.noise import (
+    FlickerNoise,
+    HeavyTailedNoise,
+    NoiseSkew,
+    RtsNoise,
+    SignalDependentNoise,
+)
 
 CLASSES: tuple[type[Effect], ...] = (
     AnalogMemory, FlickerNoise, GainDrift, HeavyTailedNoise, InterpixelCapacitance, NoiseSkew,
@@ -30,12 +31,6 @@ N_FRAMES = 2400
 @functools.cache
 def evidence_of(*effects: Effect, seed: int = 1) -> Evidence:
     return seen(taken(TRUTH, *effects, n_frames=N_FRAMES, seed=seed))
-
-
-def test_nothing_is_guessed_where_nothing_is():
-    # each fires by chance in about one stack in 300
-    fired = [c.__name__ for seed in range(3) for c in CLASSES if c.estimate(evidence_of(seed=10 + seed))]
-    assert len(fired) <= 2, fired
 
 
 @pytest.mark.parametrize(
@@ -110,10 +105,3 @@ def test_the_opposite_direction_counts_for_nothing(effect):
     plain = evidence_of(seed=10)
     against = replace(plain, z=dict.fromkeys(plain.z, -20.0))
     assert bool(effect.estimate(against)) == (effect in (AnalogMemory, NoiseSkew, Nonlinearity))
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 4), (3, 1)])
-def test_very_small_sensors_do_no_harm(shape):
-    evidence = seen(taken(drawn_truth(shape), n_frames=400))
-    for effect in CLASSES:
-        assert len(effect.estimate(evidence)) <= 6

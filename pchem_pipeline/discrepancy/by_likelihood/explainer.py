@@ -29,10 +29,10 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import Explainer, Prepared, search, silent
 from pchem_pipeline.discrepancy.verdict import Discrepancy
-from pchem_pipeline.effects.charge.spurious_charge import SpuriousCharge
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.effects.operators.fate import SpuriousCharge
 from pchem_pipeline.model.arithmetic.significance import CLEAR
 from pchem_pipeline.model.fit.shared import Samples
 

@@ -51,8 +51,7 @@ from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import Explainer, Prepared, search, silent
 from pchem_pipeline.discrepancy.verdict import Discrepancy
-from pchem_pipeline.effects.framework.added_exposure import added_exposures
-from pchem_pipeline.effects.framework.compose import along_chain
+from pchem_pipeline.effects.framework.compose import added_exposures, along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
 

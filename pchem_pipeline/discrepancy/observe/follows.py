@@ -22,8 +22,8 @@ from pchem_pipeline.discrepancy.observe.digital.groups import GROUP, MOST_SAMPLE
 from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
-from pchem_pipeline.effects.analog.empirical_response import Source
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.operators.couple import Source
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]

@@ -1,16 +1,24 @@
-"""What the counts per code tell of the code edges.
+"""What the counts per code tell of the code edges, and of a bent or broken transfer curve.
 
 If the lower edge of code c lies at ``c - 1/2 + d_c`` instead of ``c - 1/2``, the code's width is ``1 +
-d_{c+1} - d_c`` and its counts grow in proportion (histogram test of ADCs, IEEE Std 1241). The smooth part of
-d is taken for bias, gain and noise by the pixels' own fits, so only the rough part is looked at here.
+d_{c+1} - d_c`` and its counts grow in proportion (histogram test of ADCs, IEEE Std 1241). The smooth part
+of d is taken for bias, gain and noise by the pixels' own fits, so only the rough part is looked at here.
+
+A deviation ``delta(x)`` of the transfer curve moves the code edges by ``-delta``. The pixels' own fits take
+up what looks like a change of their H, g, mu or sigma; what they leave is computed here to first order, for
+a sample of pixels (the same projection as of an efficient score), summed over the codes and compared with
+the residuals for sines of many periods and for breaks at many places.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.framework.evidence import CodeResiduals
-from pchem_pipeline.effects.types import FloatArray, IntArray, PixelMaps
+from pchem_pipeline.effects.types import BoolArray, Evidence, FloatArray, IntArray, PixelMaps, SampleLaw
 
 Residuals = tuple["IntArray", "FloatArray", "FloatArray"]
 
@@ -113,3 +121,264 @@ def code_range(maps: PixelMaps) -> tuple[int, int]:
     mu, exposure, gain, noise = (np.ravel(p)[good] for p in parts)
     top = mu + (exposure + 8 * np.sqrt(exposure) + 8) / gain + 8 * noise
     return max(0, int(np.floor((mu - 8 * noise).min()))), int(np.ceil(top.max()))
+
+
+_PIXELS = 256  # that stand for all: their windows of codes overlap many times
+_PERIODS = 48  # sines that are tried, twice as many as are independent
+_MOST_CODES = 1500  # memory: a square of so many numbers
+_SHORTEST = 8.0  # DN; what changes faster is new from code to code
+# places of a break that are tried, and the share of the samples on either side that it needs
+_LEVELS = 80
+_END = 0.002
+# fall of chi2 by two coefficients at one of some 20 independent periods: p about 0.02
+_LEAST_BEND_GAIN = 14.0
+# knots of a curve, and the fall of chi2 that each further one must bring
+_KNOTS, _PRICE = (5, 7, 9, 12, 16), 3.0
+# share of the samples below its first knot, and above its last
+_RARE = 0.002
+# directions of the curve that are left at nothing: relative weight, squared standard errors
+_WEAKEST, _DOUBT = 0.003, 4.0
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A deviation ``amplitude sin(2 pi x / period + phase)``: LSB, DN, rad."""
+
+    amplitude: float
+    period: float
+    phase: float
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A smooth deviation by its values at knots: DN of the first, DN from one to the next, LSB."""
+
+    first: float
+    spacing: float
+    values: FloatArray
+
+
+@dataclass(frozen=True)
+class SampledPixels:
+    """A sample of pixels in their own windows of codes.
+
+    Attributes:
+        first: code of the first cell of each window, (n, 1).
+        density: of the samples at the cells' edges, per DN, (n, cells + 1).
+        mass: of the cells, (n, cells).
+        tangents: change of the masses with H, mu, sigma, g, orthonormal under ``1 / mass``, (n, 4, cells).
+    """
+
+    first: IntArray
+    density: FloatArray
+    mass: FloatArray
+    tangents: FloatArray
+
+
+@dataclass(frozen=True)
+class Stitch:
+    """A deviation ``slope (x - level) + step`` above a level, none below: DN per DN, DN, DN."""
+
+    level: float
+    slope: float
+    step: float
+
+
+@dataclass(frozen=True)
+class CurveResponse:
+    """What a small deviation of the transfer curve leaves in the counts per code.
+
+    Attributes:
+        edges: lower edges of the codes and the upper one of the last, DN, (codes + 1,).
+        response: standard errors per DN of deviation at each edge, (codes, codes + 1).
+        residuals: those seen, standard errors, (codes,).
+        expected: counts per code, (codes,).
+    """
+
+    edges: FloatArray
+    response: FloatArray
+    residuals: FloatArray
+    expected: FloatArray
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> CurveResponse | None:
+        """Return that of the evidence; None of too few codes or without a usable pixel."""
+        codes, residuals, expected = usable_codes(evidence.code, most=_MOST_CODES)
+        pixels = sampled_tangents(evidence.maps)
+        if codes.size < 16 or pixels is None:
+            return None
+        samples = evidence.n_frames * int(evidence.maps.usable.sum()) / len(pixels.first)
+        response = _response(pixels, codes) * (samples / np.sqrt(expected))[:, None]
+        return cls(np.append(codes, codes[-1] + 1) - 0.5, response, residuals * np.sqrt(expected), expected)
+
+    def fits(self, deviations: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return by how much pairs of deviations (kinds, 2, codes + 1) lower chi2, and their factors."""
+        found = [_fit(self.response @ pair.T, self.residuals) for pair in deviations]
+        return np.array([gain for gain, _ in found]), np.array([factors for _, factors in found])
+
+    def worth(self, gains: FloatArray, known: float = 0.0, least: float = _LEAST_BEND_GAIN) -> BoolArray:
+        """Return which gains are more than a known one, and what chance and what else is amiss brings."""
+        total = float((self.residuals**2).sum())
+        left = np.maximum(1.0, (total - gains) / max(self.residuals.size - 6, 1))
+        return np.asarray(gains - known > least * left)
+
+
+def best_bend(evidence: Evidence) -> list[Bend]:
+    """Return the sines that explain the residuals of the codes, the best first; none if none stands out."""
+    curve = CurveResponse.of(evidence)
+    if curve is None:
+        return []
+    periods = np.geomspace(_SHORTEST, max(2.0 * _in_use(curve.expected), 4.0 * _SHORTEST), _PERIODS)
+    turned = np.outer(2.0 * np.pi / periods, curve.edges)
+    gains, factors = curve.fits(np.stack([np.sin(turned), np.cos(turned)], axis=1))
+    worth = curve.worth(gains)
+    found = []
+    for place in np.argsort(-gains):
+        if worth[place] and gains[place] >= gains[max(place - 2, 0) : place + 3].max():
+            a, b = factors[place]
+            found.append(Bend(float(np.hypot(a, b)), float(periods[place]), float(np.arctan2(b, a))))
+    return found[:2]
+
+
+def best_curve(evidence: Evidence) -> Curve | None:
+    """Return the smooth curve through few knots that explains the residuals of the codes best.
+
+    None where no curve explains more than the best sine does, and than its further knots bring by chance.
+    """
+    response = CurveResponse.of(evidence)
+    if response is None:
+        return None
+    turned = [2.0 * np.pi / bend.period * response.edges for bend in best_bend(evidence)]
+    waves = np.array([[np.sin(each), np.cos(each)] for each in turned]).reshape(-1, 2, response.edges.size)
+    best, most = None, float(response.fits(waves)[0].max(initial=0.0))
+    share = np.cumsum(response.expected) / response.expected.sum()
+    first, last = response.edges[np.searchsorted(share, [_RARE, 1.0 - _RARE])]
+    for number in _KNOTS:
+        knots = np.linspace(first, last, number)
+        values, gain = _fit_knots(response, through_knots(knots, np.eye(number), response.edges))
+        # a sine has three numbers
+        least = (_LEAST_BEND_GAIN + _PRICE * (number - 3)) if best is None else 2.0 * _PRICE
+        if response.worth(np.array([gain]), most, least)[0]:
+            level = _straight(response, through_knots(knots, values, response.edges))
+            best = Curve(float(knots[0]), float(knots[1] - knots[0]), values - level(knots))
+            most = gain
+    return best
+
+
+def _straight(response: CurveResponse, deviation: FloatArray) -> np.polynomial.Polynomial:
+    """Return the straight line through a deviation (codes + 1,): bias and gain of the pixels take it up."""
+    counts = np.append(response.expected, 0.0) + np.append(0.0, response.expected)
+    return np.polynomial.Polynomial.fit(response.edges, deviation, 1, w=np.sqrt(counts))
+
+
+def _fit_knots(response: CurveResponse, basis: FloatArray) -> tuple[FloatArray, float]:
+    """Return values at the knots of a basis (codes + 1, knots), LSB, and by how much they lower chi2.
+
+    What hardly shows (a straight line, which bias and gain take up, above all) is left at nothing.
+    """
+    u, size, directions = np.linalg.svd(response.response @ basis, full_matrices=False)
+    seen = u.T @ response.residuals
+    kept = seen * np.clip(1.0 - _DOUBT / np.maximum(seen**2, 1e-9), 0.0, None)
+    kept[size < _WEAKEST * size[0]] = 0.0
+    values = directions.T @ (kept / np.maximum(size, 1e-300))
+    return values, float((seen**2 - (seen - kept) ** 2).sum())
+
+
+def through_knots(knots: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
+    """Return natural cubic splines through values (knots, ...) at places; beyond the ends as at the ends."""
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(knots, values, bc_type="natural")
+    return np.asarray(spline(np.clip(places, knots[0], knots[-1])), np.float64)
+
+
+def best_stitch(evidence: Evidence) -> list[Stitch]:
+    """Return the break of the curve that explains the residuals of the codes best; none if none does.
+
+    A kink alone first, then with a step at the level, where that explains more.
+    """
+    curve = CurveResponse.of(evidence)
+    if curve is None:
+        return []
+    share = np.cumsum(curve.expected) / curve.expected.sum()
+    inside = np.flatnonzero((share > _END) & (share < 1.0 - _END))
+    # between two edges: which of them a step moves would otherwise depend on its sign
+    levels = curve.edges[inside[:: max(1, inside.size // _LEVELS)]] - 0.5
+    if not levels.size:
+        return []
+    beyond = curve.edges - levels[:, None]
+    step = np.where(beyond >= 0.0, 1.0, 0.0)
+    kink = beyond * step
+    found: list[tuple[float, Stitch]] = []
+    for pairs in (np.stack([kink, 0.0 * step], axis=1), np.stack([kink, step], axis=1)):
+        gains, factors = curve.fits(pairs)
+        best = int(gains.argmax())
+        if curve.worth(gains)[best] and (not found or gains[best] > found[0][0] + _LEAST_BEND_GAIN / 2):
+            found.insert(0, (gains[best], Stitch(float(levels[best]), *map(float, factors[best]))))
+    return [stitch for _, stitch in found]
+
+
+def sampled_tangents(maps: PixelMaps) -> SampledPixels | None:
+    """Return masses and tangents of pixels spread over the sensor; None where none is usable."""
+    from pchem_pipeline.model.law.mass import sample_slopes
+
+    pixels = _sample(maps)
+    if pixels is None:
+        return None
+    exposure, gain, bias, noise = (each[:, None] for each in pixels.maps)
+    sigma = np.sqrt(np.maximum(noise**2 - QUANTISATION_VARIANCE, 0.01))
+    first = np.floor(bias - 5.0 * sigma).astype(np.int64)
+    cells = int(np.ceil((10.0 * sigma + (exposure + 5.0 * np.sqrt(exposure) + 2.0) / gain).max()))
+    mass, slopes = sample_slopes(SampleLaw(), pixels, first[:, 0], cells)
+    # a larger bias takes from each code what lies at its upper edge, and gives what lies at its lower one
+    density = np.pad(-np.cumsum(slopes[:, 2], axis=1), ((0, 0), (1, 0)))
+    mass = np.maximum(mass, 1e-12)
+    root = np.sqrt(mass)[:, :, None]
+    tangents = np.linalg.qr(slopes.transpose(0, 2, 1) / root)[0] * root
+    return SampledPixels(first, density, mass, tangents.transpose(0, 2, 1))
+
+
+def _in_use(expected: FloatArray) -> float:
+    """Return over how many DN the middle 98 % of the samples spread."""
+    share = np.cumsum(expected) / expected.sum()
+    return float(np.searchsorted(share, 0.99) - np.searchsorted(share, 0.01) + 1)
+
+
+def _sample(maps: PixelMaps) -> PixelMaps | None:
+    """Return pixels spread over the sensor, shape (n,), without the widest histograms."""
+    some = maps.of(maps.usable & np.isfinite(np.stack(maps.maps)).all(axis=0))
+    if not some.bias.size:
+        return None
+    widths = (some.quanta_exposure + 6.0 * np.sqrt(some.quanta_exposure)) / some.conversion_gain
+    kept = np.flatnonzero(widths <= np.quantile(widths, 0.95))
+    return some.of(kept[:: max(1, kept.size // _PIXELS)])
+
+
+def _response(pixels: SampledPixels, codes: IntArray) -> FloatArray:
+    """Return the change of the mass of the codes per DN of deviation at their edges, (codes, codes + 1).
+
+    Summed over the sample of pixels, with what their fits take up projected out.
+    """
+    n_cells = pixels.mass.shape[1]
+    total = np.zeros((codes.size + 2 * n_cells, codes.size + 2 * n_cells + 1))
+    cells = np.arange(n_cells)
+    for first, density, mass, tangents in zip(
+        pixels.first[:, 0] - codes[0] + n_cells, pixels.density, pixels.mass, pixels.tangents, strict=True
+    ):
+        if not 0 <= first <= total.shape[0] - n_cells:
+            continue
+        # a deviation at an edge moves the samples there into the upper cell
+        taken = np.zeros((len(tangents), n_cells + 1))
+        taken[:, :-1] = tangents / mass * density[:-1]
+        taken[:, 1:] -= tangents / mass * density[1:]
+        change = total[first : first + n_cells, first : first + n_cells + 1]
+        change -= tangents.T @ taken
+        change[cells, cells] += density[:-1]
+        change[cells, cells + 1] -= density[1:]
+    return total[n_cells:-n_cells, n_cells:-n_cells]
+
+
+def _fit(design: FloatArray, scaled: FloatArray) -> tuple[float, FloatArray]:
+    """Return by how much a sine and a cosine lower chi2 of the codes, and their factors."""
+    factors: FloatArray = np.linalg.lstsq(design, scaled, rcond=None)[0].astype(np.float64)
+    return float((scaled**2).sum() - ((scaled - design @ factors) ** 2).sum()), factors

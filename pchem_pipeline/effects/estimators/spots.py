@@ -1,17 +1,87 @@
-"""Spots of light: in maps of amplitudes, and in frames of which only rows and columns are known."""
+"""Spots of light: what they look like, found in maps and in rows and columns, and images that fade."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
-from scipy import special
+from numpy.typing import NDArray
+from scipy import ndimage, special
 
-from pchem_pipeline.effects.estimators.charge_sums import against_usual_gain
-from pchem_pipeline.effects.framework.spot import Falloff, spot_image
+from pchem_pipeline.effects.estimators.charge_sums import BlockCharge, against_usual_gain
+from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
+
+Falloff = Literal["gaussian", "exponential"]
+
+
+def spot_image(
+    rows: NDArray[np.int64] | NDArray[np.float64],
+    columns: NDArray[np.int64] | NDArray[np.float64],
+    shape: tuple[int, ...],
+    centre: tuple[float, float],
+    radius: float,
+    falloff: Falloff = "gaussian",
+) -> NDArray[np.float64]:
+    """Return the brightness of a spot relative to the sensor's brightest pixel, shape (rows, columns).
+
+    Args:
+        rows: of the pixels.
+        columns: of the pixels.
+        shape: rows and columns of the sensor.
+        centre: its row over the number of rows, and its column over that of columns.
+        radius: over the longer side of the sensor: standard deviation of a Gaussian, or the distance in which
+            an exponential falls to 1/e.
+        falloff: which of them.
+    """
+    side = max(shape)
+    dy = ((rows + 0.5) / shape[0] - centre[0]) * shape[0] / side
+    dx = ((columns + 0.5) / shape[1] - centre[1]) * shape[1] / side
+    # the pixel nearest to the centre, which may lie between pixels or on the border
+    nearest = [
+        (min(max(int(c * n), 0), n - 1) + 0.5 - c * n) / side for c, n in zip(centre, shape, strict=True)
+    ]
+    away, least = (dy[:, None] ** 2 + dx**2) / radius**2, (nearest[0] ** 2 + nearest[1] ** 2) / radius**2
+    if falloff == "gaussian":
+        return np.asarray(np.exp(0.5 * (least - away)))
+    return np.asarray(np.exp(np.sqrt(least) - np.sqrt(away)))
+
+
+def spot_to_window(
+    spot: dict[str, Any], falloff: Falloff, rows: Span, columns: Span, shape: tuple[int, int]
+) -> dict[str, float]:
+    """Return a spot as it is on some rows and columns that are taken for a sensor of their own.
+
+    Args:
+        spot: ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect, and whatever else it has.
+        falloff: see :func:`spot_image`.
+        rows: first, and behind the last.
+        columns: likewise.
+        shape: rows and columns of the sensor.
+    """
+    centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
+    # the brightest of these pixels is the one nearest to the centre
+    nearest = [
+        np.array([min(max(int(c * n), low), high - 1)])
+        for c, n, (low, high) in zip(centre, shape, (rows, columns), strict=True)
+    ]
+    left = spot_image(nearest[0], nearest[1], shape, centre, spot["radius"], falloff)
+    y, x = ((c * n - low) / m for c, n, (low, _), m in zip(centre, shape, (rows, columns), size, strict=True))
+    radius = spot["radius"] * max(shape) / max(size)
+    return {"centre_y": y, "centre_x": x, "radius": radius, "peak_e": spot["peak_e"] * float(left[0, 0])}
+
+
+def spot_to_sensor(
+    spot: dict[str, Any], rows: Span, columns: Span, shape: tuple[int, int]
+) -> dict[str, float]:
+    """Return on the sensor a spot that lies on some of its rows and columns; see `spot_to_window`."""
+    centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
+    y, x = ((c * m + low) / n for c, n, (low, _), m in zip(centre, shape, (rows, columns), size, strict=True))
+    return {"centre_y": y, "centre_x": x, "radius": spot["radius"] * max(size) / max(shape)}
+
 
 _RADII = (0.04, 0.06, 0.09, 0.13, 0.19, 0.28, 0.4, 0.6)
 _CENTRES = 17  # along either side
@@ -35,14 +105,6 @@ class Spot:
     def place(self) -> dict[str, float]:
         """Centre and radius as the fields of an effect."""
         return {"centre_y": self.centre[0], "centre_x": self.centre[1], "radius": self.radius}
-
-
-@dataclass(frozen=True)
-class Bursts:
-    """A spot that is bright in a share of the frames."""
-
-    spot: Spot
-    share: float
 
 
 def best_spot(
@@ -151,8 +213,8 @@ class _Lines:
         return np.concatenate([cells.sum(axis=-1), cells.sum(axis=-2)], axis=-1)
 
 
-def best_bursts(evidence: Evidence) -> Bursts | None:
-    """Return the spot whose light comes in some frames only; None where none stands out.
+def best_bursts(evidence: Evidence) -> tuple[Spot, float] | None:
+    """Return the spot whose light comes in some frames only, and their share; None if none stands out.
 
     A spot's light in a frame shows in its rows and columns. For each spot of a family the frames' light,
     less what all pixels have in proportion to H, has moments; those of the spot whose light is the least
@@ -177,7 +239,7 @@ def best_bursts(evidence: Evidence) -> Bursts | None:
     if share > _MOST or burst.sum() < _FEWEST_BURSTS:
         return None
     spot = _form(lines, burst, shape)
-    return None if spot is None else Bursts(spot, share)
+    return None if spot is None else (spot, share)
 
 
 def _lines(evidence: Evidence) -> _Lines | None:
@@ -239,3 +301,151 @@ def _form(lines: _Lines, burst: FloatArray, shape: tuple[int, ...]) -> Spot | No
         return lines.lines(spots * lines.response)
 
     return _fitted((lines.y, lines.x), shape, ("gaussian", "exponential"), seen, mean, inverse)
+
+
+# standard deviations up to which a pixel's deviation counts, and times that a mean is taken anew about which
+# they are cut: by then it stays
+_CUT, _CUT_ROUNDS = 4.0, 4
+# a cell must explain this chi-square to tell the time constant, and the differences of four cells that one
+_PRICE_OF_CELL = 6.0
+_PRICE_OF_DETAIL = 9.0
+# of the brightest cell: less than this is dark
+_DARK = 0.05
+
+
+@dataclass(frozen=True)
+class FadingCells:
+    """Amplitudes of a falling exponential in the cells of a grid over the sensor.
+
+    Attributes:
+        decay: time constant, frames.
+        amplitude: e-, less what goes with H, shape (rows, columns); 0 in cells without pixels.
+        noise: standard errors, e-; infinite in cells without pixels.
+        exposure: mean H, e-.
+        score: chi-square of all cells against 0, as a standard normal number.
+        cell: which of them each pixel of the blocks is in, flat, shape (n,).
+    """
+
+    decay: float
+    amplitude: FloatArray
+    noise: FloatArray
+    exposure: FloatArray
+    score: float
+    cell: IntArray
+
+    @classmethod
+    def of(cls, blocks: BlockCharge, exposure: FloatArray, decay: float, grid: int) -> FadingCells:
+        """Return the least squares amplitudes at a time constant, on a grid of so many rows and columns.
+
+        Each is a power of two, smaller where the sensor is.
+        """
+        shape = _exponential(blocks, decay)
+        weight = blocks.length * shape
+        found = weight @ blocks.deviation / (weight @ shape)
+        stderr = np.sqrt(blocks.variance / (weight @ shape))
+        rows, columns = (min(grid, 2 ** int(np.log2(n))) for n in exposure.shape)
+        cell = (blocks.y * rows // exposure.shape[0]) * columns + blocks.x * columns // exposure.shape[1]
+        n = rows * columns
+
+        def mean_of(values: FloatArray, inverse: FloatArray) -> FloatArray:
+            return np.bincount(cell, values * inverse, n) / np.maximum(np.bincount(cell, inverse, n), 1e-300)
+
+        inverse = stderr**-2
+        # from the middle of each cell: from 0 on a bright image would be cut at so many steps
+        amplitude = np.nan_to_num(ndimage.median(found, cell, np.arange(n)))
+        for _ in range(_CUT_ROUNDS):
+            # single pixels that jump are another effect
+            middle = amplitude[cell]
+            amplitude = mean_of(np.clip(found, middle - _CUT * stderr, middle + _CUT * stderr), inverse)
+        held = np.bincount(cell, inverse, n)
+        noise = np.where(held > 0, np.maximum(held, 1e-300) ** -0.5, np.inf)
+        freedom = max(int((held > 0).sum()) - 1, 1)
+        score = (float(np.sum((amplitude / noise) ** 2)) - freedom) / np.sqrt(2.0 * freedom)
+        bright = mean_of(exposure[blocks.y, blocks.x], inverse)
+        size = (rows, columns)
+        return cls(decay, amplitude.reshape(size), noise.reshape(size), bright.reshape(size), score, cell)
+
+    def above_background(self) -> FloatArray:
+        """Return the amplitudes with that part of H added which makes their median 0."""
+        held = np.isfinite(self.noise) & (self.exposure > 0)
+        background = float(np.median(self.amplitude[held] / self.exposure[held]))
+        return np.where(held, self.amplitude - background * self.exposure, 0.0)
+
+    def image(self) -> FloatArray:
+        """Return the amplitudes above the background without their noise, >= 0.
+
+        A group of two by two cells keeps its differences where they stand out, and has its mean otherwise; so
+        on with the means, up to the whole sensor (Donoho and Johnstone 1994, with Haar's wavelets by groups).
+        """
+        weight = np.where(np.isfinite(self.noise), self.noise, np.inf) ** -2.0
+        image = np.maximum(_denoised(self.above_background(), weight), 0.0)
+        return np.where(image > _DARK * image.max(), image, 0.0)
+
+
+def _denoised(values: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return values on a grid of powers of two, of given inverse variances, coarse where they may be."""
+    rows, columns = values.shape
+    if values.size == 1:
+        return values
+    size = (max(rows // 2, 1), min(rows, 2), max(columns // 2, 1), min(columns, 2))
+    groups, held = values.reshape(size), weight.reshape(size)
+    whole = held.sum(axis=(1, 3))
+    mean = (held * groups).sum(axis=(1, 3)) / np.maximum(whole, 1e-300)
+    details = groups - mean[:, None, :, None]
+    stands_out = (held * details**2).sum(axis=(1, 3)) > _PRICE_OF_DETAIL
+    kept: FloatArray = _denoised(mean, whole)[:, None, :, None] + np.where(
+        stands_out[:, None, :, None], details, 0.0
+    )
+    return kept.reshape(rows, columns)
+
+
+def _exponential(blocks: BlockCharge, decay: float) -> FloatArray:
+    """Return the block means of ``exp(-t / decay)``, less their mean."""
+    mean = decay / blocks.length * np.exp(-blocks.start / decay) * -np.expm1(-blocks.length / decay)
+    return mean - np.average(mean, weights=blocks.length)
+
+
+@dataclass(frozen=True)
+class Fading:
+    """How the cells fade.
+
+    Attributes:
+        decay: time constant, frames.
+        slow_decay: of a second, slower part, frames, or None.
+        slow_share: share of the slower part in the first frame.
+        scale: the first frame's amplitude over that of the cells.
+    """
+
+    decay: float
+    slow_decay: float | None
+    slow_share: float
+    scale: float
+
+
+def fading_of(blocks: BlockCharge, cells: FadingCells, n_run: int) -> Fading:
+    """Return the time constants, from the time profile of all pixels with their amplitudes as weights.
+
+    A second one where it explains more by three standard deviations.
+    """
+    # cells of noise would weigh in with the time constant that they were found with
+    significant = (cells.amplitude / cells.noise) ** 2 > _PRICE_OF_CELL
+    amplitude = np.where(significant, cells.amplitude, 0.0).reshape(-1)[cells.cell]
+    power = max(float(np.sum(amplitude**2 / blocks.variance)), 1e-300)
+    profile = blocks.deviation @ (amplitude / blocks.variance) / power
+    decays = n_run * np.geomspace(0.01, 3.0, 25)
+    shapes = np.stack([_exponential(blocks, decay) for decay in decays])
+    weighted = shapes * blocks.length
+    products, overlaps = weighted @ shapes.T, weighted @ profile
+    single = overlaps**2 / np.diag(products) * (overlaps > 0)
+    top = int(np.argmax(single))
+    best = float(single[top]) + 9.0 / power
+    fading = Fading(float(decays[top]), None, 0.5, float(overlaps[top] / products[top, top]))
+    # every pair of clearly different time constants
+    for i, j in zip(*np.triu_indices(decays.size, 3), strict=True):
+        both = np.array([i, j])
+        pair = np.linalg.solve(products[np.ix_(both, both)], overlaps[both])
+        explained = float(pair @ overlaps[both])
+        if (pair > 0).all() and explained > best:
+            best, scale = explained, float(pair.sum())
+            fading = Fading(float(decays[i]), float(decays[j]), float(pair[1]) / scale, scale)
+    return fading

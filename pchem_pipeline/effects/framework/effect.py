@@ -1,10 +1,9 @@
 """What an effect is, and the registry of our own.
 
-An effect is one class in the folder of its plane: a frozen settings class that is at once its YAML
-section, its documentation and its forward model. What several have in common is a base class of a family
-(:mod:`pchem_pipeline.effects.families`), and they only what differs. An effect is a function of a block of
-frames and of random numbers keyed on position, so that the simulated frames do not depend on how the work is
-divided:
+An effect is one class in the module of its operator (:mod:`pchem_pipeline.effects.operators`): a frozen
+settings class that is at once its YAML section, its documentation and its forward model. It is a function of
+a block of frames and of random numbers keyed on position, so that the simulated frames do not depend on how
+the work is divided:
 
 - **independent samples** need nothing: return a new array of the same shape;
 - **common modes** draw one number per frame, row, column or run: ``context.random.normal(("frame", "y"))``;
@@ -36,13 +35,13 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.settings import Section
-from pchem_pipeline.effects.framework.plane import Plane as Plane
+from pchem_pipeline.effects.framework.context import Plane as Plane
 from pchem_pipeline.effects.framework.region import Region, Span, When
 from pchem_pipeline.model.arithmetic.significance import CLEAR
 
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+    from pchem_pipeline.effects.framework.compose import AddedExposure
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
     from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -125,7 +124,7 @@ class Replacement(NamedTuple):
 class Effect(Section):
     """Base of all effects.
 
-    A subclass is registered under the default of its ``tag`` and gives:
+    A subclass gives, and one of this package is registered by its tag behind the base:
 
     Attributes:
         tag: name in the YAML and in verdicts; a ``Literal`` with one value, which is the default.
@@ -155,7 +154,7 @@ class Effect(Section):
             that is so whatever the parameters.
     """
 
-    tag: str
+    tag: str = ""
     plane: ClassVar[Plane]
     along: ClassVar[int] = 0
     title: ClassVar[str] = ""
@@ -176,6 +175,26 @@ class Effect(Section):
     reach_frames: ClassVar[int] = 0
     region: Region | None = Field(default=None, description="region of the sensor; null: everywhere")
     when: When | None = Field(default=None, description="frames concerned; null: all")
+
+    def __init_subclass__(cls, tag: str = "", **settings: Any) -> None:
+        """Give a class of this package the field of its tag: ``class RowNoise(Effect, tag="row_noise")``."""
+        super().__init_subclass__(**settings)
+        if tag:
+            cls.__annotations__ = {**cls.__annotations__, "tag": Literal[tag]}
+            cls.tag = Field(default=tag, description="name of the effect")
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, tag: str = "", **_: Any) -> None:
+        """Register a class with such a tag.
+
+        Raises:
+            ConfigError: if it has no plane or does nothing, or another class has the tag.
+        """
+        known = _registered.setdefault(tag_of(cls), cls) if tag else cls
+        if known is not cls:
+            raise ConfigError(
+                f"effect tag {tag!r} of {cls.__module__} is taken by {known.__module__}; choose another tag"
+            )
 
     @model_serializer(mode="wrap")
     def _without_defaults(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -433,25 +452,6 @@ class Effect(Section):
     def history(self) -> int:
         """Return how many frames before it a frame depends on: :attr:`reach_frames`."""
         return self.reach_frames
-
-
-EffectClass = TypeVar("EffectClass", bound=type[Effect])
-
-
-def register_effect(effect: EffectClass) -> EffectClass:
-    """Register an effect of this package under its tag (class decorator).
-
-    Raises:
-        ConfigError: if it has no tag or plane, or another class has the tag.
-    """
-    tag = tag_of(effect)
-    known = _registered.get(tag)
-    if known is not None and known.__qualname__ + known.__module__ != effect.__qualname__ + effect.__module__:
-        raise ConfigError(
-            f"effect tag {tag!r} of {effect.__module__} is taken by {known.__module__}; choose another tag"
-        )
-    _registered[tag] = effect
-    return effect
 
 
 def registered_effects() -> dict[str, type[Effect]]:

@@ -1,13 +1,15 @@
-"""Samples beside a sample and before it: where they are, in arrays and in words."""
+"""Samples beside a sample and before it: where they are, in arrays and in words, and what they predict.
+
+Replacing a sample by the median of its eight neighbours is the usual correction of hot pixels and of
+telegraph noise; their mean, or that of the left and the right one alone, are its cheaper forms.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal, get_args
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
 
 
 def neighbour_words(place: tuple[int, int, int]) -> str:
@@ -41,3 +43,39 @@ def along_axis(values: NDArray[Any], step: NDArray[np.int64], axis: int) -> NDAr
     at = np.arange(values.shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
     index = np.clip(at + step, 0, values.shape[axis] - 1)
     return np.take_along_axis(values, np.broadcast_to(index, values.shape), axis)
+
+
+Predictor = Literal["median", "mean", "row"]
+PREDICTORS: tuple[Predictor, ...] = get_args(Predictor)
+
+_AROUND = tuple((dy, dx) for dy in range(3) for dx in range(3) if (dy, dx) != (1, 1))
+# Batcher's odd-even merge sort of eight, as far as the sum of the middle two asks for it
+_COMPARATORS = (
+    (0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (1, 2), (5, 6),
+    (0, 4), (1, 5), (2, 6), (3, 7), (2, 4), (3, 5),
+)  # fmt: skip
+
+
+def predicted(frames: NDArray[np.unsignedinteger[Any]], predictor: Predictor) -> NDArray[np.int32]:
+    """Return what the neighbours predict for the samples inside the border, DN, halves cut off.
+
+    Args:
+        frames: codes (frame, y, x), DN.
+        predictor: median or mean of the eight neighbours, or mean of the left and the right one.
+
+    Returns:
+        Of (frame, y - 2, x - 2) samples: those at the border have not all neighbours.
+    """
+    codes = frames.astype(np.int32)
+    rows, columns = codes.shape[1] - 2, codes.shape[2] - 2
+    around = [codes[:, dy : dy + rows, dx : dx + columns] for dy, dx in _AROUND]
+    if predictor == "row":
+        return np.asarray((around[3] + around[4]) // 2)
+    if predictor == "mean":
+        return np.asarray(sum(around[1:], around[0]) // 8)
+    for low, high in _COMPARATORS:
+        around[low], around[high] = (
+            np.minimum(around[low], around[high]),
+            np.maximum(around[low], around[high]),
+        )
+    return np.asarray((around[3] + around[4]) // 2)

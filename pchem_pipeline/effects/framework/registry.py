@@ -1,8 +1,8 @@
 """Find effects by tag: our own files, and those of other installed packages.
 
-Both are looked for only when somebody asks. Our own are the modules in the folders named after the
-planes, so that adding an effect touches no other file; others' are announced by entry points of
-the group ``pchem_pipeline.effects`` (name: the tag; value: ``package.module:Class``).
+Both are looked for only when somebody asks. Our own are in the modules of the folder ``operators``, so that
+adding an effect touches no other file; others' are announced by entry points of the group
+``pchem_pipeline.effects`` (name: the tag; value: ``package.module:Class``).
 """
 
 from __future__ import annotations
@@ -19,10 +19,8 @@ from typing import Annotated, Any, NamedTuple
 
 from pydantic import BeforeValidator, SerializeAsAny, ValidationInfo
 
-import pchem_pipeline.effects
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.effect import Effect, registered_effects, tag_of
-from pchem_pipeline.effects.framework.plane import Plane
 
 ENTRY_POINT_GROUP = "pchem_pipeline.effects"
 
@@ -85,11 +83,9 @@ def _discover() -> _Found:
 
 
 def _import_own() -> None:
-    root = pchem_pipeline.effects
-    for plane in Plane:
-        folder = importlib.import_module(f"{root.__name__}.{plane.value}")
-        for module in pkgutil.iter_modules(folder.__path__, folder.__name__ + "."):
-            importlib.import_module(module.name)
+    folder = importlib.import_module("pchem_pipeline.effects.operators")
+    for module in pkgutil.iter_modules(folder.__path__, folder.__name__ + "."):
+        importlib.import_module(module.name)
 
 
 def _as_effect(entry: Any, info: ValidationInfo) -> Effect:

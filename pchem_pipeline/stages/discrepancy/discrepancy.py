@@ -26,8 +26,8 @@ from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, Discrepancy, Elsewhere
-from pchem_pipeline.effects.adc.clipping import Clipping
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.operators.curve import Clipping
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.model.histogram.odd_frames import frame_words
 from pchem_pipeline.run.frame_source import open_source

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+    from pchem_pipeline.effects.framework.compose import AddedExposure
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.model.electrons.electrons import KnownPixels
     from pchem_pipeline.model.law.sample_law import SampleLaw

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
-from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
+from pchem_pipeline.effects.framework.compose import AddedExposure, PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.errors.fisher import correlations
 from pchem_pipeline.model.fit.api import fit_histograms

@@ -12,12 +12,12 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError,
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.effects.analog.interpixel_capacitance import InterpixelCapacitance
-from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
-from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
-from pchem_pipeline.effects.exposure.exposure_flicker import ExposureFlicker
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.operators.couple import InterpixelCapacitance
+from pchem_pipeline.effects.operators.drifts import ExposureFlicker
+from pchem_pipeline.effects.operators.noise import NoiseSkew
+from pchem_pipeline.effects.operators.offsets import PeriodicPickup
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 

@@ -6,8 +6,8 @@ from scipy.stats import ttest_1samp
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.estimator_check import RecoveredStrength, recovered_strength
-from pchem_pipeline.effects.adc.clipping import Clipping
-from pchem_pipeline.effects.analog.shared_noise import ColumnNoise
+from pchem_pipeline.effects.operators.curve import Clipping
+from pchem_pipeline.effects.operators.offsets import ColumnNoise
 
 STACKS = {"stacks": 5, "n_frames": 400, "shape": (16, 16)}
 

@@ -17,7 +17,7 @@ from pchem_pipeline.commands.model import adopt_verdict, list_models, model_line
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE
-from pchem_pipeline.effects.framework.added_exposure import AddedExposure
+from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.run.model_versions import (
     keep_in_force,

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
-from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
-from pchem_pipeline.effects.exposure.persistence import Persistence
-from pchem_pipeline.effects.framework.added_exposure import AddedExposure, added_exposures
-from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+from pchem_pipeline.effects.framework.compose import AddedExposure, added_exposures, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.settings import ModelSettings
+from pchem_pipeline.effects.operators.light import DarkCurrentRts, Persistence
+from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.run.model_versions import (
     AddedArrays,
     keep_in_force,

@@ -7,11 +7,10 @@ import pytest
 from helpers.known_camera import KnownCamera
 
 from pchem_pipeline.base.errors import PchEmError
-from pchem_pipeline.effects.analog.bias_drift import BiasDrift
-from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
-from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
-from pchem_pipeline.effects.analog.shared_noise import ColumnNoise, FrameNoise, RowNoise
 from pchem_pipeline.effects.framework.effect import SharedOffset
+from pchem_pipeline.effects.operators.drifts import BiasDrift
+from pchem_pipeline.effects.operators.noise import NoiseSkew
+from pchem_pipeline.effects.operators.offsets import ColumnNoise, FrameNoise, PeriodicPickup, RowNoise
 from pchem_pipeline.use.common_modes import CommonModes, estimate_offsets, scene_of
 from pchem_pipeline.use.electrons import electrons
 

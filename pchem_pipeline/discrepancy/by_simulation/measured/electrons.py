@@ -20,9 +20,9 @@ from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
     PartSamples,
     frames_apart,
 )
-from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons, Fate
-from pchem_pipeline.effects.estimators.count_scores import charlier_information
+from pchem_pipeline.effects.estimators.charge_sums import charlier_information
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.operators.fate import ElectronMode, EmpiricalElectrons, Fate
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 
 FloatArray = NDArray[np.float64]

@@ -23,7 +23,7 @@ from pchem_pipeline.discrepancy.observe.digital.repeats import equal_squares
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.readout.empirical import Empirical, MixtureShift, Together
+from pchem_pipeline.effects.operators.replace import Empirical, MixtureShift, Together
 from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.significance import DECISIVE
 from pchem_pipeline.model.histogram.count import histogram_frames

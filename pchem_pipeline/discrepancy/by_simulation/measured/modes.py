@@ -23,7 +23,9 @@ from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
     PartSamples,
     frames_apart,
 )
-from pchem_pipeline.effects.analog.empirical_noise import (
+from pchem_pipeline.effects.estimators.series import Line, coherent_line
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.operators.empirical_noise import (
     Changed,
     Cycles,
     EmpiricalNoise,
@@ -32,8 +34,6 @@ from pchem_pipeline.effects.analog.empirical_noise import (
     Shared,
     root_mean_square,
 )
-from pchem_pipeline.effects.estimators.lines import Line, coherent_line
-from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, CERTAIN, DECISIVE, POSSIBLE
 from pchem_pipeline.model.law.pcd import pcd_posterior
 

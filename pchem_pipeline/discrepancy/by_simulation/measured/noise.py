@@ -25,7 +25,9 @@ from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
     frames_apart,
 )
 from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
-from pchem_pipeline.effects.analog.empirical_noise import (
+from pchem_pipeline.effects.estimators.common_modes import mean_response
+from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.effects.operators.empirical_noise import (
     EmpiricalNoise,
     Lag,
     NoiseMode,
@@ -33,8 +35,6 @@ from pchem_pipeline.effects.analog.empirical_noise import (
     root_mean_square,
     spectrum,
 )
-from pchem_pipeline.effects.estimators.common_modes import mean_response
-from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
 
 FloatArray = NDArray[np.float64]

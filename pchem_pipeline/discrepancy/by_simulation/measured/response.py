@@ -19,15 +19,15 @@ from pchem_pipeline.discrepancy.by_simulation.measured.samples import Distance, 
 from pchem_pipeline.discrepancy.observe.digital.groups import GROUP
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
-from pchem_pipeline.effects.analog.empirical_response import (
+from pchem_pipeline.effects.framework.evidence import Evidence
+from pchem_pipeline.effects.framework.neighbours import neighbours
+from pchem_pipeline.effects.operators.couple import (
     AXES,
     Axis,
     EmpiricalResponse,
     ResponseTerm,
     Source,
 )
-from pchem_pipeline.effects.framework.evidence import Evidence
-from pchem_pipeline.effects.framework.neighbours import neighbours
 from pchem_pipeline.model.arithmetic.significance import CLEAR, DECISIVE
 
 FloatArray = NDArray[np.float64]

@@ -19,8 +19,7 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.population import (
     shrinkage_bias,
 )
 from pchem_pipeline.discrepancy.observe.observe import MOST_OUTSIDE
-from pchem_pipeline.effects.framework.added_exposure import AddedExposure
-from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
+from pchem_pipeline.effects.framework.compose import AddedExposure, PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.fit.api import fit_histograms

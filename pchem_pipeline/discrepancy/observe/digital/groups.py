@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import laws
-from pchem_pipeline.effects.estimators.prediction import PREDICTORS, predicted
 from pchem_pipeline.effects.framework.evidence import PixelMaps, PredictedSamples, PreviousBits
+from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted
 from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 FloatArray = NDArray[np.float64]

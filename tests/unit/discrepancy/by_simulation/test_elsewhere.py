@@ -11,9 +11,9 @@ from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFra
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.operators.offsets import RowNoise
 
 FRAMES, SIDE, WIDTH = 900, 16, 40
 

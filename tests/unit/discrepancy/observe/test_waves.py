@@ -9,9 +9,9 @@ from pchem_pipeline.discrepancy.by_simulation.measured.noise import measured_wav
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
 from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
-from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise
-from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise
+from pchem_pipeline.effects.operators.offsets import PeriodicPickup
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 Frames = np.ndarray[Any, np.dtype[np.uint16]]

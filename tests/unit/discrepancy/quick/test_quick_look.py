@@ -17,10 +17,10 @@ from pchem_pipeline.discrepancy.quick.checks import KINDS, SIGNIFICANCE, Check, 
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
-from pchem_pipeline.effects.analog.shared_noise import ColumnNoise, RowNoise
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.operators.offsets import ColumnNoise, RowNoise
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.histogram.settings import HistogramSettings

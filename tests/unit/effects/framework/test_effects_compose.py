@@ -8,14 +8,13 @@ from helpers.drawn_pixels import draw
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import INTERVALS, interval_names, variables_of
-from pchem_pipeline.effects.adc.adc_inl import AdcInl
-from pchem_pipeline.effects.adc.black_clamp import BlackClamp
-from pchem_pipeline.effects.adc.clipping import Clipping
-from pchem_pipeline.effects.analog.rts_noise import RtsNoise
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.compose import along_chain, model_words, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect, Plane
-from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
+from pchem_pipeline.effects.operators.couple import BlackClamp
+from pchem_pipeline.effects.operators.curve import AdcInl, Clipping
+from pchem_pipeline.effects.operators.noise import RtsNoise
+from pchem_pipeline.effects.operators.offsets import RowNoise
+from pchem_pipeline.effects.operators.replace import RepeatedFrames
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.stages.fit.tile import TileFit, fit_tile

@@ -46,6 +46,7 @@ EFFECTS = [
     make("overdispersed_counts", relative_variance=0.4, exposures="lognormal"),
     make("branching_counts", branching=0.05),
     make("branching_counts", branching=0.4),
+    make("trapping", capture=0.5, release=0.3),
     make("optical_crosstalk", probability=0.1),
     make("spurious_charge", mean_e=0.3),
     make("charge_lag", fraction=0.3),

@@ -5,15 +5,18 @@ import pytest
 from helpers.small_sensors import context_of, offsets
 from scipy.special import ndtri
 
-from pchem_pipeline.effects.adc.adc_dnl import AdcDnl
-from pchem_pipeline.effects.adc.clipping import Clipping
-from pchem_pipeline.effects.analog.bias_drift import BiasDrift
-from pchem_pipeline.effects.analog.bias_jumps import BiasJumps
-from pchem_pipeline.effects.analog.periodic_pickup import PeriodicPickup
-from pchem_pipeline.effects.analog.readout_alternation import ReadoutAlternation
-from pchem_pipeline.effects.analog.shared_noise import ColumnNoise, FrameNoise, RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.readout.repeated_frames import RepeatedFrames
+from pchem_pipeline.effects.operators.curve import AdcDnl, Clipping
+from pchem_pipeline.effects.operators.drifts import BiasDrift
+from pchem_pipeline.effects.operators.offsets import (
+    BiasJumps,
+    ColumnNoise,
+    FrameNoise,
+    PeriodicPickup,
+    ReadoutAlternation,
+    RowNoise,
+)
+from pchem_pipeline.effects.operators.replace import RepeatedFrames
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 

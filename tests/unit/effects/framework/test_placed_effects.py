@@ -5,12 +5,12 @@ import pytest
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.config.load import load_config, parse_config, write_model
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.compose import effect_words, model_words
 from pchem_pipeline.effects.framework.effect import registered_effects
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.effects.framework.settings import ModelSettings
+from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings

@@ -7,7 +7,7 @@ from helpers.drawn_pixels import draw
 from helpers.plain_law import pcd_mass
 from scipy.optimize import minimize
 
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
+from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias
 from pchem_pipeline.model.fit.api import fit_histograms, likelihood_moments
 from pchem_pipeline.model.fit.settings import FitSettings

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+from pchem_pipeline.effects.operators.noise import NoiseSkew
 from pchem_pipeline.model.fit.api import fit_histograms
 
 

@@ -7,7 +7,7 @@ from iminuit import Minuit
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import INTERVALS, interval_names
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
+from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, misfit, poorest
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors
 from pchem_pipeline.model.errors import information_numba

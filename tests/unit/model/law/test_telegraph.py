@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.operators.light import DarkCurrentRts
 from pchem_pipeline.model.law import telegraph_numba
 from pchem_pipeline.model.law.telegraph import added_of, find_telegraph, transitions
 

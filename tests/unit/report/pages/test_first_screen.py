@@ -8,8 +8,8 @@ import pytest
 from helpers.report_material import report_data
 
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook, graded
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import ReportData, Sample, Samples
 from pchem_pipeline.report.pages.report_json import report_json, report_numbers

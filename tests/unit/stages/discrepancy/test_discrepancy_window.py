@@ -15,8 +15,8 @@ from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import split_frames
 from pchem_pipeline.discrepancy.verdict import Elsewhere, Verdict
-from pchem_pipeline.effects.adc.clipping import Clipping
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.operators.curve import Clipping
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.signals import InterruptedRunError
 from pchem_pipeline.stages.discrepancy import discrepancy

@@ -9,7 +9,7 @@ from helpers.drawn_pixels import draw
 
 from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.effects.charge.branching_counts import BranchingCounts
+from pchem_pipeline.effects.operators.fate import BranchingCounts
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus

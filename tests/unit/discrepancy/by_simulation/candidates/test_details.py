@@ -17,10 +17,10 @@ from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, compare
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
-from pchem_pipeline.effects.exposure.dark_current_rts import DarkCurrentRts
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.effects.operators.light import DarkCurrentRts
+from pchem_pipeline.effects.operators.offsets import RowNoise
 
 NAMES = tuple(name for name in STATISTICS if not name.startswith("frame.repeated"))[:24]
 M = len(NAMES)

@@ -15,11 +15,11 @@ from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
-from pchem_pipeline.effects.analog.empirical_response import EmpiricalResponse, ResponseTerm
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.effects.framework.registry import effect_classes
+from pchem_pipeline.effects.operators.couple import EmpiricalResponse, ResponseTerm
+from pchem_pipeline.effects.operators.offsets import RowNoise
 
 SHAPE, FRAMES = (32, 32), 1500
 

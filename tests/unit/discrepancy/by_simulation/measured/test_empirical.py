@@ -17,9 +17,9 @@ from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import (
 )
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.verdict import closed_share
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.readout.empirical import Empirical, MixtureShift, neighbour_words
+from pchem_pipeline.effects.operators.offsets import RowNoise
+from pchem_pipeline.effects.operators.replace import Empirical, MixtureShift, neighbour_words
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from pchem_pipeline.discrepancy.by_simulation.measured.electrons import electron_chances, measured_electrons
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.effects.charge.empirical_electrons import ElectronMode, EmpiricalElectrons
+from pchem_pipeline.effects.operators.fate import ElectronMode, EmpiricalElectrons
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 

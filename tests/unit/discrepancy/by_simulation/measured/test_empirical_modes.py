@@ -16,8 +16,8 @@ from pchem_pipeline.discrepancy.by_simulation.measured.modes import (
     measured_mode,
 )
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
-from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise, NoiseMode
 
 SHAPE, FRAMES, STEP = (16, 20), 1500, 14.0
 SIGNAL = 1.5 * STEP

@@ -17,8 +17,8 @@ from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode, spectrum
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise, NoiseMode, spectrum
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 

@@ -17,10 +17,10 @@ from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import Prepared
-from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
 from pchem_pipeline.effects.framework.region import Region
-from pchem_pipeline.effects.readout.empirical import Empirical
+from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise
+from pchem_pipeline.effects.operators.offsets import RowNoise
+from pchem_pipeline.effects.operators.replace import Empirical
 
 TAP = Part(Region(columns=((8, 16),)))
 

@@ -28,17 +28,16 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulati
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
-from pchem_pipeline.effects.adc.adc_inl import AdcInl
-from pchem_pipeline.effects.analog.heavy_tailed_noise import HeavyTailedNoise
-from pchem_pipeline.effects.analog.noise_skew import NoiseSkew
-from pchem_pipeline.effects.analog.shared_noise import RowNoise
-from pchem_pipeline.effects.charge.overdispersed_counts import OverdispersedCounts
-from pchem_pipeline.effects.exposure.persistence import Persistence
-from pchem_pipeline.effects.framework.added_exposure import added_exposures
+from pchem_pipeline.effects.framework.compose import added_exposures
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
-from pchem_pipeline.effects.readout.pixel_correction import PixelCorrection
+from pchem_pipeline.effects.operators.curve import AdcInl
+from pchem_pipeline.effects.operators.fate import OverdispersedCounts
+from pchem_pipeline.effects.operators.light import Persistence
+from pchem_pipeline.effects.operators.noise import HeavyTailedNoise, NoiseSkew
+from pchem_pipeline.effects.operators.offsets import RowNoise
+from pchem_pipeline.effects.operators.replace import PixelCorrection
 from pchem_pipeline.model.fit.shared import to_theta
 
 SPREAD = (0.25, 0.015, 0.06, 3.0)

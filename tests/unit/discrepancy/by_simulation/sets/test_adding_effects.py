@@ -36,10 +36,10 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import Prepared
-from pchem_pipeline.effects.analog.empirical_noise import EmpiricalNoise, NoiseMode
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
+from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise, NoiseMode
 
 NAMES = tuple(name for name in STATISTICS if not name.startswith("frame.repeated"))[:24]
 M = len(NAMES)

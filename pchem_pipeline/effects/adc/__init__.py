@@ -1,1 +1,0 @@
-"""Effects on the signal at the ADC, before rounding."""

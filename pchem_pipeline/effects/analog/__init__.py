@@ -1,1 +1,0 @@
-"""Effects on the input-referred analog signal."""

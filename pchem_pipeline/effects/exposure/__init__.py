@@ -1,1 +1,0 @@
-"""Effects on the mean number of electrons per frame."""

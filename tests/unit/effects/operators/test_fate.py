@@ -1,0 +1,208 @@
+"""Fates of electrons: forward models and laws against theory.
+
+Limits are five standard errors from theory; each test also shows that what it guards against is many more.
+"""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from helpers.small_sensors import a_sensor, electrons, exposures, simulated
+from scipy import stats
+
+from pchem_pipeline.discrepancy.estimator_check import recovered_strength
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.operators.drifts import ExposureDrift
+from pchem_pipeline.effects.operators.fate import (
+    BranchingCounts,
+    ChargeDiffusion,
+    ChargeLag,
+    OpticalCrosstalk,
+    OverdispersedCounts,
+    SpuriousCharge,
+    Trapping,
+)
+from pchem_pipeline.model.law.sample_law import SampleLaw
+
+
+def goodness(k, mass):
+    """Return chi-square against a mass as a standard normal number, classes below 20 samples joined."""
+    seen = np.bincount(k.ravel(), minlength=mass.size)[: mass.size].astype(float)
+    wanted = mass * k.size
+    enough = wanted > 20
+    seen = np.append(seen[enough], k.size - seen[enough].sum())
+    wanted = np.append(wanted[enough], k.size - wanted[enough].sum())
+    chi2 = np.sum((seen - wanted) ** 2 / np.maximum(wanted, 20.0))
+    return (chi2 - enough.sum()) / np.sqrt(2.0 * enough.sum())
+
+
+def lognormal_mass(h, variance, n=60, nodes=60):
+    """Return the masses of Poisson numbers of log-normal exposures, by many nodes."""
+    z, w = np.polynomial.hermite_e.hermegauss(nodes)
+    width = np.sqrt(np.log1p(variance))
+    means = h * np.exp(width * z - 0.5 * width**2)
+    return (w / w.sum()) @ stats.poisson.pmf(np.arange(n), means[:, None])
+
+
+@pytest.mark.parametrize("h", [0.4, 3.0, 12.0])
+@pytest.mark.parametrize("strength", [0.005, 0.05, 0.2])
+def test_the_law_of_lognormal_exposures_has_nodes_enough(h, strength):
+    maps = PixelMaps.known([np.full(2, value) for value in (h, 0.1, 100.0, 3.0)], np.ones(2, np.bool_))
+    law = OverdispersedCounts(relative_variance=strength, exposures="lognormal").sample_law(SampleLaw(), maps)
+    means = h * law.exposure_factors
+    mass = law.exposure_weights @ stats.poisson.pmf(np.arange(60), means[:, None])
+    true = lognormal_mass(h, strength)
+    # what two million samples do not tell from the truth
+    assert 2e6 * np.sum((mass - true) ** 2 / np.maximum(true, 1e-9)) < 20
+
+
+def test_overdispersed_counts_follow_an_exposure_that_changes():
+    drift = ExposureDrift(drift=1.6)
+    truth = a_sensor((30, 30), exposure=(2.0, 2.0))
+    k = simulated(truth, drift, OverdispersedCounts(relative_variance=0.3), n_frames=400)[1].astype(float)
+    h = exposures(drift, truth.quanta_exposure, 400)[:, 0, 0]
+    wanted = h + 0.3 * h**2
+    # the fourth cumulant of these laws stays below ten variances
+    error = wanted * np.sqrt((2 + 10 / wanted) / 900)
+    assert np.all(abs(k.var(axis=(1, 2)) - wanted) < 5 * error)
+    assert abs(k.var(axis=(1, 2)) - h - 0.3 * 4.0).max() > 20 * error.min()
+
+
+@pytest.mark.parametrize("cls", [OverdispersedCounts, BranchingCounts, OpticalCrosstalk])
+def test_small_strengths_change_few_samples_and_larger_ones_change_these_too(cls):
+    truth = a_sensor((20, 20))
+    plain, small, large = (
+        simulated(truth, *(() if s == 0 else (cls(**{cls.strength: s}),)), n_frames=300)[1].astype(int)
+        for s in (0, 0.002, 0.004)
+    )
+    mean = truth.quanta_exposure.mean()
+    changed = small != plain
+    bound = 0.002 * max(np.mean(truth.quanta_exposure**2), 2 * mean)
+    assert 0 < changed.mean() < bound + 5 * np.sqrt(bound / changed.size)
+    assert (large != plain)[changed].mean() > 0.99
+
+
+def test_crosstalk_correlates_neighbours_and_adds_its_electrons():
+    p, h = 0.1, 2.0
+    k = electrons(h, (60, 60), 600, OpticalCrosstalk(probability=p))[:, 1:-1, 1:-1].astype(float)
+    mean = h * (1 + p)
+    assert abs(k.mean() - mean) < 5 * np.sqrt(mean * (1 + 2 * p) / k.size)
+    # a Poisson count it stays
+    assert abs(goodness(k.astype(int), stats.poisson.pmf(np.arange(40), mean))) < 5
+    d = k - mean
+    pairs = {
+        "x": ((d[:, :, 1:] * d[:, :, :-1]), p / 2 * h),
+        "y": ((d[:, 1:] * d[:, :-1]), p / 2 * h),
+        "two apart": ((d[:, 2:] * d[:, :-2]), 0.0),
+    }
+    for products, wanted in pairs.values():
+        error = mean * (1 + 2 * p) / np.sqrt(products.size)
+        assert abs(products.mean() - wanted) < 5 * error
+    assert p / 2 * h > 20 * error
+
+
+@pytest.mark.parametrize(
+    ("effect", "mean"),
+    [(ChargeLag(fraction=0.3), 2.0), (ChargeDiffusion(fraction=0.3), 2.0), (SpuriousCharge(mean_e=0.3), 2.3)],
+)
+def test_what_cannot_be_seen_leaves_independent_poisson_electrons(effect, mean):
+    k = electrons(2.0, (50, 50), 400, effect)[1:]
+    assert abs(goodness(k, stats.poisson.pmf(np.arange(40), mean))) < 5
+    d = k - mean
+    error = mean / np.sqrt(d.size)
+    for a, b in (
+        (d[1:], d[:-1]),
+        (d[:, 1:], d[:, :-1]),
+        (d[:, :, 1:], d[:, :, :-1]),
+        (d[1:, 1:], d[:-1, :-1]),
+    ):
+        assert abs((a * b).mean()) < 5 * error
+    # it did something, and its opposite number, electrons made rather than moved, would be found
+    assert (k != electrons(2.0, (50, 50), 400)[1:]).mean() > 0.2
+    crosstalk = electrons(2.0, (50, 50), 400, OpticalCrosstalk(probability=0.3)) - 2.6
+    assert (crosstalk[:, 1:] * crosstalk[:, :-1]).mean() > 20 * error
+
+
+def test_lag_takes_electrons_from_one_frame_to_the_next():
+    truth = a_sensor((6, 6))
+    truth = dataclasses.replace(truth, quanta_exposure=np.full((6, 6), 30.0))
+    step = ExposureDrift(drift=2.0, path=(0.0, 0.0, 2.0, 2.0))
+    k = simulated(truth, step, ChargeLag(fraction=0.5), n_frames=4)[1].mean(axis=(1, 2))
+    plain = simulated(truth, step, n_frames=4)[1].mean(axis=(1, 2))
+    wanted = np.append([0.5 * plain[0]], 0.5 * (plain[1:] + plain[:-1]))
+    assert np.all(abs(k - wanted)[1:] < 5 * np.sqrt(30 / 36))
+    assert abs(k - plain)[2] > 10
+
+
+def test_diffusion_moves_electrons_and_loses_none():
+    truth = a_sensor((9, 9), exposure=(0.0, 0.0))
+    h = np.zeros((9, 9))
+    h[4, 4], h[0, 0] = 1000.0, 1000.0
+    truth = dataclasses.replace(truth, quanta_exposure=h)
+    plain, moved = (
+        simulated(truth, *e, n_frames=50)[1].astype(float) for e in ((), (ChargeDiffusion(fraction=0.2),))
+    )
+    assert np.array_equal(plain.sum(axis=(1, 2)), moved.sum(axis=(1, 2)))
+    mean = moved.mean(axis=0)
+    for place, wanted in (
+        ((4, 4), 800),
+        ((3, 4), 50),
+        ((4, 5), 50),
+        ((0, 0), 900),
+        ((0, 1), 50),
+        ((3, 3), 0),
+    ):
+        assert abs(mean[place] - wanted) <= 5 * np.sqrt(wanted / 50)
+
+
+H, TRAP_FRAMES, TRAPS = 2.0, 2000, (30, 30)
+
+
+TRAP = Trapping(capture=0.5, release=0.3)
+
+
+def theory(exposure, capture, release):
+    """Return the chance m that a sample with electrons loses one, and P(K >= 2)."""
+    some = -np.expm1(-exposure)
+    return capture * release / (release + capture * some), some - exposure * np.exp(-exposure)
+
+
+def of_numpy(seed, capture=0.3, release=0.3, shape=(20, 20), n_frames=1500):
+    """Return frames of pixels with a trap each, frame by frame: 10 DN and 0.3 e- of noise an electron."""
+    rng = np.random.default_rng(seed)
+    full = rng.random(shape) < 0.5
+    frames = np.empty((n_frames, *shape), np.uint16)
+    for t in range(-60, n_frames):
+        k = rng.poisson(H, shape)
+        freed = full & (rng.random(shape) < release)
+        caught = ~full & (k > 0) & (rng.random(shape) < capture)
+        full = (full & ~freed) | caught
+        if t >= 0:
+            seen = k + freed - caught + 0.3 * rng.standard_normal(shape)
+            frames[t] = np.rint(100 + 10 * seen)
+    return frames
+
+
+def test_variance_and_covariances_in_time_are_those_of_theory():
+    k = electrons(H, TRAPS, TRAP_FRAMES, TRAP)
+    n, pixels = TRAP_FRAMES, TRAPS[0] * TRAPS[1]
+    m, several = theory(H, TRAP.capture, TRAP.release)
+    left = 1.0 - TRAP.release - TRAP.capture * -np.expm1(-H)
+    assert abs(k.mean() - H) < 5 * np.sqrt(H / k.size)  # no charge is lost
+    off = k - k.mean(axis=0)
+    error = np.sqrt(3.0) * H / np.sqrt(n * pixels)  # of a variance; of a product it is less
+    variance = (off**2).sum() / (n - 1) / pixels
+    assert abs(variance - H - 2 * m * several) < 5 * error
+    assert 2 * m * several > 20 * error
+    for lag in (1, 2, 3):
+        found = (off[lag:] * off[:-lag]).sum() / (n - lag) / pixels + variance / n
+        expected = -TRAP.release * TRAP.capture * several * left ** (lag - 1)
+        assert abs(found - expected) < 5 * error
+        assert lag > 1 or abs(expected) > 20 * error
+
+
+@pytest.mark.parametrize("camera", [None, of_numpy], ids=["package", "numpy"])
+def test_it_is_guessed_in_every_stack(camera):
+    found = recovered_strength(Trapping(capture=0.3, release=0.3), camera=camera)
+    assert found.n_guesses == 6
+    assert 1 / 3 < found.mean / 0.3 < 3

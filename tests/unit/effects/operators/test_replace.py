@@ -1,0 +1,420 @@
+"""Samples replaced by others: forward models, laws, and estimators."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.small_sensors import context_of, drawn_truth, seen, taken
+
+from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines, own_lines
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted
+from pchem_pipeline.effects.operators.offsets import (
+    RowNoise,
+)
+from pchem_pipeline.effects.operators.replace import (
+    BitErrors,
+    MisplacedLines,
+    PixelCorrection,
+    RepeatedFrames,
+    RepeatedLines,
+)
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.settings import FitSettings
+from pchem_pipeline.model.histogram.count import histogram_frames
+from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.simulate.chain import simulate_block
+from pchem_pipeline.simulate.settings import SimulateSettings
+
+N_FRAMES, SMALL = 14, (6, 5)
+
+
+def frames_of(*effects: Effect) -> Any:
+    sensor = SimulateSettings(shape=SMALL, n_frames=N_FRAMES, seed=8, effects=effects)
+    return simulate_block(drawn_truth(SMALL), sensor, (0, N_FRAMES))[0]
+
+
+def test_repeats_are_exact_copies_of_what_was_delivered():
+    plain, listed = frames_of(), (1, 2, 5, 9, 10, 11)
+    delivered = plain.copy()
+    for t in listed:
+        delivered[t] = delivered[t - 1]
+    np.testing.assert_array_equal(frames_of(RepeatedFrames(frames=listed)), delivered)
+    some = frames_of(RepeatedFrames(frames=listed, rows=(2, 4)))
+    np.testing.assert_array_equal(some[:, 2:4], delivered[:, 2:4])
+    np.testing.assert_array_equal(np.delete(some, [2, 3], axis=1), np.delete(plain, [2, 3], axis=1))
+
+
+def test_random_repeats_come_as_often_as_they_should():
+    n_frames, p = 20_000, 0.1
+    values = np.arange(n_frames, dtype=np.uint16).reshape(-1, 1, 1)
+    out = RepeatedFrames(probability=p).apply(values, context_of((1, 1), n_frames)).ravel().astype(int)
+    number = int((np.diff(out) == 0).sum())
+    assert abs(number - p * n_frames) < 5 * np.sqrt(p * (1 - p) * n_frames)
+    # a repeat of a repeat shows the frame that was last taken
+    assert (np.arange(n_frames) - out).max() > 1
+    assert out[0] == 0
+
+
+BITS_SHAPE = (50, 50)
+
+
+BITS_FRAMES = np.random.default_rng(1).integers(90, 140, (40, *BITS_SHAPE)).astype(np.uint16)
+
+
+def by_hand(code, bit, fault):
+    """Return a code with a wrong bit, by its binary digits."""
+    digits = list(f"{code:016b}")
+    place = 15 - bit
+    digits[place] = {"zero": "0", "one": "1", "flip": "10"[int(digits[place])]}[fault]
+    return int("".join(digits), 2)
+
+
+@pytest.mark.parametrize("fault", ["zero", "one", "flip"])
+@pytest.mark.parametrize("bit", [0, 3, 5])
+def test_a_stuck_bit_is_wrong_in_every_sample(bit, fault):
+    effect = BitErrors(share=1.0, bit=bit, fault=fault)
+    found = effect.apply(BITS_FRAMES, context_of(BITS_SHAPE, 40))
+    table = np.array([by_hand(code, bit, fault) for code in range(256)])
+    np.testing.assert_array_equal(found, table[BITS_FRAMES])
+    assert found.dtype == BITS_FRAMES.dtype
+
+
+def test_a_share_of_the_samples_is_wrong():
+    found = BitErrors(share=0.02, bit=3, fault="flip").apply(BITS_FRAMES, context_of(BITS_SHAPE, 40))
+    n, wrong = BITS_FRAMES.size, int((found != BITS_FRAMES).sum())
+    assert abs(wrong - 0.02 * n) < 5 * np.sqrt(0.02 * 0.98 * n)
+
+
+def test_a_bit_that_the_converter_lacks_is_never_wrong():
+    found = BitErrors(share=1.0, bit=14, fault="one").apply(BITS_FRAMES, context_of(BITS_SHAPE, 40))
+    np.testing.assert_array_equal(found, BITS_FRAMES)
+
+
+@pytest.mark.parametrize("fault", ["zero", "one", "flip"])
+def test_the_law_has_as_many_moved_samples_and_their_mean(fault):
+    effect = BitErrors(share=0.01, bit=3, fault=fault)
+    maps = PixelMaps(
+        np.array([0.8, 2.5]), np.array([0.1, 0.07]), np.array([100.3, 97.0]), np.array([3.0, 3.4]),
+        np.ones(2, bool),
+    )  # fmt: skip
+    codes = np.arange(40, 400)
+    plain = sample_mass(SampleLaw(), maps, codes)
+    law = sample_mass(effect.sample_law(SampleLaw(), maps), maps, codes)
+    exact = 0.99 * plain
+    for place, code in enumerate(codes):
+        exact[:, by_hand(code, 3, fault) - 40] += 0.01 * plain[:, place]
+    np.testing.assert_allclose(law.sum(axis=1), 1.0, atol=1e-9)
+    np.testing.assert_allclose(law @ codes, exact @ codes, atol=2e-4)
+
+
+def test_the_law_takes_some_of_the_errors_out_of_the_read_noise():
+    rng = np.random.default_rng(7)
+    n = 24
+    maps = PixelMaps(
+        rng.uniform(0.5, 3, n), 1 / rng.uniform(8, 16, n), rng.uniform(96, 112, n), rng.uniform(2.4, 4.2, n),
+        np.ones(n, bool),
+    )  # fmt: skip
+    effect = BitErrors(share=0.004, bit=3)
+    codes = np.arange(30, 500)
+    plain = sample_mass(SampleLaw(), maps, codes)
+    mass = 0.996 * plain
+    for place, code in enumerate(codes[:300]):
+        mass[:, by_hand(int(code), 3, "zero") - 30] += 0.004 * plain[:, place]
+    counts, origin = np.rint(1e6 * mass).astype(np.uint32), np.full(n, 30)
+    errors = []
+    for law in (None, effect.sample_law(SampleLaw(), maps)):
+        fit = fit_histograms(counts, origin, law=law, settings=FitSettings(tail_guard=0))
+        errors.append(np.sqrt(np.nanmean(np.log(fit.read_noise_dn / maps.read_noise_dn) ** 2)))
+    # from which codes the samples come, the law does not know, so it is not exact
+    assert errors[1] < 0.7 * errors[0]
+    assert errors[0] > 3e-3
+
+
+BIT_CASES = [
+    (BitErrors(share=0.004, bit=3), (40, 40), 2),
+    (BitErrors(share=0.004, bit=3, fault="flip"), (32, 50), 3),
+    (BitErrors(share=0.02, bit=1), (40, 40), 4),
+    (BitErrors(share=0.002, bit=7), (40, 40), 5),
+]
+
+
+@pytest.mark.parametrize(("effect", "shape", "seed"), BIT_CASES)
+def test_bit_fault_and_share_are_found(effect, shape, seed):
+    truth = drawn_truth(shape, seed=seed)
+    guesses = BitErrors.estimate(seen(taken(truth, effect, n_frames=2000, seed=seed)))
+    assert {guess.bit for guess in guesses} == {effect.bit}
+    found = next(guess for guess in guesses if guess.fault == effect.fault)
+    # half of the pixels have no fit where a high bit is lost
+    assert 0.4 < found.share / effect.share < 2.5
+
+
+@pytest.mark.parametrize(("bit", "fault"), [(0, "zero"), (1, "one"), (3, "zero")])
+def test_a_bit_that_never_changes_is_stuck(bit, fault):
+    effect = BitErrors(share=1.0, bit=bit, fault=fault)
+    truth = drawn_truth((16, 16))
+    assert BitErrors.estimate(seen(taken(truth, effect, n_frames=800))) == (effect,)
+
+
+def predicted_by_hand(frame, y, x, predictor):
+    """Return what the neighbours of one sample predict, written down once more."""
+    around = [int(frame[y + b, x + a]) for b in (-1, 0, 1) for a in (-1, 0, 1) if a or b]
+    if predictor == "row":
+        around = [int(frame[y, x - 1]), int(frame[y, x + 1])]
+    return int(np.floor(np.median(around) if predictor == "median" else np.mean(around)))
+
+
+def corrected_by_hand(frame, threshold, predictor):
+    found = frame.copy()
+    for y in range(1, frame.shape[0] - 1):
+        for x in range(1, frame.shape[1] - 1):
+            prediction = predicted_by_hand(frame, y, x, predictor)
+            if int(frame[y, x]) - prediction > threshold:
+                found[y, x] = prediction
+    return found
+
+
+@pytest.mark.parametrize("predictor", PREDICTORS)
+def test_a_sample_above_the_threshold_becomes_what_its_neighbours_predict(predictor):
+    shape = (7, 6)
+    frames = np.random.default_rng(1).integers(90, 140, (5, *shape)).astype(np.uint16)
+    effect = PixelCorrection(threshold_dn=12, predictor=predictor)
+    found = effect.apply(frames, context_of(shape, 5))
+    np.testing.assert_array_equal(found, [corrected_by_hand(f, 12, predictor) for f in frames])
+    assert 5 < (found != frames).sum() < frames.size / 2
+
+
+def test_the_share_replaces_some():
+    shape = (40, 40)
+    frames = np.random.default_rng(2).integers(90, 140, (30, *shape)).astype(np.uint16)
+    context = context_of(shape, 30)
+    every = PixelCorrection(threshold_dn=12).apply(frames, context) != frames
+    some = PixelCorrection(threshold_dn=12, share=0.3).apply(frames, context) != frames
+    assert not (some & ~every).any()
+    n = int(every.sum())
+    assert abs(some.sum() - 0.3 * n) < 5 * np.sqrt(0.21 * n)
+
+
+def test_a_sensor_too_small_to_have_neighbours_stays_as_it_is():
+    frames = np.array([[[100, 5000]]], np.uint16)
+    np.testing.assert_array_equal(
+        PixelCorrection(threshold_dn=1).apply(frames, context_of((1, 2), 1)), frames
+    )
+
+
+def test_predictions_of_odd_dtypes_do_not_overflow():
+    frames = np.full((1, 3, 3), 250, np.uint8)
+    assert [int(predicted(frames, kind)[0, 0, 0]) for kind in PREDICTORS] == [250, 250, 250]
+
+
+CORRECTIONS = [
+    (PixelCorrection(threshold_dn=40), (24, 24), 1600, 1),
+    (PixelCorrection(threshold_dn=30, share=0.3), (24, 24), 1600, 2),
+    (PixelCorrection(threshold_dn=50, predictor="mean"), (20, 40), 1200, 3),
+    (PixelCorrection(threshold_dn=35, share=0.6, predictor="row"), (30, 16), 1200, 4),
+]
+
+
+@pytest.mark.parametrize(("effect", "shape", "n_frames", "seed"), CORRECTIONS)
+def test_threshold_and_share_are_found(effect, shape, n_frames, seed):
+    truth = drawn_truth(shape, seed=seed + 20)
+    evidence = seen(taken(truth, effect, n_frames=n_frames, seed=seed))
+    found, *_ = PixelCorrection.estimate(evidence)
+    assert found.predictor == effect.predictor
+    # thresholds are looked at every second DN here
+    assert abs(found.threshold_dn - effect.threshold_dn) <= 2
+    # a hundredth by chance; replaced neighbours lower the predictions of some of the samples beside
+    assert found.share == pytest.approx(effect.share, rel=0.1)
+    assert evidence.z["space.predicted.equal"] > 20.0
+
+
+def test_the_rule_says_what_comes_out_in_the_stead_of_a_sample():
+    frames = np.random.default_rng(4).integers(90, 140, (5, 7, 6)).astype(np.uint16)
+    effect = PixelCorrection(threshold_dn=12)
+    rule = effect.replacement(frames)
+    changed = effect.apply(frames, context_of((7, 6), 5)) != frames
+    assert changed.any()
+    assert not changed[:, ~rule.inside].any()
+    np.testing.assert_array_equal(
+        changed, (frames.astype(int) - rule.value > rule.excess) & rule.inside & (frames != rule.value)
+    )
+    assert not PixelCorrection(threshold_dn=1).replacement(frames[:, :2]).inside.any()
+
+
+LINES_SHAPE, N_LINE_FRAMES = (9, 11), 300
+
+
+MOVES = ("swapped", "early", "late", "sample_lost", "sample_twice", "line_lost", "line_twice")
+
+
+def origins(shape, frames):
+    """Return frames whose values tell where in the frame they come from."""
+    return np.broadcast_to(
+        np.arange(shape[0] * shape[1], dtype=np.uint16).reshape(shape), (frames, *shape)
+    ).copy()
+
+
+def turned(frames, lines):
+    """Return frames (frame, line, sample)."""
+    return frames if lines == "rows" else frames.swapaxes(1, 2)
+
+
+@pytest.mark.parametrize("lines", ["rows", "columns"])
+@pytest.mark.parametrize("move", MOVES)
+def test_every_sample_comes_from_where_the_move_says(move, lines):
+    frames, share = origins(LINES_SHAPE, N_LINE_FRAMES), 0.1
+    found = MisplacedLines(share=share, move=move, lines=lines).apply(
+        frames, context_of(LINES_SHAPE, N_LINE_FRAMES)
+    )
+    found, plain = turned(found, lines), turned(frames, lines)[0]
+    n, m = plain.shape
+    hits = 0
+    for one in found:
+        if move.startswith("line"):
+            moved = np.flatnonzero((one != plain).any(axis=1))
+            if moved.size:
+                hits += 1
+                come = np.clip(np.arange(n) + (1 if move == "line_lost" else -1), 0, n - 1)
+                np.testing.assert_array_equal(one[moved[0] :], plain[come][moved[0] :])
+            continue
+        y = 0
+        while y < n:
+            at = np.flatnonzero(one[y] != plain[y])
+            if at.size and move == "swapped":
+                np.testing.assert_array_equal(one[[y, y + 1]], plain[[y + 1, y]])
+                y += 1
+            elif at.size:
+                step = 1 if move in ("early", "sample_lost") else -1
+                come = np.clip(np.arange(m) + step, 0, m - 1)
+                np.testing.assert_array_equal(one[y, at[0] :], plain[y, come][at[0] :])
+                assert move not in ("early", "late") or at[0] == (0 if step == 1 else 1)
+            hits += at.size > 0
+            y += 1
+    # of a line lost at the end, or a sample twice at the end, nothing is seen
+    trials = N_LINE_FRAMES * (1 if move.startswith("line") else n)
+    shown = {"swapped": 1 - 1 / n - share, "line_lost": 1 - 1 / n, "sample_lost": 1 - 1 / m}.get(move, 1.0)
+    expected = trials * share * shown
+    assert abs(hits - expected) < 5 * np.sqrt(expected)
+
+
+def test_the_ratios_are_those_of_the_likelihoods():
+    """A plain transcription: sums of logarithms of the histograms' shares, less those at the own place."""
+    frames = np.random.default_rng(2).integers(95, 105, (64, 3, 4)).astype(np.uint16)
+    frames[:, 1] += 4
+    histograms = histogram_frames(frames)
+    counts = histograms.counts.reshape(12, -1)
+    z, _ = misplaced_lines(frames, counts, histograms.origin.ravel().astype(np.int64), np.ones((3, 4), bool))
+    codes = np.arange(94, 111)
+    share = np.array(
+        [[(frames[:, y, x, None] == codes).sum(axis=0) + 0.5 for x in range(4)] for y in range(3)]
+    )
+    # every histogram is as wide as the widest, and one code more on either side
+    width = np.flatnonzero((counts > 0).any(axis=0))
+    log = np.log(share / (64 + 0.5 * (width[-1] - width[0] + 3)))
+
+    def at(y, x, code):
+        low = histograms.origin[y, x] + width[0] - 1
+        return log[y, x, np.clip(code, low, low + width[-1] - width[0] + 2) - 94]
+
+    def gain(mixed):
+        total = []
+        for y in range(3):
+            for t in range(64):
+                row = [int(frames[(t + mixed * x) % 64, y, x]) for x in range(4)]
+                own = np.array([at(y, x, row[x]) for x in range(4)])
+                ratios = [
+                    sum(at(y + dy, x, row[x]) for x in range(4)) - own.sum() if 0 <= y + dy < 3 else 0.0
+                    for dy in (1, -1)
+                ]
+                for dx in (1, -1):
+                    moved = np.array(
+                        [at(y, x + dx, row[x]) - own[x] if 0 <= x + dx < 4 else 0 for x in range(4)]
+                    )
+                    from_there = moved[::-1].cumsum()
+                    ratios += [moved.sum(), max(0.0, from_there.max()) - np.log(4)]
+                total.append(np.log(1 - 1e-3 + 1e-3 * np.exp(ratios).mean()))
+        return np.array(total)
+
+    seen_gain, chance = gain(0), gain(64 // 4)
+    wanted = (seen_gain.sum() - chance.sum()) / np.sqrt(2 * (chance**2).sum() + 4.0)
+    assert z["space.misplaced.rows"] == pytest.approx(wanted, rel=1e-4)
+
+
+@pytest.mark.parametrize("lines", ["rows", "columns"])
+@pytest.mark.parametrize("move", MOVES)
+def test_the_move_is_found(move, lines):
+    shape, share = ((24, 20) if lines == "rows" else (20, 24)), 0.06
+    effect = MisplacedLines(share=share, move=move, lines=lines)
+    evidence = seen(taken(drawn_truth(shape), effect, n_frames=1200, seed=3))
+    assert evidence.z[f"space.misplaced.{lines}"] > 8
+    first, *_ = MisplacedLines.estimate(evidence)
+    assert (first.move, first.lines) == (move, lines)
+    # the pixels' histograms hold a share of their neighbours', so that the ratios are too small
+    assert 0.4 < first.share / share < 1.3
+
+
+@pytest.mark.parametrize("lines", ["rows", "columns"])
+@pytest.mark.parametrize("move", MOVES)
+def test_pixels_are_fitted_without_the_lines_that_were_moved(move, lines):
+    shape, n_frames = ((16, 40) if lines == "rows" else (40, 16)), 600
+    truth, effect = drawn_truth(shape), MisplacedLines(share=0.1, move=move, lines=lines)
+    frames, plain = taken(truth, effect, n_frames=n_frames, seed=5), taken(truth, n_frames=n_frames, seed=5)
+    found = own_lines(frames, np.ones(shape, np.bool_), [effect])
+    moved = turned(frames != plain, lines).any(axis=2)
+    replaced = turned(found != frames, lines).any(axis=2)
+    # where a line is cut, few of its samples may have moved
+    assert replaced[moved].mean() > (0.5 if "sample" in move else 0.8)
+    assert replaced[~moved].mean() < 0.01
+    assert own_lines(frames, np.ones(shape, np.bool_), [RowNoise(row_noise_dn=1.0)]) is frames
+
+
+def test_a_line_in_two_places_is_misplaced_too_and_its_equality_tells():
+    evidence = seen(taken(drawn_truth((18, 26)), RepeatedLines(share=0.05), n_frames=1200, seed=4))
+    assert evidence.z["space.repeated.rows"] > evidence.z["space.misplaced.rows"] > 8
+
+
+@pytest.mark.parametrize("lines", ["rows", "columns"])
+def test_a_line_is_its_own_or_the_one_before(lines):
+    frames = np.random.default_rng(1).integers(90, 140, (N_LINE_FRAMES, *LINES_SHAPE)).astype(np.uint16)
+    found = RepeatedLines(share=0.1, lines=lines).apply(frames, context_of(LINES_SHAPE, N_LINE_FRAMES))
+    repeats = 0
+    for one, plain in zip(found, frames, strict=True):
+        one, plain = (one, plain) if lines == "rows" else (one.T, plain.T)
+        np.testing.assert_array_equal(one[0], plain[0])
+        for y in range(1, len(one)):
+            if not np.array_equal(one[y], plain[y]):
+                np.testing.assert_array_equal(one[y], plain[y - 1])
+                repeats += 1
+    n = N_LINE_FRAMES * (LINES_SHAPE[0 if lines == "rows" else 1] - 1)
+    assert abs(repeats - 0.1 * n) < 5 * np.sqrt(0.09 * n)
+
+
+@pytest.mark.parametrize("lines", ["rows", "columns"])
+@pytest.mark.parametrize("share", [5e-4, 2e-2])
+def test_the_share_is_found(lines, share):
+    n_frames, shape = 1200, (18, 26)
+    effect = RepeatedLines(share=share, lines=lines)
+    evidence = seen(taken(drawn_truth(shape), effect, n_frames=n_frames, seed=3))
+    found, *_ = RepeatedLines.estimate(evidence)
+    n = n_frames * (shape[0 if lines == "rows" else 1] - 1)
+    assert found.lines == lines
+    assert abs(found.share - share) < 3.5 * np.sqrt(share / n)
+    assert evidence.z[f"space.repeated.{lines}"] == 10.0 * round(found.share * n)
+
+
+def test_lines_so_short_that_chance_repeats_them_say_nothing():
+    evidence = seen(taken(drawn_truth((40, 3)), n_frames=1200, seed=4))
+    assert "space.repeated.rows" not in evidence.z
+    assert "space.repeated.columns" in evidence.z
+    assert list(RepeatedLines.estimate(evidence)) == []
+
+
+def test_rare_repeats_are_shown_more_often_than_they_are():
+    frames = np.arange(1000)
+    shown, factor = RepeatedLines(share=1e-5).representative(frames)
+    assert shown.share * 1000 == pytest.approx(8.0)
+    assert shown.share * factor == pytest.approx(1e-5)
+    often = RepeatedLines(share=0.1)
+    assert often.representative(frames) == (often, 1.0)
