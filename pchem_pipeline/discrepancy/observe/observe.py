@@ -347,7 +347,7 @@ def _time_series(view: FrameView, n_run: int, **others: Any) -> TimeSeries:
         lag_charge=lags("charge"),
         lag_readout=lags("readout"),
         lag_readout_charge=view.correlations["time.cross.readout_charge"].of_pixels.astype(np.float32),
-        n_pairs=view.count(1),
+        n_pairs=view.correlations["time.lag1.charge"].count,
         neighbours={name: seen.mean for name, seen in beside.items()},
         neighbour_maps={name: seen.deviations.astype(np.float32) for name, seen in beside.items()},
         **others,

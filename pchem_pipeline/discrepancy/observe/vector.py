@@ -1,11 +1,9 @@
 """The vector of statistics: forms of the scores of pixels, of series of frames, of lines and of neighbours.
 
 Every statistic has its mean and variance from theory, so that it is about N(0, 1) where the PCD holds. The
-families shape, code and tail need the histograms alone. Given these, frames without an effect are in random
-order: centred series of n frames have ``E[u_t u_s] = -1 / (n - 1)`` of their variance at different times,
-exactly. Every mean of the families time, frame and space takes that into account, and what the removal of a
-common mode does to the pixels that share it. Every form is taken of every series, or of all lines, or of all
-pixels; those that are no statistics of the catalogue are dropped.
+families shape, code and tail need the histograms alone, the others the sums of :mod:`.view`. Every form is
+taken of every series, or of all lines, or of all pixels; those that are no statistics of the catalogue are
+dropped.
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ class FrameView:
         pixels = pixel_statistics(laws, maps)
         samples = Samples.by_laws(FrameBlocks.of(frames), laws, maps, standardised=False)
         halves, gain = np.zeros((2, 2, n, ny)), np.zeros(n)
-        noise, columns = np.zeros((n, ny)), np.zeros((3, n, nx))
+        rows, columns = np.zeros((3, n, ny)), np.zeros((3, n, nx))
         blocks = np.zeros((edges.size - 1, 2, ny, nx))
         products = {name: np.zeros(ny * nx) for name in PRODUCTS}
         modes = pixels.mode.astype(np.float32)
@@ -125,7 +125,7 @@ class FrameView:
             in_block = replace(samples, frames=FrameBlocks.of(frames[at:end]), most=_CHUNK_SAMPLES)
             for u in in_block.chunks():
                 some = slice(at, at + u.shape[1])
-                sum_rows(u, weights, halves[:, :, some], gain[some], noise[some])
+                sum_rows(u, weights, halves[:, :, some], gain[some], rows[2, some])
                 columns[:2, some] = u.sum(axis=2)
                 columns[2, some] = (weights[2] * u[1] * u[1]).sum(axis=1)
                 block += u.sum(axis=1, dtype=np.float64)
@@ -134,31 +134,20 @@ class FrameView:
                 joined = np.concatenate([before, u], axis=1)
                 _add_products(joined, before.shape[1], products)
                 at, before = some.stop, joined[:, -_LAGS:]
-        view = cls(
-            pixels,
-            numbers,
-            edges,
-            block_frames,
-            halves,
-            np.concatenate([halves.sum(axis=1), (noise - noise.mean(axis=0))[None]]),
-            columns,
-            (gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300),
-            blocks,
-            {},
-        )
-        columns[2] -= columns[2].mean(axis=0)
-        for name, total in products.items():
-            view.products[name] = total.reshape(ny, nx) / max(view.count(PRODUCTS[name][0][0]), 1)
-        return view
+        rows[:2] = halves.sum(axis=1)
+        for lines in (rows, columns):
+            lines[2] -= lines[2].mean(axis=0)
+        gain = (gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300)
+        means = {
+            name: total.reshape(ny, nx) / max(_count(edges, PRODUCTS[name][0][0]), 1)
+            for name, total in products.items()
+        }
+        return cls(pixels, numbers, edges, block_frames, halves, rows, columns, gain, blocks, means)
 
     @property
     def n(self) -> int:
         """Number of frames."""
         return int(self.numbers.size)
-
-    def count(self, lag: int) -> int:
-        """Return how many pairs of frames of a block are so many frames apart."""
-        return int(np.maximum(np.diff(self.edges) - lag, 0).sum())
 
     @cached_property
     def variance(self) -> FloatArray:
@@ -216,7 +205,7 @@ class FrameView:
         of_pixels = np.full(usable.shape, np.nan)
         of_pixels[one][both] = excess[both] / np.sqrt(variance[both])
         average = float(np.mean(excess[both] / scale[both])) if both.any() else float("nan")
-        return Correlation(of_pixels, average, self.count(lag))
+        return Correlation(of_pixels, average, _count(self.edges, lag))
 
     def _shared(self, a: int, b: int, one: _Slices, two: _Slices) -> FloatArray:
         """Return what removing the common modes adds to covariances of channel a of pixels with b of others.
@@ -270,6 +259,11 @@ class FrameView:
         """Return ``sum of each block / sqrt(n_b)`` of a series (n, ...), (b, ...)."""
         lengths = np.diff(self.edges).reshape(-1, *[1] * (series.ndim - 1))
         return np.asarray(np.add.reduceat(series, self.edges[:-1], axis=0) / np.sqrt(lengths))
+
+
+def _count(edges: IntArray, lag: int) -> int:
+    """Return how many pairs of frames of a block are so many frames apart."""
+    return int(np.maximum(np.diff(edges) - lag, 0).sum())
 
 
 def _add_products(u: NDArray[np.float32], known: int, products: dict[str, FloatArray]) -> None:
