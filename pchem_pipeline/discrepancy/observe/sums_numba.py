@@ -39,8 +39,9 @@ def look_up(
         usable: pixels with values, the others get 0, (y, x).
         values: to fill.
     """
-    for t in range(codes.shape[0]):
-        for y in range(codes.shape[1]):
+    # row by row, whose tables stay in the cache
+    for y in range(codes.shape[1]):
+        for t in range(codes.shape[0]):
             for x in range(codes.shape[2]):
                 code = min(max(np.int32(codes[t, y, x]), first[y, x]), last[y, x])
                 entry = tables[start[y, x] + (code - first[y, x]), channel]

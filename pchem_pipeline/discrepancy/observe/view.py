@@ -81,7 +81,8 @@ class FrameView:
         edges: positions of the blocks, (b + 1,).
         block_frames: frames in a full block.
         halves: k and r of the left and the right half of each row, (2, 2, n, y).
-        rows, columns: the sums :data:`OF_LINES` of each row, (3, n, y), and column, (3, n, x).
+        noise: weighted sums of r^2 of each row, less their mean, (n, y).
+        columns: the sums :data:`OF_LINES` of each column, (3, n, x).
         gain: relative deviation of the gain of each frame, (n,).
         blocks: sums of k and r in each block, (b, 2, y, x).
         products: means of :data:`PRODUCTS` after removal of the frames' common modes, (y, x) each.
@@ -92,7 +93,7 @@ class FrameView:
     edges: IntArray
     block_frames: int
     halves: FloatArray
-    rows: FloatArray
+    noise: FloatArray
     columns: FloatArray
     gain: FloatArray
     blocks: FloatArray
@@ -115,7 +116,7 @@ class FrameView:
         pixels = pixel_statistics(laws, maps)
         samples = Samples.by_laws(FrameBlocks.of(frames), laws, maps, standardised=False)
         halves, gain = np.zeros((2, 2, n, ny)), np.zeros(n)
-        rows, columns = np.zeros((3, n, ny)), np.zeros((3, n, nx))
+        noise, columns = np.zeros((n, ny)), np.zeros((3, n, nx))
         blocks = np.zeros((edges.size - 1, 2, ny, nx))
         products = {name: np.zeros(ny * nx) for name in PRODUCTS}
         modes = pixels.mode.astype(np.float32)
@@ -125,7 +126,7 @@ class FrameView:
             in_block = replace(samples, frames=FrameBlocks.of(frames[at:end]), most=_CHUNK_SAMPLES)
             for u in in_block.chunks():
                 some = slice(at, at + u.shape[1])
-                sum_rows(u, weights, halves[:, :, some], gain[some], rows[2, some])
+                sum_rows(u, weights, halves[:, :, some], gain[some], noise[some])
                 columns[:2, some] = u.sum(axis=2)
                 columns[2, some] = (weights[2] * u[1] * u[1]).sum(axis=1)
                 block += u.sum(axis=1, dtype=np.float64)
@@ -134,20 +135,24 @@ class FrameView:
                 joined = np.concatenate([before, u], axis=1)
                 _add_products(joined, before.shape[1], products)
                 at, before = some.stop, joined[:, -_LAGS:]
-        rows[:2] = halves.sum(axis=1)
-        for lines in (rows, columns):
-            lines[2] -= lines[2].mean(axis=0)
+        for lines in (noise, columns[2]):
+            lines -= lines.mean(axis=0)
         gain = (gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300)
         means = {
             name: total.reshape(ny, nx) / max(_count(edges, PRODUCTS[name][0][0]), 1)
             for name, total in products.items()
         }
-        return cls(pixels, numbers, edges, block_frames, halves, rows, columns, gain, blocks, means)
+        return cls(pixels, numbers, edges, block_frames, halves, noise, columns, gain, blocks, means)
 
     @property
     def n(self) -> int:
         """Number of frames."""
         return int(self.numbers.size)
+
+    @property
+    def rows(self) -> FloatArray:
+        """The sums :data:`OF_LINES` of each row, (3, n, y)."""
+        return np.concatenate([self.halves.sum(axis=1), self.noise[None]])
 
     @cached_property
     def variance(self) -> FloatArray:
