@@ -141,15 +141,15 @@ class Samples:
     ) -> Iterator[Float32Array]:
         """Yield some frames at a time as deviations (channel, frame, y, x), 0 where not usable."""
         box = rows, columns
-        first, last, start, usable = (
-            np.ascontiguousarray(each[box]) for each in (self.first, self.last, self.start, self.usable)
+        first, last, start, weight = (
+            np.ascontiguousarray(each[box])
+            for each in (self.first, self.last, self.start, self.usable.astype(np.float32))
         )
         for block in self.frames.blocks(max(1, self.most // self.usable.size)):
             codes = np.ascontiguousarray(block[:, rows, columns])
-            found = np.empty((len(channels), *codes.shape), np.float32)
-            for values, channel in zip(found, channels, strict=True):
-                look_up(codes, first, last, start, self.tables, channel, usable, values)
-            yield found
+            values = np.empty((2, *codes.shape), np.float32)
+            look_up(codes, first, last, start, self.tables, weight, values)
+            yield values[channels[0] : channels[-1] + 1]
 
     def energies(self, channel: int, mode: str, pixels: BoolArray) -> FloatArray:
         """Return the sum of the products of pairs of some pixels that share a mode, in each frame, (n,)."""

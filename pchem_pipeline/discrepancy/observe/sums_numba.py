@@ -23,20 +23,18 @@ def look_up(
     last: NDArray[np.int32],
     start: NDArray[np.int32],
     tables: Float32Array,
-    channel: int,
-    usable: NDArray[np.bool_],
+    weight: Float32Array,
     values: Float32Array,
 ) -> None:
-    """Fill values (t, y, x) with what a channel has for codes; those beyond the support count as its ends.
+    """Fill values (2, t, y, x) with k and r of codes; codes beyond the support count as its ends.
 
     Args:
         codes: of frames, DN, (t, y, x).
         first: first code of each pixel, (y, x).
         last: its last one.
         start: row of its first code in ``tables``.
-        tables: of all pixels, (rows, channel).
-        channel: column of the tables.
-        usable: pixels with values, the others get 0, (y, x).
+        tables: of all pixels, (rows, 2).
+        weight: of each pixel, (y, x).
         values: to fill.
     """
     # row by row, whose tables stay in the cache
@@ -44,8 +42,9 @@ def look_up(
         for t in range(codes.shape[0]):
             for x in range(codes.shape[2]):
                 code = min(max(np.int32(codes[t, y, x]), first[y, x]), last[y, x])
-                entry = tables[start[y, x] + (code - first[y, x]), channel]
-                values[t, y, x] = entry if usable[y, x] else np.float32(0.0)
+                row = start[y, x] + (code - first[y, x])
+                values[0, t, y, x] = tables[row, 0] * weight[y, x]
+                values[1, t, y, x] = tables[row, 1] * weight[y, x]
 
 
 @kernel
