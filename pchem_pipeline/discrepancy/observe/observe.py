@@ -30,27 +30,20 @@ from pchem_pipeline.discrepancy.observe.digital.repeats import (
 )
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
-from pchem_pipeline.discrepancy.observe.sums import (
-    MINIMUM_BLOCKS,
-    blocks_of,
-    pairs_at_lags,
-    pixel_statistics,
-    samples_beyond,
-    sum_frames,
-)
+from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS, samples_beyond
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import (
-    FrameView,
+    block_statistics,
     frame_statistics,
     goodness_of,
     in_order,
-    pixel_lags,
+    line_statistics,
+    product_statistics,
     quadrant_series,
     quadrant_sums,
     sample_statistics,
-    space_statistics,
-    time_statistics,
 )
+from pchem_pipeline.discrepancy.observe.view import FrameView
 from pchem_pipeline.discrepancy.observe.waves import waves_across
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
 from pchem_pipeline.model.fit.api import fit_histograms
@@ -110,14 +103,11 @@ def observe(
         usable = (wanted & start.usable).ravel() & _inside(seen)
     evidence, laws = _compared(seen, parameters, usable, (shape[0], shape[1]))
     evidence = evidence if result is None else _with_fit(evidence, result)
-    edges = blocks_of(numbers, block_frames)
     maps = evidence.maps
-    pixels = pixel_statistics(laws, maps)
-    sums = sum_frames(frames, edges, laws, pixels)
-    view = FrameView(sums, pixels, numbers, edges, block_frames)
+    view = FrameView.of(frames, numbers, block_frames, laws, maps)
+    edges = view.edges
     hits = [samples_beyond(frames, laws, maps.usable, above=above) for above in (True, False)]
     repeats = Repeats.of(frames, numbers)
-    lags = pixel_lags(view)
     predicted = predicted_samples(frames, edges, maps.usable)
     spread = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
     bits = previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
@@ -127,9 +117,10 @@ def observe(
     z = {
         **evidence.z,
         "tail.high.clusters": _clusters(hits[0], laws, frames.shape),
-        **time_statistics(view, lags),
+        **product_statistics(view),
+        **block_statistics(view),
         **frame_statistics(view),
-        **space_statistics(view),
+        **line_statistics(view),
         **predicted_statistics(predicted),
         **bit_statistics(bits),
         **nearer_statistics(frames, edges, maps),
@@ -141,7 +132,6 @@ def observe(
     }
     time = _time_series(
         view,
-        lags,
         n_run,
         repeated=numbers[repeats.frames],
         repeated_rows=repeats.rows_in_time,
@@ -315,42 +305,51 @@ def _clusters(hits: IntArray, laws: PixelLaws, shape: tuple[int, ...]) -> float:
     return poisson(pairs, chance)
 
 
-def _time_series(view: FrameView, lags: FloatArray, n_run: int, **others: Any) -> TimeSeries:
+def _time_series(view: FrameView, n_run: int, **others: Any) -> TimeSeries:
     """Return what is kept along time; ``others``: its fields that are not of the view."""
-    sums, pixels = view.sums, view.pixels
-    usable = pixels.usable
-    exposure, number = pixels.mode
+    exposure, number = view.pixels.mode
 
     def over(values: FloatArray, count: FloatArray) -> FloatArray:
         return np.asarray(values / np.maximum(count, 1e-300) * (count > 0))
 
     def mapped(values: FloatArray) -> NDArray[np.float32]:
-        return np.where(usable, values, np.nan).astype(np.float32)
+        return np.where(view.pixels.usable, values, np.nan).astype(np.float32)
 
-    k, r = view.lines(0, 1), view.lines(1, 1)
-    length = np.diff(view.edges)[:, None, None]
-    found = view.neighbours
+    def lags(name: str) -> NDArray[np.float32]:
+        of = (view.correlations[f"time.lag{lag}.{name}"].of_pixels for lag in (1, 2, 3))
+        return np.stack(list(of)).astype(np.float32)
+
+    rows, columns = (
+        [over(each, number.sum(axis)).astype(np.float32) for each in sums[:2]]
+        for sums, axis in ((view.rows, 1), (view.columns, 0))
+    )
+    blocks = mapped(view.blocks / np.diff(view.edges)[:, None, None, None])
+    beside = {
+        name.removeprefix("space."): seen
+        for name, seen in view.correlations.items()
+        if name.startswith("space.") and np.isfinite(seen.mean)
+    }
     return TimeSeries(
         frames=view.numbers,
         n_run=n_run,
         block_frames=view.block_frames,
         block_start=view.numbers[view.edges[:-1]],
-        frame_charge=k.sum(axis=1) / exposure.sum(),
-        frame_readout=r.sum(axis=1) / number.sum(),
-        frame_gain=sums.gain,
-        quadrant_readout=over(quadrant_series(sums.rows[2:]), quadrant_sums(number)),
-        row_charge=over(k, number.sum(axis=1)).astype(np.float32),
-        row_readout=over(r, number.sum(axis=1)).astype(np.float32),
-        column_charge=over(sums.columns[0], number.sum(axis=0)).astype(np.float32),
-        column_readout=over(sums.columns[1], number.sum(axis=0)).astype(np.float32),
-        block_charge=mapped(sums.blocks[:, 0] / length),
-        block_readout=mapped(sums.blocks[:, 1] / length),
-        lag_charge=mapped(lags[:3]),
-        lag_readout=mapped(lags[3:6]),
-        lag_readout_charge=mapped(lags[6]),
-        n_pairs=pairs_at_lags(view.edges)[0],
-        neighbours={name: seen.correlation for name, seen in found.items()},
-        neighbour_maps={name: seen.deviation.astype(np.float32) for name, seen in found.items()},
+        frame_charge=view.halves[0].sum(axis=(0, 2)) / exposure.sum(),
+        frame_readout=view.halves[1].sum(axis=(0, 2)) / number.sum(),
+        frame_gain=view.gain,
+        quadrant_readout=over(quadrant_series(view.halves[1]), quadrant_sums(number)),
+        row_charge=rows[0],
+        row_readout=rows[1],
+        column_charge=columns[0],
+        column_readout=columns[1],
+        block_charge=blocks[:, 0],
+        block_readout=blocks[:, 1],
+        lag_charge=lags("charge"),
+        lag_readout=lags("readout"),
+        lag_readout_charge=view.correlations["time.cross.readout_charge"].of_pixels.astype(np.float32),
+        n_pairs=view.correlations["time.lag1.charge"].count,
+        neighbours={name: seen.mean for name, seen in beside.items()},
+        neighbour_maps={name: seen.deviations.astype(np.float32) for name, seen in beside.items()},
         **others,
         frame_noise=view.series["noise"],
     )

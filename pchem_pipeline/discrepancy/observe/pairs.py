@@ -28,6 +28,7 @@ from pchem_pipeline.discrepancy.families import (
 )
 from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, code_ranges, pixel_statistics
+from pchem_pipeline.discrepancy.observe.sums_numba import look_up
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
@@ -95,7 +96,7 @@ class Samples:
         frames: codes (n, y, x), DN.
         first, last: smallest and largest code of each pixel's table, (y, x).
         start: row of the first one in ``tables``, (y, x).
-        tables: k and r of each code over their standard deviation, (2, rows).
+        tables: k and r of each code over their standard deviation, (rows, 2).
         usable: pixels that count, (y, x).
         most: samples that are looked at at a time, whole frames.
     """
@@ -114,17 +115,27 @@ class Samples:
         return cls.by_laws(FrameBlocks.of(frames), laws_of_frames(frames, maps), maps)
 
     @classmethod
-    def by_laws(cls, frames: FrameBlocks, laws: PixelLaws, maps: PixelMaps) -> Samples:
-        """Prepare frames by the laws of their pixels, made of all samples of the frames or of more."""
+    def by_laws(
+        cls, frames: FrameBlocks, laws: PixelLaws, maps: PixelMaps, *, standardised: bool = True
+    ) -> Samples:
+        """Prepare frames by the laws of their pixels, made of all samples of the frames or of more.
+
+        Args:
+            frames: codes.
+            laws: of the pixels' samples.
+            maps: parameters of the pixels.
+            standardised: False: k (e-) and r (DN) as they are.
+        """
         pixels = pixel_statistics(laws, maps)
         usable = pixels.usable
-        codes = np.where(laws.good, laws.support[:, 1], 0)
-        tables = laws.tables[: 1 + codes.sum()].T.copy()
-        for channel, variance in enumerate(pixels.variance):
-            deviation = np.sqrt(np.where(usable, variance, 1.0)).ravel().astype(np.float32)
-            tables[channel, 1:] /= np.repeat(deviation, codes)
-        # a track of a particle is no common mode
-        np.clip(tables, -FAR, FAR, out=tables)
+        tables = laws.tables
+        if standardised:
+            codes = np.where(laws.good, laws.support[:, 1], 0)
+            deviation = np.sqrt(np.where(usable, pixels.variance, 1.0)).reshape(2, -1).astype(np.float32)
+            tables = tables[: 1 + codes.sum()].copy()
+            tables[1:] /= np.repeat(deviation.T, codes, axis=0)
+            # a track of a particle is no common mode
+            np.clip(tables, -FAR, FAR, out=tables)
         first, last, start = code_ranges(laws, usable)
         return cls(frames, first, last, start, tables, usable)
 
@@ -139,16 +150,18 @@ class Samples:
 
     def chunks(
         self, channels: tuple[int, ...] = (0, 1), rows: slice = slice(None), columns: slice = slice(None)
-    ) -> Iterator[list[Float32Array]]:
-        """Yield some frames at a time as deviations of each channel, (frame, y, x), 0 where not usable."""
+    ) -> Iterator[Float32Array]:
+        """Yield some frames at a time as deviations (channel, frame, y, x), 0 where not usable."""
         box = rows, columns
-        first, last, offset = self.first[box], self.last[box], (self.start - self.first)[box]
-        weight = self.usable[box].astype(np.float32)
+        first, last, start, weight = (
+            np.ascontiguousarray(each[box])
+            for each in (self.first, self.last, self.start, self.usable.astype(np.float32))
+        )
         for block in self.frames.blocks(max(1, self.most // self.usable.size)):
-            at = block[(slice(None), *box)].astype(np.int32)
-            np.clip(at, first, last, out=at)
-            at += offset
-            yield [self.tables[channel][at] * weight for channel in channels]
+            codes = np.ascontiguousarray(block[:, rows, columns])
+            values = np.empty((2, *codes.shape), np.float32)
+            look_up(codes, first, last, start, self.tables, weight, values)
+            yield values[channels[0] : channels[-1] + 1]
 
     def energies(self, channel: int, mode: str, pixels: BoolArray) -> FloatArray:
         """Return the sum of the products of pairs of some pixels that share a mode, in each frame, (n,)."""

@@ -1,9 +1,4 @@
-"""One pass over the frames of a split: everything along time and between pixels, as sums.
-
-Tables of k and r (centred on each pixel's own samples) turn codes into the two channels. Given the
-histograms, frames without any effect are in random order; means and variances of all sums follow from that
-alone, so a poor fit of a pixel's histogram does not imitate an effect in time or space.
-"""
+"""The two channels of the samples of pixels: their moments, the codes that have them, and those beyond."""
 
 from __future__ import annotations
 
@@ -14,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe import sums_numba as kernel
-from pchem_pipeline.discrepancy.observe.sums_numba import FrameSums
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, PixelMaps
 
@@ -26,7 +19,6 @@ IntArray = NDArray[np.int64]
 CHANNELS = ("charge", "readout")
 #: Blocks whose means are compared, and frames whose course along time is looked at, at least.
 MINIMUM_BLOCKS, FEWEST_FRAMES = 4, 64
-_CHUNK_SAMPLES = 1 << 16
 _LEAST_NOISE = 0.5  # of the variance of r^2: residuals of hardly two values tell nothing of their size
 
 
@@ -100,47 +92,6 @@ def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
         noise=noise.reshape(shape),
         square=masked(weight / np.maximum(noise, _LEAST_NOISE)).reshape(shape),
     )
-
-
-def sum_frames(frames: NDArray[Any], edges: IntArray, laws: PixelLaws, pixels: PixelStatistics) -> FrameSums:
-    """Sum over the frames (n, y, x) of a split whose blocks begin at ``edges``."""
-    n, ny, nx = frames.shape
-    size = max(1, min(n, _CHUNK_SAMPLES // (ny * nx)))
-    samples = np.zeros((2, kernel.LAGS + size, ny, nx), np.float32)
-    sums = FrameSums(
-        rows=np.zeros((4, n, ny)),
-        columns=np.zeros((2, n, nx), np.float32),
-        gain=np.zeros(n),
-        blocks=np.zeros((edges.size - 1, 2, ny, nx)),
-        lags=np.zeros((8, ny, nx)),
-        row_noise=np.zeros((n, ny)),
-        column_noise=np.zeros((n, nx), np.float32),
-        next_column=np.zeros((3, ny, nx)),
-        next_row=np.zeros((3, ny, nx)),
-    )
-    channels = kernel.Channels(
-        support=np.ascontiguousarray(code_ranges(laws, pixels.usable).transpose(1, 0, 2)),
-        tables=laws.tables,
-        modes=pixels.mode.astype(np.float32),
-        weights=np.stack([pixels.factor, pixels.shift, pixels.square]).astype(np.float32),
-        norms=pixels.mode.sum(axis=(1, 2)),
-    )
-    for number, (first, last) in enumerate(pairwise(edges.tolist())):
-        kernel.sum_block(frames, (number, first, last), channels, samples, sums)
-    return sums._replace(
-        gain=(sums.gain - pixels.gain_offset) / max(pixels.gain_norm, 1e-300),
-        lags=sums.lags / np.maximum(pairs_at_lags(edges), 1)[:, None, None],
-        row_noise=sums.row_noise - sums.row_noise.mean(axis=0),
-        column_noise=sums.column_noise - sums.column_noise.mean(axis=0, dtype=np.float64),
-        next_column=sums.next_column / n,
-        next_row=sums.next_row / n,
-    )
-
-
-def pairs_at_lags(edges: IntArray) -> list[int]:
-    """Return how many pairs of frames of a block each of the products of `FrameSums.lags` is made of."""
-    lengths = np.diff(edges)
-    return [int(np.maximum(lengths - lag, 0).sum()) for lag in (1, 2, 3, 1, 2, 3, 1, 1)]
 
 
 def code_ranges(laws: PixelLaws, usable: NDArray[np.bool_]) -> NDArray[np.int32]:

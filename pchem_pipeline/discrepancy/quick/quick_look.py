@@ -182,19 +182,19 @@ def _normal(z: FloatArray, freedom: float) -> FloatArray:
 
 
 def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
-    frame, columns = _frame_covariance(sums)
-    rows, checks = _of_lines(sums.rows), []
-    shared = _Estimate(0.0, 0.0, 1.0)
-    if math.isfinite(frame.error):
-        shared = frame
-        checks.append(_noise_check("frame_noise", frame))
-    if math.isfinite(rows.error):
-        checks.append(_noise_check("row_noise", rows.less(shared), sums.rows))
-    if math.isfinite(columns.error):
-        checks.append(_noise_check("column_noise", columns.less(shared), sums.columns, sums.shape[1]))
+    common = _Common(sums)
+    frame = common.frame if math.isfinite(common.frame.error) else _Estimate(0.0, 0.0, 1.0)
+    checks = [
+        _noise_check(name, found, *lines)
+        for name, found, *lines in (
+            ("frame_noise", common.frame),
+            ("row_noise", common.rows.less(frame), sums.rows),
+            ("column_noise", common.columns.less(frame), sums.columns, sums.shape[1]),
+        )
+        if math.isfinite(found.error)
+    ]
     checks += series_checks(_frame_means(sums))
-    common = _Common(frame, rows, columns, sums)
-    checks += [*_lag_check(sums, common), *_neighbour_checks(sums, common), *_wandering(sums, maps)]
+    checks += [*_lag_check(common), *_neighbour_checks(common), *_wandering(sums, maps)]
     return _located(checks, sums)
 
 
@@ -289,35 +289,6 @@ def _quiet(sums: StackSums) -> NDArray[np.bool_]:
     return np.asarray(some & (variance <= _LOUD * np.median(variance[some]))) if some.any() else some
 
 
-def _frame_covariance(sums: StackSums) -> tuple[_Estimate, _Estimate]:
-    """Return the mean covariance of pixels in different rows and columns, and that within columns."""
-    columns = _of_lines(sums.columns)
-    quiet = _quiet(sums)
-    m, nx = int(quiet.sum()), sums.shape[1]
-    if m < _FEWEST_LINES or nx < _FEWEST_LINES:
-        return _NOTHING, columns
-    rows, variance = sums.rows.centred()[:, quiet], sums.rows.variance[quiet]
-    total = rows.sum(axis=1)
-    products = total**2 - np.einsum("ty,ty->t", rows, rows)
-    scale = float(variance.sum())
-    # a few frames with a track of a particle do not count in full
-    typical = max(1.0, float(np.median(total**2)) / (0.455 * scale))
-    products = np.minimum(products, _CLIP**2 * typical * scale)
-    freedom = sums.freedom
-    value = float(products.sum()) / freedom
-    chance = math.sqrt(2.0 / freedom * (scale**2 - float((variance**2).sum())))
-    pairs, along = float(nx * m * (m - 1)), 2.0 * nx * (m - 1)
-    down = sums.next_y[quiet]
-    neighbours = along * float(np.mean(down[np.isfinite(down)])) if np.isfinite(down).any() else 0.0
-    pairs_all = pairs * nx
-    others = pairs_all - pairs
-    estimate = (value - neighbours - (pairs - along) * _first_known(columns)) / others
-    error = chance / others
-    if math.isfinite(columns.error):
-        error = math.hypot(error, pairs / others * columns.error)
-    return _Estimate(estimate, error, freedom), columns
-
-
 def _noise_check(name: str, found: _Estimate, lines: Lines | None = None, width: int = 0) -> Check:
     """Return the check of a covariance that pixels share, and of single lines that share more than others."""
     p, where = normal_p(found.z), ""
@@ -357,29 +328,54 @@ def _frame_means(sums: StackSums) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Common:
-    """What pixels share, for what it does to correlations of single pixels and of neighbours."""
+    """Mean covariances of the pixels that share a line or a frame, DN^2."""
 
-    frame: _Estimate
-    rows: _Estimate
-    columns: _Estimate
     sums: StackSums
 
-    def of_row(self) -> float:
-        """Covariance of pixels of a row, DN^2."""
-        return _first_known(self.rows, self.frame)
+    @cached_property
+    def rows(self) -> _Estimate:
+        """Of pixels of a row."""
+        return _of_lines(self.sums.rows)
 
-    def of_column(self) -> float:
-        """Covariance of pixels of a column, DN^2."""
-        return _first_known(self.columns, self.frame)
+    @cached_property
+    def columns(self) -> _Estimate:
+        """Of pixels of a column, in a group of rows."""
+        return _of_lines(self.sums.columns)
+
+    @cached_property
+    def frame(self) -> _Estimate:
+        """Of pixels in different rows and columns."""
+        sums, quiet = self.sums, _quiet(self.sums)
+        m, nx = int(quiet.sum()), sums.shape[1]
+        if m < _FEWEST_LINES or nx < _FEWEST_LINES:
+            return _NOTHING
+        rows, variance = sums.rows.centred()[:, quiet], sums.rows.variance[quiet]
+        total = rows.sum(axis=1)
+        products = total**2 - np.einsum("ty,ty->t", rows, rows)
+        scale = float(variance.sum())
+        # a few frames with a track of a particle do not count in full
+        typical = max(1.0, float(np.median(total**2)) / (0.455 * scale))
+        products = np.minimum(products, _CLIP**2 * typical * scale)
+        freedom = sums.freedom
+        value = float(products.sum()) / freedom
+        chance = math.sqrt(2.0 / freedom * (scale**2 - float((variance**2).sum())))
+        pairs, along = float(nx * m * (m - 1)), 2.0 * nx * (m - 1)
+        down = sums.next_y[quiet]
+        neighbours = along * float(np.mean(down[np.isfinite(down)])) if np.isfinite(down).any() else 0.0
+        others = pairs * nx - pairs
+        estimate = (value - neighbours - (pairs - along) * _first_known(self.columns)) / others
+        error = chance / others
+        if math.isfinite(self.columns.error):
+            error = math.hypot(error, pairs / others * self.columns.error)
+        return _Estimate(estimate, error, freedom)
 
     @cached_property
     def inflation(self) -> float:
         """By how much correlated pixels raise the variance of a mean over them."""
-        ny, nx = self.sums.shape
-        variance = self.sums.variance
+        (ny, nx), variance = self.sums.shape, self.sums.variance
         typical = median_of(variance, ~(variance > 0))
         frame = _first_known(self.frame)
-        row, column = self.of_row() - frame, self.of_column() - frame
+        row, column = (_first_known(each, self.frame) - frame for each in (self.rows, self.columns))
         return 1.0 + (ny * nx * frame**2 + nx * row**2 + ny * column**2) / typical**2
 
 
@@ -420,9 +416,9 @@ def _resemblance(
     return [check_of(name, normal_p(mean / error, two_sided=True), mean, limit=limit, how=how)]
 
 
-def _lag_check(sums: StackSums, common: _Common) -> list[Check]:
+def _lag_check(common: _Common) -> list[Check]:
     """Return whether samples of a pixel resemble those of the frame before, beyond what frames share."""
-    shared, error = 0.0, 0.0
+    sums, shared, error = common.sums, 0.0, 0.0
     if common.frame.z > 3.0:
         quiet = _quiet(sums)
         total = sums.rows.centred()[:, quiet].sum(axis=1)
@@ -437,15 +433,15 @@ def _lag_check(sums: StackSums, common: _Common) -> list[Check]:
     return _resemblance("lag", sums.lag, sums.variance, common, (shared, error))
 
 
-def _neighbour_checks(sums: StackSums, common: _Common) -> list[Check]:
+def _neighbour_checks(common: _Common) -> list[Check]:
     """Return whether neighbours resemble each other, beyond what their line shares."""
-    v, found = sums.variance, []
-    for name, one, other, covariance, shared, line in (
-        ("neighbours_x", v[:, :-1], v[:, 1:], sums.next_x[:, :-1], common.of_row(), common.rows),
-        ("neighbours_y", v[:-1], v[1:], sums.next_y[:-1], common.of_column(), common.columns),
+    sums, v, found = common.sums, common.sums.variance, []
+    for name, one, other, covariance, line in (
+        ("neighbours_x", v[:, :-1], v[:, 1:], sums.next_x[:, :-1], common.rows),
+        ("neighbours_y", v[:-1], v[1:], sums.next_y[:-1], common.columns),
     ):
-        known = (shared, line.error) if math.isfinite(line.error) else (0.0, 0.0)
-        found += _resemblance(name, covariance, np.sqrt(one * other), common, known)
+        shared = (line.value, line.error) if math.isfinite(line.error) else (0.0, 0.0)
+        found += _resemblance(name, covariance, np.sqrt(one * other), common, shared)
     return found
 
 
