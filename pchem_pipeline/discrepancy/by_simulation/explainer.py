@@ -18,7 +18,7 @@ from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.additions import Extension
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper, candidate_classes, serial
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, SetFit
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened, Screening, noise_of_splits
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
@@ -272,7 +272,7 @@ class FrameExplainer(Explainer[Screened]):
         events = np.asarray(noise_of_splits(first, 2, data.settings.model_error).events)
         return Refitter(draw, first, data.z.both, events, present, allow=allow, defects=data.defects)
 
-    def _left_by(self, best: Refitted, refitter: Refitter) -> list[tuple[Hypothesis, ...]]:
+    def _left_by(self, best: Refitted, refitter: Refitter) -> list[SetFit]:
         """Return what is likely beside a refitted set: what that hid stands out there."""
         null = NullModel.from_replicates(self.prepared.first.names, best.vectors, self.prepared.first)
         null = null.shifted(np.expm1(best.change) @ best.slopes)

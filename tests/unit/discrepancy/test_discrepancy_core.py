@@ -182,8 +182,8 @@ def test_the_right_one_of_three_is_the_likeliest() -> None:
     noise = Noise(UNIT.times(0.5), 0.1)
     shift = 3.0 * prints["frame_noise"] + rng.normal(size=40) / np.sqrt(2.0)
     sets = likeliest_sets(hypotheses, shift, noise)
-    assert {h.tag for h in sets[0]} == {"frame_noise"}
-    best = fit_set(sets[0], shift, noise).log_score(shift, noise)
+    assert {h.tag for h in sets[0].hypotheses} == {"frame_noise"}
+    best = sets[0].log_score(shift, noise)
     for other in ("row_noise", "exposure_drift"):
         fit = fit_set([_hypothesis(other, prints[other])], shift, noise)
         assert fit.log_score(shift, noise) < best - 5.0
@@ -202,10 +202,10 @@ def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_senso
     assert [h.tag for h in hypotheses] == ["row_noise", "row_noise", "row_noise", "row_noise 2"]
     shift = 3.0 * left + 2.0 * right + rng.normal(size=40) / np.sqrt(2.0)
     sets = likeliest_sets(hypotheses, shift, Noise(UNIT.times(0.5), 0.05))
-    assert [h.effect.region for h in sets[0]] == regions
-    assert all(not meets_itself(one) for one in sets)
-    assert all("row_noise" in {h.tag for h in one} for one in sets)  # none is a second one alone
-    assert len({h.effect.key for h in sets[0]}) == 2
+    assert [h.effect.region for h in sets[0].hypotheses] == regions
+    assert all(not meets_itself(one.hypotheses) for one in sets)
+    assert all("row_noise" in {h.tag for h in one.hypotheses} for one in sets)  # none is a second one alone
+    assert len({h.effect.key for h in sets[0].hypotheses}) == 2
 
 
 def test_nothing_predicts_held_out_samples_where_nothing_is() -> None:

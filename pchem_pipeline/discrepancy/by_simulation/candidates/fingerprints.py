@@ -248,10 +248,8 @@ def firsts(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     return [h for h in hypotheses if (h.effect.tag, h.number - 1) not in tags]
 
 
-def likeliest_sets(
-    hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise
-) -> list[tuple[Hypothesis, ...]]:
-    """Return sets of up to three effects at their best strengths, those of the largest likelihood first.
+def likeliest_sets(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[SetFit]:
+    """Fit sets of up to three effects, and return them, those of the largest likelihood first.
 
     Less the price of their effects, and only those that are likelier than no effect. Each effect is there by
     more than its error, and seen among the others.
@@ -262,17 +260,17 @@ def likeliest_sets(
         noise: covariance of the shift.
     """
     shortlist, alone = _shortlist(hypotheses, shift, noise), set(firsts(hypotheses))
-    found: list[tuple[float, tuple[Hypothesis, ...]]] = []
+    found: list[tuple[float, SetFit]] = []
     for size in range(1, _LARGEST_SET + 1):
         for members in itertools.combinations(shortlist, size):
             once = len({h.tag for h in members}) == size and not meets_itself(members)
             if once and alone.issuperset(firsts(members)) and not share_place(h.effect for h in members):
                 fit = fit_set(members, shift, noise)
                 if _all_needed(fit, shift, noise):
-                    found.append((fit.log_score(shift, noise) - PRICE_OF_MORE * (size - 1), fit.at_best()))
+                    found.append((fit.log_score(shift, noise) - PRICE_OF_MORE * (size - 1), fit))
     least = log_density(shift, noise.covariance) + PRICE
     likely = sorted((one for one in found if one[0] > least), key=lambda one: -one[0])
-    return [members for _, members in likely]
+    return [fit for _, fit in likely]
 
 
 def _shortlist(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:

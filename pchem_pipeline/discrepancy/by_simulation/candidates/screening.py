@@ -16,6 +16,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import (
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
+    SetFit,
     held_out_gain,
     likeliest_sets,
     seconds,
@@ -51,7 +52,7 @@ class Screened:
     """
 
     hypotheses: tuple[Hypothesis, ...]
-    sets: list[tuple[Hypothesis, ...]]
+    sets: list[SetFit]
     gain: float
 
 
@@ -111,12 +112,10 @@ class Screening:
         sets = likeliest_sets(hypotheses, shift, noise)
         shifts = self.z.train - null.mean, self.z.test - null.mean
         of_split = noise_of_splits(null, 1, self.model_error)
-        gain = held_out_gain(sets[0], shifts, of_split) if sets else 0.0
+        gain = held_out_gain(sets[0].hypotheses, shifts, of_split) if sets else 0.0
         return Screened(tuple(hypotheses), sets, gain)
 
-    def beside(
-        self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray
-    ) -> list[tuple[Hypothesis, ...]]:
+    def beside(self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray) -> list[SetFit]:
         """Return sets that are likely beside one that was refitted, the likeliest first.
 
         Args:

@@ -24,6 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR_SHARE_OF_PART,
     PRICE_OF_MORE,
     Hypothesis,
+    SetFit,
     firsts,
     fit_set,
     meets_itself,
@@ -329,8 +330,8 @@ class Search:
 def compare(
     search: Search,
     hypotheses: Sequence[Hypothesis],
-    sets: Sequence[tuple[Hypothesis, ...]],
-    beside: Callable[[Refitted], Sequence[tuple[Hypothesis, ...]]] = lambda _: (),
+    sets: Sequence[SetFit],
+    beside: Callable[[Refitted], Sequence[SetFit]] = lambda _: (),
     measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]] = lambda _: (),
     rounds: int = 3,
 ) -> None:
@@ -346,8 +347,9 @@ def compare(
     """
     beside = functools.cache(beside)
     if sets:
-        search.compare((h,) for h in _singles(hypotheses, sets[0]))
-    search.compare(_of_different_effects(one for one in sets if len(one) > 1)[:_MOST_SETS])
+        search.compare((h,) for h in _singles(hypotheses, sets[0].hypotheses))
+    together = (fit.at_best() for fit in sets if len(fit.hypotheses) > 1)
+    search.compare(_of_different_effects(together)[:_MOST_SETS])
     for _ in range(rounds):
         before = search.best
         search.measure(measured)
@@ -369,9 +371,7 @@ def _singles(hypotheses: Sequence[Hypothesis], best: Sequence[Hypothesis]) -> li
     return chosen
 
 
-def _grown(
-    search: Search, beside: Callable[[Refitted], Sequence[tuple[Hypothesis, ...]]]
-) -> list[tuple[Hypothesis, ...]]:
+def _grown(search: Search, beside: Callable[[Refitted], Sequence[SetFit]]) -> list[tuple[Hypothesis, ...]]:
     """Return sets that hold one of the best so far and what stands out beside it.
 
     One that is strong hides or distorts what the frames show of the others.
@@ -385,7 +385,7 @@ def _grown(
             seeds.append(one)
     grown: list[tuple[Hypothesis, ...]] = []
     for one in seeds[:_MOST_SEEDS]:
-        others = _of_different_effects(beside(one))
+        others = _of_different_effects(fit.at_best() for fit in beside(one))
         for size, most in _MOST_GROWN.items():
             grown += [(*one.hypotheses, *each) for each in others if len(each) == size][:most]
     return grown

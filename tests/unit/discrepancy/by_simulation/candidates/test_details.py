@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import may_be_tuned, tuned
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, likeliest_sets
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
+    Hypothesis,
+    SetFit,
+    likeliest_sets,
+)
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.sets.rivals import chosen
@@ -62,7 +66,7 @@ class World:
     def refitter(self) -> Refitter:
         return Refitter(self.draw, self.null, (self.parts[0] + self.parts[1]) / 2.0, np.zeros(M))
 
-    def likely(self, hypotheses: list[Hypothesis]) -> list[tuple[Hypothesis, ...]]:
+    def likely(self, hypotheses: list[Hypothesis]) -> list[SetFit]:
         refitter = self.refitter()
         shift, noise = refitter.target - self.null.mean, refitter.noise(self.null.covariance, 40)
         return likeliest_sets(hypotheses, shift, noise)
@@ -112,7 +116,7 @@ def test_an_effect_that_wrong_numbers_of_another_brought_in_is_not_kept() -> Non
     world = World([TRUE])
     hypotheses = [Hypothesis(e, statistics([e])) for e in (BLINKING, RowNoise(row_noise_dn=0.6))]
     sets = world.likely(hypotheses)
-    assert {h.tag for h in sets[0]} == {"dark_current_rts", "row_noise"}
+    assert {h.tag for h in sets[0].hypotheses} == {"dark_current_rts", "row_noise"}
     search = Search(world.refitter(), HistogramLikelihood())
     compare(search, hypotheses, sets)
     found = chosen(search, hypotheses)

@@ -19,6 +19,8 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Repli
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
     Hypothesis,
+    SetFit,
+    fit_set,
     likeliest_sets,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened
@@ -99,7 +101,7 @@ class World:
     def refitter(self) -> Refitter:
         return Refitter(self.draw, self.null, self.z.both, np.zeros(M))
 
-    def likely(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> list[tuple[Hypothesis, ...]]:
+    def likely(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> list[SetFit]:
         noise = self.refitter().noise(self.null.covariance, 40)
         return likeliest_sets(hypotheses, self.z.both - self.null.mean - mean, noise)
 
@@ -112,7 +114,7 @@ class World:
     def best_of(
         self,
         hypotheses: Sequence[Hypothesis],
-        sets: list[tuple[Hypothesis, ...]],
+        sets: list[SetFit],
         likelihood: HistogramLikelihood | None = None,
         **how: Any,
     ) -> Comparison | None:
@@ -346,7 +348,9 @@ def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -
     true = effect("row_noise", 0.3), effect("frame_noise", 0.3), effect("interpixel_capacitance", 0.1)
     world = World(true)
     row, frame, drift = (hypothesis(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift"))
-    found = world.best_of([row, frame, drift], [(row, frame, drift)])
+    shift, noise = world.z.both - world.null.mean, world.refitter().noise(world.null.covariance, 40)
+    fit = fit_set([row, frame, drift], shift, noise)
+    found = world.best_of([row, frame, drift], [fit])
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
