@@ -177,7 +177,7 @@ def _latex(symbol: str) -> str:
 
 def effects() -> str:
     """Return every effect of this package in the order of the signal chain: what it is, settings, rivals."""
-    from pchem_pipeline.effects.framework.context import Plane
+    from pchem_pipeline.effects.framework.effect import Plane
     from pchem_pipeline.effects.framework.registry import effect_classes
 
     own = [c for c in effect_classes().values() if c.__module__.startswith("pchem_pipeline.")]

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
-from pchem_pipeline.effects.framework.context import EffectContext, Plane
+from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.framework.effect import Plane
 from pchem_pipeline.simulate.chain_numba import SampleKeys, draw_rows
 from pchem_pipeline.simulate.streams import (
     KeyedStreams,

@@ -191,7 +191,7 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, tmp_path):
     assert "maps.fits" in shell.ok("export", "dark.zarr", "-o", str(tmp_path), "--format", "fits,csv").stdout
     assert "spurious_charge" in (tmp_path / "summary.csv").read_text()
     shutil.copytree(joint / "dark.zarr", joint / "same.zarr")
-    here = ("--workers", "1", "-o", tmp_path)
+    here = ("-o", tmp_path)
     words = shell.ok("compare", "dark.zarr", "same.zarr", *here).stderr
     assert "Nothing changed" in words
     drawn = shell.ok("figures", "dark.zarr", *here, "--only", "exposures,pixel_fits").stdout

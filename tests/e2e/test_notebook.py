@@ -94,7 +94,9 @@ def test_figures_are_those_of_pchem_figures(run, finished, tmp_path):
     drawn = drawing_bytes(run.figure("electron_numbers"), "svg", dpi=600, title="Estimated electron numbers")
     assert drawn == (tmp_path / "electron_numbers.svg").read_bytes()
     assert run.figure("map_bias", width=60).get_figwidth() == pytest.approx(60 / 25.4)
-    with pytest.raises(ConfigError, match="this run has no figure nothing; it has pixel_fits"):
+    with pytest.raises(
+        ConfigError, match="this run has no figure nothing; it has electron_cells, pixel_fits"
+    ):
         run.figure("nothing")
 
 

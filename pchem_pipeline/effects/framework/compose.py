@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.effects.framework.context import Plane
-from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.sample_law import SampleLaw
 

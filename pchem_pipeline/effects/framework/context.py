@@ -1,38 +1,13 @@
-"""The planes of the signal chain, and what an effect is told about the block of frames that it acts on."""
+"""What an effect is told about the block of frames that it acts on."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-
-
-class Plane(Enum):
-    """Where in the signal chain an effect acts; iteration gives the order of the chain.
-
-    What an effect receives and returns there, always with dims (frame, y, x):
-
-    ========  =======================================================  ==============
-    plane     values                                                   dtype
-    ========  =======================================================  ==============
-    EXPOSURE  mean number of electrons H_t, e-                         float64, >= 0
-    CHARGE    number of electrons K, e-                                int64, >= 0
-    ANALOG    input-referred signal with read noise K + R, e-          float64
-    ADC       signal at the ADC before rounding, mu + (K + R) / g, DN  float64
-    READOUT   digital number X, rounded and cut to the ADC's range     unsigned
-    ========  =======================================================  ==============
-    """
-
-    EXPOSURE = "exposure"
-    CHARGE = "charge"
-    ANALOG = "analog"
-    ADC = "adc"
-    READOUT = "readout"
-
 
 Dim = Literal["frame", "y", "x"]
 #: What the random numbers depend on that samples, or all samples of a row, column or frame, have.

@@ -35,13 +35,13 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from enum import Enum
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.settings import Section
-from pchem_pipeline.effects.framework.context import Plane as Plane
 from pchem_pipeline.effects.framework.region import Region, Span, When
 from pchem_pipeline.model.arithmetic.significance import CLEAR
 
@@ -64,6 +64,29 @@ _USUAL, _USUAL_SAMPLES = 7.0, 1e6
 FEWEST_SHOWN = 8
 
 _registered: dict[str, type[Effect]] = {}
+
+
+class Plane(Enum):
+    """Where in the signal chain an effect acts; iteration gives the order of the chain.
+
+    What an effect receives and returns there, always with dims (frame, y, x):
+
+    ========  =======================================================  ==============
+    plane     values                                                   dtype
+    ========  =======================================================  ==============
+    EXPOSURE  mean number of electrons H_t, e-                         float64, >= 0
+    CHARGE    number of electrons K, e-                                int64, >= 0
+    ANALOG    input-referred signal with read noise K + R, e-          float64
+    ADC       signal at the ADC before rounding, mu + (K + R) / g, DN  float64
+    READOUT   digital number X, rounded and cut to the ADC's range     unsigned
+    ========  =======================================================  ==============
+    """
+
+    EXPOSURE = "exposure"
+    CHARGE = "charge"
+    ANALOG = "analog"
+    ADC = "adc"
+    READOUT = "readout"
 
 
 class Unit(NamedTuple):

@@ -209,7 +209,7 @@ def _path(
 
 def _moved(effect: Effect, context: EffectContext) -> FloatArray:
     """Return relative exposure and offset (DN) of the frames of a block, shape (2, n_frames)."""
-    from pchem_pipeline.effects.framework.context import Plane
+    from pchem_pipeline.effects.framework.effect import Plane
 
     truth, gain = context.truth, context.truth["conversion_gain"]
     full = (context.frames.size, *gain.shape)
