@@ -143,7 +143,7 @@ class BitErrors(Effect, tag="bit_errors"):
 
         first, last = code_range(maps)
         codes = np.arange(first, last + 1)
-        mass = np.nan_to_num(sample_mass(SampleLaw(), maps, codes, far_tails=False))
+        mass = np.nan_to_num(sample_mass(SampleLaw(), maps, codes, smallest=1e-50))
         is_set = (codes >> self.bit & 1).astype(np.float64)
         up, down = mass @ (1.0 - is_set), mass @ is_set
         return (up * (self.fault != "zero"), down * (self.fault != "one"))

@@ -167,7 +167,7 @@ def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatA
     law = SampleLaw()
     for some, first, n_codes in parts_of_similar_width(law, pixels, (dn.start, dn.start + dn.size - 1)):
         codes = first[:, None] + np.arange(n_codes)
-        mass = share[some, None] * sample_mass(law, pixels.of(some), codes, far_tails=None)
+        mass = share[some, None] * sample_mass(law, pixels.of(some), codes, smallest=1e-17)
         out += np.bincount((codes - dn.start).ravel(), mass.ravel(), dn.size + n_codes)[: dn.size]
     return out
 

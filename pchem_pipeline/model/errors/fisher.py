@@ -33,7 +33,7 @@ def expected_scores(parameters: Parameters) -> tuple[FloatArray, FloatArray]:
         codes = first[:, None] + np.arange(n_codes)
         own = columns[some]
         exposure, gain, bias, sigma = (own[:, [i]] for i in range(4))
-        mass = sample_mass(SampleLaw(), list(own.T), codes, far_tails=False)
+        mass = sample_mass(SampleLaw(), list(own.T), codes, smallest=1e-50)
         given, precision = pcd_posterior(codes, exposure, gain, bias, sigma), sigma**-2.0
         score = np.stack(
             [

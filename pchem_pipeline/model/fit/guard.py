@@ -70,7 +70,7 @@ def expected_counts(
             found[row, part.start + code] = pcd(first[row] + code, *(each[row] for each in own))
         else:
             codes, free = first[:, None] + np.arange(part.stop - part.start), tuple(satellites.T)
-            mass = sample_mass(laws[j].of(pixels), own, codes, satellites=free, far_tails=False)
+            mass = sample_mass(laws[j].of(pixels), own, codes, satellites=free, smallest=1e-50)
             aside = ~kept[:, part].all(axis=1, keepdims=True)  # the likelihood is given the others
             inside = np.where(kept[:, part], mass, 0.0).sum(axis=1, keepdims=True)
             found[:, part] = np.where(aside, mass / inside, mass)

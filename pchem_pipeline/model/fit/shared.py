@@ -149,7 +149,7 @@ class SharedProblem:
         """Return the mass of every code, those left out included, shape (n, B)."""
         own = to_parameters(self.samples.rows(theta))
         codes = self.origin[:, None] + np.arange(self.counts.shape[1])
-        return sample_mass(self.law(shared, own), list(own.T), codes, far_tails=False)
+        return sample_mass(self.law(shared, own), list(own.T), codes, smallest=1e-50)
 
     def log_masses(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
         """Return the logarithm of the mass given that the code is kept, shape (n, B); 0 where it is not."""

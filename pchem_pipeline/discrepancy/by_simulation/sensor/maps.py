@@ -260,7 +260,7 @@ def expected_codes(
         law = sample_law(effects, pixel_maps(flat, usable[usable]), beside, places)
     except ConfigError:
         return None
-    return np.asarray(numbers.size * sample_mass(law, flat, codes, far_tails=False).sum(axis=0))
+    return np.asarray(numbers.size * sample_mass(law, flat, codes, smallest=1e-50).sum(axis=0))
 
 
 def _places(maps: PixelMaps, numbers: NDArray[np.int64]) -> PixelPlaces:
