@@ -222,6 +222,7 @@ def _start_anew(
     cut: bool,
     score: float,
     settled: bool,
+    gap: float,
     best: FloatArray,
     out: FloatArray,
     found: Found,
@@ -229,7 +230,7 @@ def _start_anew(
     """Climb from other starts in pixels that the density may have led astray.
 
     These are pixels at the limits of the codes, those of few DN per electron, those whose gain is not
-    settled, and those whose climb did not arrive.
+    settled or has a near rival, and those whose climb did not arrive.
     """
     n, limits, no = pixel.facts.shape[0], tools.limits, np.bool_(False)
     place = n + STEP
@@ -240,7 +241,8 @@ def _start_anew(
     # several samples, some of them cut, may have led the density astray
     astray = not settled if n == 1 else score > SUSPICIOUS
     lost = known and not best[place] > 0.0
-    if lost or (limits.scan and (astray or few)):
+    rivalled = n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap
+    if lost or rivalled or (limits.scan and (astray or few)):
         found = _climb_few(pixel, tools, best, out, found)
     if not (limits.scan and best[place] < ALIASED_STEP):
         return found
@@ -315,11 +317,9 @@ def search_cells(
         score = score_of(out)
         sure = np.bool_(not settled(pixel, best, np.bool_(False), loglik - null, out)[1])
         found = Found(loglik, runner_up, used + 1, found.degenerate)
-    found = _start_anew(pixel, tools, known, cut, score, sure, best, out, found)
+    found = _start_anew(pixel, tools, known, cut, score, sure, gap, best, out, found)
     if not best[n + STEP] > 0.0:
         return FIT_NOT_CONVERGED, found.used, 0
-    if n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap:
-        found = _climb_few(pixel, tools, best, out, found)
     bias_gap = min(gap, found.loglik - found.runner_up)
     blurred = math.inf
     if n == 1 and not (limits.warm or limits.reshapes):
