@@ -232,6 +232,27 @@ def status(
 
 
 @app.command()
+def info(
+    places: Annotated[
+        list[Path] | None, typer.Argument(help="camera files and folders, a config.yaml, or a store")
+    ] = None,
+) -> None:
+    """List formats and effects, or show what camera files or a run are.
+
+    Without argument: version, formats that can be read, known effects, and where compiled kernels are kept.
+    """
+    from pchem_pipeline.commands.info import about_files, about_program, about_run, is_run
+
+    if not places:
+        lines = about_program()
+    elif len(places) == 1 and is_run(places[0]):
+        lines = about_run(places[0])
+    else:
+        lines = about_files(places)
+    say("\n".join(lines))
+
+
+@app.command()
 def model(
     target: Target,
     use: Annotated[int | None, typer.Option(min=1, help="use this version")] = None,

@@ -33,6 +33,7 @@ class FrameReader(ABC):
         format_name: name of the format, as in ``input.format``.
         suffixes: file suffixes, lower case, with the dot.
         magic: first bytes that tell the format.
+        library: that reads it; empty for one of another package.
         paths: the files behind the reader, in the order of their frames.
         shape: (number of frames, rows, columns).
         dtype: native unsigned type of the samples that `read_into` delivers.
@@ -53,6 +54,7 @@ class FrameReader(ABC):
     format_name: ClassVar[str] = ""
     suffixes: ClassVar[tuple[str, ...]] = ()
     magic: ClassVar[tuple[bytes, ...]] = ()
+    library: ClassVar[str] = ""
 
     paths: tuple[Path, ...]
     shape: tuple[int, int, int]
@@ -125,6 +127,11 @@ class FrameReader(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def described(reader: type[FrameReader]) -> str:
+    """Return the name of the format that a reader is for, with the library that it reads it with."""
+    return reader.format_name + (f" ({reader.library})" if reader.library else "")
 
 
 def check_window(

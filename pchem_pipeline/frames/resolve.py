@@ -40,6 +40,7 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
     if not settings.files:
         raise ConfigError("input.files is empty; give camera files, a glob such as frames/*.tif, or a folder")
     found: list[Path] = []
+    missing: list[Path] = []
     for entry in settings.files:
         if is_remote(entry):
             found += fetch(entry)
@@ -55,7 +56,12 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
         elif _GLOB.search(entry):
             found += _glob(path, base_dir, entry)
         else:
-            raise InputError(f"{path}: no such file or folder; correct the path (input.files)")
+            missing.append(path)
+    if missing:
+        more = f" and {len(missing) - 1} more (last {missing[-1].name})" if len(missing) > 1 else ""
+        raise InputError(
+            f"{missing[0]}{more}: no such file or folder; bring it back, or correct the path (input.files)"
+        )
     for path in found:
         if not (path.is_file() or path.is_dir()):
             raise InputError(f"{path}: not a regular file; write its content to a file first")
@@ -101,7 +107,9 @@ def _glob(pattern: Path, base_dir: Path, entry: str) -> list[Path]:
     files = [p for p in matches if not p.name.startswith(".") and p.suffix.lower() not in SIDECARS]
     plain = [path for path in files if path.is_file() or is_zarr(path)]
     if not plain:
-        raise InputError(f"{entry}: matches no file; correct the pattern (input.files)")
+        raise InputError(
+            f"{entry}: matches no file; bring the files back, or correct the pattern (input.files)"
+        )
     return plain
 
 

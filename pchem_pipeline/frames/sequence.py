@@ -14,7 +14,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import shared_facts
 from pchem_pipeline.frames.identity import SCRATCH_BYTES
 from pchem_pipeline.frames.inspect import InputReport
-from pchem_pipeline.frames.reader import FrameReader, check_window, shared_notes
+from pchem_pipeline.frames.reader import FrameReader, check_window, described, shared_notes
 from pchem_pipeline.frames.settings import InputSettings
 
 
@@ -143,6 +143,11 @@ class FrameSequence(FrameReader):
             part = buffer[offset : offset + end - first]
             self._read_part(reader, part, first, end, rows)
             yield reader, part
+
+    @property
+    def formats(self) -> str:
+        """Names of the formats of the files, and of the library that reads each."""
+        return ", ".join(dict.fromkeys(described(type(reader)) for reader in self._readers))
 
     @property
     def whole_shape(self) -> tuple[int, int]:

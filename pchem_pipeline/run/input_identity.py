@@ -20,23 +20,26 @@ def known_identity(context: StageContext) -> dict[str, Any]:
     """Return the content identity of the input, see `content_identity`.
 
     It is kept in the store with names, sizes and times of change; where these are as they were, it is not
-    taken again. Where the files cannot be found any more, the last known identity is returned. Before the
-    files are hashed for the first time, they are looked at for mistakes.
+    taken again. Where the files cannot be found any more, it is that of those that were ingested, else the
+    last one known. Before the files are hashed for the first time, they are looked at for mistakes.
 
     Raises:
         InputError: files are missing or bad, and nothing is known of them from before.
     """
     settings = context.config.input
     known: dict[str, Any] = {}
+    held: dict[str, Any] = {}
     with suppress(StoreError):  # one that is damaged is as good as none: the files are hashed again
         known = read_record(_place(context)) or {}
+        held = ingested_identity(context) or {}
     same_files = known.get("files") == list(settings.files)
     try:
         paths = input_paths(settings, context.base_dir)
         quick = quick_identity(paths)
     except InputError:
-        if same_files:
-            return dict(known["identity"])
+        for last in (held, known):  # files that were refused in between are known, but not held
+            if last.get("files") == list(settings.files):
+                return dict(last["identity"])
         raise
     if known.get("quick") == quick:
         return dict(known["identity"])

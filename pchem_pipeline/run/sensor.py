@@ -56,6 +56,7 @@ class SensorInfo:
         camera: its name, serial number, temperature and date, as far as the files say.
         shown: place of the one whose histograms, H and ensemble are shown.
         whole: rows and columns of the frames in the files, whatever the region of interest; None: not known.
+        reader: format of the files and the library that read them; empty: not known.
     """
 
     kind: Literal["frames", "histograms", "samples"]
@@ -73,6 +74,7 @@ class SensorInfo:
     camera: CameraFacts = field(default_factory=CameraFacts)
     whole: tuple[int, int] | None = None
     seen_limits: tuple[int | None, int | None] = (None, None)
+    reader: str = ""
 
     @property
     def shape(self) -> tuple[int, int]:

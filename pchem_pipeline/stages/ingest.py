@@ -76,6 +76,8 @@ def run(context: StageContext) -> None:
     done = context.prepared.get(context.stage)
     reader = open_frames(settings, context.base_dir) if done is None else done.frames
     context.begin()
+    files = f"{len(reader.paths)} file{'s' * (len(reader.paths) != 1)}"
+    context.reporter.info(f"ingest: {files} read as {reader.formats}")
     if reader.time_words:
         (context.note if reader.integration_time is None else context.reporter.info)(reader.time_words)
     if message := reader.report.message():
@@ -117,6 +119,7 @@ def sensor_of(reader: FrameSequence, context: StageContext, identity: dict[str, 
         identity=identity,
         camera=reader.camera,
         whole=reader.whole_shape,
+        reader=reader.formats,
     )
 
 
@@ -207,5 +210,6 @@ def _record_histograms(context: StageContext) -> None:
         mode="reference",
         identity=shortened(known_identity(context)),
         names=given.names,
+        reader="histogram",
     ).write(context.store)
     _run_whole(context)

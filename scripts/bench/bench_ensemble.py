@@ -137,9 +137,9 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
     began = time.process_time()
     whole = KnownPixels(pixels, SampleLaw())
     law = number_tables(*whole.codes(), whole.exposure, whole, detailed=True)
-    sums, _ = mass_sums(law.mass, law.first, law.start, pixels, dn, axis)
+    sums = mass_sums(law.mass, law.first, law.start, pixels, dn, axis)
     clock.lap("exact EPCD and NUCed EPCD", began)
-    raw, raw_all, nuced = (np.zeros(m, dtype=np.int64) for m in (dn.size, dn.size, axis.size))
+    raw, raw_all, nuced = (np.zeros(m) for m in (dn.size, dn.size, axis.size))
     numbers, errors = np.zeros(60, dtype=np.int64), []
     for chunk in chunks:
         part, use = UsablePixels.from_maps(chunk.fitted)

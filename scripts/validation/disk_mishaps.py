@@ -21,6 +21,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +148,7 @@ def gone_on(bench: Bench, work: Work, expected: dict[str, Any]) -> str:
     """Do the same command again; return what is wrong then, or nothing."""
     again = work
     for _ in range(8):
-        code, said = in_a_child(lambda again=again: done(bench, again))
+        code, said = in_a_child(partial(done, bench, again))
         here = found(bench, work) if code in (0, 3) else {}
         # chunks are not synced: a line says which stage to do again
         cure = re.search(r"do it again: pchem (\w+) (\S+) --force", f"{said} {here.get('refused', '')}")

@@ -1,6 +1,6 @@
 """How near the joint fit of several exposures comes to its Cramer-Rao bound, up to a read noise of 1 e-.
 
-Prints a table and draws it: pixels are drawn from the exact quantised law at each read noise, fitted jointly,
+Prints a table: pixels are drawn from the exact quantised law at each read noise, fitted jointly,
 and their errors compared with the joint bound: over all pixels that have a value, and over those with a good
 fit (``fit_status`` 0); beside it one sample of the middle exposure with all the frames. Where fewer pixels
 are good, a neighbouring gain was nearly as likely in the others, or was taken: those that are good are a
@@ -8,7 +8,7 @@ selection, so the ratio over all pixels says what the method does, and that over
 keeps. Between 0.42 and 0.55 e-, where the peaks of the brightest sample fade, no estimate reaches the bound:
 it takes for certain which electron each of them belongs to, and its error in H3 is a tenth of an electron.
 
-    python scripts/validation/joint_efficiency.py --figure joint_efficiency.png    # half a CPU minute
+    python scripts/validation/joint_efficiency.py    # half a CPU minute
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from helpers.bounds import cramer_rao  # noqa: E402
 from helpers.plain_law import pcd_mass  # noqa: E402
 
 from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
-from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes, styled  # noqa: E402
 
 NOISES = (0.2, 0.3, 0.4, 0.45, 0.5, 0.55, 0.6, 0.7, 0.8, 0.9, 1.0)
 EXPOSURES = (0.5, 3.0, 12.0)
@@ -98,33 +97,11 @@ def row(noise, n_pixels, n_frames):
     )
 
 
-@styled
-def figure(look, rows):
-    """Draw the relative error of g against the read noise."""
-    drawn, colours = look.empty(75.0), look.palette
-    axes = drawn.add_subplot()
-    noise = [each.noise for each in rows]
-    axes.plot(
-        noise, [100 * each.single_bound for each in rows], color=colours.vermilion, label="one sample: bound"
-    )
-    single = [100 * each.single_error for each in rows]
-    axes.plot(noise, single, "x", color=colours.vermilion, label="one sample: fitted (where it has a value)")
-    axes.plot(noise, [100 * each.bound for each in rows], color=colours.blue, label="jointly: bound")
-    for which, marker, words in (("of_all", "+", "all pixels"), ("of_good", "o", "good pixels")):
-        joint = [100 * each.bound * getattr(each, which)[0] for each in rows]
-        axes.plot(noise, joint, marker, color=colours.blue, markersize=3.5, label=f"jointly: fitted, {words}")
-    axes.axvline(0.5, color=colours.bars, linewidth=0.8, linestyle=":")
-    axes.set(yscale="log", xlabel="read noise (e⁻)", ylabel="error of the conversion gain (%)")
-    axes.legend(loc="lower right")
-    return drawn
-
-
 def main(arguments=None):
-    """Print the table; draw it where asked to."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pixels", type=int, default=300)
     parser.add_argument("--frames", type=int, default=4000, help="of each sample")
-    parser.add_argument("--figure", type=Path)
     options = parser.parse_args(arguments)
     write = sys.stdout.write
     write(
@@ -146,9 +123,6 @@ def main(arguments=None):
             f"{100 * r.single_bound:15.3f} {100 * r.single_error:6.2f} {100 * r.single_good:6.1f}\n"
         )
         sys.stdout.flush()
-    if options.figure is not None:
-        options.figure.write_bytes(drawing_bytes(figure(Look(120.0), rows), "png", dpi=150))
-        write(f"{options.figure}\n")
 
 
 if __name__ == "__main__":

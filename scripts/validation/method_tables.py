@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from typing import Any
 
 from pchem_pipeline.compute.environment import prepare_environment
 
@@ -67,21 +68,25 @@ def plan_table(options: argparse.Namespace) -> None:
     from pchem_pipeline.planning.plan import plan_one_sample, plan_samples
     from pchem_pipeline.planning.point import Point
     from pchem_pipeline.planning.targets import parse_target
-    from pchem_pipeline.planning.verify import verify, verify_samples
+    from pchem_pipeline.planning.verify import verify
 
     target = parse_target("conversion_gain=1%")
-    limits = {"budget": None, "max_exposure": 10.0, "max_frames": 1e8}
+    limits: dict[str, Any] = {"budget": None, "max_exposure": 10.0, "max_frames": 1e8}
     print(f"\nplans for {target}, {options.pixels} pixels fitted")
     print(f"{'read noise, e-':>16}{'exposures, e-':>18}{'frames':>12}{'rms error, %':>22}")
     for noise in (0.2, 0.3, 0.4, 0.5):
         for exposure in (0.5, 2.0, 8.0):
             point = Point(exposure, noise, options.gain)
             frames = int(plan_one_sample([target], point, exposure_given=True, **limits).frames)
-            row(noise, f"{exposure:g}", verify([target], point, frames, options.pixels, options.seed))
+            row(
+                noise,
+                f"{exposure:g}",
+                verify([target], point, [exposure], [frames], options.pixels, options.seed),
+            )
     for noise in (0.3, 0.6, 1.0):
         point = Point(1.0, noise, options.gain)
         plan = plan_samples([target], [0.0, 8.0], point, **limits)
-        found = verify_samples([target], point, (0.0, 8.0), plan.per_sample, options.pixels, options.seed)
+        found = verify([target], point, (0.0, 8.0), plan.per_sample, options.pixels, options.seed)
         row(noise, "0 and 8", found)
 
 

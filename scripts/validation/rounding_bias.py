@@ -1,10 +1,10 @@
 """Bias of the density's and of the exact estimates against the number of DN per electron, 0.7 to 20.
 
-Prints a table and draws it. At each 1/g pixels with biases over a whole DN are drawn from the exact
+Prints a table. At each 1/g pixels with biases over a whole DN are drawn from the exact
 quantised law and fitted with both likelihoods; beside it the bias that the density is predicted to have. All
 in standard errors of one pixel, the median over the pixels of the four parameters, the largest of the four.
 
-    python scripts/validation/rounding_bias.py --figure rounding_bias.png    # a quarter of a CPU minute
+    python scripts/validation/rounding_bias.py    # a quarter of a CPU minute
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 import numpy as np  # noqa: E402
 from helpers.plain_law import pcd_mass  # noqa: E402
 
-from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias  # noqa: E402
+from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_bias  # noqa: E402
 from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
 from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
-from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes, styled  # noqa: E402
 
 STEPS = (0.7, 0.85, 1.0, 1.2, 1.5, 1.8, 2.2, 2.7, 3.3, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0)
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
@@ -72,49 +71,18 @@ def row(step, exposure, noise, n_pixels, n_frames):
     known = np.isfinite(plain.conversion_gain)
     named = biased_by_rounding([getattr(plain, name) for name in NAMES], frames)
     return Row(
-        step, float(np.median(predicted)), *shifts, float(known.mean()), float(good.mean()),
+        step, float(np.median(predicted)), shifts[0], shifts[1], float(known.mean()), float(good.mean()),
         float(named.sum() / max(known.sum(), 1)),
     )  # fmt: skip
 
 
-@styled
-def figure(look, rows, n_pixels):
-    """Draw the biases against 1/g."""
-    drawn, colour = look.empty(75.0), look.palette
-    axes = drawn.add_subplot()
-    step = [each.step for each in rows]
-    axes.plot(
-        step,
-        [each.predicted for each in rows],
-        color=colour.vermilion,
-        label="density, predicted (typical bias)",
-    )
-    axes.plot(step, [each.density for each in rows], "x", color=colour.vermilion, label="density, fitted")
-    axes.plot(
-        step, [each.exact for each in rows], "o", color=colour.blue, markersize=3.5, label="exact, fitted"
-    )
-    axes.axhline(
-        LARGEST_BIAS, color=colour.green, linewidth=0.9, linestyle=":", label=f"limit {LARGEST_BIAS:g}"
-    )
-    # the largest of four medians of pure noise
-    axes.axhspan(
-        1e-5, 2.2 * 1.2533 / np.sqrt(n_pixels), color=colour.bars, alpha=0.3, linewidth=0, label="noise"
-    )
-    axes.set(xscale="log", yscale="log", ylim=(1e-4, 100.0))
-    axes.set(xlabel="1/g (DN per electron)", ylabel="largest bias (standard errors)")
-    axes.set_xticks([0.7, 1, 2, 5, 10, 20], labels=["0.7", "1", "2", "5", "10", "20"])
-    axes.legend(loc="upper right")
-    return drawn
-
-
 def main(arguments=None):
-    """Print the table; draw it where asked to."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pixels", type=int, default=400)
     parser.add_argument("--frames", type=int, default=17_750)
     parser.add_argument("--exposure", type=float, default=2.0, help="H, e-")
     parser.add_argument("--read-noise", type=float, default=0.3, help="analog, e-")
-    parser.add_argument("--figure", type=Path)
     options = parser.parse_args(arguments)
     write = sys.stdout.write
     write(
@@ -133,9 +101,6 @@ def main(arguments=None):
             f"{100 * r.exact_known:7.1f} {100 * r.flagged:9.1f}\n"
         )
         sys.stdout.flush()
-    if options.figure is not None:
-        options.figure.write_bytes(drawing_bytes(figure(Look(120.0), rows, options.pixels), "png", dpi=150))
-        write(f"{options.figure}\n")
 
 
 if __name__ == "__main__":

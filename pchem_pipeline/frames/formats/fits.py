@@ -59,6 +59,7 @@ class FitsReader(ContiguousReader):
     """The first image of a FITS file that has data, 2-D or 3-D."""
 
     format_name = "fits"
+    library: ClassVar[str] = "astropy"
     kind = "FITS file"
     suffixes: ClassVar[tuple[str, ...]] = (".fits", ".fit", ".fts", ".fz")
     magic: ClassVar[tuple[bytes, ...]] = (b"SIMPLE  =",)

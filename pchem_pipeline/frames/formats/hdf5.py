@@ -65,6 +65,7 @@ class Hdf5Reader(ContiguousReader):
     """One dataset of an HDF5 file."""
 
     format_name = "hdf5"
+    library: ClassVar[str] = "h5py"
     kind = "HDF5 file"
     order_by_habit = True
     suffixes: ClassVar[tuple[str, ...]] = (".h5", ".hdf5", ".hdf", ".nxs", ".nx5")

@@ -44,6 +44,7 @@ class ZarrReader(ContiguousReader):
     """A zarr array, the only stack of a zarr group, or the full resolution of an OME-Zarr image."""
 
     format_name = "zarr"
+    library: ClassVar[str] = "zarr"
     kind = "zarr store"
     suffixes: ClassVar[tuple[str, ...]] = (".zarr",)
 

@@ -45,6 +45,7 @@ class TiffReader(ContiguousReader):
     """Pages of a TIFF file as frames."""
 
     format_name = "tiff"
+    library: ClassVar[str] = "tifffile"
     kind = "TIFF file"
     suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8", ".stk")
     magic: ClassVar[tuple[bytes, ...]] = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")

@@ -1,0 +1,114 @@
+"""Which exit code each command gives where input files are gone or unreadable, or the store is half made."""
+
+import shutil
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pchem_pipeline.base.errors import ExitCode
+from pchem_pipeline.cli.app import app
+
+CONFIG = "run: {{store: run.zarr, tile: 8}}\ninput: {{files: [a.npy, b.npy], mode: {mode}}}\n"
+
+
+def _unreadable(folder):
+    (folder / "b.npy").write_bytes((folder / "b.npy").read_bytes()[:1000])
+
+
+def _gone(folder):
+    for path in folder.glob("*.npy"):
+        path.unlink()
+
+
+def _refused_then_gone(folder):
+    _unreadable(folder)
+    assert _code(folder, "ingest") == ExitCode.INPUT
+    _gone(folder)
+
+
+def _no_store(folder):
+    shutil.rmtree(folder / "run.zarr")
+
+
+def _gone_without_store(folder):
+    _no_store(folder)
+    _gone(folder)
+
+
+def _no_histogram(folder):
+    shutil.rmtree(folder / "run.zarr" / "histogram")
+
+
+def _no_files_and_no_histogram(folder):
+    _no_histogram(folder)
+    _gone(folder)
+
+
+COMMANDS = ("ingest", "histogram", "run", "fit", "status", "model", "export")
+OK, INPUT = ExitCode.OK, ExitCode.INPUT
+
+#: Of a run that has its histograms: what happened to it, and the exit code of each command then.
+TABLE = {
+    "files unreadable": (_unreadable, (INPUT, OK, INPUT, OK, OK, OK, INPUT)),
+    "files gone": (_gone, (OK, OK, OK, OK, OK, OK, INPUT)),
+    "files refused, then gone": (_refused_then_gone, (OK, OK, OK, OK, OK, OK, INPUT)),
+    "files gone, no store": (_gone_without_store, (INPUT, INPUT, INPUT, INPUT, OK, INPUT, INPUT)),
+    "no store": (_no_store, (OK, INPUT, OK, INPUT, OK, INPUT, INPUT)),
+    "no histogram in the store": (_no_histogram, (OK, OK, OK, INPUT, OK, OK, INPUT)),
+    "files gone, no histogram": (_no_files_and_no_histogram, (OK, OK, OK, INPUT, OK, OK, INPUT)),
+}
+#: Where the frames stay in the files, what differs from this.
+REFERENCED = {
+    "files refused, then gone": {},
+    "files gone, no histogram": {"histogram": INPUT, "run": INPUT},
+}
+
+
+def _invoke(folder, command, *options):
+    until = ("--until", "histogram") if command == "run" else ()
+    place = ("--output", str(folder / command)) if command == "export" else ()
+    return CliRunner().invoke(app, [command, str(folder / "run.yaml"), *until, *place, *options])
+
+
+def _code(folder, command):
+    error = _invoke(folder, command).exception
+    return ExitCode.OK if error is None else getattr(error, "exit_code", ExitCode.INTERNAL)
+
+
+@pytest.fixture(scope="module")
+def counted(tmp_path_factory):
+    """Folders of a run up to its histograms, by how it reads its files."""
+    rng = np.random.default_rng(4)
+    folders = {}
+    for mode in ("copy", "reference"):
+        folders[mode] = tmp_path_factory.mktemp(mode)
+        for name in ("a", "b"):
+            frames = np.rint(100 + 9 * rng.poisson(2, (300, 8, 8)) + rng.normal(0, 2, (300, 8, 8)))
+            np.save(folders[mode] / f"{name}.npy", frames.astype(np.uint16))
+        (folders[mode] / "run.yaml").write_text(CONFIG.format(mode=mode))
+        assert _code(folders[mode], "run") == ExitCode.OK
+    return folders
+
+
+@pytest.mark.parametrize(
+    ("mode", "state"),
+    [*(("copy", state) for state in TABLE), *(("reference", state) for state in REFERENCED)],
+)
+def test_exit_codes_are_those_of_the_table(counted, mode, state, tmp_path):
+    happens, codes = TABLE[state]
+    wanted = dict(zip(COMMANDS, codes, strict=True)) | (REFERENCED[state] if mode == "reference" else {})
+    found = {}
+    for command in COMMANDS:
+        folder = tmp_path / command
+        shutil.copytree(counted[mode], folder)
+        happens(folder)
+        found[command] = _code(folder, command)
+    assert found == wanted
+
+
+def test_missing_files_are_named_with_the_cure(counted, tmp_path):
+    shutil.copytree(counted["copy"], tmp_path / "run")
+    _gone_without_store(tmp_path / "run")
+    message = str(_invoke(tmp_path / "run", "ingest").exception)
+    assert "a.npy and 1 more (last b.npy): no such file or folder; bring it back" in message
