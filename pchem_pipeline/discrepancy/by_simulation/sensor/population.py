@@ -196,7 +196,7 @@ def shrinkage_bias(posterior: Posterior, totals: NDArray[np.integer], law: Sampl
 
 
 def clipped_mean(values: FloatArray) -> FloatArray:
-    """Return means over the pixels, (n, m) -> (m,), pixels far from the others cut to three deviations."""
+    """Return means over the pixels, (n, m) -> (m,), one at least, those far off cut to three deviations."""
     middle = np.median(values, axis=0)
     widest = 3.0 * robust_sd(values, middle, axis=0)
     return np.asarray(np.clip(values, middle - widest, middle + widest).mean(axis=0))
@@ -205,7 +205,7 @@ def clipped_mean(values: FloatArray) -> FloatArray:
 def posterior_of_estimates(parameters: FloatArray, covariance: FloatArray) -> Posterior:
     """Learn the same from estimates (n, 4) with covariances (n, 4, 4), whose errors are taken for Gaussian.
 
-    Pixels without them are drawn like the others.
+    Pixels without them are drawn like the others; one at least has them.
     """
     known = np.asarray(np.isfinite(parameters).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
     theta = to_theta(np.where(known[:, None], parameters, 1.0))
@@ -514,8 +514,10 @@ def _cumulants(pixels: _Pixels) -> tuple[FloatArray, FloatArray]:
         ]
     )
     apart = np.abs(k - np.median(k, axis=1)[:, None])
-    usual = (apart <= _OUTLYING * np.median(apart, axis=1)[:, None]).all(axis=0)
-    return mean, k[:, usual]
+    middle = np.maximum(np.median(apart, axis=1), np.finfo(np.float64).tiny)
+    farthest = (apart / middle[:, None]).max(axis=0)
+    # of pixels of several kinds each may stand out in another cumulant
+    return mean, k[:, farthest <= max(_OUTLYING, float(np.median(farthest)))]
 
 
 def _first_guess(theta: FloatArray) -> Population:
