@@ -315,7 +315,8 @@ class Sensor:
         Raises:
             NotFittedError: no pixel is fitted in both.
         """
-        both = _some(wanted.usable & simulated.usable).ravel()
+        both = (wanted.usable & simulated.usable).ravel()
+        _need(both.any())
         theta = [
             to_theta(np.stack([m.ravel()[both] for m in fit.maps], axis=1)) for fit in (wanted, simulated)
         ]
@@ -330,15 +331,10 @@ class Sensor:
         return replace(maps, usable=self.usable & self.drawn)
 
 
-def _some(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which pixels are known, one of them at least.
-
-    Raises:
-        NotFittedError: none is.
-    """
-    if not pixels.any():
+def _need(some: bool | np.bool_) -> None:
+    """Raise a NotFittedError where it is not true that some pixels are known."""
+    if not some:
         raise NotFittedError("no pixel can be fitted with it")
-    return pixels
 
 
 def learn_sensor(
@@ -372,7 +368,7 @@ def learn_sensor(
     law = _law_of_all(effects, parameters, places, fit.added)
     if law is None or law.free_satellites:
         drawn = usable
-        _some(np.isfinite(covariance[drawn]).all(axis=(1, 2)))
+        _need(np.isfinite(covariance[drawn]).all(axis=(1, 2)).any())
         posterior = posterior_of_estimates(parameters[drawn], covariance[drawn])
         lost = lost or 0.0
     else:
@@ -380,8 +376,9 @@ def learn_sensor(
         counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
         outside = (histograms.under + histograms.over).ravel()
         drawn = (counts > 0).sum(axis=1) >= _FEWEST_CODES
-        drawn = _some(drawn & ((outside <= MOST_OUTSIDE * counts.sum(axis=1)) | usable))
-        origin = histograms.origin.ravel()
+        drawn &= (outside <= MOST_OUTSIDE * counts.sum(axis=1)) | usable
+        _need(drawn.any())
+        origin = histograms.origin.ravel().astype(np.int64)
         replaced = _replaced(effects, frames if before is None else before, places, origin, counts.shape[1])
         posterior = posterior_of(
             counts[drawn],
