@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.covariance import Covariance
-from pchem_pipeline.discrepancy.null import NullModel, moments
+from pchem_pipeline.discrepancy.null import STRAY, NullModel, moments
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
@@ -28,9 +28,8 @@ FloatArray = NDArray[np.float64]
 _REST_OF_NAMED = 0.1  # largest remaining gap beside a named effect, over the gap that the effect closes
 _FLOOR_QUANTILE = 0.95
 _INTERVAL = 1.96
-# robust standard deviations from the median beyond which a replicate is an outlier: without effects, and with
-# effects, which may occur in a few replicates only
-_APART, _APART_WITH_EFFECTS = 8.0, 30.0
+# robust standard deviations from the median beyond which a replicate without effects is an outlier
+_APART = 8.0
 
 
 @dataclass(frozen=True)
@@ -185,9 +184,7 @@ class StatisticsGap:
                 white = covariance.among(index).white(apart[:, index])
                 own[family].append(0.5 * np.sum(white**2, axis=1))
         found = {family: np.concatenate(values) for family, values in own.items()}
-        kept = among_themselves(
-            np.sum(list(found.values()), axis=0), _APART if known else _APART_WITH_EFFECTS
-        )
+        kept = among_themselves(np.sum(list(found.values()), axis=0), _APART if known else STRAY)
         found = {family: values[kept] for family, values in found.items()}
         # the vectors are kept with it: an id is given again to what comes after them
         self._known[key] = replicates, strengths, found

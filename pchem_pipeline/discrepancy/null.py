@@ -23,7 +23,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import without_skew
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
-from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR, PRICE
 
 FloatArray = NDArray[np.float64]
 
@@ -43,11 +43,11 @@ _COUNTS = ("cnt", "count", "pixels", "clusters")
 _WIDER = 0.01  # p-value below which a statistic has widened
 _REPLICATION = 0.02  # p-value required in each split, with the same sign
 #: Held-out log-likelihood ratio, nats, required where no statistic is significant by itself.
-CONVINCING = 6.0
+CONVINCING = 2.0 * PRICE
 _SUSPICION = 0.1  # global p-value below which candidates are compared
-# robust standard deviations at which replicates are winsorised: with effects, which may change a few
-# replicates only, and without
-_STRAY, _STRAY_ALONE = 30.0, 10.0
+#: Robust standard deviations beyond which a replicate is an outlier: with effects, which may change a few
+#: replicates only; and at which a statistic is winsorised without any.
+STRAY, _STRAY_ALONE = 30.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class NullModel:
                 neither shift nor widen are pooled with it.
             effects: whether the model has effects, as one with a model before it has.
         """
-        vectors = without_strays(vectors, _STRAY if effects or before is not None else _STRAY_ALONE)
+        vectors = without_strays(vectors, STRAY if effects or before is not None else _STRAY_ALONE)
         mean, std, covariance = moments(vectors)
         skewness = _skewness(names, vectors)
         tests = _effective_tests(names, vectors, skewness)
@@ -140,14 +140,14 @@ class NullModel:
         """Degrees of freedom of the standard deviations."""
         return self.n_replicates - 1 + _PRIOR_WEIGHT
 
-    def pulls(self, z: FloatArray, splits: int = 1) -> FloatArray:
-        """Compute (z - mean) / (std sqrt(1/splits + 1/b)) for the mean of ``splits`` vectors."""
-        scale = np.sqrt(1.0 / splits + 1.0 / self.n_replicates)
-        return np.asarray((z - self.mean) / (self.std * scale))
+    def pulls(self, z: FloatArray, splits: int = 1, tolerance: FloatArray | float = 0.0) -> FloatArray:
+        """Compute (z - mean) / sqrt(std^2 (1/splits + 1/b) + tolerance^2), z a mean of ``splits`` vectors."""
+        chance = self.std**2 * (1.0 / splits + 1.0 / self.n_replicates)
+        return np.asarray((z - self.mean) / np.sqrt(chance + np.square(tolerance)))
 
-    def p_values(self, z: FloatArray, splits: int = 1) -> FloatArray:
+    def p_values(self, z: FloatArray, splits: int = 1, tolerance: FloatArray | float = 0.0) -> FloatArray:
         """Compute two-sided p-values of the mean of ``splits`` vectors."""
-        return self.p_of(self.pulls(z, splits), splits)
+        return self.p_of(self.pulls(z, splits, tolerance), splits)
 
     def p_of(self, pulls: FloatArray, splits: int = 1) -> FloatArray:
         """Compute two-sided p-values of pulls of the mean of ``splits`` vectors.
@@ -179,7 +179,7 @@ def two_sided(pulls: FloatArray, freedom: float) -> FloatArray:
     return np.asarray(np.maximum(2.0 * special.stdtr(freedom, -np.abs(pulls)), 1e-300))
 
 
-def without_strays(vectors: FloatArray, apart: float = _STRAY) -> FloatArray:
+def without_strays(vectors: FloatArray, apart: float = STRAY) -> FloatArray:
     """Winsorise replicates, (b, m), at ``apart`` robust standard deviations from the median.
 
     A single badly fitted pixel makes a sum of squares of one replicate thousands of times as large as in all
@@ -335,9 +335,9 @@ def disagrees(
         tolerance: model error of each statistic, shape (m,), added in quadrature: effects in the model are
             never known exactly.
     """
-    p = _p_values(null, z, tolerance)
+    p = null.p_values(z.both, 2, tolerance)
     limit = 1.0 - (1.0 - significance) ** (1.0 / null.effective_tests)
-    pulls = [_pulls(null, part, tolerance, 1) for part in (z.train, z.test)]
+    pulls = [null.pulls(part, 1, tolerance) for part in (z.train, z.test)]
     alone = [null.p_of(pull) < _REPLICATION for pull in pulls]
     same = alone[0] & alone[1] & (pulls[0] * pulls[1] > 0)
     same |= np.isin(null.names, list(EXACT))  # no false positives: one split is enough
@@ -369,15 +369,6 @@ def misfits(
     signature = np.abs(shift) > CLEAR * null.std
     if not signature.any():
         return False
-    smallest = float(_p_values(null, z, tolerance)[signature].min())
+    smallest = float(null.p_values(z.both, 2, tolerance)[signature].min())
     tests = min(null.effective_tests, float(signature.sum()))
     return look_elsewhere(smallest, tests) < significance
-
-
-def _p_values(null: NullModel, z: Measured, tolerance: FloatArray | float) -> FloatArray:
-    return null.p_of(_pulls(null, z.both, tolerance, 2), 2)
-
-
-def _pulls(null: NullModel, z: FloatArray, tolerance: FloatArray | float, splits: int) -> FloatArray:
-    chance = null.std**2 * (1.0 / splits + 1.0 / null.n_replicates)
-    return np.asarray((z - null.mean) / np.sqrt(chance + np.square(tolerance)))

@@ -52,7 +52,7 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     if effect.far_reaching:
         blocks = max(_BLOCKS * _MOST_ROWS**2 // maps.usable.size, _FEWEST_BLOCKS)
     else:
-        maps = PixelMaps(*(np.asarray(getattr(maps, name))[:_MOST_ROWS, :_MOST_ROWS] for name in _FIELDS))
+        maps = maps.of(np.s_[:_MOST_ROWS, :_MOST_ROWS])
     if not maps.usable.any():
         return None
     blocks = min(blocks, -(-n_frames // _BLOCK_FRAMES))
@@ -124,9 +124,6 @@ def _spread(changes: Sequence[NDArray[np.float64]], share: float) -> float:
     """Return by how much samples change from frame to frame, where they change if that is rare."""
     mean_square = np.mean([np.mean((change - change.mean(axis=0)) ** 2) for change in changes])
     return float(np.sqrt(mean_square / (share if 0.0 < share < RARE else 1.0)))
-
-
-_FIELDS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "usable")
 
 
 def _watched(effect: Effect, seen: list[NDArray[np.float64]]) -> Effect:

@@ -11,8 +11,8 @@ from scipy import special
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     LARGEST_DECREASE,
     Hypothesis,
-    Noise,
     correction,
+    counted,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import noise_of_splits
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import ESTABLISHED, Refitted, lesser
@@ -75,7 +75,7 @@ class Acceptance:
         events, where chance makes one, is known to a third: there it counts how far from chance they are.
         """
         first, n, model_error = self.first, len(added.vectors), self.settings.model_error
-        certain = _certain(added, self.z.both - first.mean, noise_of_splits(first, 2, model_error))
+        certain = counted(added.parts, self.z.both - first.mean, noise_of_splits(first, 2, model_error))
         noise = noise_of_splits(first, 1, model_error)
         noise = replace(noise, covariance=added.covariance.times(1.0 + 1.0 / n))
         # about the set at its best fit: strong effects do not add up to what they do together
@@ -119,9 +119,3 @@ def _overwhelming(parts: FloatArray, shift: FloatArray, scatter: FloatArray) -> 
     beyond = (np.abs(shift) - others) * np.sign(shift)
     least = _OVERWHELMING * scatter
     return np.asarray(((beyond * np.sign(parts) > least) & (np.abs(parts) > least)).any(axis=1))
-
-
-def _certain(added: Refitted, shift: FloatArray, noise: Noise) -> NDArray[np.bool_]:
-    """Tell which effects an exact count asks for, however few events it has."""
-    counted = (added.parts * noise.events > 0.0) & (shift > 0.0)
-    return np.asarray(counted.any(axis=1))

@@ -12,14 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from pchem_pipeline.model.arithmetic.robust import chi_square as chi_square
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
 FloatArray = NDArray[np.float64]
 
 _SMALL = 1e-12
 # an event that is next to impossible counts as much as this many standard deviations
 _CERTAIN = 10.0
-#: Coincidences expected, below which each is proof.
-RARE = 1e-3
 #: Standard deviations: values beyond count as so many, so that a few of them make no mean.
 FAR = 6.0
 #: Slowest waves along a series whose squares are summed (the adaptive test of Neyman, Fan 1996).
@@ -53,7 +52,7 @@ def poisson(count: int, expected: float) -> float:
 
 def repeats(count: int, expected: float) -> float:
     """Return 10 for each coincidence that cannot happen; where they do happen, what :func:`counted` says."""
-    return float(_CERTAIN * count) if expected < RARE else float(counted(count, expected))
+    return float(_CERTAIN * count) if expected < SIGNIFICANCE else float(counted(count, expected))
 
 
 def largest_normal(values: FloatArray) -> float:

@@ -13,14 +13,13 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
 Level = Literal["good", "note", "caution", "serious"]
 
-#: A check has failed if its p-value, corrected for the number of checks, is below this.
-SIGNIFICANCE = 1e-3
 #: Share of the read noise from which a size deserves caution, and from which it is serious: in quadrature a
 #: tenth adds half a per cent to the read noise, a half adds an eighth.
 _SOME, _MUCH = 0.1, 0.5

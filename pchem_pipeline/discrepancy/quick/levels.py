@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
+from pchem_pipeline.model.arithmetic.significance import CERTAIN
 from pchem_pipeline.model.histogram.odd_frames import FEWEST_FRAMES, frame_words
 
 FloatArray = NDArray[np.float64]
 
 #: Frames of a level, at least, and as a share of all.
 _FEWEST_OF_LEVEL, _LEAST_SHARE = 4, 0.01
-#: Gap between two levels, in standard deviations within them. The halves of a normal or a uniform
-#: distribution of n frames are some 4/n apart.
-_CLEAN = 4.0
 #: Growth of the variance with the mean, as a share of that of shot noise; an offset has none.
 _SHOT_SHARE = 0.25
 _MOST_LEVELS = 8
@@ -90,7 +88,8 @@ def _halves(frames: NDArray[np.int64], mean: FloatArray, fewest: int) -> list[ND
     cut = int(count[np.argmax(below**2 / (count * (n - count)))])
     low, high = values[:cut], values[cut:]
     within = float(np.sqrt((cut * low.var() + (n - cut) * high.var()) / n))
-    if high[0] - low[-1] <= _CLEAN * within:
+    # the halves of a normal or a uniform distribution of n frames are some 4/n standard deviations apart
+    if high[0] - low[-1] <= CERTAIN * within:
         return None
     return [np.sort(ordered[:cut]), np.sort(ordered[cut:])]
 

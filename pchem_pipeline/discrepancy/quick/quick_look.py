@@ -25,7 +25,7 @@ from scipy import special
 
 from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
-from pchem_pipeline.discrepancy.quick.checks import KINDS, SIGNIFICANCE, Check, QuickLook, check_of, graded
+from pchem_pipeline.discrepancy.quick.checks import KINDS, Check, QuickLook, check_of, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.places import block_deviations, sensor_cells, sensor_places
@@ -34,6 +34,7 @@ from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, SIGNIFICANCE
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_words, odd_words
 from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY
 from pchem_pipeline.model.maps.ordered import median_of
@@ -45,9 +46,6 @@ FloatArray = NDArray[np.float64]
 
 #: Lines with a variance above this multiple of the median hold hot pixels, and are left out of frame means.
 _LOUD = 4.0
-#: Standard deviations beyond which single pixels and lines do not count any more: a few tracks of particles
-#: or blinking pixels are no property of the sensor.
-_CLIP = 5.0
 #: Standard deviations from which on a check fails for sure (19 of 20), with a dozen checks.
 _SURE = 5.4
 _FEWEST_LINES = 4
@@ -266,7 +264,7 @@ def _of_lines(lines: Lines) -> _Estimate:
     if some.size < _FEWEST_LINES:
         return _NOTHING
     error = lines.covariance[1][some]
-    value = np.clip(z, centre - _CLIP * spread, centre + _CLIP * spread) * error
+    value = np.clip(z, centre - BEYOND_DOUBT * spread, centre + BEYOND_DOUBT * spread) * error
     weight = error**-2
     total = float(weight.sum())
     effective = total**2 / float((weight**2).sum())
@@ -355,7 +353,7 @@ class _Common:
         scale = float(variance.sum())
         # a few frames with a track of a particle do not count in full
         typical = max(1.0, float(np.median(total**2)) / (0.455 * scale))
-        products = np.minimum(products, _CLIP**2 * typical * scale)
+        products = np.minimum(products, BEYOND_DOUBT**2 * typical * scale)
         freedom = sums.freedom
         value = float(products.sum()) / freedom
         chance = math.sqrt(2.0 / freedom * (scale**2 - float((variance**2).sum())))
@@ -407,7 +405,8 @@ def _resemblance(
     z = covariance[some]
     z /= size
     z *= math.sqrt(freedom)
-    np.clip(z, -_CLIP, _CLIP, out=z)
+    # a few tracks of particles or blinking pixels are no property of the sensor
+    np.clip(z, -BEYOND_DOUBT, BEYOND_DOUBT, out=z)
     ratio = float(np.mean(np.minimum(1.0 / size, 4.0 / median_of(size))))
     mean = float(z.mean()) / math.sqrt(freedom) - shared[0] * ratio
     error = math.hypot(math.sqrt(common.inflation / freedom / z.size), shared[1] * ratio)

@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 _REWEIGHTINGS = 3
 _LEAK = 0.1
 LARGEST_DECREASE, _LARGEST_INCREASE = 0.75, 3.0
-PRICE_OF_MORE = 6.0  # nats for every further one
+PRICE_OF_MORE = 2.0 * PRICE  # nats for every further one
 _LARGEST_SET = 3
 _SHORTLIST = (4, 3, 2)  # hypotheses that are taken alone, beside the best one, and beside the best two
 #: Nats behind from which on a fingerprint is no rival of a right set, and share of what there is to explain,
@@ -198,8 +198,18 @@ def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -
         variance = np.diag(np.linalg.pinv(design.T @ design))
         # where effects do the same, rounding may leave less than nothing of what separates them
         stderr = np.sqrt(np.where(variance > 0.0, variance, np.inf))
-    counted = (columns * factors[:, None] * noise.events > 0.0) & (shift > 0.0)
-    return SetFit(tuple(hypotheses), factors, stderr, np.asarray(counted.any(axis=1)))
+    return SetFit(tuple(hypotheses), factors, stderr, counted(columns * factors[:, None], shift, noise))
+
+
+def counted(parts: FloatArray, shift: FloatArray, noise: Noise) -> NDArray[np.bool_]:
+    """Tell which effects an exact count asks for, however few events it has, shape (e,).
+
+    Args:
+        parts: shifts of the statistics by effect, shape (e, m).
+        shift: what is seen of all, shape (m,).
+        noise: of the shift.
+    """
+    return np.asarray(((parts * noise.events > 0.0) & (shift > 0.0)).any(axis=1))
 
 
 def held_out_gain(

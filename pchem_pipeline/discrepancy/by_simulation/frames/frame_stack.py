@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.frames.suspects import with_ends
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition
-from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
+from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence
 from pchem_pipeline.discrepancy.splits import Splits, block_length, split_frames
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
@@ -95,19 +94,8 @@ class FrameStack:
         return self.numbers[self.seen]
 
     def observe(self, part: IntArray, maps: PixelMaps | None = None) -> Evidence:
-        """Observe some frames, and as replicates are observed: near known maps, and the same pixels.
-
-        A fit from nothing finds a bias that is off by an electron more often than one near the truth: then
-        frames and replicates would differ without any effect.
-        """
-        return observe(
-            self.stack[part],
-            self.numbers[part],
-            n_run=self.n_run,
-            block_frames=self.splits.block_frames,
-            exclude=None if maps is None else ~maps.usable,
-            start=maps,
-        )
+        """Observe some frames as replicates are observed."""
+        return self.acquisition().observe(self.stack[part], self.numbers[part], maps)
 
     def with_parts(self, parts: tuple[Part, ...]) -> FrameStack:
         """Return it with parts, dealt in blocks so short that a range of frames is alike in all splits."""
@@ -142,15 +130,7 @@ class FrameStack:
 
     def statistics(self, part: IntArray, evidence: Evidence) -> dict[str, float]:
         """Return the statistics of some frames, those of the parts included, as replicates have them."""
-        apart = part_statistics(
-            self.stack[part],
-            self.numbers[part],
-            evidence.maps,
-            self.parts,
-            block_frames=self.splits.block_frames,
-            window=self.window,
-        )
-        return {**evidence.z, **apart}
+        return self.acquisition().statistics(self.stack[part], self.numbers[part], evidence)
 
     def seen_apart(self, evidence: Evidence) -> list[tuple[Part, Evidence]]:
         """Return the evidence of each part, of train and test frames together."""

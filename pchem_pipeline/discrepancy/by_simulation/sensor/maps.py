@@ -311,8 +311,12 @@ class Sensor:
         Args:
             wanted: plain fits of the data.
             simulated: of a sensor drawn from this one, with the effects of the model.
+
+        Raises:
+            NotFittedError: no pixel is fitted in both.
         """
         both = (wanted.usable & simulated.usable).ravel()
+        _need(both.any())
         theta = [
             to_theta(np.stack([m.ravel()[both] for m in fit.maps], axis=1)) for fit in (wanted, simulated)
         ]
@@ -325,6 +329,12 @@ class Sensor:
         """Return the same of the pixels whose fit can be relied upon."""
         maps = self.draw(seed)
         return replace(maps, usable=self.usable & self.drawn)
+
+
+def _need(some: bool | np.bool_) -> None:
+    """Raise a NotFittedError where it is not true that some pixels are known."""
+    if not some:
+        raise NotFittedError("no pixel can be fitted with it")
 
 
 def learn_sensor(
@@ -347,6 +357,9 @@ def learn_sensor(
         lost: see :class:`Sensor`; None: not known yet.
         before: frames like these before effects replaced samples of them, which tell what stands in for
             each; None: those that were fitted, which differ little.
+
+    Raises:
+        NotFittedError: no pixel tells anything.
     """
     maps = fit.maps
     usable = maps.usable.ravel()
@@ -355,6 +368,7 @@ def learn_sensor(
     law = _law_of_all(effects, parameters, places, fit.added)
     if law is None or law.free_satellites:
         drawn = usable
+        _need(np.isfinite(covariance[drawn]).all(axis=(1, 2)).any())
         posterior = posterior_of_estimates(parameters[drawn], covariance[drawn])
         lost = lost or 0.0
     else:
@@ -363,7 +377,8 @@ def learn_sensor(
         outside = (histograms.under + histograms.over).ravel()
         drawn = (counts > 0).sum(axis=1) >= _FEWEST_CODES
         drawn &= (outside <= MOST_OUTSIDE * counts.sum(axis=1)) | usable
-        origin = histograms.origin.ravel()
+        _need(drawn.any())
+        origin = histograms.origin.ravel().astype(np.int64)
         replaced = _replaced(effects, frames if before is None else before, places, origin, counts.shape[1])
         posterior = posterior_of(
             counts[drawn],

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.effort import MOST_LEARNT_FROM
 from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.arithmetic.significance import POSSIBLE
 from pchem_pipeline.model.fit.climb_numba import LEAST_STEP, MAX_LOG_EXPOSURE
 from pchem_pipeline.model.fit.shared import LOWEST_LOG_VARIANCE, to_parameters, to_theta
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
@@ -45,15 +46,13 @@ _LARGEST_STEP = np.array([0.7, 0.15, 0.5, 0.8])  # of theta at once; of mu in DN
 # scatters below which pixels are alike for all purposes: of log H, log 1/g, mu (DN), log sigma_R^2
 _LEAST_SCATTER = np.array([2e-3, 2e-4, 5e-3, 2e-3])
 _LOWEST_LOG_EXPOSURE = float(np.log(1e-5))
-_HARDLY_ANY = 0.003  # share of mistaken pixels up to which the fits are nearly the truth
+_HARDLY_ANY = 0.003  # share of pixels, mistaken ones say: what they are like does not count
 #: The same beyond which they are no start, and what is learnt does not rest on the pixels' maxima.
 MANY_MISTAKEN = 0.3
 _SHIFTS = (0, 1, -1)  # electrons by which a bias may be mistaken
 _ALIKE = np.array([0.3, 0.02, 0.5, 0.15])  # scatter of theta of pixels that are much alike
 _WIDEST_DRAW = 1.5  # of log H and log sigma_R^2 from the maximum
-_RARE = 0.003
 _ARRIVED = 0.2  # nats, twice the rise that a further step promises: more, and a point is no maximum
-_APART = 4.0  # squared standard deviations between two maxima
 _AGAIN = 100  # resamplings of the pixels behind the error of the centre
 _LARGEST_ERROR = np.array([0.8, 0.25, np.inf, 0.8])  # of theta
 _USUAL_NOISE, _NOISE_RANGE = 0.3, 0.2  # e-^2: squared read noise where peaks are hardly resolved, its scatter
@@ -196,7 +195,7 @@ def shrinkage_bias(posterior: Posterior, totals: NDArray[np.integer], law: Sampl
 
 
 def clipped_mean(values: FloatArray) -> FloatArray:
-    """Return means over the pixels, (n, m) -> (m,), pixels far from the others cut to three deviations."""
+    """Return means over the pixels, (n, m) -> (m,), one at least, those far off cut to three deviations."""
     middle = np.median(values, axis=0)
     widest = 3.0 * robust_sd(values, middle, axis=0)
     return np.asarray(np.clip(values, middle - widest, middle + widest).mean(axis=0))
@@ -205,7 +204,7 @@ def clipped_mean(values: FloatArray) -> FloatArray:
 def posterior_of_estimates(parameters: FloatArray, covariance: FloatArray) -> Posterior:
     """Learn the same from estimates (n, 4) with covariances (n, 4, 4), whose errors are taken for Gaussian.
 
-    Pixels without them are drawn like the others.
+    Pixels without them are drawn like the others; one at least has them.
     """
     known = np.asarray(np.isfinite(parameters).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
     theta = to_theta(np.where(known[:, None], parameters, 1.0))
@@ -294,7 +293,7 @@ class _Maxima:
             for i in range(j):  # one of the earlier ones again
                 apart = ends[j] - ends[i]
                 distance = np.einsum("na,nab,nb->n", apart, precision[i], apart)
-                counts[j] &= ~counts[i] | (distance > _APART)
+                counts[j] &= ~counts[i] | (distance > POSSIBLE**2)
         # the prior's factor, its scatter widened in each pixel
         factor = 0.5 * np.linalg.slogdet(prior)[1] - 2.0 * np.log(self.widening)
         self.evidence = np.logaddexp.reduce(evidence, axis=0) + factor
@@ -326,7 +325,7 @@ class _Maxima:
     def likely(self, population: Population) -> _Maxima:
         """Return the maxima without those kinds that hardly a pixel has."""
         share = self.solve(population)[2].mean(axis=1)
-        return self._among((share > _RARE) | (np.arange(share.size) == 0), slice(None))
+        return self._among((share > _HARDLY_ANY) | (np.arange(share.size) == 0), slice(None))
 
     def posterior(self, population: Population) -> Posterior:
         """Return the posterior under a population."""
@@ -514,8 +513,10 @@ def _cumulants(pixels: _Pixels) -> tuple[FloatArray, FloatArray]:
         ]
     )
     apart = np.abs(k - np.median(k, axis=1)[:, None])
-    usual = (apart <= _OUTLYING * np.median(apart, axis=1)[:, None]).all(axis=0)
-    return mean, k[:, usual]
+    middle = np.maximum(np.median(apart, axis=1), np.finfo(np.float64).tiny)
+    farthest = (apart / middle[:, None]).max(axis=0)
+    # of pixels of several kinds each may stand out in another cumulant
+    return mean, k[:, farthest <= max(_OUTLYING, float(np.median(farthest)))]
 
 
 def _first_guess(theta: FloatArray) -> Population:

@@ -205,7 +205,8 @@ def _all_seen(search: Search, one: Refitted) -> bool:
     if not complete and not all(own.any() for own in apart):
         return False
     for hypothesis in one.hypotheses:
-        others = search.at_best_fit([h for h in one.hypotheses if h is not hypothesis])
+        rest = [h for h in one.hypotheses if h is not hypothesis]
+        others = search.at_best_fit(rest, one.penalised_log_likelihood)
         if others is None:
             return False
         part = hypothesis.fingerprint

@@ -183,14 +183,20 @@ class Search:
             note_defect(self.refitter.defects, " + ".join(h.tag for h in trial.members), error)
             trial.ended = True
 
-    def settle(self, trial: Trial) -> Refitted | None:
-        """Simulate a trial to its best strengths; None where it cannot be fitted."""
-        while not trial.ended:
+    def settle(self, trial: Trial, least: float = -np.inf) -> Refitted | None:
+        """Simulate a trial to its best strengths; None where it cannot be fitted.
+
+        Or until it cannot come to ``least`` nats, less the price of its effects.
+        """
+        while not trial.ended and _may_reach(trial, least):
             self.advance(trial)
         return None if trial.way is None else trial.way.best
 
-    def at_best_fit(self, members: Sequence[Hypothesis]) -> Refitted | None:
-        """Return a set of some effects at its best fit, at numbers of its own where these were tuned."""
+    def at_best_fit(self, members: Sequence[Hypothesis], least: float = -np.inf) -> Refitted | None:
+        """Return a set of some effects at its best fit, at numbers of its own where these were tuned.
+
+        Or at strengths from where it cannot come to ``least`` nats, less the price of its effects.
+        """
         tags = {h.tag for h in members}
         tuned = next(
             (
@@ -204,7 +210,7 @@ class Search:
             return tuned
         self.add(members)
         trial = next((each for each in self.trials if same_kinds(members, each.members)), None)
-        return None if trial is None else self.settle(trial)
+        return None if trial is None else self.settle(trial, least)
 
     def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]]) -> None:
         """Measure what is left without effects, then beside the best set; at the limit some is left out.
@@ -279,12 +285,10 @@ class Search:
             if named and self._is_blind(trial.members):
                 return False
             share = _FAR_SHARE if named and len(trial.members) >= len(best.hypotheses) else FAR_SHARE_OF_PART
-            doubt = FAR + share * explained
-        else:
-            if len(trial.members) == 1 and self._explains_a_part(trial.way.best):
-                return False
-            doubt = _MISJUDGED * (trial.promise - trial.way.best.penalised_log_likelihood)
-        return trial.promise + doubt >= best.penalised_log_likelihood
+            return trial.promise + FAR + share * explained >= best.penalised_log_likelihood
+        if len(trial.members) == 1 and self._explains_a_part(trial.way.best):
+            return False
+        return _may_reach(trial, best.penalised_log_likelihood)
 
     def _explains_a_part(self, one: Refitted) -> bool:
         """Test whether an effect not at its best strength will leave far more than chance at that, too."""
@@ -325,6 +329,14 @@ class Search:
                 own = {h.tag: h for h in one.hypotheses} | own
         known = tuple(own.get(h.tag, h) for h in members)
         return tuple(members) if meets_itself(known) else known
+
+
+def _may_reach(trial: Trial, least: float) -> bool:
+    """Test whether further steps of a trial may bring it to a log score, less the price of its effects."""
+    if trial.way is None:
+        return True
+    doubt = _MISJUDGED * (trial.promise - trial.way.best.penalised_log_likelihood)
+    return trial.promise + doubt >= least
 
 
 def compare(

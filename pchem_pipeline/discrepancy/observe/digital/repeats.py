@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -73,7 +74,7 @@ class Repeats:
         }
         for name, found in (("rows", self.rows), ("columns", self.columns)):
             expected = n_frames * chance[name]
-            if expected < laws.RARE and by_axis[name].size > 1:
+            if expected < SIGNIFICANCE and by_axis[name].size > 1:
                 z[f"space.repeated.{name}"] = laws.repeats(found, expected)
         return z
 

@@ -13,7 +13,7 @@ from helpers.quick_stacks import EXPOSURE, GAIN, READ_NOISE, added, codes_of, ma
 from pchem_pipeline import fit_counts
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.quick import places
-from pchem_pipeline.discrepancy.quick.checks import KINDS, SIGNIFICANCE, Check, QuickLook
+from pchem_pipeline.discrepancy.quick.checks import KINDS, Check, QuickLook
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.levels import levels_check
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
@@ -22,6 +22,7 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.operators.offsets import ColumnNoise, RowNoise
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY, FrameSpectrum

@@ -1,22 +1,26 @@
 """Sensors for simulations and sensors that a search learns: pixels scatter as the true parameters do."""
 
+from dataclasses import replace
 from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
 from helpers.small_sensors import context_of
+from scipy import stats
 
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import serial
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     MANY_MISTAKEN,
+    NotFittedError,
     Refit,
     learn_sensor,
     refit_maps,
 )
-from pchem_pipeline.discrepancy.by_simulation.sensor.population import posterior_of_estimates
+from pchem_pipeline.discrepancy.by_simulation.sensor.population import posterior_of, posterior_of_estimates
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import (
     Acquisition,
     Replicate,
@@ -157,6 +161,38 @@ def test_pixels_of_a_sharp_sensor_stay_what_they_are():
     # drawn within the error of the fit
     assert 0.7 < off.std() < 1.3
     assert (sensor.usual(1).usable == some).all()
+
+
+def test_a_sensor_of_three_kinds_of_pixels_is_learnt():
+    """Each kind stands out in another cumulant: none of them is left out for it."""
+    codes, electrons = np.arange(2000), np.arange(200)
+    kinds = ((96.5, 1.19, 7.89), (0.00903, 12.1, 20.0), (0.277, 3.84, 13.96))  # e-, DN per e-, DN
+    counts = [
+        1e9 * stats.poisson.pmf(electrons, h) @ stats.norm.pdf(codes, 900 + g * electrons[:, None], noise)
+        for h, g, noise in kinds
+    ]
+    counts = np.rint(np.repeat(counts, 4, axis=0)).astype(np.uint32)
+    nothing = np.full((12, 4), np.nan)
+    drawn = posterior_of(counts, np.zeros(12, np.int64), nothing).draw(np.random.default_rng(1))
+    assert np.isfinite(drawn).all()
+
+
+class Lawless(RowNoise):
+    def sample_law(self, model, maps):
+        raise ConfigError("no law")
+
+
+def test_a_sensor_of_which_no_pixel_is_known_is_not_learnt():
+    _, seen, sensor = learnt(PlainCamera(0.22, 1.5, 12.0, (8, 8), 400, SPREAD), 4)
+    none = replace(seen.maps, usable=np.zeros((8, 8), np.bool_))
+    with pytest.raises(NotFittedError, match="no pixel"):
+        sensor.corrected(seen.maps, none)
+    unknown = Refit(seen.maps, {}, np.full((8, 8, 4, 4), np.nan))
+    frames = np.zeros((8, 8, 8), np.uint16)
+    with pytest.raises(NotFittedError, match="no pixel"):
+        learn_sensor(frames, np.arange(8), unknown, (Lawless(row_noise_dn=1.0),), 0.0)
+    with pytest.raises(NotFittedError, match="no pixel"):
+        learn_sensor(frames, np.arange(8), unknown, (), 0.0)
 
 
 def test_errors_of_estimates_are_taken_off():

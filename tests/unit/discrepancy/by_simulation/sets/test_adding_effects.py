@@ -270,6 +270,18 @@ def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> No
     assert begun(members[:2], known, alone)[0].effect == alone.effects[0]
 
 
+def test_a_set_that_cannot_come_to_another_is_not_simulated_further() -> None:
+    world = World([effect("row_noise", 0.4), effect("frame_noise", 0.4)])
+    search = Search(world.refitter(), HistogramLikelihood())
+    both = search.at_best_fit([hypothesis("row_noise", 0.4), hypothesis("frame_noise", 0.4)])
+    before = world.drawn
+    begun = search.at_best_fit([hypothesis("row_noise")], both.penalised_log_likelihood)
+    assert world.drawn == before + 6
+    whole = search.at_best_fit([hypothesis("row_noise")])
+    assert world.drawn > before + 6
+    assert begun.score < whole.score < both.score
+
+
 def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
     world = World([effect("row_noise", 0.5)])
     # frame noise helps the fingerprint of row noise out where that is extrapolated
