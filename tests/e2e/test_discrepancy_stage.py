@@ -150,16 +150,6 @@ def test_what_cannot_be_searched_is_one_clear_line(tmp_path, old, new, message):
     assert "Traceback" not in result.stderr
 
 
-def test_without_add_the_model_stays(fitted, tmp_path):
-    text = CAMERA.replace("# quick\n", "# quick\n  add: false\n")
-    other = copy_of(fitted, tmp_path, text)
-    for _ in range(2):
-        other.ok("discrepancy", "run.yaml")
-    assert verdict(other)["effects"] == ["row_noise"]
-    assert (tmp_path / "run.yaml").read_text() == text
-    assert [path.name for path in (tmp_path / "run.zarr/model").glob("0*")] == ["0001.json"]
-
-
 def test_a_notebook_has_the_search_and_its_verdict(searched, tmp_path):
     shell = copy_of(searched[0], tmp_path)
     run = open_run(shell.folder / "run.yaml")

@@ -1,7 +1,6 @@
 """Readers say which rows come together; the stages that read frames keep to it."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -12,9 +11,6 @@ from astropy.io import fits
 
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
-from pchem_pipeline.run.stage import markers
-from pchem_pipeline.stages.bands import tile_bands
-from pchem_pipeline.store.tiles import tile_grid
 
 STACK = np.random.default_rng(8).integers(0, 4096, (6, 32, 48)).astype(np.uint16)
 
@@ -68,20 +64,3 @@ def test_tiles_of_compressed_fits(tmp_path: Path, tile: tuple[int, ...] | None, 
 def test_chunks_of_zarr(tmp_path: Path) -> None:
     zarr.create_array(tmp_path / "a.zarr", data=STACK, chunks=(2, 16, 16))
     assert rows_per_read(tmp_path / "a.zarr") == 16
-
-
-@pytest.mark.parametrize(
-    ("rows", "workers", "bands"),
-    [(1, 2, 8), (128, 2, 4), (512, 2, 1), (500, 2, 1), (256, 4, 8), (27, 4, 8)],
-)
-def test_bands_of_tiles_are_decoded_once_where_it_pays(rows: int, workers: int, bands: int) -> None:
-    tiles = tile_grid((512, 128), 64)
-    context = SimpleNamespace(
-        tiles=lambda: tiles,
-        tiles_done=lambda stage: {tile.key for tile in tiles},
-        pending=lambda units: units,
-        executor=SimpleNamespace(workers=workers),
-    )
-    found = tile_bands(context, "fit", 10_000, rows)
-    assert len(found) == bands
-    assert {key for band in found for key in markers(band)} == {tile.key for tile in tiles}

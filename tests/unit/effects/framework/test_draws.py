@@ -1,9 +1,10 @@
-"""Random numbers of electrons that are lost or grouped anew."""
+"""Random numbers of electrons that are lost or grouped anew, and mixtures of exposures by their moments."""
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from pchem_pipeline.effects.estimators.charge_sums import exposure_nodes
 from pchem_pipeline.effects.framework.draws import binomial_upper, further_uniform, regrouped
 
 
@@ -40,3 +41,15 @@ def test_of_very_many_electrons_of_which_nearly_all_are_lost_the_few_are_left():
     )
     assert abs(left.mean() - 90.0) < 4.0 * np.sqrt(900 * 0.09 / 2000)
     assert left.var() == pytest.approx(81.0, rel=4.0 * np.sqrt(2.0 / 2000))
+
+
+def test_exposures_of_a_run_are_a_mixture_with_its_moments():
+    factors = 1.0 + 0.8 * np.random.default_rng(3).beta(0.5, 2.0, 1000)
+    factors /= factors.mean()
+    weights, nodes = exposure_nodes(factors)
+    for power in range(6):
+        assert weights @ nodes**power == pytest.approx(np.mean(factors**power), rel=1e-9)
+    assert exposure_nodes(np.ones(5))[1].tolist() == [1.0]
+    two = exposure_nodes(np.array([0.9, 1.1]))
+    assert np.allclose(two[1], [0.9, 1.1])
+    assert np.allclose(two[0], 0.5)

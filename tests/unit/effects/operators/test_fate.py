@@ -11,7 +11,6 @@ from helpers.small_sensors import a_sensor, electrons, exposures, simulated
 from scipy import stats
 
 from pchem_pipeline.discrepancy.estimator_check import recovered_strength
-from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.operators.drifts import ExposureDrift
 from pchem_pipeline.effects.operators.fate import (
     BranchingCounts,
@@ -22,7 +21,6 @@ from pchem_pipeline.effects.operators.fate import (
     SpuriousCharge,
     Trapping,
 )
-from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
 def goodness(k, mass):
@@ -34,26 +32,6 @@ def goodness(k, mass):
     wanted = np.append(wanted[enough], k.size - wanted[enough].sum())
     chi2 = np.sum((seen - wanted) ** 2 / np.maximum(wanted, 20.0))
     return (chi2 - enough.sum()) / np.sqrt(2.0 * enough.sum())
-
-
-def lognormal_mass(h, variance, n=60, nodes=60):
-    """Return the masses of Poisson numbers of log-normal exposures, by many nodes."""
-    z, w = np.polynomial.hermite_e.hermegauss(nodes)
-    width = np.sqrt(np.log1p(variance))
-    means = h * np.exp(width * z - 0.5 * width**2)
-    return (w / w.sum()) @ stats.poisson.pmf(np.arange(n), means[:, None])
-
-
-@pytest.mark.parametrize("h", [0.4, 3.0, 12.0])
-@pytest.mark.parametrize("strength", [0.005, 0.05, 0.2])
-def test_the_law_of_lognormal_exposures_has_nodes_enough(h, strength):
-    maps = PixelMaps.known([np.full(2, value) for value in (h, 0.1, 100.0, 3.0)], np.ones(2, np.bool_))
-    law = OverdispersedCounts(relative_variance=strength, exposures="lognormal").sample_law(SampleLaw(), maps)
-    means = h * law.exposure_factors
-    mass = law.exposure_weights @ stats.poisson.pmf(np.arange(60), means[:, None])
-    true = lognormal_mass(h, strength)
-    # what two million samples do not tell from the truth
-    assert 2e6 * np.sum((mass - true) ** 2 / np.maximum(true, 1e-9)) < 20
 
 
 def test_overdispersed_counts_follow_an_exposure_that_changes():

@@ -35,12 +35,6 @@ def brute_width(h: np.ndarray, g: np.ndarray, mu: np.ndarray, s2: np.ndarray, k:
     return float(first), float(second - first**2)
 
 
-def test_there_are_sixteen_cases() -> None:
-    assert len(set(COMPONENT_CASES)) == 16
-    assert COMPONENT_CASES[0] == ()
-    assert COMPONENT_CASES[-1] == ("H", "g", "mu", "sigma2")
-
-
 def test_every_case_is_that_of_maps_held_constant() -> None:
     pixels = make_pixels(500)
     result = component_widths(pixels, 12)

@@ -1,17 +1,10 @@
 """Bands cover the sensor, cut no tile and no group of rows, and keep to the memory allowed."""
 
-import gc
-import weakref
-from types import SimpleNamespace
-
-import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.stages.bands import plan_bands
-from pchem_pipeline.stages.histogram import counting
 from pchem_pipeline.stages.histogram.arrays import row_frames
 from pchem_pipeline.store.tiles import tile_grid
 
@@ -72,37 +65,3 @@ def test_row_sums_of_tall_sensors_are_read_in_smaller_pieces():
     assert row_frames(512) == 4096
     assert row_frames(10_000) * 10_000 * 16 < 2**28
     assert row_frames(200_000) > 0
-
-
-def test_a_band_that_is_done_holds_no_memory(tmp_path, monkeypatch):
-    frames = np.random.default_rng(1).integers(90, 130, (40, 64, 16)).astype(np.uint16)
-
-    class Store:
-        def array(self, name):
-            return SimpleNamespace(chunks=(64, 16))
-
-        def file_shape(self, name):
-            return (64, 16)
-
-        def attributes(self, name):
-            return {}
-
-        def set_attributes(self, name, values):
-            pass
-
-        def write(self, name, region, data):
-            pass
-
-        def write_arrays(self, group, arrays, region):
-            pass
-
-    monkeypatch.setattr(counting, "open_store", lambda path: Store())
-    job = counting.CountJob(tmp_path, frames.shape, 64, HistogramSettings())
-    counter = counting.StackCounter(job, [(0, 64)])
-    held = weakref.ref(counter._counters[0]._histograms)
-    gc.disable()  # nothing but the end of the counter may free it
-    try:
-        counter.count([(0, [frames])])
-        assert held() is None
-    finally:
-        gc.enable()
