@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 from scipy.stats import norm, poisson
 
-from pchem_pipeline.model.arithmetic import simd_math_numba
 from pchem_pipeline.model.fit import (
     climb_numba,
     search_numba,
