@@ -132,12 +132,6 @@ def selected(tab: Tab) -> int:
     return int(found[1].replace(",", ""))
 
 
-def test_it_opens_from_disk_and_asks_nobody(tab: Tab) -> None:
-    assert tab.asked == [tab.page.url.split("#")[0]]
-    assert tab.page.locator("#inspector-map option").count() >= 15
-    assert tab.text("#inspector-histogram-words").startswith("read noise: median")
-
-
 def test_the_policy_of_the_page_forbids_network_and_other_scripts(browser: Any, store: RunStore) -> None:
     page = browser.new_page()
     page.goto(file_url(store))
@@ -382,18 +376,6 @@ def test_a_line_of_channels(open_tab: Any, tmp_path: Path) -> None:
     tab.wait(1)
     assert tab.text("#inspector-title") == "Channel 1 red <b>"
     assert tab.page.locator("#inspector-canvas").bounding_box()["height"] >= 40
-
-
-def test_the_address_leads_to_the_pixel(open_tab: Any, store: RunStore) -> None:
-    first = open_tab(file_url(store))
-    first.show("maps/bias")
-    first.click(33, 44)
-    address = first.page.url
-    assert address.endswith("#pixel=33,44&map=maps/bias")
-    second = open_tab(address)
-    second.wait(33 * NX + 44)
-    assert second.page.get_attribute("#inspector-app", "data-map") == "maps/bias"
-    assert second.text("#inspector-title") == "Pixel y = 33, x = 44"
 
 
 def test_it_opens_on_the_median_pixel_and_stays_at_the_top(tab: Tab, store: RunStore) -> None:

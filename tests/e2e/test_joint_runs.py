@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import time
 
 import numpy as np
 import pytest
@@ -211,21 +210,6 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, tmp_path):
     assert refused.code == 4
     assert "was made from samples; electron numbers need" in refused.last
     assert "electrons" not in run.status()
-
-
-def test_killed_it_ends_with_the_same_bits(joint):
-    shell = Shell(joint)
-    four = [("dark_1s.zarr", ""), ("dark_2s.zarr", ""), ("dark_5s.zarr", ""), ("bias.zarr", "bias: true")]
-    write(joint, "killed", four)
-    with shell.start("run", "killed.yaml", "--until", "maps", "--quiet", "--backend", "serial") as process:
-        done = joint / "killed.zarr" / ".pchem" / "done" / "fit"
-        while process.poll() is None and not list(done.rglob("*.json")):
-            time.sleep(0.01)
-        process.kill()
-    assert shell.ok("run", "killed.yaml", "--until", "maps", "--quiet").stderr == ""
-    one, other = (RunStore.open(joint / f"{name}.zarr") for name in ("killed", "dark"))
-    for name in ("fit/fit_status", "fit/bias", "samples/covariance", "maps/dark_current"):
-        np.testing.assert_array_equal(one.read(name), other.read(name), err_msg=name)
 
 
 @pytest.mark.parametrize(

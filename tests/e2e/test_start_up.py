@@ -6,10 +6,6 @@ import sys
 
 import pytest
 
-from pchem_pipeline.cli.app import app
-from pchem_pipeline.run.declaration import imported
-from pchem_pipeline.stages.table import STAGES
-
 COMMAND = """
 import sys
 from pchem_pipeline.cli import app
@@ -73,14 +69,3 @@ def test_a_command_that_knows_of_effects_does_not_import_what_few_of_them_call()
     )
     outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=200)
     assert outcome.stdout == "set()\n", outcome.stdout + outcome.stderr
-
-
-@pytest.mark.parametrize("name", STAGES)
-def test_every_function_that_a_row_names_is_there(name):
-    stage = STAGES[name]
-    single_pass = None if stage.single_pass is None else stage.single_pass.run
-    for place in (stage.run, stage.identity, stage.plan, single_pass):
-        assert place is None or callable(imported(place))
-    commands = {command.name or command.callback.__name__ for command in app.registered_commands}
-    assert name in commands
-    assert {*stage.upstream, *stage.follows} < set(STAGES)

@@ -1,8 +1,10 @@
 """What must hold for any pixels and any tiling of the ensemble."""
 
+import dataclasses
 import itertools
 
 import numpy as np
+from helpers.drawn_pixels import draw
 from helpers.plain_law import joint_mass
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -10,6 +12,8 @@ from hypothesis import strategies as st
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, nuced_axis
 from pchem_pipeline.model.ensemble.totals import EnsembleAxes
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.model.maps.maps import display_edges
@@ -90,3 +94,36 @@ def test_the_display_of_a_map_follows_the_ranks(values: list[float]) -> None:
     # the root of 3 q^2 - 2 q^3 = rank in 0..1, in closed form
     expected = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * known.shares(array)) / 3.0)
     assert (np.abs(found + 0.005 - expected) < 0.005 + 1e-9).all()
+
+
+_N = 24
+
+
+def _pixels() -> tuple[np.ndarray, np.ndarray, FitResult]:
+    rng = np.random.default_rng(9)
+    pixels = draw(
+        rng, rng.uniform(0.05, 9, _N), rng.uniform(8, 14, _N), rng.uniform(0.15, 0.5, _N), n_frames=4000
+    )
+    counts = pixels.counts.copy()
+    counts[5] = 0  # a dead pixel amid the others
+    return counts, pixels.origin, fit_histograms(counts, pixels.origin)
+
+
+_COUNTS, _ORIGIN, _WHOLE = _pixels()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    cuts=st.lists(st.integers(1, _N - 1), unique=True, max_size=6),
+    extra=st.integers(0, 40),
+    reverse=st.booleans(),
+)
+def test_any_batching_gives_the_same_bits(cuts: list[int], extra: int, reverse: bool) -> None:
+    order = np.arange(_N)[::-1] if reverse else np.arange(_N)
+    padded = np.pad(_COUNTS, ((0, 0), (3, extra)))
+    for part in np.split(order, sorted(cuts)):
+        answer = fit_histograms(padded[part].astype(np.uint16), _ORIGIN[part] - 3)
+        for field in dataclasses.fields(FitResult):
+            if field.name != "intervals":
+                mine, whole = getattr(answer, field.name), getattr(_WHOLE, field.name)
+                np.testing.assert_array_equal(mine, whole[part])

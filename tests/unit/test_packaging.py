@@ -4,7 +4,6 @@ import re
 import tomllib
 from pathlib import Path
 
-import pytest
 import yaml
 
 from pchem_pipeline import __version__
@@ -34,13 +33,6 @@ def test_a_system_without_the_module_resource_is_no_reason_to_fail(monkeypatch):
     monkeypatch.setattr(environment, "_RESOURCE", None)
     assert environment.peak_rss_bytes() == 0
     assert environment.available_workers() >= 1
-
-
-@pytest.mark.parametrize(
-    "name", ["report/templates/report.html.j2", "report/templates/inspector.js", "py.typed"]
-)
-def test_files_of_the_package_are_those_that_a_wheel_takes(name):
-    assert (ROOT / "pchem_pipeline" / name).exists()
 
 
 def test_no_folder_has_more_than_twenty_files():

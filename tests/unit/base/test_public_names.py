@@ -1,13 +1,17 @@
+"""Public names, what imports bring, results as JSON data, shares in words."""
+
 import doctest
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
+from types import MappingProxyType
 
+import numpy as np
 import pytest
-from helpers.places import ROOT
 
 import pchem_pipeline
+from pchem_pipeline.base.plain import plain
+from pchem_pipeline.base.units import per_cent
 
 
 def test_the_public_names_are_these():
@@ -54,13 +58,32 @@ def test_what_is_imported_imports_nothing_heavy(module: str, light: set[str]) ->
     assert done.stdout == "set()\n"
 
 
-def test_versions_agree():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["version"] == pchem_pipeline.__version__
-
-
 def test_every_module_says_what_it_is_for_and_fits_in_the_head():
     for path in Path(pchem_pipeline.__file__).parent.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= 800, path
         assert text.lstrip().startswith('"""'), path
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [(0.0123, "1.2 %"), (0.68, "68 %"), (0.9949, "99 %"), (0.997, "100 %"), (3.4, "340 %")],
+)
+def test_a_share_is_never_told_as_a_power_of_ten(share: float, words: str) -> None:
+    assert per_cent(share) == words
+
+
+def test_json_has_no_nan_and_no_arrays():
+    values = {
+        "a": [1, float("nan"), (2.5, float("inf"))],
+        "b": "x",
+        1: np.float32(0.5),
+        "m": MappingProxyType({}),
+    }
+    assert plain(values) == {"a": [1, None, [2.5, None]], "b": "x", "1": 0.5, "m": {}}
+    assert plain([np.array([1.0, np.nan]), np.bool_(True), np.float64("inf"), object]) == [
+        [1.0, None],
+        True,
+        None,
+        "<class 'object'>",
+    ]

@@ -11,9 +11,10 @@ import pytest
 from typer.testing import CliRunner
 
 from pchem_pipeline import __version__
-from pchem_pipeline.base.errors import ConfigError, ExitCode, InputError
+from pchem_pipeline.base.errors import ConfigError, ExitCode, InputError, StoreError
 from pchem_pipeline.cli import app
 from pchem_pipeline.commands import first_screen, new_run
+from pchem_pipeline.commands.figures import figures_of_run
 from pchem_pipeline.commands.new_run import find_or_start
 from pchem_pipeline.config.load import load_config, parse_config
 from pchem_pipeline.config.tree import RunConfig
@@ -76,24 +77,6 @@ def test_run_does_every_stage(calls):
     [(_, stages, _)] = calls
     assert stages == ("ingest", "histogram", "fit", "maps", "ensemble", "report")
     assert result.stdout == "/x/run.zarr\n"  # there is no report in this folder
-
-
-def test_run_from_camera_files_writes_the_yaml_that_it_uses(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "frames").mkdir()
-    files = [Path("frames") / f"f{number}.tif" for number in range(3)]
-    for path in files:
-        path.touch()
-    target, is_new = find_or_start(files, Path("out/my run.zarr"), {"integration_time": 4.87})
-    assert is_new
-    written = load_config(tmp_path / "out" / "my run.yaml")
-    assert written == target.config
-    assert written.input.files == ("../frames/f0.tif", "../frames/f1.tif", "../frames/f2.tif")
-    assert written.input.integration_time == 4.87
-    again, _ = find_or_start(files, Path("out/my run.zarr"), {"integration_time": 4.87})
-    assert again == target
-    with pytest.raises(ConfigError, match="exists with other settings"):
-        find_or_start(files, Path("out/my run.zarr"), {"integration_time": 2})
 
 
 def test_options_for_camera_files_do_not_fit_a_yaml(tmp_path):
@@ -225,3 +208,27 @@ def test_what_is_written_beside_a_store_lies_on_this_machine(arguments, tmp_path
 def test_simulated_frames_lie_on_this_machine():
     with pytest.raises(ConfigError, match=r"^s3://lab/frames: only stores"):
         parse_config("simulate: {output: 's3://lab/frames'}")
+
+
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        ({"formats": ("pdf", "jpg")}, "--format: jpg cannot be drawn; choose from pdf, svg, png"),
+        ({"formats": ()}, "--format: no format"),
+        ({"width": "88 px"}, "--width '88 px': write a length such as 88mm"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        figures_of_run(Path("nowhere.zarr"), Path("out"), **wanted)
+
+
+@pytest.mark.parametrize("option", ["--only", "--format"])
+def test_a_list_of_nothing_does_not_mean_all(option: str) -> None:
+    with pytest.raises(ConfigError, match=f"{option}: ' ,' is no name"):
+        invoke("figures", "run.zarr", option, " ,")
+
+
+def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="there is no run at"):
+        figures_of_run(tmp_path, tmp_path / "out")

@@ -159,24 +159,6 @@ def test_a_refusal_that_names_a_setting_says_where_settings_are(tmp_path, monkey
     assert "pchem init" not in str(refused.value)
 
 
-def test_commands_in_messages_can_be_pasted(tmp_path):
-    (tmp_path / "my run").mkdir()
-    with pytest.raises(Exception, match=r"--store '.*my run'"):
-        RunStore.open(Path(tmp_path / "my run"))
-
-
-def test_a_refused_run_says_which_keys_differ_and_the_ways_out(tmp_path, file):
-    place = tmp_path / "run.zarr"
-    target, _ = find_or_start([file], place, {"bit_depth": 8, "integration_time": 2.0})
-    RunStore.create(place).records.write(StageRecord("ingest", 1, "f", {}, finished=True))
-    with pytest.raises(ConfigError) as refused:
-        find_or_start([file], place, {"bit_depth": 8, "integration_time": 4.87})
-    said = str(refused.value)
-    assert "(input.integration_time 2.0 in the file, 4.87 here)" in said
-    assert f"pchem run {target.config_path}" in said
-    assert "--store" in said
-
-
 @pytest.mark.parametrize("options", [(), ("--roi", "0:99,0:4")])
 def test_a_first_try_that_is_refused_leaves_nothing_behind(tmp_path, file, monkeypatch, options):
     monkeypatch.chdir(tmp_path)

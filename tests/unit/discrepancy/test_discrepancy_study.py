@@ -10,7 +10,7 @@ sys.path.append(str(ROOT / "scripts" / "bench"))
 
 from bench_discrepancy import read_results
 from discrepancy_cases import EFFECTS, NAMED_SINCE, OUTSIDE, SEALED, TRIED, UNTESTABLE, Plan, remaining
-from discrepancy_figures import Answer, print_figures, wilson
+from discrepancy_figures import Answer
 from hidden import chain
 
 SHAPE = (64, 64, 4000)
@@ -62,42 +62,6 @@ def record(hidden, verdict, *steps, kind="single", level=4.0, **more):
 )
 def test_an_answer_lands_in_its_column(hidden, verdict, steps, word):
     assert Answer(record(hidden, verdict, *steps)).word == word
-
-
-def test_figures_count_and_compare_with_their_targets(capsys):
-    good = [record(["row_noise"], "named", "row_noise") for _ in range(9)]
-    bias = {"before": -3.0, "after": 0.2, "chance": 0.05, "pixels": 4096}
-    good[0]["bias"] = dict.fromkeys(("quanta_exposure", "conversion_gain", "bias", "read_noise_e"), bias)
-    wrong = record(["row_noise"], "named", "adc_inl")
-    failed = record(["row_noise"], "error", error="ValueError: broken")
-    null = record([], "consistent", kind="null", level=0.0)
-    decoys = [
-        record(["dead_time"], "unexplained", kind="decoy"),
-        record(["row_swap"], "named", "rts_noise", kind="decoy"),
-    ]
-    good[1]["hidden"] = [{"tag": "row_noise", "strength": 0.4, "parameters": {}}]
-    good[1]["verdict"]["steps"][0]["parameters"] = {"row_noise_dn": {"value": 0.41, "stderr": 0.002}}
-    print_figures([*good, wrong, failed, null, *decoys])
-    lines = capsys.readouterr().out.splitlines()
-
-    def line(text):
-        return next(line for line in lines if text in line)
-
-    assert "9/11 " in line("4 s95: named alone")
-    assert "MISSED" in line("4 s95: named alone")
-    assert "1/11 " in line("4 s95: a wrong name")
-    assert "0/1 " in line("nothing hidden: any name  ")
-    assert "1/1 " in line("all, bias: beyond one s.e.")
-    assert "reached" in line("a placebo closes a quarter")
-    assert "1/2 " in line("decoys: any name")
-    assert "0/1 " in line("4 s95: within 3 standard errors")
-    assert any("failed x1: ValueError: broken" in text for text in lines)
-
-
-def test_the_interval_of_a_fraction():
-    # Wilson 1927: 0 of 10 and 5 of 10
-    assert wilson(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-3)
-    assert wilson(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-3)
 
 
 def test_every_beginning_of_the_study_is_balanced():

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
 
-from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, refit_maps
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.operators.couple import InterpixelCapacitance
@@ -19,10 +17,6 @@ from pchem_pipeline.effects.operators.drifts import ExposureFlicker
 from pchem_pipeline.effects.operators.noise import NoiseSkew
 from pchem_pipeline.effects.operators.offsets import PeriodicPickup
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
-
-CAMERA = PlainCamera(0.3, 1.5, 9.0, (16, 16), 600)
-QUICK = DiscrepancySettings(replicates=20, extended_replicates=12, candidates=("row_noise",))
 
 
 def test_work_is_counted_and_refused_once_the_limit_is_reached():
@@ -111,28 +105,6 @@ def test_a_law_that_differs_by_pixel_costs_no_more_for_that():
     places = PixelPlaces.of_block(None, shape, np.arange(100))
     placed = sample_law((flicker.at_place(Region(rows=((2, 5),)), None),), maps, None, places)
     assert 1 < placed.components <= 2 * everywhere.components
-
-
-@pytest.fixture(scope="module")
-def noisy_rows():
-    rng = np.random.default_rng(3)
-    frames = CAMERA.frames(3).astype(np.int64)
-    frames += np.rint(1.5 * rng.standard_normal((*frames.shape[:2], 1))).astype(np.int64)
-    return np.maximum(frames, 0).astype(np.uint16)
-
-
-def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tried(noisy_rows):
-    told = []
-    short = QUICK.model_copy(update={"effort": 0.002})
-    found = find_discrepancies(noisy_rows, settings=short, tell=told.append).verdict
-    assert found.verdict == "unexplained"
-    assert found.effects == ()
-    assert "used its budget" in found.limit
-    assert "row_noise" in found.limit
-    assert found.limit in found.sentence
-    assert "no effect tried explains it" in found.sentence
-    assert "--effort" in verdict_text(found)
-    assert find_discrepancies(noisy_rows, settings=short).verdict == found
 
 
 def test_a_law_that_fits_hardly_a_pixel_is_given_up_after_some():

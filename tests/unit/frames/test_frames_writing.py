@@ -127,13 +127,6 @@ def test_blocks_must_make_up_the_shape(tmp_path: Path) -> None:
         write_frames("jpeg", tmp_path / "a", iter([stack]), SHAPE, "uint16")
 
 
-def test_a_folder_in_the_way(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    words = r"cannot use .*a file is in place of the folder: choose another place"
-    with pytest.raises(StoreError, match=words):
-        write_frames("npy", tmp_path / "file" / "a", iter([make_stack("uint8")]), SHAPE, "uint8")
-
-
 PROGRAM = """
 import json, resource, signal, sys
 from pathlib import Path

@@ -6,8 +6,7 @@ from helpers import reference_pchem
 from helpers.drawn_pixels import draw, samples
 from scipy.stats import kstat
 
-from pchem_pipeline.methods import base
-from pchem_pipeline.methods.base import Method, PixelSamples, Sample, Settings, sample_moments
+from pchem_pipeline.methods.base import PixelSamples, Sample, Settings, sample_moments
 from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, summarise_errors
 from pchem_pipeline.methods.peak_valley import comb, read_noise_of_valley
 from pchem_pipeline.methods.plain_em import run_em
@@ -26,31 +25,6 @@ def sample(exposure, noise=0.3, n_pixels=3, n_frames=3000, seed=1, gain=1 / 11):
         n_frames,
     )
     return Sample(drawn.counts, drawn.origin)
-
-
-def test_every_method_says_what_it_is():
-    found = methods()
-    assert {"pchem_em", "plain_em", "photon_transfer", "peak_valley", "cumulants", "emva1288"} <= set(found)
-    assert list(found) == sorted(found, key=lambda name: (found[name].order, name))
-    for name, method in found.items():
-        assert method.name == name
-        assert method.title
-        assert method.source
-        assert method.remark
-
-
-def test_a_method_is_added_by_its_class(monkeypatch):
-    monkeypatch.setattr(base, "_REGISTERED", {})
-
-    class Guess(Method):
-        name, title, source, needs, remark, order = "guess", "guess", "nobody", "one sample", "wrong", 99
-
-        def estimate(self, pixels, settings):
-            return base.Estimates(base.no_estimates(pixels.n_pixels))
-
-    assert base.registered() == {"guess": Guess}
-    with pytest.raises(ValueError, match="registered twice"):
-        type("Other", (Guess,), {"__module__": "elsewhere"})
 
 
 def test_drawn_histograms_have_the_moments_of_the_pcd():

@@ -88,15 +88,6 @@ def test_copy(tmp_path: Path, small_chunks: None, backend: str) -> None:
     assert run(context).state == "complete"
 
 
-def test_copy_applies_region_range_and_shift(tmp_path: Path) -> None:
-    (tmp_path / "cam").mkdir()
-    np.save(tmp_path / "cam" / "a.npy", STACK << 4)
-    context = make_context(tmp_path, roi=(3, 20, 5, 25), frame_range=(2, 39), bit_shift=4)
-    run(context)
-    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK[2:39, 3:20, 5:25])
-    assert context.sensor.bit_depth == 12
-
-
 def test_reference_copies_nothing(tmp_path: Path) -> None:
     write_stack(tmp_path / "cam")
     context = make_context(tmp_path, mode="reference")
@@ -227,21 +218,6 @@ def test_stated_time_is_kept_apart_from_the_configured_one(tmp_path: Path) -> No
     run(configured)
     assert SensorInfo.read(configured.store).integration_time == 4.87
     assert configured.sensor.integration_time == 2.0
-
-
-def test_bad_files_stop_or_are_left_out(tmp_path: Path) -> None:
-    write_stack(tmp_path / "cam")
-    broken = tmp_path / "cam" / "f10.tif"
-    broken.write_bytes(broken.read_bytes()[:-100])
-    with pytest.raises(InputError, match=r"1 of 4 input files cannot be used: .*f10\.tif: .*truncated"):
-        run(make_context(tmp_path))
-    context = make_context(tmp_path, on_bad_file="skip")
-    assert run(context).state == "complete"
-    np.testing.assert_array_equal(context.store.read("frames/dn"), np.concatenate([STACK[:20], STACK[30:]]))
-    record = context.store.records.read("ingest")
-    assert record is not None
-    assert "truncated" in record.notes[0]
-    assert "skipped (input.on_bad_file: skip)" in record.notes[0]
 
 
 def test_file_that_vanishes_while_copying(

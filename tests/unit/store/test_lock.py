@@ -49,15 +49,6 @@ def test_the_lock_is_there_while_it_is_held(run, lock):
     assert not is_locked(run, run / ".pchem")
 
 
-def test_a_lock_of_a_disk_is_seen_without_a_change(tmp_path):
-    store = RunStore.create(tmp_path / "run.zarr")
-    private = store.path / ".pchem"
-    assert not is_locked(store.path, private)
-    with store.locked():
-        assert is_locked(store.path, private)
-    assert not is_locked(store.path, private)
-
-
 @pytest.mark.parametrize("content", [None, b"", b"\0", b"[]", b'"x"'])
 def test_another_machine_has_it_or_nobody_knows(run, lock, content):
     """No clock frees it; the line that the message has does."""

@@ -1,4 +1,3 @@
-import errno
 import subprocess
 import sys
 from pathlib import Path
@@ -8,8 +7,7 @@ import pytest
 import xarray as xr
 
 from pchem_pipeline.base.errors import LockedError, StoreError
-from pchem_pipeline.store.files import is_fatal, read_json, storage_error, write_json
-from pchem_pipeline.store.records import Records, StageRecord, fingerprint_of
+from pchem_pipeline.store.records import Records, fingerprint_of
 from pchem_pipeline.store.run_store import RunStore
 
 
@@ -28,17 +26,6 @@ def test_xarray_reads_a_group_with_units_and_dimensions(store):
     assert data.bias.attrs["symbol"] == "mu"
     assert float(data.bias[0, 0]) == 3.5
     assert np.isnan(data.bias[99, 69])
-
-
-def test_integers_and_floats_come_back_exactly(store):
-    rng = np.random.default_rng(5)
-    counts = rng.integers(0, 2**16, (10, 12, 40), dtype=np.uint16)
-    store.create_array("histogram/counts", counts.shape, chunks=(8, 8, 40), dtype=np.uint16)
-    store.write("histogram/counts", (slice(None),) * 3, counts)
-    np.testing.assert_array_equal(store.read("histogram/counts"), counts)
-    values = rng.normal(size=(9, 9))
-    store.write_array("fit/log_likelihood", values)
-    np.testing.assert_array_equal(store.read("fit/log_likelihood"), values)
 
 
 @pytest.mark.parametrize("shards", [None, (8, 32, 40)])
@@ -180,22 +167,6 @@ def test_partial_files_of_a_killed_process_are_removed(store):
         assert not orphan.exists()
 
 
-def test_damaged_json_names_the_file(tmp_path):
-    write_json(tmp_path / "a.json", {"x": 1})
-    assert read_json(tmp_path / "a.json") == {"x": 1}
-    assert read_json(tmp_path / "b.json") is None
-    (tmp_path / "a.json").write_text("{")
-    with pytest.raises(StoreError, match=r"a\.json is damaged"):
-        read_json(tmp_path / "a.json")
-
-
-def test_disk_errors_are_translated_with_their_cure():
-    full = OSError(errno.ENOSPC, "No space left on device")
-    assert "free space" in str(storage_error(full, "run.zarr"))
-    assert is_fatal(full)
-    assert not is_fatal(ValueError())
-
-
 def test_fingerprint_depends_on_content_not_on_order():
     assert fingerprint_of({"a": 1, "b": 2}) == fingerprint_of({"b": 2, "a": 1})
     assert fingerprint_of({"a": 1}) != fingerprint_of({"a": 2})
@@ -206,16 +177,6 @@ def test_a_key_that_is_no_name_of_a_file_is_refused(tmp_path, key):
     records = Records(tmp_path)
     with pytest.raises(ValueError, match="not a file name"):
         records.mark("discrepancy", "f" * 64, key, {})
-
-
-def test_markers_belong_to_one_fingerprint(tmp_path):
-    records = Records(tmp_path)
-    records.mark("fit", "f" * 64, "0.1", {"pixels": 5})
-    assert records.done("fit", "f" * 64) == {"0.1"}
-    assert records.done("fit", "e" * 64) == set()
-    assert records.summaries("fit", "f" * 64) == {"0.1": {"pixels": 5}}
-    records.unmark("fit", "f" * 64, ["0.1"])
-    assert records.done("fit", "f" * 64) == set()
 
 
 def test_markers_that_a_writer_removes_while_they_are_listed_are_no_markers(tmp_path, monkeypatch):
@@ -230,12 +191,3 @@ def test_markers_that_a_writer_removes_while_they_are_listed_are_no_markers(tmp_
     monkeypatch.setattr(Path, "glob", removed_first)
     assert records.done("fit", "a" * 64) == set()
     assert not (tmp_path / "done" / "fit").exists()
-
-
-def test_stage_record_survives_the_disk(tmp_path):
-    records = Records(tmp_path)
-    record = StageRecord("fit", 1, "abc", {"settings": {}}, keys=4, failed={"0.0": "why"}, notes=("n",))
-    records.write(record)
-    assert records.read("fit") == record
-    records.forget("fit")
-    assert records.read("fit") is None

@@ -6,7 +6,6 @@ from helpers.small_sensors import context_of, offsets
 from scipy.special import ndtri
 
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.operators.curve import AdcDnl, Clipping
 from pchem_pipeline.effects.operators.drifts import BiasDrift
 from pchem_pipeline.effects.operators.offsets import (
     BiasJumps,
@@ -16,7 +15,6 @@ from pchem_pipeline.effects.operators.offsets import (
     ReadoutAlternation,
     RowNoise,
 )
-from pchem_pipeline.effects.operators.replace import RepeatedFrames
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -73,22 +71,3 @@ def test_gaussian_offsets_widen_the_law(effect, size):
     quantiles = NORMAL / NORMAL.std() * size
     change = np.abs(smeared(quantiles) - smeared(np.zeros(1))).max()
     assert np.abs(law_of(effect.scaled(size)) - smeared(quantiles)).max() < 0.06 * change
-
-
-def test_random_widths_and_repeats_leave_the_law_as_it_is():
-    model = SampleLaw()
-    for effect in (AdcDnl(dnl_lsb=0.3), RepeatedFrames(probability=0.1)):
-        assert effect.sample_law(model, maps_of(MU)) is model
-
-
-def test_edges_of_several_effects_add_up():
-    maps = maps_of(MU)
-    first = AdcDnl(dnl_lsb=0.1, pattern="edges", first_code=100, edges=(1.0, 2.0))
-    second = AdcDnl(dnl_lsb=0.1, pattern="edges", first_code=99, edges=(1.0, 1.0))
-    both = second.sample_law(first.sample_law(SampleLaw(), maps), maps)
-    assert both.edge_first == 99
-    np.testing.assert_allclose(both.edge_shift, [0.1, 0.2, 0.2])
-    limits = Clipping(low=90, high=200).sample_law(
-        Clipping(low=95, high=300).sample_law(SampleLaw(), maps), maps
-    )
-    assert (limits.clip_low, limits.clip_high) == (95, 200)

@@ -30,17 +30,6 @@ def test_flicker_has_its_covariance_anywhere(effect, times, first):
     within((u * r).mean(), 0.0, 0.3 / np.sqrt(u.size))
 
 
-def test_flicker_exchanges_noise_and_adds_none():
-    after, _, k, _ = analog(FlickerNoise(share=0.3, correlation_frames=3.0))
-    z = (after - k) / 0.3
-    power = (z**2).mean(axis=0)
-    within(power.mean(), 1.0, power.std() / np.sqrt(power.size))
-    lagged = (z[1:] * z[:-1]).mean(axis=0)
-    expected = 0.3 * np.exp(-1 / 3)
-    within(lagged.mean(), expected, lagged.std() / np.sqrt(lagged.size))
-    assert lagged.mean() > 20 * lagged.std() / np.sqrt(lagged.size)
-
-
 def test_traps_are_in_a_share_of_the_pixels():
     after, before, _, _ = analog(RtsNoise(fraction=0.1, amplitude_e=1.0, probability=0.5))
     touched = (after != before).any(axis=0)

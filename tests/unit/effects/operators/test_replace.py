@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
-from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines, own_lines
+from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted
@@ -22,7 +22,6 @@ from pchem_pipeline.effects.operators.replace import (
 )
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.simulate.chain import simulate_block
@@ -297,49 +296,6 @@ def test_every_sample_comes_from_where_the_move_says(move, lines):
     shown = {"swapped": 1 - 1 / n - share, "line_lost": 1 - 1 / n, "sample_lost": 1 - 1 / m}.get(move, 1.0)
     expected = trials * share * shown
     assert abs(hits - expected) < 5 * np.sqrt(expected)
-
-
-def test_the_ratios_are_those_of_the_likelihoods():
-    """A plain transcription: sums of logarithms of the histograms' shares, less those at the own place."""
-    frames = np.random.default_rng(2).integers(95, 105, (64, 3, 4)).astype(np.uint16)
-    frames[:, 1] += 4
-    histograms = histogram_frames(frames)
-    counts = histograms.counts.reshape(12, -1)
-    z, _ = misplaced_lines(frames, counts, histograms.origin.ravel().astype(np.int64), np.ones((3, 4), bool))
-    codes = np.arange(94, 111)
-    share = np.array(
-        [[(frames[:, y, x, None] == codes).sum(axis=0) + 0.5 for x in range(4)] for y in range(3)]
-    )
-    # every histogram is as wide as the widest, and one code more on either side
-    width = np.flatnonzero((counts > 0).any(axis=0))
-    log = np.log(share / (64 + 0.5 * (width[-1] - width[0] + 3)))
-
-    def at(y, x, code):
-        low = histograms.origin[y, x] + width[0] - 1
-        return log[y, x, np.clip(code, low, low + width[-1] - width[0] + 2) - 94]
-
-    def gain(mixed):
-        total = []
-        for y in range(3):
-            for t in range(64):
-                row = [int(frames[(t + mixed * x) % 64, y, x]) for x in range(4)]
-                own = np.array([at(y, x, row[x]) for x in range(4)])
-                ratios = [
-                    sum(at(y + dy, x, row[x]) for x in range(4)) - own.sum() if 0 <= y + dy < 3 else 0.0
-                    for dy in (1, -1)
-                ]
-                for dx in (1, -1):
-                    moved = np.array(
-                        [at(y, x + dx, row[x]) - own[x] if 0 <= x + dx < 4 else 0 for x in range(4)]
-                    )
-                    from_there = moved[::-1].cumsum()
-                    ratios += [moved.sum(), max(0.0, from_there.max()) - np.log(4)]
-                total.append(np.log(1 - 1e-3 + 1e-3 * np.exp(ratios).mean()))
-        return np.array(total)
-
-    seen_gain, chance = gain(0), gain(64 // 4)
-    wanted = (seen_gain.sum() - chance.sum()) / np.sqrt(2 * (chance**2).sum() + 4.0)
-    assert z["space.misplaced.rows"] == pytest.approx(wanted, rel=1e-4)
 
 
 @pytest.mark.parametrize("lines", ["rows", "columns"])

@@ -5,7 +5,6 @@ import pytest
 
 from pchem_pipeline.model.checks.shrinkage import LOOSEST, Judged, NoisePool, noise_of
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.fit.status import FAILED, FitStatus
 
 SETTINGS = FitSettings()
 
@@ -84,7 +83,3 @@ def test_noise_in_electrons_by_the_delta_method() -> None:
     noise, error = noise_of(*(np.array([value]) for value in values))
     assert noise[0] == pytest.approx(0.3)
     assert error[0] == pytest.approx(np.sqrt(9 * 4e-6 + 0.01 * 0.01 - 2 * 0.3 * 1e-4))
-
-
-def test_the_word_is_a_caution_and_no_failure() -> None:
-    assert not int(FitStatus.WEAKLY_IDENTIFIED) & int(FAILED)

@@ -52,13 +52,6 @@ def test_thresholds_are_where_the_largest_membership_changes(case: tuple[float, 
     np.testing.assert_array_equal(np.searchsorted(table, x), membership_argmax(x, *case))
 
 
-def test_the_paper_s_example_is_not_centred() -> None:
-    # x ~ PCD(1.8, 1, 0, 0.33^2), fig:optimal_quantization
-    edges = thresholds(1.8, 1.0, 0.0, 0.33, 3)
-    np.testing.assert_allclose(edges, [0.5 + 0.1089 * np.log(j / 1.8) + j - 1 for j in (1, 2, 3)])
-    assert edges[0] < 0.5 < edges[2] - 2
-
-
 def test_pixels_without_parameters_have_no_number() -> None:
     frames = np.full((2, 1, 3), 130, dtype=np.uint16)
     maps = [np.array([[v, v, v]]) for v in (2.0, 0.1, 100.0, 3.0)]

@@ -51,11 +51,6 @@ def test_the_predicted_bias_is_where_the_density_goes_on_the_exact_masses():
     np.testing.assert_allclose(predicted, shift / errors, rtol=0.05, atol=0.005)
 
 
-def test_there_is_no_bias_to_tell_where_the_noise_is_rounding_alone():
-    parameters = [np.array([v]) for v in (0.4, 1 / 3.0, 7.3, 0.28)]
-    assert np.isinf(rounding_bias(parameters, np.array([1000.0]))).all()
-
-
 def test_pixels_are_named_where_rounding_matters_and_what_is_skipped_is_safe():
     n = np.full(6, 17_750.0)
     gains = 1 / np.array([1.5, 2.5, 4.0, 5.0, 10.0, np.nan])
@@ -143,15 +138,6 @@ def test_few_dn_per_electron_have_their_own_starts():
     known = np.isfinite(before)
     assert known.sum() >= 4
     assert abs(before[known].mean()) * np.sqrt(known.sum()) > 5  # rounding biases the density
-
-
-def test_nothing_to_fit_stays_nothing():
-    counts = np.zeros((2, 9), np.uint32)
-    counts[1, 3] = 50
-    plain = fit_histograms(counts, np.zeros(2, np.int64))
-    found = fit_histograms(counts, np.zeros(2, np.int64), settings=EXACT, start=plain)
-    assert found.fit_status.tolist() == plain.fit_status.tolist()
-    assert np.isnan(found.conversion_gain).all()
 
 
 def test_a_run_says_how_many_pixels_rounding_biases_and_that_a_default_would_do_it_again(tmp_path, capsys):

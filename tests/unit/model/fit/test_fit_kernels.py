@@ -6,14 +6,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from helpers.drawn_pixels import draw, samples
-from helpers.em_trace import LIMITS, em_trace, evaluated, one_sample
+from helpers.em_trace import em_trace, evaluated, one_sample
 from helpers.reference_pchem import Theta, em, log_likelihood
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 from scipy.stats import norm, poisson
 
-from pchem_pipeline.model.arithmetic import simd_math_numba
-from pchem_pipeline.model.errors import algebra_numba
 from pchem_pipeline.model.fit import (
     climb_numba,
     search_numba,
@@ -24,8 +22,6 @@ from pchem_pipeline.model.law.likelihood import density_likelihood
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     DERIVATIVES,
-    FIXED,
-    HELD,
     INFORMATION,
     LOGLIK_ALONE,
     SCORE,
@@ -132,27 +128,7 @@ def test_em_iterates_follow_the_paper(case: tuple[float, float, float]) -> None:
     assert not np.allclose(trace.parameters[1], trace.parameters[0], rtol=1e-4)
 
 
-def test_compiled_evaluation_equals_plain() -> None:
-    sample, centre, _, theta = prepare(CASES[0])
-    point = internal(theta, centre)
-    loglik = run(sample, point)
-    compiled = sample.at.copy()
-    plain = density_numba.evaluate_density(
-        sample.pixel, point, DERIVATIVES, sample.scratch, sample.scratch.evaluations[AT]
-    )
-    assert plain == pytest.approx(loglik, rel=1e-13)
-    np.testing.assert_allclose(sample.at, compiled, rtol=1e-9, atol=1e-7)
-
-
-def take_plain_simd(monkeypatch: pytest.MonkeyPatch) -> None:
-    """From here on loops in plain Python take their lanes from numpy; nothing can be compiled."""
-    for name in ("artanh_series", "simd_exp", "simd_log"):
-        plain = getattr(simd_math_numba, name).py_func
-        for module in (simd_math_numba, density_numba):
-            monkeypatch.setattr(module, name, plain, raising=False)
-
-
-def test_compiled_sums_equal_plain_at_every_width(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sums_of_a_width_are_those_of_any() -> None:
     kernels = {
         1: density_numba.sums_of_3,
         2: density_numba.sums_of_5,
@@ -174,17 +150,11 @@ def test_compiled_sums_equal_plain_at_every_width(monkeypatch: pytest.MonkeyPatc
             assert wide == half or wide >= half == 9
             comb = density_numba._Comb(a, np.exp(-point[3]), zero, first, last, wide, n_bins, stride)
             blocks, answers = -(-n_bins // stride), []
-            for function in (kernels[half], density_numba.sums_of_any, kernels[half].py_func):
-                if function is kernels[half].py_func:
-                    take_plain_simd(monkeypatch)
-                    for part in ("_lanes", "_add_moments", "_weighted_logs"):
-                        monkeypatch.setattr(density_numba, part, getattr(density_numba, part).py_func)
+            for function in (kernels[half], density_numba.sums_of_any):
                 rows[0] = 0.0
                 function(bins, comb, blocks, rows, sample.scratch.coefficients)
                 answers.append(rows[0, :10].copy())
-            monkeypatch.undo()
-            np.testing.assert_allclose(answers[0], answers[1], rtol=1e-11, atol=1e-9)
-            np.testing.assert_allclose(answers[0], answers[2], rtol=1e-11, atol=1e-9)
+            np.testing.assert_allclose(*answers, rtol=1e-11, atol=1e-9)
 
 
 def test_large_electron_numbers_and_a_comb_finer_than_any() -> None:
@@ -212,26 +182,6 @@ def test_far_values_have_the_density_of_the_nearest_component() -> None:
         k = np.arange(60)
         terms = poisson.logpmf(k, 1.0) + norm.logpdf(x[:, None], theta.bias + 11.0 * k, sigma)
         assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)
-
-
-def test_compiled_steps_equal_plain() -> None:
-    sample, centre, _, theta = prepare(CASES[0])
-    point = internal(theta, centre)
-    run(sample, point)
-    at, scratch, limits = sample.scratch.evaluations[AT], sample.scratch, LIMITS._replace(bound=-9.0)
-    scratch.flags[FIXED, 4] = scratch.flags[HELD, 4] = True
-    compiled, plain = np.zeros(5), np.zeros(5)
-    for kernel, arguments in (
-        (climb_numba.em_step, (sample.pixel, point, at, limits)),
-        (climb_numba.newton_step, (at, 0.01, 1e-5, scratch)),
-        (algebra_numba.solve_arrow, (at, 0.0, scratch)),
-    ):
-        assert kernel(*arguments, compiled) == pytest.approx(kernel.py_func(*arguments, plain))
-        np.testing.assert_allclose(compiled, plain, rtol=1e-9)
-    for find in (climb_numba.find_held, climb_numba.find_held.py_func):
-        held = np.zeros(5, np.bool_)
-        find(point, at, np.array([False, False, True, False, True]), limits, held)
-        assert held.tolist() == [False, False, True, False, True]
 
 
 def test_a_tied_step_leaves_the_noise_in_electrons() -> None:

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.model.histogram import count, count_numba
+from pchem_pipeline.model.histogram import count_numba
 from pchem_pipeline.model.histogram.count import (
     HistogramAccumulator,
     choose_bins,
@@ -139,40 +139,3 @@ def test_empty_block_changes_nothing():
     one.add(frames[:0])
     one.add(frames)
     np.testing.assert_array_equal(one.finish().counts, histogram_frames(frames, bins=128).counts)
-
-
-class TestCompiledEqualsPlain:
-    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
-    def test_whole_pass(self, monkeypatch, dtype):
-        frames = pcd_like(11, (60, 2, 3), dtype)
-        frames[3, 1, 1], frames[44, 0, 0], frames[45, 0, 2] = 0, 255, 1
-        frames[30:, 1, 2] += 20
-        compiled = histogram_frames(frames, bins=64, window_frames=20)
-        for name in ("count_frames", "place_windows", "recentre", "update_extremes", "update_range"):
-            monkeypatch.setattr(count, name, getattr(count_numba, name).py_func)
-        for name in ("shift_counts", "densest_origin", "_centred"):
-            monkeypatch.setattr(count_numba, name, getattr(count_numba, name).py_func)
-        plain = histogram_frames(frames, bins=64, window_frames=20)
-        assert (compiled.over + compiled.under).any()
-        for name, expected in vars(compiled).items():
-            np.testing.assert_array_equal(getattr(plain, name), expected, err_msg=name)
-
-    def test_extremes(self, monkeypatch):
-        frames = pcd_like(12, (70, 2, 3))
-        results = []
-        for _ in range(2):
-            results.append(pixels_by_range(frames, 1024))
-            monkeypatch.setattr(count, "update_extremes", count_numba.update_extremes.py_func)
-        np.testing.assert_array_equal(*results)
-
-    @pytest.mark.parametrize("shift", [-40, -32, -5, 0, 1, 31, 32, 40])
-    def test_shift(self, shift):
-        counts = np.arange(1, 33, dtype=np.uint16)
-        expected = np.zeros(32, np.uint16)
-        for k in range(32):
-            if 0 <= k + shift < 32:
-                expected[k] = counts[k + shift]
-        for function in (count_numba.shift_counts, count_numba.shift_counts.py_func):
-            moved = counts.copy()
-            function(moved, shift)
-            np.testing.assert_array_equal(moved, expected)

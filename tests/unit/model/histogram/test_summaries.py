@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.histogram import summaries, summaries_numba
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
     BlockSums,
@@ -137,19 +136,3 @@ def test_frame_statistics_with_a_large_mean():
     plain = line_sums(noise(7, (6, 10, 11)))
     _, variance = frame_statistics(plain.row_sum, plain.row_sum_square, 11)
     np.testing.assert_allclose(variance, noise(7, (6, 10, 11)).var(axis=(1, 2)), rtol=1e-11)
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32])
-def test_compiled_equals_plain(monkeypatch, dtype):
-    frames = noise(8, (12, 3, 4), dtype)
-    if dtype is not np.uint8:
-        frames[5, 1, 1] = 65535  # the row is summed in 64 bits
-    blocks, maps = summarise(frames, 5, (3, 4))
-    lines = line_sums(frames)
-    for name in ("add_products", "sum_lines"):
-        monkeypatch.setattr(summaries, name, getattr(summaries_numba, name).py_func)
-    plain_blocks, plain_maps = summarise(frames, 5, (3, 4))
-    pairs = [(lines, line_sums(frames)), (maps, plain_maps), *zip(blocks, plain_blocks, strict=True)]
-    for compiled, plain in pairs:
-        for name, expected in vars(compiled).items():
-            np.testing.assert_array_equal(getattr(plain, name), expected, err_msg=name)

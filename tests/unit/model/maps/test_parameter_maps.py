@@ -8,6 +8,7 @@ from pchem_pipeline.model.ensemble.settings import EnsembleSettings, MapsSetting
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.maps.exposure_series import exposure_line
 from pchem_pipeline.model.maps.maps import (
     CAUTION,
     GOOD,
@@ -20,7 +21,7 @@ from pchem_pipeline.model.maps.maps import (
     status_counts,
     summarise,
 )
-from pchem_pipeline.model.maps.ordered import Ordered
+from pchem_pipeline.model.maps.ordered import Ordered, median_of
 from pchem_pipeline.stages.maps import maps_tile
 
 PARAMETERS = {
@@ -204,3 +205,119 @@ def test_settings_refuse_nonsense() -> None:
         MapsSettings(percentiles=(50.0, 10.0))
     with pytest.raises(ValueError, match=r"0 to 100"):
         MapsSettings(percentiles=(50.0, 110.0))
+
+
+TIMES = np.array([0.5, 1.0, 2.0, 4.0])
+
+
+def test_equal_independent_errors_are_ordinary_least_squares():
+    rng = np.random.default_rng(1)
+    exposures = 5.0 + 0.1 * TIMES + 0.01 * rng.standard_normal((3, 4))
+    found = exposure_line(exposures, np.tile(1e-4 * np.eye(4), (3, 1, 1)), np.full((3, 4), 1e-4), TIMES)
+    for pixel in range(3):
+        slope, offset = np.polyfit(TIMES, exposures[pixel], 1)
+        assert found.slope[pixel] == pytest.approx(slope, rel=0.01)
+        assert found.offset[pixel] == pytest.approx(offset, rel=0.001)
+    np.testing.assert_allclose(
+        found.residual, exposures - found.slope[:, None] * TIMES - found.offset[:, None]
+    )
+    assert found.dof == 2
+
+
+def test_an_error_that_all_exposures_share_goes_into_the_offset():
+    rng = np.random.default_rng(2)
+    n, shared = 4000, 0.2
+    own = np.sqrt((1.05 + 0.3 * TIMES) / 2000)
+    exposures = 1.05 + 0.3 * TIMES + own * rng.standard_normal((n, 4)) + shared * rng.standard_normal((n, 1))
+    covariance = np.tile(np.diag(own**2) + shared**2, (n, 1, 1))
+    found = exposure_line(exposures, covariance, np.tile(own**2, (n, 1)), TIMES)
+    pull = (found.slope - 0.3) / np.sqrt(found.covariance[:, 0, 0])
+    assert abs(pull.mean()) < 5 / np.sqrt(n)
+    assert abs(pull.std() - 1) < 5 / np.sqrt(2 * n)
+    # unaware of the shared error, the slope would be weighed wrongly: its error is far below the shared one
+    assert np.sqrt(found.covariance[:, 0, 0]).max() < 0.1 * shared < np.sqrt(found.covariance[:, 1, 1]).min()
+    assert abs(found.chi2.mean() - 2) < 5 * 2 / np.sqrt(n)
+    spread = (found.residual / found.residual_stderr).std(axis=0)
+    assert (np.abs(spread - 1) < 5 / np.sqrt(2 * n)).all()
+
+
+def test_small_exposures_do_not_claim_too_much_weight():
+    # with variances at the estimates, low estimates weigh most and the slope is biased low
+    rng = np.random.default_rng(3)
+    n, frames = 20_000, 400
+    exposures = rng.poisson(0.02 * TIMES * frames, (n, 4)) / frames
+    variance = np.maximum(exposures, 1e-4) / frames
+    found = exposure_line(exposures, np.einsum("nj,jk->njk", variance, np.eye(4)), variance, TIMES)
+    error = found.slope.std() / np.sqrt(n)
+    weights = 1 / np.maximum(exposures, 1e-4)
+    naive = (weights * exposures / TIMES).sum(axis=1) / weights.sum(axis=1)
+    assert abs(naive.mean() - 0.02) > 20 * error
+    assert abs(found.slope.mean() - 0.02) < 0.1 * found.slope.std()
+
+
+def test_pixels_without_exposures_and_two_samples():
+    exposures = np.array([[1.0, 2.0], [np.nan, 2.0]])
+    found = exposure_line(exposures, np.tile(0.01 * np.eye(2), (2, 1, 1)), np.full((2, 2), 0.01), [1.0, 3.0])
+    assert found.slope[0] == pytest.approx(0.5)
+    assert found.offset[0] == pytest.approx(0.5)
+    assert np.isnan(found.slope[1])
+    assert np.isnan(found.p).all()
+    assert found.residual_stderr[0].tolist() == [0.0, 0.0]
+
+
+def test_equal_times_give_no_line():
+    with pytest.raises(ValueError, match="two different"):
+        exposure_line(np.ones((1, 2)), np.ones((1, 2, 2)), np.ones((1, 2)), [1.0, 1.0])
+
+
+def _maps():
+    rng = np.random.default_rng(4)
+    for n in (1, 2, 3, 4, 7, 50, 51, 20_001):
+        yield rng.standard_normal(n)
+        yield rng.integers(0, 4, n).astype(np.float64)
+        yield np.exp(4.0 * rng.standard_normal(n))
+
+
+@pytest.mark.parametrize("values", list(_maps()), ids=lambda values: f"n{values.size}")
+def test_every_number_is_that_of_numpy_to_the_bit(values):
+    found = Ordered.of(values)
+    shares = np.random.default_rng(values.size).random(9)
+    np.testing.assert_array_equal(found.quantiles(shares), np.quantile(values, shares))
+    assert found.median == median_of(values) == np.median(values)
+    assert found.robust_sd == 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    for rank in (-1.0, 0.3 * values.size, values.size + 1.0):
+        assert found.at_rank(rank) == np.interp(rank, np.arange(values.size), np.sort(values))
+    edges = np.linspace(np.quantile(values, 0.1) - 1e-9, values.max(), 9)
+    np.testing.assert_array_equal(found.histogram(edges), np.histogram(values, edges)[0])
+    middle = values[values.size // 2]
+    assert (found.n_below(middle), found.n_above(middle)) == (
+        (values < middle).sum(),
+        (values > middle).sum(),
+    )
+    np.testing.assert_array_equal(
+        found.within(0.0, middle).values, np.sort(values[(values >= 0.0) & (values <= middle)])
+    )
+    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
+    np.testing.assert_array_equal(
+        found.shares(values), ((np.cumsum(counts) - 0.5 * counts) / values.size)[inverse]
+    )
+
+
+def test_what_has_no_value_or_is_left_out_is_counted():
+    values = np.array([[3.0, np.nan, 1.0], [np.inf, 2.0, 7.0]])
+    found = Ordered.of(values, values == 7.0)
+    np.testing.assert_array_equal(found.values, [1.0, 2.0, 3.0])
+    assert (found.n_missing, found.n_left_out) == (2, 1)
+    assert median_of(values, values == 7.0) == 2.0
+    nothing = Ordered.of(np.full(3, np.nan))
+    assert np.isnan(median_of(np.full(3, np.nan)))
+    assert np.isnan(nothing.median)
+    assert np.isnan(nothing.robust_sd)
+
+
+def test_a_map_is_not_changed():
+    values = np.array([3.0, -np.inf, 1.0, 2.0, np.nan])
+    before = values.copy()
+    assert Ordered.of(values, values == 3.0).median == 1.5
+    assert median_of(values, values == 3.0) == 1.5
+    np.testing.assert_array_equal(values, before)

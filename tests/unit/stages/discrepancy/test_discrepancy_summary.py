@@ -51,26 +51,11 @@ def test_a_verdict_says_why_the_next_rivals_lost() -> None:
     )
 
 
-def test_nats_are_plain_numbers() -> None:
-    found = verdict_of("named")
-    (rival, *_), first = found.steps[0].rivals, found.steps[0]
-    far = rival.model_copy(update={"behind": -6594.2})
-    found = found.model_copy(update={"steps": (first.model_copy(update={"rivals": (far,)}),)})
-    assert "(log-likelihood lower by 6,594)" in " ".join(verdict_text(found).split())
-
-
 def test_an_unexplained_verdict_says_what_is_left() -> None:
     lines = verdict_text(verdict_of("unexplained")).splitlines()
     at = lines.index("unexplained:")
     assert "adjacent codes deviate from the model with opposite signs (22 sigma)" in lines[at + 1]
     assert "unexplained:" not in verdict_text(verdict_of("named"))
-
-
-def test_a_consistent_verdict_has_no_candidates() -> None:
-    text = verdict_text(verdict_of("consistent"))
-    assert "CONSISTENT: Data and model agree within sampling noise." in text
-    assert "score" not in text
-    assert "→" not in text
 
 
 def test_a_strangers_message_keeps_the_columns() -> None:

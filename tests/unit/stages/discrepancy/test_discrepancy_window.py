@@ -109,47 +109,6 @@ def test_the_window_becomes_smaller_with_the_memory(shape):
         within_memory(settings, shape, None, 100.0, 290 << 20)
 
 
-def test_a_search_that_was_stopped_goes_on_in_the_window_that_it_had(monkeypatch):
-    """With other memory, too: its simulated stacks are of that window."""
-    markers, looked = {}, []
-
-    def seen(*_):
-        looked.append(1)
-        return Survey({"next_x": place(columns=[[3, 8]])}, {"neighbours": 0.3})
-
-    def run_units(units, task, **_):
-        markers.update({unit.key: json.loads(json.dumps(task(unit, None))) for unit in units})
-
-    def context(limit):
-        return SimpleNamespace(
-            config=SimpleNamespace(
-                discrepancy=DiscrepancySettings(), compute=SimpleNamespace(max_memory=limit)
-            ),
-            store=SimpleNamespace(
-                records=SimpleNamespace(summaries=lambda *_: markers), has=lambda name: False
-            ),
-            fingerprint="x",
-            note=notes.append,
-            run_units=run_units,
-        )
-
-    notes: list[str] = []
-    monkeypatch.setattr(discrepancy, "survey", seen)
-
-    def fewer(_, allowed, *__):
-        return allowed.model_copy(update={"max_samples": 1 << 17})
-
-    monkeypatch.setattr(discrepancy, "fewer_samples", fewer)
-    source = SimpleNamespace(shape=(1000, 512, 512))
-    first = discrepancy._surveyed(context(400), source, (), None, lambda _: None)
-    assert first[0].max_pixels < 8192
-    assert first[0].max_samples == 1 << 17
-    assert [note.split()[0] for note in notes] == ["compute.max_memory", "clear"]
-    again = discrepancy._surveyed(context(None), source, (), None, lambda _: None)
-    assert again == first
-    assert (len(looked), len(notes)) == (2, 2)
-
-
 def test_the_region_asked_for_is_looked_at():
     window = choose_window((1000, 64, 64), WHOLE, (8, 24, 16, 48))
     assert (window.rows, window.columns) == ((8, 24), (16, 48))

@@ -11,11 +11,10 @@ from pchem_pipeline.base import variables
 from pchem_pipeline.base.variables import Variable
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.inspector import map_facts
 from pchem_pipeline.report.pages import report as page_report
 from pchem_pipeline.report.pages.page import Section
 from pchem_pipeline.stages.report import inspector
-from pchem_pipeline.stages.report.inspector import listed_maps, read_maps
+from pchem_pipeline.stages.report.inspector import listed_maps
 from pchem_pipeline.stages.report.pixels import choose_inspected
 from pchem_pipeline.store.run_store import RunStore
 
@@ -104,22 +103,6 @@ def test_of_many_pixels_a_page_holds_few_megabytes_and_little_is_tried(
     assert inspector._coarse(512 * 512)[1].startswith("a sixteenth")
 
 
-@pytest.mark.parametrize("budget", [1e9, 1500.0])
-def test_threads_change_nothing(
-    store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch, budget: float
-) -> None:
-    monkeypatch.setattr(inspector, "_MAPS_BUDGET", budget)
-    index = np.array([3, 50, 7])
-    (one, exact), (several, also) = (read_maps(store, SHAPE, index, threads=n) for n in (1, 3))
-    assert [map_facts(each) for each in several] == [map_facts(each) for each in one]
-    assert [each.packed and each.packed.data for each in several] == [
-        each.packed and each.packed.data for each in one
-    ]
-    assert list(also) == list(exact)
-    for path, values in exact.items():
-        np.testing.assert_array_equal(also[path], values)
-
-
 def test_the_charge_rate_costs_nothing(store: RunStore, data: ReportData) -> None:
     shown = inspector_of(store, data.maps, data.fit)
     entry = next(each for each in shown.maps if each.path == "maps/charge_rate")
@@ -167,12 +150,6 @@ def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
     for line, n in ((chosen.index // 120, 100), (chosen.index % 120, 120)):
         parts = np.histogram(line, bins=10, range=(0, n))[0]
         assert parts.min() > 100
-
-
-def test_the_choice_repeats() -> None:
-    data = report_data((100, 120))
-    choices = [choose_inspected(data.maps, data.fit, [], everything=10, most=300).index for _ in range(2)]
-    np.testing.assert_array_equal(*choices)
 
 
 # -- the first screen and the sections -------------------------------------------------------

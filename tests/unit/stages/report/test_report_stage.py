@@ -14,13 +14,11 @@ from pchem_pipeline.compute.executor import beside
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.report.figures.catalogue import report_figures
 from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
-from pchem_pipeline.stages.report import report
 from pchem_pipeline.stages.report.pixels import choose_pixels
 from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.stages.table import STAGES
@@ -62,12 +60,6 @@ def folder(base: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Write without drawing: fast."""
-    monkeypatch.setattr(report, "render_report", lambda data, draw: {"report.html": "page"})
-
-
 def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     context = make_context(folder, title="My <sensor>")
     assert execute("report", context).state == "complete"
@@ -94,15 +86,6 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     assert status(STAGES["report"], context).state == "complete"
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_settings_of_the_report_make_only_it_stale(folder: Path) -> None:
-    execute("report", make_context(folder))
-    changed = make_context(folder, {"pixels": [[0, 1]]})
-    state = status(STAGES["report"], changed)
-    assert state.state == "stale"
-    assert "report.pixels [] -> [[0, 1]]" in state.why
-
-
 def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder: Path) -> None:
     context = make_context(folder, {"pixels": [[2, 1], [15, 23]]})
     data = gather(context.store, context.config, [])
@@ -125,18 +108,6 @@ def test_a_report_is_the_same_whoever_works_on_it(folder: Path) -> None:
             pages.append(page_without_pictures(data))
     assert 'id="inspector-app"' in pages[0]
     assert len(set(pages)) == 1  # without pytest's comparison
-
-
-def test_figures_alone_pack_no_maps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise AssertionError("packed")
-
-    monkeypatch.setattr(report, "read_maps", fail)
-    context = make_context(folder)
-    data = gather(context.store, context.config, [])
-    assert report_figures(data)
-    with pytest.raises(AssertionError, match="packed"):
-        data.inspector()  # type: ignore[misc]
 
 
 def test_a_histogram_is_that_of_its_pixel(folder: Path) -> None:

@@ -1,0 +1,119 @@
+"""What commands refuse before they write, which frames they take for the same, and tables for others."""
+
+import csv
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.commands.apply.source import open_like_run
+from pchem_pipeline.commands.compare.compare import _data_digest
+from pchem_pipeline.commands.compare.history import PixelStates, history_csv
+from pchem_pipeline.commands.demo import hidden_effect, run_demo
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.effects.framework.region import Region, When
+from pchem_pipeline.report.comparison import HistoryRow, RunFacts
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.target import Target
+from pchem_pipeline.store.records import StageRecord
+from pchem_pipeline.store.run_store import RunStore
+
+
+def test_another_dataset_of_the_same_file_holds_other_frames(tmp_path):
+    sensor = SensorInfo("frames", 9, 4, 4, "uint16", 12, None, "copy", {"digest": "d"})
+    digests = []
+    for number, dataset in enumerate(("dark/frames", "dark/frames", "light/frames")):
+        store = RunStore.create(tmp_path / f"{number}.zarr")
+        content = {"settings": {"input.dataset": dataset}}
+        store.records.write(StageRecord("ingest", 1, "f", content, finished=True))
+        digests.append(_data_digest(store, sensor))
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_labels_are_no_formulas_of_a_spreadsheet():
+    labels = ["=1+1", "@SUM(A1)", "-2+cmd|'/C x'!A0", "+1 V (high)", "-20 °C", "-5.5", "night 3"]
+    run = RunFacts("A", "=x.zarr", (8, 8), 9, "", summary={})
+    rows = [HistoryRow(label, "", None, np.nan, run) for label in labels]
+    cells = [line[0] for line in csv.reader(history_csv(rows).splitlines()[1:])]
+    assert cells == ["'=1+1", "'@SUM(A1)", "'-2+cmd|'/C x'!A0", "'+1 V (high)", *labels[4:]]
+    assert {line["run"] for line in csv.DictReader(history_csv(rows).splitlines())} == {"'=x.zarr"}
+
+
+def test_a_pixel_is_newly_hot_unless_its_exposure_agrees_within_the_errors_that_are_known():
+    exposure = np.array([[1.0, 6.0, 6.0, 60.0]])
+    nothing = np.zeros((2, 1, 4), np.uint8)
+    hot = PixelStates(exposure > 5.5, exposure, np.array([[0.1, 0.1, 0.1, np.nan]]), *nothing)
+    before = np.array([[1.0, 5.4, 1.0, 1.0]])
+    first = PixelStates(before > 5.5, before, np.full((1, 4), 0.1), *nothing)
+    assert hot.new_since(first) == ((0, 2), (0, 3))
+    assert first.new_since(hot) == ()
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ("rownoise@columns=2:5", r"'rownoise': no such effect; choose one of: adc_dnl, .*row_noise"),
+        ("row_noise@colums=2:5", "columns=A:B"),
+        ("row_noise@columns=2:9000", "the sensor has"),
+        ("clipping", "has no typical strength"),
+    ],
+)
+def test_what_cannot_be_hidden_is_refused(tmp_path: Path, asked: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        run_demo(tmp_path / "x", hidden=asked, size=8, n_frames=60, seed=1)
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").touch()
+    with pytest.raises(ConfigError, match="is not empty; choose another folder"):
+        run_demo(tmp_path, hidden="row_noise", size=8, n_frames=60, seed=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_an_effect_can_be_hidden_in_a_place() -> None:
+    effect = hidden_effect("row_noise@columns=2:5,frames=10:20", 12, 60)
+    everywhere = hidden_effect("row_noise", 12, 60).model_dump()["row_noise_dn"]
+    assert effect.model_dump()["row_noise_dn"] == pytest.approx(everywhere * (4 * 6) ** 0.5)
+    assert effect.region == Region(columns=((2, 5),))
+    assert effect.when == When(range=((10, 20),))
+
+
+def test_a_region_of_frames_of_another_size_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sensor = SensorInfo("frames", 5, 4, 4, "uint16", None, None, "copy", {}, whole=(8, 9))
+    config = RunConfig.model_validate({"input": {"files": ["a.npy"], "roi": [2, 6, 3, 7]}})
+    target = Target(config, tmp_path, tmp_path / "run.zarr")
+    frames = np.arange(3 * 8 * 9, dtype=np.uint16).reshape(3, 8, 9)
+    given = {"whole": frames, "region": frames[:, 2:6, 3:7], "other": np.zeros((3, 12, 12), np.uint16)}
+    for name, dn in given.items():
+        np.save(f"{name}.npy", dn)
+    for name in ("whole", "region"):
+        with open_like_run(target, sensor, [f"{name}.npy"]) as found:
+            np.testing.assert_array_equal(found.read(), frames[:, 2:6, 3:7])
+    with pytest.raises(
+        InputError, match=r"other.npy: frames of 12 x 12 .* \[2, 6, 3, 7\] of frames of 8 x 9"
+    ):
+        open_like_run(target, sensor, ["other.npy"])
+
+
+def test_the_dataset_of_other_frames_may_be_another(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    dark, light = np.full((2, 5, 4, 4), 100, np.uint16)
+    light += 20
+    with h5py.File("night.h5", "w") as file:
+        file["dark/frames"], file["light/frames"] = dark, light
+    sensor = SensorInfo("frames", 5, 4, 4, "uint16", None, None, "copy", {})
+    for own, given, found in (
+        ("dark/frames", None, dark),
+        ("dark/frames", "light/frames", light),
+        (None, "light/frames", light),
+    ):
+        config = RunConfig.model_validate({"input": {"files": ["a.h5"], "dataset": own}})
+        target = Target(config, tmp_path, tmp_path / "run.zarr")
+        with open_like_run(target, sensor, ["night.h5"], given) as frames:
+            np.testing.assert_array_equal(frames.read(), found)
+    with pytest.raises(InputError, match=r"several datasets: .*; choose one with input\.dataset"):
+        open_like_run(target, sensor, ["night.h5"])
