@@ -48,13 +48,13 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
         path = Path(entry)
         with suppress(RuntimeError):  # a file called ~x.tif
             path = path.expanduser()
-        path = base_dir / path
+        pattern, path = path, base_dir / path
         if path.is_dir() and not is_zarr(path):
             found += _folder(path, settings)
         elif path.exists():
             found.append(path)
         elif _GLOB.search(entry):
-            found += _glob(path, base_dir, entry)
+            found += _glob(pattern, base_dir)
         else:
             missing.append(path)
     if missing:
@@ -98,7 +98,7 @@ def mask_path(settings: InputSettings, base_dir: Path) -> Path | None:
     return resolve_files(settings.model_copy(update={"files": (settings.mask,)}), base_dir)[0]
 
 
-def _glob(pattern: Path, base_dir: Path, entry: str) -> list[Path]:
+def _glob(pattern: Path, base_dir: Path) -> list[Path]:
     """Return the files that a pattern names; in the names of ``base_dir`` nothing is a pattern."""
     whole = pattern.is_absolute()
     folder = Path(pattern.anchor) if whole else base_dir
@@ -108,7 +108,7 @@ def _glob(pattern: Path, base_dir: Path, entry: str) -> list[Path]:
     plain = [path for path in files if path.is_file() or is_zarr(path)]
     if not plain:
         raise InputError(
-            f"{entry}: matches no file; bring the files back, or correct the pattern (input.files)"
+            f"{base_dir / pattern}: matches no file; bring the files back, or correct input.files"
         )
     return plain
 

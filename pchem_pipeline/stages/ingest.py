@@ -212,4 +212,5 @@ def _record_histograms(context: StageContext) -> None:
         names=given.names,
         reader="histogram",
     ).write(context.store)
+    keep_ingested(context)
     _run_whole(context)

@@ -84,10 +84,11 @@ class RunStore:
         from pchem_pipeline.store.zarr_store import zarr_store
 
         path = place_of(path)
-        strangers = _strangers(path)  # looked for first: another process may be making the same store
+        # looked for first: another process may be making the same store
+        others = _holds_other_files(path)
         if (path / DESCRIPTION).exists():
             return cls.open(path, writable=True)
-        if strangers:
+        if others:
             raise StoreError(f"{path} exists and is not a run; choose another --store or remove it")
         with _one_line(path, path), suppress(ContainsGroupError):
             disk.make_folder(path)
@@ -438,7 +439,7 @@ def _refuse_links(path: Path) -> None:
         )
 
 
-def _strangers(path: Path) -> bool:
+def _holds_other_files(path: Path) -> bool:
     """Tell whether there is more at a path than a store that has just begun, or is being made, or a run."""
     if not path.is_dir():
         return path.exists() and not path.is_dir()  # another process may make the folder meanwhile

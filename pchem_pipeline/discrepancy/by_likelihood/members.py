@@ -218,7 +218,7 @@ def find_members(
         if effect.rough_law:
             untestable[tag] = _FEW_PIXELS
             continue
-        # whatever a stranger's effect raises must not stop the others
+        # an effect of a plug-in may raise anything: the others are compared all the same
         try:
             starts = [*effect.typical(), *effect.estimate(evidence)]
             found = [Member.of(start) for start in _distinct(starts) if _changes(start, evidence)]

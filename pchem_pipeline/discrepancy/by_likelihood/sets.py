@@ -231,7 +231,7 @@ class SetComparison:
         if kinds in self._known:
             return self._known[kinds]
         self.effort.check(f"{' with '.join(m.tag for m in members) or 'the model'} was fitted")
-        # whatever a stranger's effect raises must not stop the others
+        # an effect of a plug-in may raise anything: the others are compared all the same
         try:
             return self._known.setdefault(kinds, self.fit(members, start))
         except ValueError:
@@ -284,7 +284,7 @@ class SetComparison:
                 continue
             try:
                 slope, step = self._slope(base, theta, member, tangent.log_masses)
-            # whatever a stranger's effect raises must not stop the others
+            # an effect of a plug-in may raise anything: the others are compared all the same
             except Exception as error:
                 self.failed[member.tag] = error_words(error)
                 continue

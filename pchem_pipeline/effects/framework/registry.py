@@ -68,7 +68,7 @@ def _discover() -> _Found:
     classes = registered_effects()
     broken: dict[str, str] = {}
     for point in entry_points(group=ENTRY_POINT_GROUP):
-        # whatever a stranger's import raises must not stop a run that does not use it
+        # a plug-in may raise anything when it is imported: a run that does not use it goes on
         try:
             effect = point.load()
             tag = tag_of(effect)

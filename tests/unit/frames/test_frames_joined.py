@@ -50,6 +50,10 @@ def test_resolve(tmp_path: Path) -> None:
     literal = tmp_path / "odd[1].npy"
     np.save(literal, STACK)
     assert names("odd[1].npy") == ["odd[1].npy"]
+    folder = tmp_path / "run [1]"
+    folder.mkdir()
+    np.save(folder / "f.npy", STACK)
+    assert resolve_files(InputSettings(files=("*.npy",)), folder) == [folder / "f.npy"]
 
 
 def test_missing_and_empty(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def serial(replicates: Sequence[Replicate]) -> list[Vector | Exception]:
     for replicate in replicates:
         try:
             found.append(replicate())
-        # whatever a stranger's effect raises must not stop the others
+        # an effect of a plug-in may raise anything: the others are compared all the same
         except Exception as error:
             found.append(error)
     return found
@@ -105,7 +105,7 @@ def placebo_for(
             continue
         try:
             typical = effect.typical() if effect.strength else ()
-        # whatever a stranger's effect raises must not stop the others
+        # an effect of a plug-in may raise anything: the others are compared all the same
         except Exception as error:
             note_defect(defects, tag, error)
             continue
@@ -181,7 +181,7 @@ class ReplicateSimulator:
                         if not any(self._overlap(there, present, window.shape) for present in taken):
                             found.append(there)
                             placed.append((rank, -clear, there))
-            # whatever a stranger's estimator raises must not stop the others
+            # an estimator of a plug-in may raise anything: the others are compared all the same
             except Exception as error:
                 note_defect(self.defects, tag, error)
         placed.sort(key=lambda item: item[:2])

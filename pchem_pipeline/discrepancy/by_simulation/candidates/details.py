@@ -111,7 +111,7 @@ def _numbers(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> list[tuple
     """
     found: list[tuple[int, str]] = []
     for place, h in enumerate(hypotheses):
-        # whatever a stranger's effect raises must not stop the others
+        # an effect of a plug-in may raise anything: the others are compared all the same
         try:
             tuned = (
                 h.effect.details() if h.effect.strength and not identifiable_from_histograms(h.effect) else ()

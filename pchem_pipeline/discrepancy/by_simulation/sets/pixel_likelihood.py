@@ -122,7 +122,7 @@ class PixelLikelihood:
         """
         fits: list[tuple[float, Effect]] = []
         for kind in kinds:
-            # whatever a stranger's effect raises must not stop the others
+            # an effect of a plug-in may raise anything: the others are compared all the same
             try:
                 starts = _starts(kind)
             except Exception as error:
@@ -189,7 +189,7 @@ class PixelLikelihood:
             if fitted.fit.log_likelihood.sum() - without > _ASTRAY * len(fitted.fit.log_likelihood):
                 for electrons in (-1.0, 1.0):
                     fitted = _electrons_off(sets, fitted, electrons)
-        # whatever a stranger's effect raises must not stop the others
+        # an effect of a plug-in may raise anything: the others are compared all the same
         except Exception as error:
             if not _refuses(error):
                 note_defect(self._defects, (*besides, *effects)[-1].tag, error)
