@@ -180,6 +180,190 @@ def test_a_plain_stack_has_the_moments_of_the_pcd(seed):
         assert abs(value) < 5 * error
 
 
+def noise_of(tag, k=None, n=400):
+    """The hook of a noise effect on normal numbers, in units of the plain noise."""
+    (effect,) = made(tag).effects
+    rng = np.random.default_rng(1)
+    s = effect.sensor.noise
+    k = np.zeros(SHAPE, int) if k is None else k
+    plain = [s * rng.standard_normal(SHAPE) for _ in range(n)]
+    return effect, np.array([effect.noise(t, p, k) / s for t, p in enumerate(plain)])
+
+
+def test_rts_widens_the_chosen_pixels_only():
+    hiding = made("rts_noise")
+    (effect,) = hiding.effects
+    pulls = lambda v: (v.c.var(axis=0, ddof=1) - v.var) / np.sqrt((v.fourth - v.var**2) / FRAMES)  # noqa: E731
+    inside, outside = pulls(View(hiding))[effect.affected], pulls(View(hiding))[~effect.affected]
+    assert inside.sum() > 5 * np.sqrt(inside.size)
+    assert abs(outside.mean()) < 5 / np.sqrt(outside.size)
+    assert abs(pulls(View(made()))[effect.affected].sum()) < 5 * np.sqrt(inside.size)
+
+
+def test_the_trap_of_averaged_reads_moves_in_steps():
+    for seed in range(30):
+        (effect,) = hide(("rts_noise",), 4.0, seed, (8, 8), 40).effects
+        jumps = np.array([effect.noise(t, np.zeros((8, 8)), None)[effect.where] for t in range(40)])
+        levels = jumps / effect.amplitude * max(effect.reads, 1)
+        if effect.reads:
+            np.testing.assert_allclose(levels, np.round(levels), atol=1e-9)
+            assert abs(levels).max() <= effect.reads
+            assert levels.min() < 0 < levels.max()
+        else:
+            assert len(np.unique(levels[:, 0].round(9))) <= 2
+
+
+def test_blinking_pixels_follow_their_defects():
+    hiding = made("dark_current_rts")
+    (effect,) = hiding.effects
+    regressor = np.zeros((FRAMES, *SHAPE))
+    regressor[:, *effect.where] = effect.extra
+    value, error = regress(View(hiding), regressor)
+    assert abs(value - 1) < 5 * max(error, 0.02)
+    assert 5 * error < 1
+    value, error = regress(View(made()), regressor)
+    assert abs(value) < 5 * error
+
+
+def test_heavy_tails_and_skew():
+    effect, noise = noise_of("heavy_tailed_noise")
+    kurtosis = (noise**4).mean() / (noise**2).mean() ** 2 - 3
+    # a mixture of widths, or Student's law of the same excess kurtosis
+    expected = 3 * effect.strength * (effect.parameters.get("width", 3.0) ** 2 - 1) ** 2
+    assert abs(kurtosis - expected) < 0.3 * expected
+    assert expected > 5 * np.sqrt(24 / noise.size)
+    effect, noise = noise_of("noise_skew")
+    assert abs((noise**2).mean() - 1) < 0.05
+    assert abs((noise**3).mean() - 2 * effect.side * effect.strength**3) < 0.15
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_flicker_keeps_the_power_and_correlates_its_part(seed):
+    (effect,) = hide(("flicker_noise",), 100.0, seed, (64, 64), 400).effects
+    rng = np.random.default_rng(seed)
+    s = effect.sensor.noise
+    noise = np.array([effect.noise(t, s * rng.standard_normal(s.shape), None) / s for t in range(60)])
+    assert abs((noise**2).mean() - 1) < 0.05
+    expected = effect.strength * np.exp(-1 / effect.tau).mean()
+    assert abs((noise[1:] * noise[:-1]).mean() - expected) < 5 / np.sqrt(noise.size) + 0.05 * expected
+    assert expected > 10 / np.sqrt(noise.size)
+
+
+def test_noise_grows_with_the_electrons():
+    effect, noise = noise_of("signal_dependent_noise", k=np.full(SHAPE, 4))
+    expected = 1 + effect.each**2 * 4 ** (2 * effect.power) * (1 / effect.sensor.noise**2).mean()
+    assert abs((noise**2).mean() - expected) < 5 * np.sqrt(2 / noise.size) * expected
+    assert expected - 1 > 5 * np.sqrt(2 / noise.size)
+    empty = noise_of("signal_dependent_noise")[1]
+    assert abs((empty**2).mean() - 1) < 5 * np.sqrt(2 / noise.size)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_codes_have_the_widths_of_their_pattern(seed):
+    (effect,) = hide(("adc_dnl",), 40.0, seed, (8, 8), 400).effects
+    fine = np.arange(80, 240, 1 / 2000)
+    code = effect.convert(0, fine, np.floor(fine + 0.5).astype(int))
+    assert (np.diff(code) >= 0).all()
+    width = np.bincount(code, minlength=300)[90:230] / 2000
+    np.testing.assert_allclose(width, 1 + np.diff(effect.edges)[90:230], atol=2e-3)
+    assert abs(width - 1).max() > 0.1
+    assert abs(width.mean() - 1) < 0.02
+
+
+def test_a_bent_converter_stays_within_its_amplitude():
+    (effect,) = made("adc_inl").effects
+    dn = np.linspace(*effect.sensor.code_range, 1000)
+    bend = effect.voltage(0, dn) - dn
+    assert 0.9 * effect.strength < abs(bend).max() <= effect.strength * (1 + 1e-9)
+
+
+def test_clipping_catches_the_part_that_is_asked():
+    for seed in (1, 2, 3, 4):
+        hiding = hide(("clipping",), 4.0, seed, SHAPE, FRAMES)
+        (effect,) = hiding.effects
+        plain = made(seed=seed).frames
+        limit = effect.parameters["limit_dn"]
+        cut = np.maximum(plain, limit) if effect.side == "low" else np.minimum(plain, limit)
+        np.testing.assert_array_equal(hiding.frames, cut)
+        assert 0.4 < effect.parameters["samples"] / (effect.strength * plain.size) < 2.5
+
+
+def test_repeats_are_exact_and_where_the_key_says():
+    hiding, plain = made("repeated_frames"), made().frames
+    (effect,) = hiding.effects
+    same = (hiding.frames[1:, effect.rows] == hiding.frames[:-1, effect.rows]).all(axis=(1, 2))
+    assert (np.flatnonzero(same) + 1).tolist() == effect.parameters["frames"]
+    assert not (plain[1:] == plain[:-1]).all(axis=(1, 2)).any()
+
+
+def test_corrected_pixels_equal_their_median():
+    hiding, plain = hide(("pixel_correction",), 20.0, SEED, SHAPE, FRAMES), made().frames.astype(int)
+    (effect,) = hiding.effects
+    changed = np.argwhere(hiding.frames != plain)
+    assert len(changed) > 50
+    for t, y, x in changed[:50]:
+        around = np.delete(plain[t, y - 1 : y + 2, x - 1 : x + 2].ravel(), 4)
+        assert hiding.frames[t, y, x] == int(np.median(around)) < plain[t, y, x] - effect.limit
+
+
+def test_wrong_bits_are_the_bit_and_the_share_of_the_key():
+    hiding, plain = made("bit_errors"), made().frames
+    (effect,) = hiding.effects
+    changed = hiding.frames != plain
+    assert set((hiding.frames ^ plain)[changed].tolist()) == {2**effect.bit}
+    possible = np.ones(plain.shape, bool) if effect.kind == "flip" else (plain >> effect.bit & 1) == 1
+    n = int(possible.sum())
+    assert abs(changed.sum() - n * effect.strength) < 5 * np.sqrt(n * effect.strength)
+
+
+def test_offsets_follow_the_bit_before():
+    hiding, plain = hide(("binary_offset",), 20.0, SEED, SHAPE, FRAMES), made().frames.astype(int)
+    (effect,) = hiding.effects
+    moved = (hiding.frames.astype(int) - plain)[:, :, 1:]
+    one = (hiding.frames[:, :, :-1] >> effect.bit & 1) == 1
+    apart = moved[one].mean() - moved[~one].mean()
+    assert abs(apart / (effect.side * effect.strength) - 1) < 0.05
+
+
+def test_repeated_lines_are_those_before_them():
+    for seed in (1, 2, 3):
+        hiding, plain = hide(("repeated_lines",), 20.0, seed, SHAPE, FRAMES), made(seed=seed).frames
+        (effect,) = hiding.effects
+        found, before = (np.moveaxis(f, effect.axis + 1, 1) for f in (hiding.frames, plain))
+        changed = (found != before).any(axis=2)
+        t, y = np.nonzero(changed)
+        np.testing.assert_array_equal(found[t, y], before[t, y - 1])
+        n = changed[:, 1:].size
+        assert abs(changed.sum() - n * effect.strength) < 5 * np.sqrt(n * effect.strength)
+
+
+def test_misplaced_lines_hold_the_samples_of_others():
+    moves = set()
+    for seed in range(12):
+        hiding, plain = hide(("misplaced_lines",), 20.0, seed, SHAPE, FRAMES), made(seed=seed).frames
+        (effect,) = hiding.effects
+        found, before = (np.moveaxis(f, effect.axis + 1, 1) for f in (hiding.frames, plain))
+        changed = (found != before).any(axis=2)
+        n = FRAMES if effect.move == "line_lost" else changed.size
+        hit = changed.any(axis=1).sum() if effect.move == "line_lost" else changed.sum()
+        # a sample lost near the end of a short line is often not seen
+        assert 0.6 * n * effect.strength < hit < n * effect.strength + 5 * np.sqrt(n * effect.strength)
+        t, y = np.nonzero(changed)
+        if effect.move in ("early", "late"):
+            come = np.clip(
+                np.arange(found.shape[2]) + (1 if effect.move == "early" else -1), 0, found.shape[2] - 1
+            )
+            np.testing.assert_array_equal(found[t, y], before[t, y][:, come])
+        moves.add(effect.move)
+    assert len(moves) >= 4
+
+
+def test_particles_leave_what_no_electron_count_does():
+    hot = View(made("cosmic_rays")).d > 40
+    assert 4 <= hot.any(axis=(1, 2)).sum() <= made("cosmic_rays").effects[0].parameters["tracks"]
+    assert not (View(made()).d > 40).any()
+
+
 @pytest.mark.parametrize("tag", UNTESTABLE)
 def test_the_untestable_leave_the_electrons_poisson_and_independent(tag):
     hiding = made(tag)
@@ -194,6 +378,15 @@ def test_the_untestable_leave_the_electrons_poisson_and_independent(tag):
     assert (hiding.frames != made().frames).mean() > 0.1
 
 
+def test_those_outside_the_library_do_something():
+    (effect,) = made("self_trigger_cut").effects
+    k = np.random.default_rng(2).poisson(effect.sensor.exposure, (400, *SHAPE))
+    cut = np.array([effect.electrons(0, one) for one in k])
+    expected = ((k == 0).sum(axis=0) * (1 + effect.strength * np.expm1(-effect.sensor.exposure))).sum()
+    assert abs((cut == 0).sum() / expected - 1) < 0.01
+    assert (cut == 0).sum() < 0.995 * (k == 0).sum()
+
+
 def test_the_sensor_does_not_depend_on_what_is_hidden():
     alone, pair = made("row_noise"), hide(("row_noise", "adc_dnl"), 4.0, SEED, SHAPE, FRAMES)
     for sensor in (alone.sensor, pair.sensor):
@@ -201,6 +394,19 @@ def test_the_sensor_does_not_depend_on_what_is_hidden():
     assert alone.effects[0].parameters == pair.effects[0].parameters
     with pytest.raises(SystemExit, match="nothing known as ghost"):
         hide(("ghost",), 4.0, 1)
+
+
+@pytest.mark.parametrize("other", ["adc_dnl", "binary_offset", "bit_errors"])
+def test_lines_are_repeated_as_they_were_converted_in_whatever_order_they_are_hidden(other):
+    seen = []
+    for tags in (("repeated_lines", other), (other, "repeated_lines")):
+        hiding = hide(tags, 400.0, SEED, SHAPE, 100)
+        axis = 1 if hiding.effects[-1].parameters["lines"] == "rows" else 2
+        frames = np.moveaxis(hiding.frames, axis, 1)
+        seen.append((frames[:, 1:] == frames[:, :-1]).all(axis=2).mean())
+        share = hiding.effects[-1].strength
+        assert seen[-1] == pytest.approx(share, abs=5 * np.sqrt(share / (100 * 19)))
+    assert seen[0] == seen[1]
 
 
 def test_the_chain_shares_no_code_with_the_package():
