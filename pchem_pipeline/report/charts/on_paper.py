@@ -18,6 +18,7 @@ from typing import Any, cast
 import matplotlib as mpl
 import numpy as np
 import PIL.Image
+from matplotlib.artist import setp
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, ListedColormap
@@ -49,6 +50,7 @@ from pchem_pipeline.report.charts.chart import (
     tick_rows,
 )
 from pchem_pipeline.report.style.palette import LIGHT, MAP_COLOURS
+from pchem_pipeline.report.style.wording import power_of_ten
 
 _STYLE: Any = {
     "axes.axisbelow": True,
@@ -155,9 +157,10 @@ def _lay_out(drawing: Drawing) -> None:
         return
     for spine in (each for axes in drawing.axes for each in axes.spines.values()):
         spine.set_in_layout(False)  # within the labels, but each would find all ticks of its axis once more
-    square = any(axes.get_aspect() != "auto" for axes in drawing.axes)
-    for _ in range(1 + square):  # once more, now that maps, whose sides are in proportion, have their size
-        engine.execute(drawing)
+    square: Any = [axes for axes in drawing.axes if axes.get_aspect() != "auto"]
+    setp(square, aspect="auto")  # maps take all of their room, lest its margins depend on their size
+    engine.execute(drawing)
+    setp(square, aspect="equal")
     with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         drawing.set_layout_engine(None)
 
@@ -363,6 +366,8 @@ def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
     one, set_scale = getattr(axes, f"{name}axis"), getattr(axes, f"set_{name}scale")
     if axis.log:
         set_scale("log")
+        # characters: a formula takes ten times as long
+        one.set_major_formatter(lambda place, _: power_of_ten(round(np.log10(place))) or "1")
     elif axis.linear_to:
         set_scale("symlog", linthresh=axis.linear_to, linscale=1.5)
     if axis.ticks:

@@ -377,28 +377,19 @@ def _missing(run: StoredRun, maps: Mapping[str, NDArray[Any]]) -> dict[str, str]
     if not any(np.isfinite(values).any() for values in maps.values()):
         found["maps"] = "no pixel has a value"
     why = "no pixel has parameters" if "maps" in found else "the stage ensemble has no result"
-    for part, name in (
-        ("ensemble", "density"),
-        ("nuced", "nuced_density"),
-        ("electrons", "electron_mass"),
-        ("components", "component_variance"),
+    for part, name, what in (
+        ("ensemble", "density", "no ensemble prediction"),
+        ("nuced", "nuced_density", "no non-uniformity correction"),
+        ("electrons", "electron_mass", "no electron numbers"),
+        ("components", "component_variance", "no component widths"),
     ):
         if name not in run.ensemble:
-            found[part] = f"{_PARTS[part]}: {why}"
+            found[part] = f"{what}: {why}"
     if run.sensor.samples:
-        words = "compare methods in the run of one sample (pchem methods RUN --with OTHER)"
-        found["methods"] = words
+        found["methods"] = "compare methods in the run of one sample (pchem methods RUN --with OTHER)"
     elif run.methods is None:
         found["methods"] = f"to compare other methods: pchem methods {quoted(Path(run.name))}"
     return found
-
-
-_PARTS = {
-    "ensemble": "no ensemble prediction",
-    "nuced": "no non-uniformity correction",
-    "electrons": "no electron numbers",
-    "components": "no component widths",
-}
 
 
 def _workers(settings: ComputeSettings) -> int:
