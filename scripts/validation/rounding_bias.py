@@ -53,7 +53,7 @@ def row(step, exposure, noise, n_pixels, n_frames):
     truth = [np.full(n_pixels, exposure), np.full(n_pixels, 1 / step), bias]
     truth.append(np.full(n_pixels, np.sqrt((noise * step) ** 2 + 1 / 12)))
     frames = np.full(n_pixels, float(n_frames))
-    plain = fit_histograms(counts, origin)
+    plain = fit_histograms(counts, origin, settings=FitSettings(likelihood="density"))
     exact = fit_histograms(counts, origin, settings=FitSettings(likelihood="exact"), start=plain)
     errors = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
     good = exact.fit_status == 0
