@@ -233,23 +233,12 @@ def status(
 
 @app.command()
 def info(
-    places: Annotated[
-        list[Path] | None, typer.Argument(help="camera files and folders, a config.yaml, or a store")
-    ] = None,
+    places: Annotated[list[Path] | None, typer.Argument(help="camera files and folders")] = None,
 ) -> None:
-    """List formats and effects, or show what camera files or a run are.
+    """List formats and effects, or show what camera files are."""
+    from pchem_pipeline.commands.info import about_files, about_program
 
-    Without argument: version, formats that can be read, known effects, and where compiled kernels are kept.
-    """
-    from pchem_pipeline.commands.info import about_files, about_program, about_run, is_run
-
-    if not places:
-        lines = about_program()
-    elif len(places) == 1 and is_run(places[0]):
-        lines = about_run(places[0])
-    else:
-        lines = about_files(places)
-    say("\n".join(lines))
+    say("\n".join(about_files(places) if places else about_program()))
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""What can be read, which effects are known, and what given files or a given run are."""
+"""What can be read, which effects are known, and what camera files are."""
 
 from __future__ import annotations
 
@@ -16,19 +16,6 @@ from pchem_pipeline.frames.reader import FrameReader, described
 from pchem_pipeline.frames.registry import reader_class, reader_names
 from pchem_pipeline.frames.resolve import HISTOGRAM_SUFFIXES
 from pchem_pipeline.frames.settings import InputSettings
-from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import run_status
-from pchem_pipeline.store.remote_path import place_of
-from pchem_pipeline.store.run_store import RunStore
-
-_SHOWN = 20  # files
-
-
-def is_run(place: Path) -> bool:
-    """Tell whether a path is a YAML file or the store of a run, and no camera file."""
-    place = place_of(place)
-    return place.suffix.lower() in (".yaml", ".yml") or (place / ".pchem").is_dir()
 
 
 def about_program() -> list[str]:
@@ -44,54 +31,21 @@ def about_program() -> list[str]:
     return [*lines, "", f"compiled kernels: {os.environ.get('NUMBA_CACHE_DIR') or cache_folder()}"]
 
 
-def about_files(places: Sequence[Path]) -> list[str]:
-    """Return a line for each camera file: reader, frames, what its metadata say, or why it cannot be read.
+def about_files(places: Sequence[Path]) -> Iterator[str]:
+    """Yield a line for each camera file: reader, frames, what its metadata say, or why it cannot be read.
 
     Raises:
         InputError: files are missing, or a folder has none.
     """
-    return list(_files(InputSettings(files=tuple(map(str, places))), Path.cwd()))
-
-
-def about_run(place: Path) -> list[str]:
-    """Return the reader and the stages of a run, and where its input was not read yet, the camera files.
-
-    Raises:
-        ConfigError: the YAML is wrong.
-        StoreError: the store is damaged.
-    """
-    run = find_run(place)
-    lines = [f"{run.store}:"]
-    states = run_status(run)
-    if all(state.state == "missing" for state in states):
-        return [*lines, "  no stage was run yet", *_files(run.config.input, run.base_dir)]
-    store = RunStore.open(run.store)
-    if "sensor" in store.attributes("frames"):
-        sensor = SensorInfo.read(store)
-        size = f"{sensor.n_frames} frames of {sensor.ny} x {sensor.nx} {sensor.dtype}"
-        lines.append(f"  {sensor.kind}, reader {sensor.reader or 'not recorded'}, {size}, mode {sensor.mode}")
-    return [*lines, *(f"  {state.stage:12}{state.words()}" for state in states)]
-
-
-def _files(settings: InputSettings, base_dir: Path) -> Iterator[str]:
-    """Yield what is found of the files of a section ``input``, a line each, and remarks on all."""
-    if not settings.files:
-        yield "  no camera files are named"
+    settings, here = InputSettings(files=tuple(map(str, places))), Path.cwd()
+    if is_histogram_input(settings, here):
+        given = read_histograms(settings, here)
+        yield f"histograms of {given.shape[0] * given.shape[1]} channels, {given.counts.shape[2]} bins"
         return
-    if is_histogram_input(settings, base_dir):
-        given = read_histograms(settings, base_dir)
-        yield f"histogram: {given.shape[0] * given.shape[1]} channels of {given.counts.shape[2]} bins"
-        return
-    readers, report = survey(settings, base_dir)
+    readers, report = survey(settings, here)
     by_path = {reader.paths[0]: reader for reader in readers}
-    for entry in report.files[:_SHOWN]:
-        reader = by_path.get(entry.path)
-        found = entry.problem if reader is None or entry.problem else _reader_words(reader)
-        yield f"{entry.path}: {found}"
-    if len(report.files) > _SHOWN:
-        yield f"{len(report.files) - _SHOWN} more, {len(report.bad)} of all cannot be used"
-    first = next(iter(report.bad), None)
-    yield "first problem: " + (f"{first.path}: {first.problem}" if first else "none")
+    for entry in report.files:
+        yield f"{entry.path}: {entry.problem or _reader_words(by_path[entry.path])}"
     yield from report.notes
 
 

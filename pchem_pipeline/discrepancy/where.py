@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.families import SURE
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
@@ -24,6 +23,7 @@ FloatArray = NDArray[np.float64]
 
 #: Maps of neighbours, along x and along y: charge with charge, readout with readout, one with the other.
 PAIRS = ("x.kk", "x.rr", "x.rk", "y.kk", "y.rr", "y.rk")
+_FALSE_DISCOVERY_RATE = 0.05
 _MOST_LISTED = 50
 _MOST_PLACES = 20
 _WIDEST_CODE_WINDOW = 24
@@ -232,7 +232,7 @@ def _pixels(name: str, evidence: Evidence, maps: Mapping[str, FloatArray]) -> tu
     deviations = np.abs(np.where(evidence.maps.usable, values, 0.0)).ravel()
     p = 2.0 * special.ndtr(-deviations)
     order = np.argsort(p, kind="stable")
-    allowed = SURE * np.arange(1, p.size + 1) / max(int(evidence.maps.usable.sum()), 1)
+    allowed = _FALSE_DISCOVERY_RATE * np.arange(1, p.size + 1) / max(int(evidence.maps.usable.sum()), 1)
     passed = np.flatnonzero(p[order] <= allowed)
     count = min(int(passed[-1]) + 1, _MOST_LISTED) if passed.size else 0
     return tuple((int(i) // values.shape[1], int(i) % values.shape[1]) for i in order[:count])

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
 from pchem_pipeline.planning.point import FloatArray, Point
@@ -74,6 +73,7 @@ def best_exposure(targets: Sequence[Target], point: Point, low: float, high: flo
     Returns:
         H (e-) and frames; the frames are infinite where no exposure reaches the targets.
     """
+    from scipy.optimize import minimize_scalar  # takes a fifth of a second, and reports import this
 
     def needed(log_exposure: float) -> float:
         there = replace(point, quanta_exposure=float(np.exp(log_exposure)))

@@ -10,10 +10,10 @@ their empty ends, small counts in one byte.
 from __future__ import annotations
 
 import base64
-import gzip
 import hashlib
 import importlib.resources
 import json
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -34,8 +34,6 @@ FloatArray = NDArray[np.float64]
 _NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
 #: Quantiles between which a value is surely inside the range; the range is three times wider on each side.
 _TAIL = 1e-3
-#: Values from which quantiles are taken, at least.
-_ENOUGH = 500_009
 #: Values that are worked on at a time.
 AT_ONCE = 1 << 17
 #: Step of logarithmic maps: 2.3 %.
@@ -117,12 +115,12 @@ def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0
     return Scale(float(first) - shift * wide, wide, log)
 
 
-def some_of(values: NDArray[Any]) -> NDArray[Any]:
+def some_of(values: NDArray[Any], enough: int = 65_537) -> NDArray[Any]:
     """Return the values of a flat array, of many every k-th: enough for a quantile that only sets a scale.
 
     k is odd: no column of a sensor is left out for good.
     """
-    return values[:: max(values.size // _ENOUGH, 1) | 1]
+    return values[:: max(values.size // enough, 1) | 1]
 
 
 def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
@@ -147,7 +145,13 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
     odd = np.flatnonzero(outside)
     content = b"".join((codes >> shift).astype(np.uint8).tobytes() for shift in (0, 8))
     content += odd.astype("<u4").tobytes() + flat[odd].astype("<f4").tobytes()
-    return PackedMap(scale, int(odd.size), gzip.compress(content, 6, mtime=0), bars)
+    return PackedMap(scale, int(odd.size), _zipped(content), bars)
+
+
+def _zipped(content: bytes) -> bytes:
+    """Return gzip of numbers: runs of equal bytes are all that repeats in them."""
+    zipped = zlib.compressobj(6, zlib.DEFLATED, 16 + zlib.MAX_WBITS, 9, zlib.Z_RLE)
+    return zipped.compress(content) + zipped.flush()
 
 
 def _places(values: NDArray[Any], scale: Scale) -> FloatArray:
@@ -487,7 +491,7 @@ def _sample_bytes(sample: PixelSample) -> bytes:
         *(root.astype("<u2").tobytes() for root in roots),
         counts,
     ]
-    return gzip.compress(b"".join(parts), 6, mtime=0)
+    return _zipped(b"".join(parts))
 
 
 def _base64(content: bytes) -> str:

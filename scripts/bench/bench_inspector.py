@@ -31,7 +31,7 @@ from pchem_pipeline.report.inspector import (  # noqa: E402  # noqa: E402
     choose_scale,
     pack_map,
 )
-from pchem_pipeline.report.pages.pictures import Drawn  # noqa: E402
+from pchem_pipeline.report.pages.page import Drawn  # noqa: E402
 from pchem_pipeline.report.pages.report import render_report  # noqa: E402
 
 #: Median, spread between pixels and standard error of one pixel: as of the paper's sensor.

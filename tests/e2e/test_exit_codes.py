@@ -111,4 +111,4 @@ def test_missing_files_are_named_with_the_cure(counted, tmp_path):
     shutil.copytree(counted["copy"], tmp_path / "run")
     _gone_without_store(tmp_path / "run")
     message = str(_invoke(tmp_path / "run", "ingest").exception)
-    assert "a.npy and 1 more (last b.npy): no such file or folder; bring it back" in message
+    assert "a.npy and 1 more (last b.npy): no such file or folder; restore it" in message

@@ -13,7 +13,7 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.inspector import InspectorData, PixelSample
-from pchem_pipeline.report.pages.pictures import Drawn
+from pchem_pipeline.report.pages.page import Drawn
 from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.report.inspector import inspector_data, read_maps

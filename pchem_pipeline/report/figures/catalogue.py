@@ -16,7 +16,6 @@ from pchem_pipeline.report.figures import (
     methods,
     pixels,
     samples,
-    trust,
 )
 from pchem_pipeline.report.figures.figure import Figure
 
@@ -26,7 +25,7 @@ REPORT_FIGURES: tuple[Callable[[ReportData], Iterable[Figure]], ...] = (
     pixels.pixel_figures,
     samples.exposure_figures,
     samples.transfer_figures,
-    trust.goodness_figures,
+    maps.goodness_figures,
     maps.map_figures,
     lambda data: data.stability,
     ensemble.ensemble_figures,

@@ -366,11 +366,10 @@ _LINEAR = 4.0
 #: Number of stretches of the run over which frames are averaged.
 _STRETCHES = 24
 #: Factor and unit in which frames are shown, by what is shown of them, and the label of the axis.
-_SCALES = {"charge": (100.0, "%"), "readout": (1.0, "DN"), "noise": (1.0, "sigma")}
-_LABELS = {
-    "charge": "charge: exposure (%)",
-    "readout": "readout: mean (DN)",
-    "noise": "noise (sigma)",
+_SCALES = {
+    "charge": (100.0, "%", "charge: exposure (%)"),
+    "readout": (1.0, "DN", "readout: mean (DN)"),
+    "noise": (1.0, "sigma", "noise (sigma)"),
 }
 _PANEL_MM, _AXIS_MM = 42.0, 12.0
 
@@ -420,7 +419,7 @@ def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
     sds = {shown: sd for shown, sd in sds.items() if shown in frames}
     words = []
     for channel, sd in sds.items():
-        (scale, unit), values = _SCALES[channel], frames[channel]
+        (scale, unit, _), values = _SCALES[channel], frames[channel]
         centre, mean = stretches["frame"], stretches[channel]
         drift = float(np.polyfit(centre, mean, 1)[0] * np.ptp(centre)) if centre.size > 2 else math.nan
         chance = f" (expected {short(scale * sd)})" if np.isfinite(sd) else ""
@@ -477,7 +476,7 @@ def _frame_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, DataTa
     number = np.asarray(arrays["frame_number"], dtype=np.float64)
     columns, means = {"frame": number}, dict[str, FloatArray]()
     units: dict[str, str] = {}
-    for channel, (scale, unit) in _SCALES.items():
+    for channel, (scale, unit, _) in _SCALES.items():
         if f"frame_{channel}" not in arrays:
             continue
         columns[channel] = scale * np.asarray(arrays[f"frame_{channel}"], dtype=np.float64)
@@ -579,8 +578,9 @@ def _frames_chart(
             if place.channel in ("readout" if channel == "noise" else channel, "cross", "")
             for span in _marked(place.frames, frames["frame"])
         ]
-        marks, ends, note = _channel(frames, stretches, channel, _SCALES[channel][0] * sd)
-        panel = Panel(Axis(_LABELS[channel], *ends), (*shaded, *marks), note=note, corner="lower right")
+        scale, _, label = _SCALES[channel]
+        marks, ends, note = _channel(frames, stretches, channel, scale * sd)
+        panel = Panel(Axis(label, *ends), (*shaded, *marks), note=note, corner="lower right")
         panels.append(panel)
     return Chart(
         (Stack(tuple(panels), Axis("frame"), height_mm=len(panels) * _PANEL_MM + _AXIS_MM),), legend=(5, 2)

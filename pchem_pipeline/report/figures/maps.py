@@ -1,4 +1,4 @@
-"""Figures of the sensor: maps with their histograms (Appendix C), and the fit status."""
+"""Figures of the sensor: maps with their histograms (Appendix C), goodness of fit, and the fit status."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.model.checks.multiple_testing import misfit
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import (
+    PAGE_MM,
     Axis,
     Bars,
     Chart,
@@ -19,6 +21,7 @@ from pchem_pipeline.report.charts.chart import (
     Mark,
     Panel,
     Points,
+    Span,
     Stack,
     Steps,
     y_window,
@@ -31,8 +34,15 @@ from pchem_pipeline.report.figures.figure import (
     image_stack,
     is_strip,
     place_of,
+    sensor_stack,
 )
-from pchem_pipeline.report.style.ranges import DisplayRange, histogram_edges, map_colours, robust_range
+from pchem_pipeline.report.style.ranges import (
+    DisplayRange,
+    finite,
+    histogram_edges,
+    map_colours,
+    robust_range,
+)
 from pchem_pipeline.report.style.wording import count, measured, percent, plain, short, stored_unit, symbol
 
 FloatArray = NDArray[np.float64]
@@ -121,6 +131,34 @@ def status_figures(data: ReportData) -> Iterator[Figure]:
         "Map of the fit status. " + "; ".join(parts) + ".",
         (DataTable({"fit_status": status}), *([DataTable(reasons, part="reasons")] if rows else [])),
         status_chart(status, rows, data.unfitted),
+    )
+
+
+def goodness_figures(data: ReportData) -> Iterator[Figure]:
+    """Return the p-values and the map of the goodness of fit."""
+    names = ("p", "chi2", "dof", "q")
+    if not data.misfits or any(f"goodness_{name}" not in data.fit for name in names):
+        return
+    facts = data.misfits
+    rate = float(facts["false_discovery_rate"])
+    columns = {name: data.fit[f"goodness_{name}"] for name in names}
+    columns["misfit"] = misfit(columns["chi2"], columns["dof"])
+    table = DataTable(columns, {"misfit": "standard deviations"})
+    text = (
+        f"p-values and misfit of {count(int(facts['tested']), data.noun)}; "
+        f"{count(int(facts['misfits']), 'misfit')} at a false-discovery rate of {rate:g}."
+    )
+    yield Figure(
+        "goodness",
+        "goodness",
+        "Goodness of fit of all pixels",
+        "p-values of the goodness of fit of all pixels (blue): uniform where the model holds (line; gray: 2 "
+        "sigma), with a peak at 0 from pixels that the model does not describe. Map: chi-square as standard "
+        f"normal deviate, clipped at −4 and 6; circles: misfits at a false-discovery rate of {rate:g}.",
+        text,
+        (table,),
+        _goodness_chart(table, rate),
+        PAGE_MM,
     )
 
 
@@ -291,3 +329,23 @@ def status_chart(
 
 def _share(part: int, whole: int) -> str:
     return f"{part:,} ({percent(part, whole)})"
+
+
+def _goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
+    """Return the p-values of all pixels against what chance gives, and a map of the goodness of fit."""
+    bins = 20
+    deviate, known = table["misfit"], finite(table["p"])
+    counts, edges = np.histogram(known, bins, (0.0, 1.0))
+    mean = known.size / bins
+    spread = np.sqrt(mean * (1.0 - 1.0 / bins))
+    marks = (
+        Span(mean - 2 * spread, mean + 2 * spread, colour="band"),
+        Level(mean, colour="ink", width=0.6),
+        Steps(edges, counts, width=1.2),
+    )
+    high = 1.05 * max(float(counts.max()), mean + 2 * spread)
+    left = Stack((Panel(Axis("pixels", 0.0, high), marks),), Axis("p-value of the goodness of fit", 0.0, 1.0))
+    found = table["q"] <= false_discovery_rate
+    ringed = found if is_strip(found.shape) or found.sum() <= 400 else None
+    right = sensor_stack(deviate, (-4.0, 6.0), "misfit (σ)", ringed=ringed, ring="vermilion", whole=True)
+    return Chart((left, right), (1.0, 1.15))

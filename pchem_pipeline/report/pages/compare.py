@@ -10,8 +10,7 @@ from pchem_pipeline.base.plain import plain
 from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.pages.page import Finding, Section, render_page
-from pchem_pipeline.report.pages.pictures import DrawAll, draw_here
+from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, draw_here, render_page
 from pchem_pipeline.report.pages.summary import Flag, Level
 from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
 from pchem_pipeline.report.style.wording import (

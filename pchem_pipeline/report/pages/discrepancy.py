@@ -371,55 +371,51 @@ def _examined(data: DiscrepancyData) -> Table:
 
 #: File of the verdict's own page in the folder of a run.
 DISCREPANCY_PAGE = "discrepancy.html"
-#: Changes below this share of the standard error per pixel are negligible.
-_IMMATERIAL = 0.2
-#: Changes below this are none.
-_NOT_MOVED = 0.01
 
-#: (id, heading, introduction) of the parts of the page.
-PARTS: tuple[tuple[str, str, str], ...] = (
+#: Changes of a parameter in standard errors of a pixel: below these negligible, and none.
+_IMMATERIAL, _NOT_MOVED = 0.2, 0.01
+#: (id, heading, introduction, what is said where there is nothing to show) of the parts of the page.
+PARTS: tuple[tuple[str, str, str, str], ...] = (
     (
         "signature",
         "Largest disagreement, before and after",
         "The statistic that the added effect changes most (else the largest disagreement), and all "
         "statistics before and after, in sigma.",
+        "",
     ),
     (
         "where",
         "Where data and model disagree",
         "Effects of light and charge show in the charge channel, effects of the electronics in the readout "
         "residuals. Figures show the training frames, numbers training and test frames.",
+        "No data were kept for figures.",
     ),
     (
         "evidence",
         "Identification of the effect",
         "Log-likelihood of each fitted candidate on test frames, relative to the best; larger is better. A "
         "difference below three standard errors is not decisive.",
+        "No candidates were compared: data and model agree within sampling noise.",
     ),
     (
         "shown",
         "Remaining gap between data and model",
         "Gap on held-out frames, micronats per sample.",
+        "No gap was measured.",
     ),
     (
         "parameters",
         "Parameters of the effect, and changes of the maps",
         "",
+        "Nothing was added to the model.",
     ),
     (
         "limits",
         "Limits of these data",
         "Effects that no number of frames of one constant exposure can show, and the samples examined.",
+        "Nothing was recorded.",
     ),
 )
-
-_EMPTY = {
-    "where": "No data were kept for figures.",
-    "evidence": "No candidates were compared: data and model agree within sampling noise.",
-    "shown": "No gap was measured.",
-    "parameters": "Nothing was added to the model.",
-    "limits": "Nothing was recorded.",
-}
 
 
 def finding(data: DiscrepancyData) -> Finding:
@@ -445,7 +441,8 @@ def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
     tables = discrepancy_tables(data)
     parts = []
     first = _signature(data.found)
-    for id_, title, intro in PARTS:
+    described = any(step.verdict == "described" for step in data.found.steps)
+    for id_, title, intro, empty in PARTS:
         shown = [each for each in figures if each.section == id_ and each.name not in first]
         if id_ == "signature":
             shown = [each for name in first for each in figures if each.name == name]
@@ -454,17 +451,12 @@ def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
             continue  # no disagreement, or no data for figures
         if id_ == "where" and not data.found.where:
             title = "Data and model side by side"
-        missing = () if shown or rows else (_empty(data.found, id_),)
+        if id_ == "evidence" and described:
+            empty = "No known effect explains the disagreement; the empirical description has no rivals."
+        missing = () if shown or rows else (empty,)
         part = f"discrepancy-part-{id_}"
         parts.append(Section(id=part, title=title, intro=intro, missing=missing, figures=shown, tables=rows))
     return parts
-
-
-def _empty(found: Verdict, part: str) -> str:
-    """Return why a part of the page is empty."""
-    if part == "evidence" and any(step.verdict == "described" for step in found.steps):
-        return "No known effect explains the disagreement; the empirical description has no rivals."
-    return _EMPTY[part]
 
 
 #: Family of a statistic, or its beginning, to the figure that shows it.

@@ -6,9 +6,10 @@ import base64
 import gzip
 import importlib.resources
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 import jinja2
 from markupsafe import Markup, escape
@@ -19,7 +20,6 @@ from pchem_pipeline.report.inspector import content_policy, json_for_html, text_
 from pchem_pipeline.report.style.wording import short_name, visible
 
 if TYPE_CHECKING:
-    from pchem_pipeline.report.pages.pictures import Drawn
     from pchem_pipeline.report.pages.summary import Flag
     from pchem_pipeline.report.pages.tables import Table
 
@@ -258,6 +258,44 @@ class Section:
     kind: str = ""
     content: Any = None
     folded: bool = False
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure as a page embeds it.
+
+    Attributes:
+        source: data URL.
+        width, height: size on the page, px.
+    """
+
+    source: str
+    width: int
+    height: int
+
+
+#: Draws many figures at once and returns them by name.
+DrawAll = Callable[[Sequence[Figure]], Mapping[str, Drawn]]
+
+
+def draw_figure(figure: Figure) -> Drawn:
+    """Draw a figure as a page embeds it; pure.
+
+    Text on the page stays text: it can be found, and takes half the room of outlines.
+    """
+    from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes
+
+    drawing = figure.draw(Look(figure.width_mm, svg_text=True))
+    # what needs no escape in a data URL within an attribute
+    picture = quote(drawing_bytes(drawing, "svg"), safe=" !$()*+,-./:;=?@[]^_`{|}~")
+    # 4.5 px for a millimetre on paper
+    width, height = (round(4.5 * 25.4 * side) for side in drawing.get_size_inches())
+    return Drawn(f"data:image/svg+xml,{picture}", width, height)
+
+
+def draw_here(figures: Sequence[Figure]) -> dict[str, Drawn]:
+    """Draw figures one after the other, in this process."""
+    return {figure.name: draw_figure(figure) for figure in figures}
 
 
 def render_page(

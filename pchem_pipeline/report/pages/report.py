@@ -20,8 +20,7 @@ from pchem_pipeline.report.figures.samples import AXES, slope_of
 from pchem_pipeline.report.inspector import embedded, script
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
 from pchem_pipeline.report.pages.emva import emva_tables
-from pchem_pipeline.report.pages.page import Finding, Section, render_page
-from pchem_pipeline.report.pages.pictures import DrawAll, Drawn, draw_here
+from pchem_pipeline.report.pages.page import DrawAll, Drawn, Finding, Section, draw_here, render_page
 from pchem_pipeline.report.pages.report_json import report_json
 from pchem_pipeline.report.pages.summary import (
     answers,
@@ -252,7 +251,9 @@ def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, st
         data: what the run found.
         draw: draws all figures at once, for example by several workers; None: one after the other, here.
     """
-    shown, others = report_figures(data), discrepancy_figures(data.discrepancy)
+    # those without a section are drawn by ``pchem figures`` alone
+    shown = [figure for figure in report_figures(data) if figure.section]
+    others = discrepancy_figures(data.discrepancy)
     drawn = (draw or draw_here)([*shown, *others])
     verdict = None if data.discrepancy is None else finding(data.discrepancy)
     makers = (result_tables, method_tables, emva_tables, provenance_tables)

@@ -16,7 +16,6 @@ from pchem_pipeline.report.figures.ensemble import bias_remark
 from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.figures.methods import crossing_text, percent_text
 from pchem_pipeline.report.figures.samples import AXES, middle
-from pchem_pipeline.report.figures.trust import noise_shares
 from pchem_pipeline.report.pages.summary import check_title
 from pchem_pipeline.report.pages.summary import size_text as check_size
 from pchem_pipeline.report.style.ranges import finite
@@ -158,13 +157,9 @@ def _flagged(data: ReportData) -> Table:
     )
 
 
-#: More channels than these are in the maps of the store only.
-_MOST_CHANNELS = 100
-
-
 def _channels(data: ReportData) -> Table | None:
-    if data.shape[0] > 1 or data.shape[1] > _MOST_CHANNELS:
-        return None
+    if data.shape[0] > 1 or data.shape[1] > 100:
+        return None  # the maps of the store have them all
     rows = (_channel_row(data, x) for x in range(data.shape[1]))
     return Table.of("channels", "Channels", "Estimates with their standard errors.", rows)
 
@@ -310,10 +305,6 @@ def _moment_row(row: Mapping[str, Any]) -> Row:
     }
 
 
-#: Larger electron numbers are in ``report.json`` only.
-_MOST_NUMBERS = 24
-
-
 def _electrons(data: ReportData) -> Table | None:
     arrays, facts = data.ensemble, data.ensemble_facts
     if "electron_mass" not in arrays:
@@ -343,7 +334,7 @@ def _electrons(data: ReportData) -> Table | None:
                 "predicted p(k)": f"{pmf[i]:.5f}",
                 "expected share": f"{expected[i]:.5f}" if expected is not None else "",
             }
-            for i in range(min(last + 1, _MOST_NUMBERS))
+            for i in range(min(last + 1, 24))  # ``report.json`` has all
         ),
         "electrons",
     )
@@ -391,8 +382,25 @@ def _intervals(data: ReportData) -> Table:
     )
 
 
+def _noise_shares(data: ReportData, names: tuple[str, ...]) -> dict[str, float]:
+    """Return, by map, the part of its variance over the pixels that the errors of the estimates make.
+
+    Both are robust: the median squared standard error over ``(1.4826 MAD)^2``. Maps that do not exist or have
+    fewer than 8 values are left out.
+    """
+    found = {}
+    for name in names:
+        error = data.pixel_error(name, with_flagged=True)
+        if error is None or not data.has_values(name):
+            continue
+        summary = data.summary(name, with_flagged=True)
+        if summary.n_valid >= 8 and summary.robust_sd > 0:
+            found[name] = float(error**2 / summary.robust_sd**2)
+    return found
+
+
 def _interval_rows(data: ReportData) -> Iterator[Row]:
-    shares = noise_shares(data, _ORDER)
+    shares = _noise_shares(data, _ORDER)
     for name in _known(data):
         error = data.pixel_error(name, with_flagged=True)
         if error is None:

@@ -30,7 +30,7 @@ from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector import InspectorData, PixelSample
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
-from pchem_pipeline.report.pages.pictures import DrawAll, Drawn, draw_figure
+from pchem_pipeline.report.pages.page import DrawAll, Drawn, draw_figure
 from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.report.pages.summary import check_sentence
 from pchem_pipeline.report.style.wording import short_name
@@ -364,7 +364,9 @@ def _stage_row(store: RunStore, record: StageRecord) -> dict[str, Any]:
 def _input_text(sensor: SensorInfo) -> str:
     if sensor.samples:
         return f"{len(sensor.samples)} samples; maps and ensemble show {sensor.samples[sensor.shown].name}"
-    return f"{sensor.kind}, {sensor.mode}" if sensor.kind == "frames" else "ready-made histograms"
+    if sensor.kind != "frames":
+        return "ready-made histograms"
+    return f"frames, {sensor.mode}" + (f", read as {sensor.reader}" if sensor.reader else "")
 
 
 def _missing(run: StoredRun, maps: Mapping[str, NDArray[Any]]) -> dict[str, str]:

@@ -6,9 +6,6 @@ import tifffile
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.commands import info
-from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.run.target import Target
-from pchem_pipeline.runner.session import Command, run_stages
 
 FRAMES = np.random.default_rng(3).integers(90, 130, (40, 8, 9), dtype=np.uint16)
 
@@ -24,27 +21,11 @@ def test_formats_effects_and_the_cache_are_listed(monkeypatch):
     assert lines[-1] == "compiled kernels: /somewhere/kernels"
 
 
-def test_files_are_described_with_the_first_problem(tmp_path):
+def test_files_are_described_and_what_cannot_be_read_says_why(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack")
     (tmp_path / "b.tif").write_bytes(b"hello")
-    good, bad, first = info.about_files([tmp_path / "a.tif", tmp_path / "b.tif"])
+    good, bad = info.about_files([tmp_path / "a.tif", tmp_path / "b.tif"])
     assert "tiff (tifffile), 40 frames of 8 x 9, uint16, bit depth not stated, no exposure time" in good
-    assert "b.tif" in bad
-    assert first.startswith(f"first problem: {tmp_path / 'b.tif'}: ")
+    assert bad.startswith(f"{tmp_path / 'b.tif'}: ")
     with pytest.raises(InputError, match="no such file"):
-        info.about_files([tmp_path / "none.tif"])
-
-
-def test_a_run_says_its_reader_and_stages(tmp_path):
-    np.save(tmp_path / "a.npy", FRAMES)
-    text = "run: {store: run.zarr}\ninput: {files: [a.npy]}\n"
-    path = tmp_path / "run.yaml"
-    path.write_text(text)
-    assert info.is_run(path)
-    assert "no stage was run yet" in info.about_run(path)[1]
-    target = Target(parse_config(text), tmp_path, tmp_path / "run.zarr", path)
-    run_stages(target, ["ingest"], Command(quiet=True))
-    assert info.is_run(target.store)
-    _, reader, ingest, *_ = info.about_run(target.store)
-    assert reader == "  frames, reader npy, 40 frames of 8 x 9 uint16, mode copy"
-    assert ingest.split() == ["ingest", "complete"]
+        list(info.about_files([tmp_path / "none.tif"]))

@@ -316,7 +316,7 @@ class Sensor:
             NotFittedError: no pixel is fitted in both.
         """
         both = (wanted.usable & simulated.usable).ravel()
-        _need(both.any())
+        _require(both)
         theta = [
             to_theta(np.stack([m.ravel()[both] for m in fit.maps], axis=1)) for fit in (wanted, simulated)
         ]
@@ -331,9 +331,9 @@ class Sensor:
         return replace(maps, usable=self.usable & self.drawn)
 
 
-def _need(some: bool | np.bool_) -> None:
-    """Raise a NotFittedError where it is not true that some pixels are known."""
-    if not some:
+def _require(pixels: NDArray[np.bool_]) -> None:
+    """Raise a NotFittedError unless there is one of these pixels."""
+    if not pixels.any():
         raise NotFittedError("no pixel can be fitted with it")
 
 
@@ -368,7 +368,7 @@ def learn_sensor(
     law = _law_of_all(effects, parameters, places, fit.added)
     if law is None or law.free_satellites:
         drawn = usable
-        _need(np.isfinite(covariance[drawn]).all(axis=(1, 2)).any())
+        _require(np.asarray(np.isfinite(covariance[drawn]).all(axis=(1, 2))))
         posterior = posterior_of_estimates(parameters[drawn], covariance[drawn])
         lost = lost or 0.0
     else:
@@ -377,7 +377,7 @@ def learn_sensor(
         outside = (histograms.under + histograms.over).ravel()
         drawn = (counts > 0).sum(axis=1) >= _FEWEST_CODES
         drawn &= (outside <= MOST_OUTSIDE * counts.sum(axis=1)) | usable
-        _need(drawn.any())
+        _require(drawn)
         origin = histograms.origin.ravel().astype(np.int64)
         replaced = _replaced(effects, frames if before is None else before, places, origin, counts.shape[1])
         posterior = posterior_of(

@@ -42,7 +42,7 @@ from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector import json_for_html
-from pchem_pipeline.report.pages.pictures import draw_figure
+from pchem_pipeline.report.pages.page import draw_figure
 from pchem_pipeline.report.style.palette import DIVERGING, LIGHT, MAP_COLOURS, shades
 from pchem_pipeline.report.style.wording import symbol, without_formulas
 

@@ -6,7 +6,7 @@ import pytest
 
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages import report as report_module
-from pchem_pipeline.report.pages.pictures import Drawn
+from pchem_pipeline.report.pages.page import Drawn
 
 
 @pytest.fixture
