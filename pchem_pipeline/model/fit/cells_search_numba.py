@@ -40,7 +40,6 @@ from pchem_pipeline.model.fit.search_numba import (
     plus,
     rival_moves_gain,
     score_of,
-    settled,
 )
 from pchem_pipeline.model.fit.starts_numba import (
     add_line_starts,
@@ -221,7 +220,6 @@ def _start_anew(
     known: bool,
     cut: bool,
     score: float,
-    settled: bool,
     gap: float,
     best: FloatArray,
     out: FloatArray,
@@ -229,8 +227,9 @@ def _start_anew(
 ) -> Found:
     """Climb from other starts in pixels that the density may have led astray.
 
-    These are pixels at the limits of the codes, those of few DN per electron, those whose gain is not
-    settled or has a near rival, and those whose climb did not arrive.
+    These are pixels at the limits of the codes, those of few DN per electron, and those whose climb did not
+    arrive. Of other pixels the density has scanned all combs, unless their law is another: then those with a
+    near rival are started anew, too.
     """
     n, limits, no = pixel.facts.shape[0], tools.limits, np.bool_(False)
     place = n + STEP
@@ -238,11 +237,10 @@ def _start_anew(
         used = _scan_cut(pixel, tools)
         found = climb_starts(pixel, tools, no, plus(found, used), best, out)
     few = not best[place] > FEW_STEP
-    # several samples, some of them cut, may have led the density astray
-    astray = not settled if n == 1 else score > SUSPICIOUS
-    lost = known and not best[place] > 0.0
+    astray = few or score > SUSPICIOUS
     rivalled = n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap
-    if lost or rivalled or (limits.scan and (astray or few)):
+    lost = known and not best[place] > 0.0
+    if lost or (astray if limits.scan else rivalled):
         found = _climb_few(pixel, tools, best, out, found)
     if not (limits.scan and best[place] < ALIASED_STEP):
         return found
@@ -297,7 +295,6 @@ def search_cells(
     n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
     known = task.near[n + STEP] > 0.0
     gap, score = task.gap if known else math.inf, math.inf
-    sure: bool | np.bool_ = np.bool_(False)
     best[n + STEP] = 0.0
     tools.scratch.flags[FIXED, n + SATELLITE] = True
     out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
@@ -315,9 +312,8 @@ def search_cells(
                 gap = math.inf  # that of another law, or of a sample that nothing cuts
         examine(pixel, tools, best, out)
         score = score_of(out)
-        sure = np.bool_(not settled(pixel, best, np.bool_(False), loglik - null, out)[1])
         found = Found(loglik, runner_up, used + 1, found.degenerate)
-    found = _start_anew(pixel, tools, known, cut, score, sure, gap, best, out, found)
+    found = _start_anew(pixel, tools, known, cut, score, gap, best, out, found)
     if not best[n + STEP] > 0.0:
         return FIT_NOT_CONVERGED, found.used, 0
     bias_gap = min(gap, found.loglik - found.runner_up)

@@ -46,6 +46,7 @@ MOST_HYPOTHESES = 6  # of one effect
 _MOST_IN_PARTS = 6
 _REFINED = 12  # hypotheses of which the strength is refined by a second simulation
 _STEPS = 2  # that refine a strength
+_STRONGER = 4.0  # times the fingerprint of a hypothesis that is too weak to be seen
 _CLOSE = 0.15  # relative: a strength known so well is not simulated again
 REPEATS = 3  # simulations of the hypotheses that sets are made of
 _CHANCE_OF_MEAN = 1.0  # standard errors of the mean of several simulations, below which it is nothing
@@ -248,6 +249,7 @@ class ReplicateSimulator:
         """
         if not hypotheses:
             return []
+        hypotheses = self._visible(hypotheses)
         fits = [fit_set([h], shift, noise) for h in hypotheses]
         scores = np.array([fit.log_score(shift, noise) for fit in fits])
         order = np.argsort(-scores, kind="stable")
@@ -268,6 +270,15 @@ class ReplicateSimulator:
         sharp = {id(h.effect): h for h in self.fingerprints([h.effect for h in best_of.values()], REPEATS)}
         better = {i: sharp.get(id(one.effect), one) for i, one in best_of.items()}
         return [better.get(int(i), hypotheses[i]) for i in order]
+
+    def _visible(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return hypotheses, four times as strong those that chance hides at the strength as guessed.
+
+        Of what drowns a little more strength may move much: no factor of its fingerprint tells.
+        """
+        faint = {id(h): h.rescaled(_STRONGER) for h in hypotheses if np.abs(h.fingerprint).max() < CERTAIN}
+        seen = {id(h.effect): h for h in self.fingerprints(list(faint.values()))}
+        return [seen.get(id(faint.get(id(h))), h) for h in hypotheses]
 
     def _tuned(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
         """Tune the strength of each by simulation; a step that predicts worse is halved.

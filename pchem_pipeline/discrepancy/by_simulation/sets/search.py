@@ -2,8 +2,8 @@
 
 A set of effects is a trial. Its promise is the log score that it may come to: by its fingerprints before it
 was simulated (:mod:`pchem_pipeline.discrepancy.by_simulation.candidates`), by its slopes afterwards. A trial
-is open while its promise, and what that may be wrong by, reaches the best one. Of the open trials those with
-the fewest effects go first, of these the most promising.
+is open while its promise, and what that may be wrong by, reaches the best one. The most promising one goes
+first; before a set, each of its effects alone, which tells where the set begins.
 
 Forward selection: where the best set leaves something, sets with what stands out beside it are trials, and so
 is what is measured without a name. Backward elimination: so is the best set without each of its effects.
@@ -91,6 +91,12 @@ class Trial:
         """The effects."""
         return tuple(h.effect for h in self.members)
 
+    def begins_with(self, other: Trial) -> bool:
+        """Test whether another trial, an effect of this one alone, was to be simulated before this one."""
+        own = {h.tag for h in self.members}
+        new = self.way is None and other.way is None
+        return new and len(own) > 1 and len(other.members) == 1 and other.members[0].tag in own
+
     @property
     def promise(self) -> float:
         """Log score that it may come to, less the price of its effects, nats."""
@@ -155,14 +161,9 @@ class Search:
         for members in sets:
             self.add(members)
         while self.limit is None and (left := [trial for trial in self.trials if self._is_open(trial)]):
-            fewest = min(len(trial.members) for trial in left)
             # what is expensive comes last: it may be beaten by then
-            self.advance(
-                max(
-                    (trial for trial in left if len(trial.members) == fewest),
-                    key=lambda trial: (not is_expensive(trial.effects), trial.promise),
-                )
-            )
+            next_one = max(left, key=lambda trial: (not is_expensive(trial.effects), trial.promise))
+            self.advance(next((each for each in left if next_one.begins_with(each)), next_one))
         self.eliminate()
         self.tune()
 
@@ -178,7 +179,7 @@ class Search:
             self.limit, trial.ended = spent, True
         except NotFittedError:
             trial.ended = True
-        # whatever a stranger's effect raises must not stop the others
+        # an effect of a plug-in may raise anything: the others are compared all the same
         except Exception as error:
             note_defect(self.refitter.defects, " + ".join(h.tag for h in trial.members), error)
             trial.ended = True
@@ -250,7 +251,7 @@ class Search:
                 better = tuned(self.refitter, one)
             except (EffortSpentError, NotFittedError):
                 continue
-            except Exception as error:  # of a stranger's effect, as above
+            except Exception as error:  # of a plug-in, as above
                 note_defect(self.refitter.defects, one.words, error)
                 continue
             if better is not one:
@@ -347,7 +348,7 @@ def compare(
     measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]] = lambda _: (),
     rounds: int = 3,
 ) -> None:
-    """Try single effects, then sets with one effect more or fewer, as long as the best one becomes better.
+    """Try effects and sets, then with one effect more or fewer, as long as the best one becomes better.
 
     Args:
         search: out: all that was tried.
@@ -358,10 +359,9 @@ def compare(
         rounds: of sets, at most.
     """
     beside = functools.cache(beside)
-    if sets:
-        search.compare((h,) for h in _singles(hypotheses, sets[0].hypotheses))
+    singles = [(h,) for h in _singles(hypotheses, sets[0].hypotheses)] if sets else []
     together = (fit.at_best() for fit in sets if len(fit.hypotheses) > 1)
-    search.compare(_of_different_effects(together)[:_MOST_SETS])
+    search.compare([*singles, *_of_different_effects(together)[:_MOST_SETS]])
     for _ in range(rounds):
         before = search.best
         search.measure(measured)

@@ -282,6 +282,22 @@ def test_a_set_that_cannot_come_to_another_is_not_simulated_further() -> None:
     assert begun.score < whole.score < both.score
 
 
+def test_a_promising_set_does_not_wait_for_the_best_strengths_of_its_effects() -> None:
+    world = World([effect("row_noise", 0.4), effect("frame_noise", 0.4)])
+    hypotheses = [hypothesis(tag) for tag in STRENGTHS]
+    asked: list[str] = []
+
+    def allow(words: str) -> None:
+        asked.append(words)
+        if len(asked) > 3:  # each of the two, and both
+            raise EffortSpentError(words)
+
+    search = Search(replace(world.refitter(), allow=allow), HistogramLikelihood())
+    compare(search, hypotheses, world.likely(*hypotheses))
+    assert search.limit is not None
+    assert search.best.tags == {"row_noise", "frame_noise"}
+
+
 def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
     world = World([effect("row_noise", 0.5)])
     # frame noise helps the fingerprint of row noise out where that is extrapolated
