@@ -165,7 +165,10 @@ class Search:
             next_one = max(left, key=lambda trial: (not is_expensive(trial.effects), trial.promise))
             self.advance(next((each for each in left if next_one.begins_with(each)), next_one))
         self.eliminate()
+        before = self.best
         self.tune()
+        if self.best is not before:
+            self.eliminate()
 
     def advance(self, trial: Trial) -> None:
         """Simulate a trial a step further."""
@@ -236,39 +239,42 @@ class Search:
         gained = 0.0
         while (best := self.best) is not None and not self.complete:
             near = best.penalised_log_likelihood - gained
-            close = [
-                one
-                for one in self.tried
-                if one.penalised_log_likelihood >= near
-                and one.tags not in self._tuned
-                and may_be_tuned(self.refitter, one)
-            ]
+            close = [one for one in self.tried if one.penalised_log_likelihood >= near and self._untuned(one)]
             if not close:
                 return
-            one = max(close, key=PENALISED)
-            self._tuned.add(one.tags)
-            try:
-                better = tuned(self.refitter, one)
-            except (EffortSpentError, NotFittedError):
-                continue
-            except Exception as error:  # of a plug-in, as above
-                note_defect(self.refitter.defects, one.words, error)
-                continue
-            if better is not one:
-                self.trials.append(Trial.of(better))
-                gained = max(gained, better.score - one.score)
+            gained = max(gained, self._tune(max(close, key=PENALISED)))
+
+    def _untuned(self, one: Refitted) -> bool:
+        """Test whether what a set leaves asks for other numbers, which were not sought yet."""
+        return one.tags not in self._tuned and may_be_tuned(self.refitter, one)
+
+    def _tune(self, one: Refitted) -> float:
+        """Tune the numbers of a set; return the nats that it gained."""
+        self._tuned.add(one.tags)
+        try:
+            better = tuned(self.refitter, one)
+        except (EffortSpentError, NotFittedError):
+            return 0.0
+        except Exception as error:  # of a plug-in, as above
+            note_defect(self.refitter.defects, one.words, error)
+            return 0.0
+        self.trials += [] if better is one else [Trial.of(better)]
+        return better.score - one.score
 
     def eliminate(self) -> None:
         """Try the best set without each of its effects, the weakest first, as long as that is better.
 
-        Where it leaves something, only without those of which its best fit leaves no more than their error.
+        The others may have come in for wrong numbers of one that stays: these are tuned without them.
+        Where the set leaves something, only without those of which its best fit leaves no more than their error.
         """
         best, scale = self.best, self.refitter.null.std
         if best is None or len(best.hypotheses) < 2 or self.limit is not None:
             return
         for weakest in sorted(best.hypotheses, key=lambda h: float(np.sum((h.fingerprint / scale) ** 2))):
             if self.complete or weakest.tag in vanished(best):
-                self.at_best_fit([h for h in best.hypotheses if h is not weakest])
+                rest = self.at_best_fit([h for h in best.hypotheses if h is not weakest])
+                if rest is not None and self.complete and self._untuned(rest):
+                    self._tune(rest)
                 self.tune()
                 if self.best is not best:
                     return self.eliminate()

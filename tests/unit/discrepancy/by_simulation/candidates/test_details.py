@@ -111,9 +111,10 @@ def test_nothing_is_simulated_at_the_limit() -> None:
     assert world.drawn == drawn
 
 
-def test_an_effect_that_wrong_numbers_of_another_brought_in_is_not_kept() -> None:
-    """Row noise explains what blinking leaves at the guessed numbers; at its own it leaves nothing."""
-    world = World([TRUE])
+@pytest.mark.parametrize("truth", [TRUE, BLINKING.model_copy(update={"dwell_low_frames": 165.0})])
+def test_an_effect_that_wrong_numbers_of_another_brought_in_is_not_kept(truth: DarkCurrentRts) -> None:
+    """Row noise explains what blinking leaves at the guessed numbers, at once or when tuned, too."""
+    world = World([truth])
     hypotheses = [Hypothesis(e, statistics([e])) for e in (BLINKING, RowNoise(row_noise_dn=0.6))]
     sets = world.likely(hypotheses)
     assert {h.tag for h in sets[0].hypotheses} == {"dark_current_rts", "row_noise"}
