@@ -265,7 +265,8 @@ class Search:
         """Try the best set without each of its effects, the weakest first, as long as that is better.
 
         The others may have come in for wrong numbers of one that stays: these are tuned without them.
-        Where the set leaves something, only without those of which its best fit leaves no more than their error.
+        Where the set leaves something, only without those of which its best fit leaves no more than their
+        error.
         """
         best, scale = self.best, self.refitter.null.std
         if best is None or len(best.hypotheses) < 2 or self.limit is not None:
