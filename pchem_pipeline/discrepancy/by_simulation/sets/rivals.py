@@ -84,7 +84,8 @@ class Comparison:
             else:
                 behind = one.penalised_log_likelihood - self.chosen.penalised_log_likelihood
                 error = _apart(one, self.chosen)
-                probability = float(np.exp(min(behind, 0.0)))
+                # predictions d errors apart tell d^2 / 2 nats (Kullback and Leibler 1951); more is chance
+                probability = float(np.exp(min(max(behind, -0.5 * error**2), 0.0)))
             found[name] = Contender(hypothesis, behind, error, probability)
         total = sum(c.probability for c in found.values())
         shared = [replace(c, probability=c.probability / total) for c in found.values()]

@@ -344,6 +344,20 @@ def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
     assert open_.rivals_of("row_noise")[1].probability > 0.1
 
 
+def test_predictions_that_lie_near_each_other_are_not_told_apart_by_chance(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two errors apart, they are told apart by two nats; by chance the likelihood makes nearly five of it."""
+    row, world = TRUTH["row_noise"], World([effect("row_noise", 0.5)], seed=20)
+    twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
+    monkeypatch.setitem(TRUTH, "frame_noise", (row[0] + 0.35 * np.eye(M)[1], row[1]))
+    found: Any = world.compare(hypothesis("row_noise", 0.5), twin)
+    _, second = found.rivals_of("row_noise")
+    assert second.score < -4.0
+    assert second.stderr == pytest.approx(2.4, abs=0.1)
+    assert second.probability == pytest.approx(1.0 / (1.0 + np.exp(second.stderr**2 / 2.0)))
+
+
 def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
     """Nothing in the frames leads to the noise of frames: it is guessed of what the rows' leaves."""
     world = World([effect("row_noise", 0.3), effect("frame_noise", 0.04)])
