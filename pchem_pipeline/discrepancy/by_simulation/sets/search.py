@@ -54,9 +54,6 @@ LOOSE = 0.1
 PENALISED = operator.attrgetter("penalised_log_likelihood")
 _MOST_SINGLES, _MOST_SETS = 7, 3  # hypotheses that are tried alone, sets that fingerprints propose
 _MISJUDGED = 5.0  # times the gain that the next step promises, that all further ones may bring
-# nats, and share of what there is to explain, that an effect alone must promise to leave for it not to be all
-# there is; the logarithm of a factor up to which its promise is believed
-_SHORT, _SHORT_SHARE, _BELIEVED = 100.0, 0.05, 0.75
 _FAR_SHARE = 0.25  # of what there is to explain, beside `FAR`, for a set that leaves nothing
 _HARDLY = 0.1  # of a deviation, what effects may move the statistic by that cannot account for it
 # sets beside which others are asked for, share of what the best one explains by which one may be behind it,
@@ -294,15 +291,7 @@ class Search:
                 return False
             share = _FAR_SHARE if named and len(trial.members) >= len(best.hypotheses) else FAR_SHARE_OF_PART
             return trial.promise + FAR + share * explained >= best.penalised_log_likelihood
-        if len(trial.members) == 1 and self._explains_a_part(trial.way.best):
-            return False
         return _may_reach(trial, best.penalised_log_likelihood)
-
-    def _explains_a_part(self, one: Refitted) -> bool:
-        """Test whether an effect not at its best strength will leave far more than chance at that, too."""
-        known = bool(np.all(np.abs(one.change) < _BELIEVED))
-        left = _SHORT + _SHORT_SHARE * (one.chance - self.refitter.nothing)
-        return known and one.promise < one.chance - left
 
     def _foreseen(self, members: Sequence[Hypothesis]) -> tuple[np.ndarray, float]:
         """Return what fingerprints at their best strengths leave where they move nothing, and the log score.
