@@ -30,8 +30,8 @@ from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.model.arithmetic.robust import look_elsewhere
-from pchem_pipeline.model.arithmetic.significance import FALSE_ALARM, NO_DIFFERENCE, OUTLYING
+from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, FALSE_ALARM, NO_DIFFERENCE, OUTLYING
 
 FloatArray = NDArray[np.float64]
 
@@ -379,9 +379,10 @@ class Refitter:
         return np.asarray(foreseen + beyond_chance(apart.mean(axis=0) - foreseen, error))
 
     def passes_goodness_of_fit(self, one: Refitted) -> bool:
-        """Tell whether a set leaves no statistic beyond chance."""
-        p = float(self.null.p_of(one.rest, _SPLITS).min())
-        return look_elsewhere(p, self.null.effective_tests) > FALSE_ALARM
+        """Tell whether a set leaves no statistic beyond chance, nor all of them together (chi-square)."""
+        p, number = float(self.null.p_of(one.rest, _SPLITS).min()), one.rest.size
+        together = float(chi_square(2.0 * (one.chance - one.score) + number, number))
+        return look_elsewhere(p, self.null.effective_tests) > FALSE_ALARM and together < CERTAIN
 
     def ranked(self, sets: Iterable[Refitted]) -> list[Refitted]:
         """Return sets, the best first: the likeliest; if it leaves nothing, the smallest that does so."""

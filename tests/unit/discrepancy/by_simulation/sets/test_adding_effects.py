@@ -344,6 +344,20 @@ def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
     assert open_.rivals_of("row_noise")[1].probability > 0.1
 
 
+def test_statistics_that_are_all_off_a_little_are_no_good_fit() -> None:
+    """Each by less than chance may leave among so many, but all of them by more than it does together."""
+    world, guess = World([effect("row_noise", 0.5)]), [hypothesis("row_noise", 0.5)]
+    fitted = world.refitter().refined(guess)
+    assert world.refitter().passes_goodness_of_fit(fitted)
+    scatter = world.refitter().scatter(fitted.covariance, len(fitted.vectors))
+    off = replace(
+        world.refitter(), target=fitted.mean + 2.5 * scatter * np.where(np.arange(M) % 2, 1.0, -1.0)
+    )
+    left = off.refined(guess)
+    assert np.abs(left.rest).max() < 2.0
+    assert not off.passes_goodness_of_fit(left)
+
+
 def test_predictions_that_lie_near_each_other_are_not_told_apart_by_chance(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
