@@ -31,7 +31,7 @@ from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere
-from pchem_pipeline.model.arithmetic.significance import CERTAIN, FALSE_ALARM, NO_DIFFERENCE, OUTLYING
+from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, FALSE_ALARM, NO_DIFFERENCE, OUTLYING
 
 FloatArray = NDArray[np.float64]
 
@@ -382,7 +382,7 @@ class Refitter:
         """Tell whether a set leaves no statistic beyond chance, nor all of them together (chi-square)."""
         p, number = float(self.null.p_of(one.rest, _SPLITS).min()), one.rest.size
         together = float(chi_square(2.0 * (one.chance - one.score) + number, number))
-        return look_elsewhere(p, self.null.effective_tests) > FALSE_ALARM and together < CERTAIN
+        return look_elsewhere(p, self.null.effective_tests) > FALSE_ALARM and together < BEYOND_DOUBT
 
     def ranked(self, sets: Iterable[Refitted]) -> list[Refitted]:
         """Return sets, the best first: the likeliest; if it leaves nothing, the smallest that does so."""
