@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pchem_pipeline.stages.methods.inputs import METHODS_FILE, open_other_runs, read_methods
+from pchem_pipeline.stages.methods import METHODS_FILE, open_other_runs, read_methods
 
 if TYPE_CHECKING:
     from pchem_pipeline.run.target import Target

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample, Settings
-from pchem_pipeline.methods.registry import methods
+from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample, methods
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,
@@ -90,7 +90,7 @@ class MethodResult:
 def compare(
     pixels: PixelSamples,
     reference: FloatArray | None,
-    settings: Settings,
+    settings: MethodsSettings,
     *,
     skip_errors: Sequence[str] = (),
     only: Sequence[str] | None = None,
@@ -113,7 +113,7 @@ def compare(
 
 
 def _run(
-    name: str, method: Method, pixels: PixelSamples, reference: FloatArray | None, settings: Settings
+    name: str, method: Method, pixels: PixelSamples, reference: FloatArray | None, settings: MethodsSettings
 ) -> MethodResult:
     head = (name, method.title, method.source, method.remark)
     used = pixels if method.needs != "one sample" else PixelSamples(pixels.samples[:1], pixels.adc_limits)

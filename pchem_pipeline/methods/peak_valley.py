@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
-from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Settings, no_estimates
+from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, no_estimates
 from pchem_pipeline.methods.plain_em import closed_form_start
+from pchem_pipeline.methods.settings import MethodsSettings
 
 _SMOOTHING = 0.12  # standard deviation of the smoothing in units of the distance of two peaks
 
@@ -33,7 +34,7 @@ class PeakValley(Method):
     remark = "needs resolved peaks (read noise below about 0.3 e-), the lowest at zero electrons"
     order = 41
 
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return the estimates from the first sample."""
         sample = pixels.samples[0]
         spacing = 1.0 / closed_form_start(sample)[:, 1]

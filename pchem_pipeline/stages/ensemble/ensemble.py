@@ -35,7 +35,7 @@ from pchem_pipeline.run.frame_source import open_source
 from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, markers, nothing_left
 from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
-from pchem_pipeline.stages.electrons.electrons import read_tables
+from pchem_pipeline.stages.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
 from pchem_pipeline.stages.fit.code_sums import on_axis
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_effects, fitted_satellites
