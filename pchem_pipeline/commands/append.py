@@ -18,7 +18,7 @@ from pchem_pipeline.frames.identity import digest_of, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.run.fingerprint import setting_values
-from pchem_pipeline.run.input_identity import ingested_identity, keep_identity, known_identity
+from pchem_pipeline.run.input import ingested_identity, keep_identity, known_identity
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.runner.session import Command, run_stages, run_status, working_run
 from pchem_pipeline.stages.fit.start import keep_fit

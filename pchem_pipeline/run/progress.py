@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TextIO, TypeVar
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.kernel_cache import cache_folder, is_writable, listening
 from pchem_pipeline.base.units import typeset
 from pchem_pipeline.store.progress_file import ProgressFile
 
@@ -149,9 +150,45 @@ class Reporter:
                 self._end_log()
                 self._line(f"warning: --log-json: no further events written: {error.strerror or error}")
 
-    def compiling(self, spent: float) -> None:
-        """Take note of how long kernels were compiled so far in this stage, s: no work is done meanwhile."""
-        self._compiled = spent
+    @contextmanager
+    def compilation(self, stage: str, limit: int | None = None) -> Iterator[None]:
+        """Say when a stage compiles kernels, or waits for another process that does: how many, and how long.
+
+        Args:
+            stage: its name.
+            limit: memory that the run may take, MiB: where compiling takes more, that is a warning.
+        """
+        seconds: list[float] = []
+        most = 490  # MiB of this process while it compiles
+
+        def listener(kernel: str, took: float | None) -> None:
+            if took is not None:
+                seconds.append(took)
+            elif not seconds:
+                self.info(f"{stage}: compiling kernels (once after an installation or update)")
+                if limit is not None and limit < most:
+                    self.warning(
+                        f"{stage}: compiling takes up to {most} MiB, more than compute.max_memory "
+                        f"(--max-memory) allows ({limit} MiB); later work stays within the limit"
+                    )
+            self._compiled = sum(seconds)  # no work is done meanwhile
+            self.event("compiling", stage=stage, kernel=kernel, seconds=took)
+
+        try:
+            with listening(listener):
+                yield
+        finally:
+            self._compiled = 0.0
+        if not seconds:
+            return
+        self.info(
+            f"{stage}: {len(seconds)} kernel{'s' * (len(seconds) > 1)} compiled in {sum(seconds):.0f} s"
+        )
+        if not is_writable(cache_folder()):
+            self.warning(
+                f"{stage}: {cache_folder()} is not writable, so every command compiles its kernels again; "
+                "set NUMBA_CACHE_DIR to another folder"
+            )
 
     @contextmanager
     def phases(self, stage: str) -> Iterator[Callable[[str], None]]:

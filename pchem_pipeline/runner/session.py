@@ -13,7 +13,6 @@ from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputErr
 from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.load import dump_config, effects_file, found_model
-from pchem_pipeline.run.compilation import announced
 from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.model_versions import keep_in_force, model_in_force
@@ -145,11 +144,11 @@ def _bring_samples(target: Target, stages: Sequence[str], command: Command) -> N
 
 def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageState:
     """Bring a stage up to date; with those after it, where one pass does the work of all."""
-    single_pass = STAGES[name].single_pass
     of_files = not context.config.input.samples
-    with announced(context.reporter, name, context.config.compute.max_memory):
-        if of_files and single_pass is not None and set(single_pass.stages) <= set(stages):
-            imported(single_pass.run)(context)
+    passes = [STAGES[later].single_pass for later in stages if name in STAGES[later].upstream]
+    with context.reporter.compilation(name, context.config.compute.max_memory):
+        for single_pass in filter(None, passes if of_files else ()):
+            imported(single_pass)(context)
         return execute(name, context)
 
 

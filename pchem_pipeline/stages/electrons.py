@@ -22,7 +22,7 @@ from pchem_pipeline.model.electrons.electrons import (
     NumberTables,
     number_tables,
 )
-from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import BAND_BYTES, tile_bands
 from pchem_pipeline.stages.fit.fitted_model import fitted_pixels

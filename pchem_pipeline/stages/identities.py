@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic_core import to_jsonable_python
 
-from pchem_pipeline.run.input_identity import known_identity
+from pchem_pipeline.run.input import known_identity
 from pchem_pipeline.run.model_versions import model_versions, with_digest
 
 if TYPE_CHECKING:

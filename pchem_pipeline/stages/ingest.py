@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.frames.first_look import limits_in
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.open import open_frames
-from pchem_pipeline.run.input_identity import keep_ingested, known_identity, shortened
+from pchem_pipeline.run.input import keep_ingested, listed_identity
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, StageContext, Task, nothing_left
 from pchem_pipeline.stages.samples import check_samples, sample_sensor
@@ -82,7 +82,7 @@ def run(context: StageContext) -> None:
         (context.note if reader.integration_time is None else context.reporter.info)(reader.time_words)
     if message := reader.report.message():
         context.note(message)
-    sensor_of(reader, context, shortened(known_identity(context))).write(context.store)
+    sensor_of(reader, context, listed_identity(context)).write(context.store)
     if reader.excluded is not None:
         context.create("frames/excluded", lengths=dict(zip(("y", "x"), reader.shape[1:], strict=True)))
         context.store.write("frames/excluded", (slice(None),) * 2, reader.excluded.astype(np.uint8))
@@ -208,7 +208,7 @@ def _record_histograms(context: StageContext) -> None:
         seen_limits=limits_in(given.counts, given.origin),
         integration_time=None,
         mode="reference",
-        identity=shortened(known_identity(context)),
+        identity=listed_identity(context),
         names=given.names,
         reader="histogram",
     ).write(context.store)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.frames.camera import shared_facts
-from pchem_pipeline.run.input_identity import LISTED_FILES
+from pchem_pipeline.run.input import LISTED_FILES
 from pchem_pipeline.run.sensor import Sample, SensorInfo
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.store.run_store import RunStore

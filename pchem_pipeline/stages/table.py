@@ -10,7 +10,7 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from pchem_pipeline.run.declaration import SinglePass, Stage
+from pchem_pipeline.run.declaration import Stage
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
@@ -36,8 +36,6 @@ _INPUT_SETTINGS = (
 )
 
 _LINE = ("linearity_residual", "linearity_residual_stderr", "linearity_chi2", "linearity_p")
-
-_SINGLE_PASS = SinglePass(("ingest", "histogram"), f"{_HERE}.histogram.single_pass:count_in_one_pass")
 
 
 _ALL = (
@@ -65,7 +63,6 @@ _ALL = (
         identity=f"{_HERE}.identities:input_content",
         follows=("simulate",),
         reads_input=True,
-        single_pass=_SINGLE_PASS,
     ),
     Stage(
         "histogram",
@@ -82,6 +79,7 @@ _ALL = (
         reads=("frames",),
         writes=("histogram", "summary"),
         run=f"{_HERE}.histogram.histogram:run",
+        single_pass=f"{_HERE}.histogram.single_pass:count_in_one_pass",
         summary="Make the histogram of each pixel, and sums in time and space.",
         plan=f"{_HERE}.histogram.dry_run:plan_lines",
     ),

@@ -42,7 +42,6 @@ from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.effects.framework.compose import model_words
-from pchem_pipeline.run.compilation import announced
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
@@ -107,7 +106,7 @@ def apply_to_frames(
     reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json)
     with contextlib.ExitStack() as stack:
         stack.callback(reporter.close)
-        stack.enter_context(announced(reporter, STAGE, target.config.compute.max_memory))
+        stack.enter_context(reporter.compilation(STAGE, target.config.compute.max_memory))
         made = _make_job(run, target, files, wanted)
         output = place_of(output) if wanted.format == "zarr" else local_path(output)
         place = output if wanted.format == "zarr" else output.with_name(f".{output.name}.unfinished.zarr")

@@ -30,7 +30,7 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.operators.curve import Clipping
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.model.histogram.odd_frames import frame_words
-from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, Named, StageContext, nothing_left
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays

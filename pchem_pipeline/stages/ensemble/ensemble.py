@@ -31,7 +31,7 @@ from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, Ense
 from pchem_pipeline.model.fit.status import flags_of
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
-from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, markers, nothing_left
 from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands

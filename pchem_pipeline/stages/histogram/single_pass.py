@@ -29,7 +29,7 @@ from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.frames.stream import HashedFrameStream
 from pchem_pipeline.model.histogram.count import choose_bins, most_bins, pixels_by_range
-from pchem_pipeline.run.input_identity import identity_is_new, keep_identity
+from pchem_pipeline.run.input import identity_is_new, keep_identity
 from pchem_pipeline.run.progress import whole_mebibytes
 from pchem_pipeline.run.stage import Prepared, StageContext
 from pchem_pipeline.stages import ingest
