@@ -21,7 +21,7 @@ from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.input import ingested_identity, keep_identity, known_identity
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.runner.session import Command, run_stages, run_status, working_run
-from pchem_pipeline.stages.fit.start import keep_fit
+from pchem_pipeline.stages.fit.fit import keep_fit
 from pchem_pipeline.stages.histogram.arrays import extend_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes

@@ -37,7 +37,6 @@ from pchem_pipeline.run.stage import StageContext, markers, nothing_left
 from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
 from pchem_pipeline.stages.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
-from pchem_pipeline.stages.fit.code_sums import on_axis
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_effects, fitted_satellites
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of, uncounted_frames
 
@@ -67,7 +66,7 @@ class _Job:
         axes: axes of the ensemble.
         tiles: number and place of each tile by its key.
         frames: the chosen frames (first, end), or None where there are none to choose from.
-        codes: by tile the samples of all frames, where the fit has counted them; see `CodeSums`.
+        codes: by tile the samples of all frames, where the fit has counted them; see `code_sums`.
         source: where frames come from, if any are read.
         truth: first row, first column and first frame of the input in the true electron numbers, or None.
         effects: with which the maps were fitted.
@@ -315,6 +314,16 @@ def _sum_tile(
         integers[job.axes.integers["outside_all"]] = outside
         floats[job.axes.floats["share_all"]] = samples / job.sensor.n_frames
     return integers, floats
+
+
+def on_axis(content: dict[str, Any], axis: DnAxis) -> tuple[NDArray[np.int64], int]:
+    """Return the samples at each DN of an axis, and those beyond it; see `code_sums`."""
+    place = np.array(content["dn"], np.int64) - axis.start
+    samples = np.array(content["samples"], np.int64)
+    inside = (place >= 0) & (place < axis.size)
+    found = np.zeros(axis.size, np.int64)
+    found[place[inside]] = samples[inside]
+    return found, int(samples[~inside].sum()) + int(content["outside"])
 
 
 def _read_counted(store: RunStore, tile: Tile, origin: NDArray[np.int64]) -> PixelHistograms:

@@ -14,7 +14,7 @@ from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
-from pchem_pipeline.stages.fit.start import kept_fit
+from pchem_pipeline.stages.fit.fit import kept_fit
 from pchem_pipeline.store.run_store import RunStore
 
 QUIET = Command(quiet=True)
