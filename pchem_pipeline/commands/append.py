@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.base.errors import InputError, StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds
-from pchem_pipeline.config.memory import allowed_bytes, worker_count
 from pchem_pipeline.frames.identity import digest_of, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
@@ -24,7 +23,7 @@ from pchem_pipeline.runner.session import Command, run_stages, run_status, worki
 from pchem_pipeline.stages.fit.fit import keep_fit
 from pchem_pipeline.stages.histogram.arrays import extend_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import single_pass_bytes
+from pchem_pipeline.stages.histogram.memory import allowed_bytes, single_pass_bytes
 from pchem_pipeline.stages.histogram.single_pass import PREPARED, hashed_frames, prepared
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import remove_files, write_record
@@ -146,7 +145,7 @@ def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path
         )
     bins = context.store.array("histogram/counts").shape[2]
     need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
-    if need > allowed_bytes(context.config, worker_count(context.config)):
+    if need > allowed_bytes(context.config, context.config.compute.count()):
         raise StoreError(
             f"{place}: appending needs {need >> 20} MiB; allow this (--max-memory), or run all again: pchem "
             f"run {quoted(place)}"
@@ -155,7 +154,7 @@ def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path
 
 def _go_on(context: StageContext, frames: FrameSequence, added: list[Path]) -> dict[str, Any]:
     """Count the new frames; return the identity of their files."""
-    config, store, workers = context.config, context.store, worker_count(context.config)
+    config, store, workers = context.config, context.store, context.config.compute.count()
     bins = store.array("histogram/counts").shape[2]
     copies = config.input.mode == "copy"
     job = CountJob(store.path, frames.shape, bins, config.histogram, copies)

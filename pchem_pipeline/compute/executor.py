@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from pchem_pipeline.base.errors import ConfigError, ExitCode, IncompleteRunError, PchEmError
-from pchem_pipeline.compute.environment import available_workers, prepare_environment
+from pchem_pipeline.compute.environment import prepare_environment
 from pchem_pipeline.compute.settings import ComputeSettings
 
 T = TypeVar("T")
@@ -217,18 +217,17 @@ def make_executor(settings: ComputeSettings, notices: Notices | None = None) -> 
     Raises:
         PchEmError: it cannot be had; the message says why.
     """
-    workers = available_workers() if settings.workers == "auto" else settings.workers
-    if workers < 1:
-        raise ConfigError(f"compute.workers: {workers}; give 1 or more, or auto")
+    if settings.workers != "auto" and settings.workers < 1:
+        raise ConfigError(f"compute.workers: {settings.workers}; give 1 or more, or auto")
     match settings.backend:
         case "serial":
             return SerialExecutor()
         case "threads":
-            return PoolExecutor(workers, processes=False)
+            return PoolExecutor(settings.count(), processes=False)
         case "processes":
-            return PoolExecutor(workers, processes=True)
+            return PoolExecutor(settings.count(), processes=True)
         case "distributed":
             from pchem_pipeline.compute.cluster import DistributedExecutor
 
-            return DistributedExecutor(settings, workers, notices or Notices())
+            return DistributedExecutor(settings, settings.count(), notices or Notices())
     raise PchEmError(f"unknown backend {settings.backend}")

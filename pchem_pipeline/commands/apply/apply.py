@@ -21,8 +21,7 @@ from pchem_pipeline.commands.apply.characterisation import (
     read_calibration,
     with_moments,
 )
-from pchem_pipeline.commands.apply.files import write_files
-from pchem_pipeline.commands.apply.finish import finish_maps
+from pchem_pipeline.commands.apply.finish import finish_maps, write_files
 from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
 from pchem_pipeline.commands.apply.source import (
     check_camera,
@@ -40,7 +39,6 @@ from pchem_pipeline.commands.apply.tasks import (
 )
 from pchem_pipeline.compute.executor import Notices, make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
-from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
@@ -48,6 +46,7 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.session import Command, with_overrides
+from pchem_pipeline.stages.histogram.memory import band_bytes
 from pchem_pipeline.store.records import StageRecord, fingerprint_of
 from pchem_pipeline.store.remote_path import local_path, place_of
 from pchem_pipeline.store.run_store import RunStore

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_scores, odd_frames
@@ -25,7 +24,7 @@ from pchem_pipeline.run.stage import StageContext, Task, nothing_left
 from pchem_pipeline.stages.bands import Band, plan_bands
 from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, create_counts, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import bytes_per_row
+from pchem_pipeline.stages.histogram.memory import band_bytes, bytes_per_row
 from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore

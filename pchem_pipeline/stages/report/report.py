@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
-from pchem_pipeline.compute.environment import available_workers
 from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
 from pchem_pipeline.compute.settings import ComputeSettings
@@ -396,7 +395,7 @@ def _missing(run: StoredRun, maps: Mapping[str, NDArray[Any]]) -> dict[str, str]
 
 def _workers(settings: ComputeSettings) -> int:
     """Return how many may work on a report at a time."""
-    workers = available_workers() if settings.workers == "auto" else settings.workers
+    workers = settings.count()
     if settings.max_memory is not None:
         workers = min(workers, max(1, ((settings.max_memory << 20) - BASE_BYTES) // SECOND_PROGRAM_BYTES))
     return workers
