@@ -204,7 +204,7 @@ def joint(
 
     One gain, bias and read noise per pixel; charge rate from the slope of H. Missing histograms are made.
     """
-    from pchem_pipeline.commands.joint import find_joint, run_joint
+    from pchem_pipeline.commands.new_run import find_joint, run_joint
 
     target, is_new = find_joint(targets, bias or [], store, against, write=not command.options.dry_run)
     run_joint(target, command, typer.echo, is_new=is_new, strict=strict)
@@ -363,13 +363,13 @@ def compare(
     Runs on the same frames are compared value by value, others in standard errors.
     """
     from pchem_pipeline.commands.compare.compare import compare_runs
-    from pchem_pipeline.commands.compare.history import HistorySettings
 
     for path in compare_runs(
         runs,
         output,
         tolerance=tolerance,
-        history=HistorySettings(label or (), fdr),
+        labels=label or (),
+        rate=fdr,
         progress=progress,
     ):
         typer.echo(path)

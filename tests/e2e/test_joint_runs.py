@@ -10,7 +10,7 @@ from helpers.commands import Shell
 from helpers.places import ROOT
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
-from pchem_pipeline.commands.joint import find_joint, run_joint
+from pchem_pipeline.commands.new_run import find_joint, run_joint
 from pchem_pipeline.commands.notebook import open_run
 from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.discrepancy.verdict import read_verdict

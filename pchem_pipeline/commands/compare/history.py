@@ -25,31 +25,12 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.run_store import RunStore
 
-#: Name of the file.
-HISTORY_CSV = "history.csv"
-
-_NUMBER = re.compile(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)")
-
-
-@dataclass(frozen=True)
-class HistorySettings:
-    """What a history shows.
-
-    Attributes:
-        labels: of the runs, in their order, such as setpoints, which they are drawn against by the numbers
-            that these begin with; none: the dates.
-        rate: false-discovery rate at which a pixel counts as moved since the first run.
-    """
-
-    labels: Sequence[str] = ()
-    rate: float = 0.01
-
 
 def history_rows(
     runs: Sequence[RunFacts],
     stores: Sequence[RunStore],
     pairs: Sequence[Pair],
-    wanted: HistorySettings,
+    labels: Sequence[str],
     states: Sequence[PixelStates],
 ) -> list[HistoryRow]:
     """Return a row for each run, in the order given.
@@ -58,13 +39,12 @@ def history_rows(
         runs: the runs.
         stores: of them.
         pairs: the first with each of the others.
-        wanted: labels, and what they are drawn against.
+        labels: of the runs; none: their dates.
         states: of the pixels of each run.
 
     Raises:
         ConfigError: there are labels, but not one for each run.
     """
-    labels = wanted.labels
     if labels and len(labels) != len(runs):
         raise ConfigError(
             f"--label: {len(labels)} labels for {len(runs)} runs; give one per run, in the same order"
@@ -114,7 +94,7 @@ def _days(date: str) -> float:
 
 def _number(label: str) -> float:
     """Return the number that a label begins with; NaN where it begins with none."""
-    match = _NUMBER.match(label)
+    match = re.match(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)", label)
     return float(match[1]) if match else float("nan")
 
 

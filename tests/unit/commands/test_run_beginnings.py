@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.cli.app import app
-from pchem_pipeline.commands.joint import find_joint
-from pchem_pipeline.commands.new_run import find_or_start, first_try, unwritten
+from pchem_pipeline.commands.new_run import find_joint, find_or_start, first_try, unwritten
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
