@@ -27,7 +27,7 @@ from pchem_pipeline.config.template import SCHEMA_NAME, commented_config, json_s
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import Command, nothing_left_of_a_refusal
-from pchem_pipeline.stages.table import STAGES, pipeline_of
+from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
 from pchem_pipeline.store.run_store import RunStore, stored_config
@@ -36,8 +36,6 @@ _YAML = (".yaml", ".yml")
 #: Settings that differ, as many as a message tells.
 _SHOWN = 4
 _WIDTH = 70  # characters of a setting that differs
-#: A setting as messages name it.
-_SETTING = re.compile(rf"\b(?:{'|'.join(RunConfig.model_fields)})\.[a-z_]+")
 
 
 def write_template(
@@ -66,15 +64,12 @@ def find_or_start(
     store: Path | None,
     given: Mapping[str, Any],
     roi: tuple[int, int, int, int] | None = None,
-    *,
-    write: bool = True,
 ) -> tuple[Target, bool]:
-    """Return the run that ``targets`` name, and whether it was made from camera files.
+    """Return the run that ``targets`` name, and whether they are camera files.
 
-    One YAML file or one store is an existing run. Anything else is camera files: a YAML with the
-    settings in ``given`` and the region ``roi`` is written beside the store (unless
-    ``write`` is off), and used. One that is there and agrees with these is used as it is, whatever
-    else it sets.
+    One YAML file or one store is an existing run. Anything else is camera files, of a run with the settings
+    in ``given`` and the region ``roi``, whose YAML is beside the store. One that is there and agrees with
+    these is used as it is, whatever else it sets.
 
     Raises:
         ConfigError: options do not fit the target, or the YAML exists with other settings.
@@ -94,32 +89,25 @@ def find_or_start(
             f"{missing[0]} does not exist; give camera files, a folder of them, or a config.yaml"
         )
     place = place_of(store or Path("run.zarr")).resolve()
-    remote, path = isinstance(place, RemotePath), settings_of(place)
+    path = settings_of(place)
     region = {} if roi is None else {"roi": roi}
-    stated: dict[str, Any] = {
-        "run": {"store": str(place) if remote else place.name},
-        "input": {"files": _file_list(targets, path.parent), **region, **given},
-    }
-    config = make_config(stated, "the command line")
-    if path.exists() and not _came_to_nothing(place, path):
-        config = settings_there(path, stated, ways_out("run", path))
-    target = Target(config, path.parent, place, path)
-    text = unwritten(target)
-    if write and text is not None:
-        write_config(path, text)
-    return target, True
+    stated = {"files": _file_list(targets, path.parent), **region, **given}
+    return _stated_run(place, stated, "run", anew=path.exists() and _came_to_nothing(place, path)), True
 
 
-def unwritten(target: Target) -> str | None:
-    """Return the text of a run's YAML that is to be written; None where its file has these settings.
-
-    Raises:
-        ConfigError: the YAML is wrong.
-    """
-    path = target.config_path
-    if path is not None and path.exists() and load_config(path) == target.config:
-        return None
-    return dump_config(target.config)
+def _stated_run(place: Path, stated: Mapping[str, Any], command: str, *, anew: bool = False) -> Target:
+    """Return the run with a store and a stated input; a YAML that is there must agree, or is made anew."""
+    path = settings_of(place)
+    store = str(place) if isinstance(place, RemotePath) else place.name
+    content = {"run": {"store": store}, "input": stated}
+    config = make_config(content, "the command line")
+    if path.exists() and not anew:
+        ways = (
+            f"continue with these: pchem {command} {quoted(path)}; or edit the file, or start another run "
+            "with --store NAME.zarr"
+        )
+        config = settings_there(path, content, ways)
+    return Target(config, path.parent, place, path)
 
 
 def settings_of(store: Path) -> Path:
@@ -158,14 +146,6 @@ def settings_there(path: Path, stated: Mapping[str, Any], ways: str) -> RunConfi
     raise ConfigError(f"{path} exists with other settings ({'; '.join([*shown, *more])}); {ways}")
 
 
-def ways_out(command: str, path: Path) -> str:
-    """Say what to do where a command line contradicts the YAML of its run."""
-    return (
-        f"continue with these: pchem {command} {quoted(path)}; or edit the file, or start another run with "
-        "--store NAME.zarr"
-    )
-
-
 def _laid_over(there: Any, stated: Any) -> Any:
     """Return settings with those that are stated in their place, key by key; lists of sections one by one."""
     if isinstance(there, Mapping) and isinstance(stated, Mapping):
@@ -176,21 +156,34 @@ def _laid_over(there: Any, stated: Any) -> Any:
     return stated
 
 
+def run_new(
+    target: Target,
+    stages: Sequence[str],
+    command: Command,
+    say: Callable[[str], None],
+    *,
+    strict: bool = False,
+) -> None:
+    """Write the YAML of a run where it is not there with its settings, and do its stages.
+
+    Raises:
+        PchEmError: a stage cannot be done; the message says why.
+    """
+    with contextlib.nullcontext() if command.options.dry_run else first_try(target):
+        run_to_first_screen(target, stages, command, say, strict=strict)
+
+
 @contextlib.contextmanager
-def first_try(target: Target, text: str | None) -> Iterator[None]:
+def first_try(target: Target) -> Iterator[None]:
     """Write the YAML of a run; where the run is refused before any work, take away what was not there before.
 
     A refusal whose cure is a setting then says where settings are, now that the YAML is gone.
-
-    Args:
-        target: the run.
-        text: of its YAML; None: it has one.
     """
     path = target.config_path
-    had_yaml = text is None or path is None or path.exists()
+    had_yaml = path is None or path.exists()
     had_run = isinstance(target.store, RemotePath) or (target.store / ".pchem").is_dir()
-    if text is not None and path is not None:
-        write_config(path, text)
+    if path is not None and not (path.exists() and load_config(path) == target.config):
+        write_config(path, dump_config(target.config))
     try:
         with nothing_left_of_a_refusal(target.store):
             yield
@@ -200,7 +193,8 @@ def first_try(target: Target, text: str | None) -> Iterator[None]:
         if had_yaml or path is None:
             raise
         path.unlink(missing_ok=True)
-        if _SETTING.search(str(error)) is None or "(--" in str(error):
+        named = re.search(rf"\b(?:{'|'.join(RunConfig.model_fields)})\.[a-z_]+", str(error))
+        if named is None or "(--" in str(error) or target.config.input.samples:
             raise
         name = shlex.quote(path.name)
         raise type(error)(
@@ -238,13 +232,11 @@ def find_joint(
     bias: Sequence[Path] = (),
     store: Path | None = None,
     against: str | None = None,
-    *,
-    write: bool = True,
 ) -> tuple[Target, bool]:
-    """Return the run of several samples that ``targets`` name, and whether its YAML was written just now.
+    """Return the run of several samples that ``targets`` name, and whether they are those samples.
 
-    One YAML file or store whose input is samples is an existing one. Several runs (YAML files or stores) make
-    a new one: its YAML is written beside the store, unless ``write`` is off.
+    One YAML file or store whose input is samples is an existing run. Several runs (YAML files or stores) are
+    the samples of one whose YAML is beside the store.
 
     Raises:
         ConfigError: options do not fit the target, or the YAML exists with other settings.
@@ -262,46 +254,13 @@ def find_joint(
                 raise ConfigError(f"--{name}: only with runs; {targets[0]} sets {option}, change it there")
         return found, False
     place = place_of(store or Path("joint.zarr")).resolve()
-    remote, path = isinstance(place, RemotePath), settings_of(place)
-    runs = [*targets, *bias]
-    samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, path.parent)} for each in runs]
+    runs, folder = [*targets, *bias], settings_of(place).parent
+    samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, folder)} for each in runs]
     for sample in samples[len(targets) :]:
         sample["bias"] = True
     given: dict[str, Any] = {"samples": samples}
     if against is not None or len(targets) == 1:
         given["against"] = against or "none"  # a line needs two exposures
-    content = {"run": {"store": str(place) if remote else place.name}, "input": given}
-    config = make_config(content, "the command line")
     for each in runs:
         find_run(each)
-    is_new = write and not path.exists()
-    if path.exists():
-        config = settings_there(path, content, ways_out("joint", path))
-    if is_new:
-        write_config(path, dump_config(config))
-    return Target(config, path.parent, place, path), is_new
-
-
-def run_joint(
-    target: Target,
-    command: Command,
-    say: Callable[[str], None],
-    *,
-    is_new: bool = False,
-    strict: bool = False,
-) -> None:
-    """Do every stage of a run of several samples, and what their own runs need for it.
-
-    The new YAML of a run that is refused is taken away again, so that its name is free.
-
-    Raises:
-        ConfigError: the samples do not belong together.
-        IncompleteRunError: tiles failed, or more pixels failed than the configuration allows.
-        PchEmError: a stage cannot be done; the message says why.
-    """
-    try:
-        run_to_first_screen(target, pipeline_of(target.config), command, say, strict=strict)
-    except (ConfigError, InputError, StoreError):
-        if is_new and target.config_path is not None and not (target.store / ".pchem").is_dir():
-            target.config_path.unlink(missing_ok=True)
-        raise
+    return _stated_run(place, given, "joint"), True
