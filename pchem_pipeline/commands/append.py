@@ -55,6 +55,8 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
         StoreError: the run is not finished as far as its histograms, or was made with other settings.
     """
     begun = target.store / _BEGUN
+    if command.options.dry_run:
+        return run_stages(target, PREPARED, command)
     if begun.exists() and any(state.state != "complete" for state in run_status(target)[: len(PREPARED)]):
         states = run_stages(target, PREPARED, command)
         remove_files(begun)

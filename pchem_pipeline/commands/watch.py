@@ -10,9 +10,9 @@ from typing import Any
 
 from pchem_pipeline.base.errors import one_line
 from pchem_pipeline.run.fingerprint import StageState
+from pchem_pipeline.run.progress import read_progress
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import run_status
-from pchem_pipeline.store.progress_file import read_progress
 
 _INTERVAL = 1.0
 #: Moves the cursor up so many lines and clears what is below.

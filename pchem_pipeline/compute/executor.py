@@ -36,19 +36,6 @@ class Stop(Exception):
     """Raised by ``on_result`` to end the work: nothing new starts, what runs is finished."""
 
 
-@dataclass(frozen=True)
-class Notices:
-    """What an executor that has to wait calls.
-
-    Attributes:
-        say: with one line for people.
-        check: now and then; raises where the wait shall end.
-    """
-
-    say: Callable[[str], None] = lambda text: None
-    check: Callable[[], None] = lambda: None
-
-
 OnResult = Callable[[Any, Outcome], None]
 
 
@@ -207,12 +194,17 @@ class PoolExecutor:
         """The pool lives only during :meth:`map`."""
 
 
-def make_executor(settings: ComputeSettings, notices: Notices | None = None) -> Executor:
+def make_executor(
+    settings: ComputeSettings,
+    say: Callable[[str], None] = lambda text: None,
+    check: Callable[[], None] = lambda: None,
+) -> Executor:
     """Return the executor that the settings ask for.
 
     Args:
         settings: the section ``compute``.
-        notices: what to call while waiting for workers.
+        say: takes one line for people while workers are waited for.
+        check: called meanwhile; raises where the wait shall end.
 
     Raises:
         PchEmError: it cannot be had; the message says why.
@@ -229,5 +221,5 @@ def make_executor(settings: ComputeSettings, notices: Notices | None = None) -> 
         case "distributed":
             from pchem_pipeline.compute.cluster import DistributedExecutor
 
-            return DistributedExecutor(settings, settings.count(), notices or Notices())
+            return DistributedExecutor(settings, settings.count(), say, check)
     raise PchEmError(f"unknown backend {settings.backend}")

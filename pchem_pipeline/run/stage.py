@@ -284,14 +284,16 @@ class StageContext:
         chosen = {tile.key for tile in roi_tiles(self.options.roi, self.tiles())}
         return [unit for unit in units if unit is WHOLE or chosen & set(markers(unit))]
 
-    def pending(self, units: Sequence[AnyUnit], *, by_tiles: bool = True) -> list[AnyUnit]:
-        """Return the chosen units that are not done; with ``--force`` all the chosen ones.
+    def pending(
+        self, units: Sequence[AnyUnit], *, by_tiles: bool = True, resumes: bool = False
+    ) -> list[AnyUnit]:
+        """Return the chosen units that are not done; with ``--force`` all, unless the stage ``resumes``.
 
         Units that are no tiles (``by_tiles=False``) are always chosen, and not forced by a choice of tiles.
         """
         done = self.store.records.done(self.stage, self.fingerprint)
         chosen = self.selected(units) if by_tiles else list(units)
-        if self.options.force and (by_tiles or self.options.roi is None):
+        if self.options.force and not resumes and (by_tiles or self.options.roi is None):
             return chosen
         return [unit for unit in chosen if not set(markers(unit)) <= done]
 
@@ -325,7 +327,7 @@ class StageContext:
         """
         self.begin()
         self._know_total(sum(len(markers(unit)) for unit in units) if total is None else total)
-        todo = self._ready(self._pending_of(units, by_tiles, total), needs)
+        todo = self._ready(self.pending(units, by_tiles=by_tiles, resumes=total is not None), needs)
         self.store.records.unmark(
             self.stage, self.fingerprint, (key for unit in todo for key in markers(unit))
         )
@@ -333,7 +335,9 @@ class StageContext:
         shown = len(self.selected(units) if by_tiles else units)
         undivided = list(units) == [WHOLE]
         # what is not divided is done here, and tells its own steps
-        executor = self._affordable(SerialExecutor() if undivided else self.executor, unit_bytes)
+        executor = SerialExecutor() if undivided else self.executor
+        if (limit := self.config.compute.max_memory) is not None and unit_bytes:
+            executor = affordable(executor, limit << 20, unit_bytes, f"stage {self.stage}")
         with self.reporter.progress(
             self.stage, shown, unit_name, shown - len(todo), hidden=undivided
         ) as advance:
@@ -373,18 +377,6 @@ class StageContext:
         for name, stage in self.created.items():
             if stage == self.stage and "frame" not in VARIABLES[name].dims:
                 self.store.fill(name)
-
-    def _affordable(self, executor: Executor, unit_bytes: int) -> Executor:
-        limit = self.config.compute.max_memory
-        if limit is None or not unit_bytes:
-            return executor
-        return affordable(executor, limit << 20, unit_bytes, f"stage {self.stage}")
-
-    def _pending_of(self, units: Sequence[AnyUnit], by_tiles: bool, total: int | None) -> list[AnyUnit]:
-        if total is None:
-            return self.pending(units, by_tiles=by_tiles)
-        done = self.store.records.done(self.stage, self.fingerprint)
-        return [unit for unit in units if not set(markers(unit)) <= done]
 
     def _know_total(self, n_keys: int) -> None:
         """Record how many markers the stage will have, before the first is set: a kill must not lose it."""

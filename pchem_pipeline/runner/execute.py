@@ -6,11 +6,10 @@ import platform
 import time
 from dataclasses import replace
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from pchem_pipeline.base.errors import StoreError, quoted
-from pchem_pipeline.compute.environment import cpu_seconds, peak_rss_bytes
+from pchem_pipeline.compute.environment import cpu_seconds, peak_rss_bytes, versions_of
 from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.fingerprint import StageState, changed_file, fingerprint_content, rests_on, status
 from pchem_pipeline.run.stage import StageContext
@@ -44,9 +43,6 @@ def execute(name: str, context: StageContext) -> StageState:
             raise StoreError(f"{name} needs {upstream} first; run: pchem {upstream} {place}")
     if stage.upstream:
         context.selected(())
-    if context.options.dry_run:
-        context.reporter.info(f"{name}: {before.words()} -> would run")
-        return before
     for upstream in stage.upstream:
         record = context.store.records.known(upstream)
         if record is not None and (file := changed_file(record, context.store)):
@@ -94,7 +90,7 @@ def _perform(
         content,
         keys=old.keys if resumes and old is not None else 0,
         started=datetime.now(UTC).isoformat(timespec="seconds"),
-        versions=_versions(),
+        versions={"python": platform.python_version(), **versions_of("pchem-pipeline", *_LIBRARIES)},
     )
     record = replace(record, model=rests_on(record, context.store))
     records.write(record)
@@ -165,15 +161,3 @@ def written_files(stage: Stage, folder: Path) -> dict[str, str]:
                 places += [description, description.parent]
     found = {place.relative_to(folder).as_posix(): digest_of(place) for place in places}
     return {name: digest for name, digest in found.items() if digest is not None}
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version(), "pchem-pipeline": _version("pchem-pipeline")}
-    return found | {name: text for name in _LIBRARIES if (text := _version(name))}
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return ""

@@ -37,7 +37,7 @@ from pchem_pipeline.commands.apply.tasks import (
     moments_piece,
     offsets_piece,
 )
-from pchem_pipeline.compute.executor import Notices, make_executor
+from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.run.model_versions import model_of
@@ -115,7 +115,7 @@ def apply_to_frames(
         store, fresh = _output_store(place, made.content, force=command.options.force)
         stack.enter_context(store.locked())
         stop = stack.enter_context(stop_on_signals())
-        executor = make_executor(target.config.compute, Notices(reporter.warning, stop.check))
+        executor = make_executor(target.config.compute, reporter.warning, stop.check)
         stack.callback(executor.close)
         context = StageContext(
             target.config, target.base_dir, store, executor, reporter, stop, stage=STAGE, fresh=fresh

@@ -11,8 +11,14 @@ from pchem_pipeline.base import kernel_cache
 from pchem_pipeline.commands.watch import rows
 from pchem_pipeline.run import progress
 from pchem_pipeline.run.fingerprint import StageState
-from pchem_pipeline.run.progress import Reporter, paced, parts_told, telling_parts
-from pchem_pipeline.store.progress_file import ProgressFile, read_progress
+from pchem_pipeline.run.progress import (
+    ProgressFile,
+    Reporter,
+    paced,
+    parts_told,
+    read_progress,
+    telling_parts,
+)
 from pchem_pipeline.store.run_store import RunStore
 
 

@@ -228,13 +228,6 @@ def test_changes_of_the_input_are_said_in_words():
     assert differences(digest, other) == ["the input has changed"]
 
 
-def test_dry_run_writes_nothing(make):
-    context = make(dry_run=True)
-    assert execute("fit", context).state == "missing"
-    assert context.store.records.read("fit") is None
-    assert CALLS == []
-
-
 def test_a_stage_without_its_upstream_names_the_command(make):
     with pytest.raises(StoreError, match="maps needs fit first; run: pchem fit"):
         execute("maps", make())
