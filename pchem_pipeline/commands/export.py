@@ -23,7 +23,6 @@ from pchem_pipeline.store.run_store import RunStore
 #: Formats that maps can be exported to, their CSV summary, and a table in the words of EMVA 1288.
 FORMATS = ("fits", "tiff", "npz", "csv", "emva")
 
-_FROM_FIT = ("fit_status", "likelihood_gap", "goodness_p")
 _COLUMNS = (
     "n_valid",
     "n_missing",
@@ -78,7 +77,8 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
 
 def _images(store: RunStore) -> list[MapImage]:
     chosen: list[Variable] = [v for v in variables_of("maps") if store.has(v.path)]
-    chosen += [v for v in variables_of("fit") if v.name in _FROM_FIT and store.has(v.path)]
+    own = ("fit_status", "likelihood_gap", "goodness_p")
+    chosen += [v for v in variables_of("fit") if v.name in own and store.has(v.path)]
     return [MapImage(v.name, store.read(v.path), v.unit, v.long_name) for v in chosen]
 
 

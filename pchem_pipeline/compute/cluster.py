@@ -22,10 +22,7 @@ from pchem_pipeline.compute.settings import ComputeSettings
 
 T = TypeVar("T")
 
-#: seconds between looks for results, between looks at the workers, and without workers before it is said
-_POLL, _LOOK, _SAY = 0.01, 1.0, 5.0
-#: share of a worker's memory above which dask gives it no more work
-_USABLE = 0.8
+_LOOK = 1.0  # s between looks at the workers
 
 
 class OtherVersionsError(ConfigError):
@@ -91,7 +88,8 @@ class DistributedExecutor:
         known = self._workers()
         self.workers = max(1, len(known))
         limits = [each["memory_limit"] for each in known if each["memory_limit"]]
-        self.memory_limit = int(_USABLE * min(limits)) if limits else None
+        # dask gives a worker no more work above this share of its memory
+        self.memory_limit = int(0.8 * min(limits)) if limits else None
 
     def _workers(self) -> list[dict[str, Any]]:
         return list(self._client.scheduler_info(n_workers=-1)["workers"].values())
@@ -112,7 +110,7 @@ class DistributedExecutor:
         seconds, waited = self._seconds, now - self._since
         if waited >= seconds:
             raise IncompleteRunError(self._given_up(workers))
-        if not self._said and waited >= min(_SAY, seconds / 2):
+        if not self._said and waited >= min(5.0, seconds / 2):
             self._said = True
             why = f": all {len(workers)} are paused, memory nearly full" if workers else ""
             self._say(f"waiting for workers of {self._name}{why}")
@@ -144,7 +142,7 @@ class DistributedExecutor:
             if time.monotonic() - looked > _LOOK:
                 looked = time.monotonic()
                 self._can_work()
-            time.sleep(_POLL)
+            time.sleep(0.01)
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
         """See :class:`Executor`.

@@ -11,8 +11,6 @@ from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamp
 from pchem_pipeline.methods.plain_em import closed_form_start
 from pchem_pipeline.methods.settings import MethodsSettings
 
-_SMOOTHING = 0.12  # standard deviation of the smoothing in units of the distance of two peaks
-
 
 class PeakValley(Method):
     """Gain from the distance of the peaks, read noise from the valley-peak modulation (VPM).
@@ -39,7 +37,7 @@ class PeakValley(Method):
         sample = pixels.samples[0]
         spacing = 1.0 / closed_form_start(sample)[:, 1]
         spacing[~(spacing < 0.5 * sample.counts.shape[1])] = np.nan
-        width = np.maximum(_SMOOTHING * spacing, 0.3)
+        width = np.maximum(0.12 * spacing, 0.3)
         found = np.full((pixels.n_pixels, 4), np.nan)
         for pixel in np.flatnonzero(np.isfinite(spacing)):
             found[pixel] = comb(sample.counts[pixel], spacing[pixel], width[pixel])

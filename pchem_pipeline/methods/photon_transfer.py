@@ -9,8 +9,6 @@ import numpy as np
 from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, no_estimates
 from pchem_pipeline.methods.settings import MethodsSettings
 
-_LINEAR_RANGE = 0.7  # of the saturation, EMVA 1288 release 3.1, section on sensitivity
-
 
 class PhotonTransferSeries(Method):
     """Weighted straight line through variance against mean (the photon transfer curve).
@@ -85,7 +83,7 @@ class Emva1288(Method):
         signal, noise = mean - mean[dark], variance - variance[dark]
         linear = np.ones(mean.size, np.bool_)
         if pixels.adc_limits is not None:
-            linear = signal <= _LINEAR_RANGE * (pixels.adc_limits[1] - mean[dark])
+            linear = signal <= 0.7 * (pixels.adc_limits[1] - mean[dark])
         out = no_estimates(pixels.n_pixels)
         steepness = float((signal * noise)[linear].sum())
         if steepness <= 0:

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
 
-_TILE = "run.tile"
 _NEWS = {f"input.{name}": f"new result of pchem {name}" for name in ("discrepancy", "methods")}
 
 
@@ -69,9 +68,9 @@ def fingerprint_content(stage: Stage, context: StageContext) -> dict[str, Any]:
 def setting_values(stage: Stage, context: StageContext) -> dict[str, Any]:
     """Return the settings that a stage reads, as JSON data; of the tiles what they are."""
     found = {key: setting_of(context.config, key) for key in stage.settings}
-    if found.get(_TILE) == "auto":
+    if found.get("run.tile") == "auto":
         rows, columns = context.tile
-        found[_TILE] = rows if rows == columns else [rows, columns]
+        found["run.tile"] = rows if rows == columns else [rows, columns]
     return found
 
 

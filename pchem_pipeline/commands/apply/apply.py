@@ -65,16 +65,9 @@ _VERSION = 4
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
-#: Frames that tell the scene while offsets are found, and codes in a DN once they are taken away.
-_SCENE_FRAMES, _PARTS = 256, 4
 #: Share of the samples at a limit of the ADC beyond which offsets cannot be told: with 6 % of them the stated
 #: probabilities of electron numbers are as right as without, with 32 % they are 0.1 too high.
 _MOST_CUT = 0.2
-#: Frames that tell how wide the histograms are.
-_SEEN_FRAMES = 64
-#: Bytes that a code of a pixel takes while numbers are looked up.
-_BYTES_OF_CODE = 24
-_EXPOSURE = ("exposure", "exposure_stderr", "exposure_stderr_counting", "exposure_stderr_calibration")
 
 
 def apply_to_frames(
@@ -369,7 +362,8 @@ def _with_moments(context: StageContext, job: Job, made: _Made) -> tuple[Job, _M
 def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
     """Find the offsets of frames, rows and columns; return the job that takes them away."""
     n, ny, nx = job.source.shape
-    chosen = np.unique(np.linspace(0, n - 1, _SCENE_FRAMES).astype(int)).tolist()
+    # some frames tell the scene
+    chosen = np.unique(np.linspace(0, n - 1, 256).astype(int)).tolist()
     mean = sum(made.frames.read(t, t + 1)[0].astype(np.float64) for t in chosen) / len(chosen)
     job = replace(job, scene=scene_of(np.asarray(mean), made.calibration))
     parts = job.modes.parts
@@ -396,10 +390,10 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
     found = [summary for key, summary in done.items() if key.startswith("offsets-")]
     left = sum((np.array(each["left"]) for each in found), start=np.zeros(len(parts))) / n
     lift = int(np.ceil(max(float(each["largest"]) for each in found))) + 1 if found else 0
-    # codes are cut to parts of a DN: their own rounding is part of what is not known
-    variance = np.tensordot(left, parts, 1) + QUANTISATION_VARIANCE / _PARTS**2
+    # codes are cut to quarters of a DN: their own rounding is part of what is not known
+    variance = np.tensordot(left, parts, 1) + QUANTISATION_VARIANCE / 4**2
     reached = (any(each["reached"][0] for each in found), any(each["reached"][1] for each in found))
-    return replace(job, parts=_PARTS, lift=lift, offset_variance=variance, reached=reached)
+    return replace(job, parts=4, lift=lift, offset_variance=variance, reached=reached)
 
 
 def _counted(context: StageContext, job: Job, made: _Made) -> Job:
@@ -409,9 +403,11 @@ def _counted(context: StageContext, job: Job, made: _Made) -> Job:
 
     n, ny, _ = job.source.shape
     most = context.config.histogram.max_bins
-    bins = job.parts * bins_of(job.source, _SEEN_FRAMES, most // job.parts, _CHUNK_ROWS)
+    # the first 64 frames tell how wide the histograms are
+    bins = job.parts * bins_of(job.source, 64, most // job.parts, _CHUNK_ROWS)
     job = replace(job, bins=min(most, bins), window=min(job.window, n))
-    names = [f"applied/{name}" for name in _EXPOSURE] if "exposure" in job.kinds else []
+    ends = ("", "_stderr", "_stderr_counting", "_stderr_calibration")
+    names = [f"applied/exposure{end}" for end in ends] if "exposure" in job.kinds else []
     names += ["applied_parts/prior"] if job.learns_prior else []
     _create(context, job, "applied_parts/range", *names, lengths={"end": 2})
     bytes_of_pixel = 10 * job.bins + 2 * job.window * made.frames.dtype.itemsize + 200
@@ -445,7 +441,7 @@ def _converted(context: StageContext, job: Job) -> None:
     if "numbers" in job.kinds:
         ends = context.store.read("applied_parts/range")
         codes = int(np.ceil((ends[1] - ends[0] + 1).mean()))
-    bytes_of_pixel = job.depth * 24 + _BYTES_OF_CODE * codes + 400
+    bytes_of_pixel = 24 * (job.depth + codes) + 400
     step = _rows_of_band(context, job, bytes_of_pixel)
     # independent of the workers, so that the sums are, too
     rows = _chunks(job.source.shape)[1]

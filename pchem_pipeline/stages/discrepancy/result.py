@@ -15,9 +15,6 @@ from pchem_pipeline.report.data import DiscrepancyData
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
 
-_STAGE = "discrepancy"
-_VECTORS = ("z_before", "z_after")  # a number for each statistic
-
 
 def discrepancy_state(store: RunStore) -> str | None:
     """Return in words which verdict a run has, None without one that can be read.
@@ -30,7 +27,7 @@ def discrepancy_state(store: RunStore) -> str | None:
         return None
     if found is None:
         return None
-    record = store.records.known(_STAGE)
+    record = store.records.known("discrepancy")
     when = f" ({record.fingerprint[:8]}, {record.started})" if record is not None else ""
     return f"{found.verdict}{when}"
 
@@ -46,8 +43,8 @@ def verdict_data(found: Verdict, arrays: Mapping[str, NDArray[Any]]) -> Discrepa
 
     effects = effect_classes()
     # those of a search with other statistics are in another order: what its JSON tells is left
-    of_others = [name for name in _VECTORS if name in arrays and len(arrays[name]) != len(STATISTICS)]
-    arrays = {name: array for name, array in arrays.items() if name not in of_others}
+    vectors = ("z_before", "z_after")  # a number for each statistic
+    arrays = {n: array for n, array in arrays.items() if n not in vectors or len(array) == len(STATISTICS)}
     signs = dict(zip(STATISTICS, arrays.get("z_before", ()), strict=False))
     return DiscrepancyData(
         found=found,

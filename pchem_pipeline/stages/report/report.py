@@ -58,17 +58,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.store.records import StageRecord
 
-#: Where a version of the model comes from, in words.
-_SOURCES = {"config": "from the configuration", "verdict": "from the search for missing effects"}
-#: All channels of a line of so few are shown.
-_FEW_CHANNELS = 12
-#: Pixels in full that have the mass of a model with effects.
-_SOME_MASSES = 300
-#: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 940 MiB in all.
-_PIXEL_BYTES = 300
-#: Precisions whose frames the report tells, at the median pixel.
-_TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
-
 
 def run(context: StageContext) -> None:
     """Write the report.
@@ -90,7 +79,8 @@ def run(context: StageContext) -> None:
         stages=_stage_rows(context),
         draw=draw_and_say(context.reporter, context.stage),
     )
-    done = context.run_units([WHOLE], task, unit_name="report", unit_bytes=ny * nx * _PIXEL_BYTES)
+    held = 300 * ny * nx  # the maps as a whole; measured at 2048 x 1152, 940 MiB in all
+    done = context.run_units([WHOLE], task, unit_name="report", unit_bytes=held)
     for text in done.get(WHOLE.key, {}).get("warnings", ()):
         context.note(text)
 
@@ -186,7 +176,8 @@ def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
     full = choose_inspected(run.maps, run.fit, places, suspects, bins=bins)
     index = np.concatenate([pixel_index(shown, run.sensor.shape), full.index])
     histograms = read_histograms(store, index, run.sensor.shape)
-    drawn, held, some = slice(0, len(shown)), slice(len(shown), None), slice(0, len(shown) + _SOME_MASSES)
+    drawn, held = slice(0, len(shown)), slice(len(shown), None)
+    some = slice(0, len(shown) + 300)  # those with the mass of a model with effects
     masses = bin_masses(_parameters(run, index[some]), histograms.of(some), run.model.at(index[some]))
     channel = run.sensor.kind == "histograms"
     fits = pixel_fits(shown, run.maps, run.fit, histograms.of(drawn), masses[drawn], channel=channel)
@@ -218,7 +209,7 @@ def _at_hand(run: StoredRun) -> dict[str, NDArray[Any]]:
 def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
     """Return the pixels that stand for the sensor."""
     chosen: list[Chosen] = [("", y, x) for y, x in config.report.pixels]
-    if not chosen and run.sensor.names and run.sensor.nx <= _FEW_CHANNELS:
+    if not chosen and run.sensor.names and run.sensor.nx <= 12:
         chosen = [(short_name(name), 0, x) for x, name in enumerate(run.sensor.names)]
     if not chosen:
         chosen = choose_pixels(run.maps["read_noise_e"], run.maps["quanta_exposure"], run.fit["fit_status"])
@@ -295,9 +286,10 @@ def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict
         point = Point(exposure, noise, gain)
     except ConfigError:
         return None
+    targets = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
     rows = [
         {"target": str(target), "name": target.name, "frames": frames_needed(target, point)}
-        for target in map(parse_target, _TARGETS)
+        for target in map(parse_target, targets)
     ]
     reached = {} if n_frames is None else precision(point, n_frames)
     return {"rows": rows, "reached": reached, "exposure": exposure, "read_noise": noise}
@@ -332,7 +324,8 @@ def _run_facts(run: StoredRun, config: RunConfig) -> dict[str, Any]:
     if version is not None and version.effects:
         facts["model"] = model_words(version.effects)
     if version is not None:
-        facts["version of the model"] = f"{version.number} ({_SOURCES[version.source]})"
+        source = "search for missing effects" if version.source == "verdict" else "configuration"
+        facts["version of the model"] = f"{version.number} (from the {source})"
     if run.record is not None:
         facts["report made (UTC)"] = run.record.started
         facts["versions"] = run.record.versions
