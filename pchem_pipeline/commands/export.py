@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import Variable, variables_of
-from pchem_pipeline.commands.figures import warn_if_old
+from pchem_pipeline.commands.figures import check_formats, warn_if_old
 from pchem_pipeline.frames.formats.map_files import MapImage, write_fits, write_npz, write_tiff
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.pages.emva import COLUMNS as EMVA_COLUMNS
@@ -52,10 +51,7 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
         ConfigError: an unknown format, or none.
         StoreError: the run has no maps, or the folder cannot be written.
     """
-    unknown = [name for name in formats if name not in FORMATS]
-    if unknown or not formats:
-        what = f"{', '.join(unknown)} cannot be written" if unknown else "no format"
-        raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
+    check_formats(formats, FORMATS, "written")
     target = find_run(path)
     store = with_maps(target.stored())
     warn_if_old(target, ("maps",), "written in this state")

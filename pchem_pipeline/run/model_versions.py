@@ -62,6 +62,10 @@ class AddedArrays:
         rows, columns = (tuple(values[name]) for name in ("rows", "columns"))
         return cls(group, rows, columns, tuple(values["effects"]), values["digest"])
 
+    def attributes(self) -> dict[str, Any]:
+        """Return what stands with the arrays, of which :meth:`of_group` makes it again."""
+        return {name: value for name, value in asdict(self).items() if name != "group"}
+
 
 @dataclass(frozen=True)
 class ModelVersion:
@@ -236,20 +240,11 @@ def _keep(store: RunStore, version: ModelVersion) -> ModelVersion:
     if version.added is not None and not version.added.group.startswith(f"{_GROUP}/"):
         for array in (_WEIGHT, _EXPOSURE):
             values = store.read(f"{version.added.group}/{array}")
-            store.write_array(f"{name}/{array}", values, _attributes(version.added))
+            store.write_array(f"{name}/{array}", values, version.added.attributes())
         version = replace(version, added=replace(version.added, group=name))
     version = replace(version, made=datetime.now(UTC).isoformat(timespec="seconds"))
     write_record(store.path / f"{name}.json", asdict(version))
     return version
-
-
-def _attributes(added: AddedArrays) -> dict[str, Any]:
-    return {
-        "rows": list(added.rows),
-        "columns": list(added.columns),
-        "effects": list(added.effects),
-        "digest": added.digest,
-    }
 
 
 # -- what results rest on ------------------------------------------------------------------------
@@ -307,14 +302,11 @@ def write_added_exposure(
         return
     arrays = [np.ascontiguousarray(values, np.float64) for values in added]
     digest = hashlib.sha256(b"".join(values.tobytes() for values in arrays)).hexdigest()
-    adding = tuple(e.model_dump(mode="json") for e in effects if _adds(e))
+    adding = [e for e in effects if type(e).added_exposure is not Effect.added_exposure]
+    kept = tuple(e.model_dump(mode="json") for e in adding)
     store.write_array(f"{group}/{_WEIGHT}", arrays[1])
-    facts = AddedArrays(group, rows, columns, adding, digest)
-    store.write_array(f"{group}/{_EXPOSURE}", arrays[0], _attributes(facts))
-
-
-def _adds(effect: Effect) -> bool:
-    return type(effect).added_exposure is not Effect.added_exposure
+    facts = AddedArrays(group, rows, columns, kept, digest)
+    store.write_array(f"{group}/{_EXPOSURE}", arrays[0], facts.attributes())
 
 
 def read_added_exposure(

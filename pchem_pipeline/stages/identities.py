@@ -13,6 +13,7 @@ from pchem_pipeline.run.model_versions import model_versions, with_digest
 if TYPE_CHECKING:
     from pchem_pipeline.methods.settings import MethodsSettings
     from pchem_pipeline.run.stage import StageContext
+    from pchem_pipeline.store.run_store import RunStore
 
 
 def input_content(context: StageContext) -> dict[str, Any]:
@@ -73,14 +74,31 @@ def integration_time(context: StageContext) -> dict[str, Any]:
 
 def verdict(context: StageContext) -> dict[str, str] | None:
     """Return what the report depends on beside its upstream stages: a verdict, a comparison of methods."""
-    from pchem_pipeline.stages.discrepancy.result import discrepancy_state
-
-    state = discrepancy_state(context.store)
+    state, records = discrepancy_state(context.store), context.store.records
     found = {} if state is None else {"discrepancy": state}
-    compared = context.store.records.known("methods")
+    compared = records.known("methods")
     if compared is not None and compared.finished:
         found["methods"] = f"{compared.fingerprint[:8]}, {compared.started}"
     return found or None
+
+
+def discrepancy_state(store: RunStore) -> str | None:
+    """Return in words which verdict a run has, None without one that can be read.
+
+    It changes whenever the verdict was redone.
+    """
+    from pchem_pipeline.base.errors import StoreError
+    from pchem_pipeline.discrepancy.verdict import read_verdict
+
+    try:
+        found = read_verdict(store.path)
+    except StoreError:  # the stage that wrote it is stale
+        return None
+    if found is None:
+        return None
+    record = store.records.known("discrepancy")
+    when = f" ({record.fingerprint[:8]}, {record.started})" if record is not None else ""
+    return f"{found.verdict}{when}"
 
 
 def methods_settings(context: StageContext) -> MethodsSettings:

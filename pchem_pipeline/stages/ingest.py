@@ -9,11 +9,10 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pchem_pipeline.frames.first_look import limits_in
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
@@ -49,11 +48,6 @@ class CopyUnit:
     def key(self) -> str:
         """What messages call it, and its marker."""
         return f"frames-{self.t0}-{self.t1 - 1}-rows-{self.y0}-{self.y1 - 1}"
-
-
-def frames_tile(reader: FrameReader, unit: CopyUnit) -> NDArray[Any]:
-    """Return the frames of a unit (frame, y, x)."""
-    return reader.read(unit.t0, unit.t1, unit.y0, unit.y1)
 
 
 def run(context: StageContext) -> None:
@@ -167,9 +161,9 @@ def _copy(unit: CopyUnit, store: RunStore, *, reader: FrameReader) -> None:
     """Read the frames of a unit and write them into the store, a row of chunks at a time."""
     rows = store.array("frames/dn").chunks[1]
     for y in range(unit.y0, unit.y1, rows):
-        part = replace(unit, y0=y, y1=min(y + rows, unit.y1))
-        region = (slice(part.t0, part.t1), slice(part.y0, part.y1), slice(None))
-        store.write("frames/dn", region, frames_tile(reader, part))
+        end = min(y + rows, unit.y1)
+        region = (slice(unit.t0, unit.t1), slice(y, end), slice(None))
+        store.write("frames/dn", region, reader.read(unit.t0, unit.t1, y, end))
 
 
 def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:

@@ -1,8 +1,7 @@
 """The table of stages: what each needs, reads and writes, which settings decide it, and what does it.
 
 The runner, the session and the command line know the stages from here only. A new stage is a row and a module
-with a pure ``*_tile`` function and ``run(context)``. Nothing that computes is imported here, so that ``pchem
-status`` answers at once.
+with ``run(context)``. Nothing that computes is imported here, so that ``pchem status`` answers at once.
 """
 
 from __future__ import annotations

@@ -18,6 +18,9 @@ from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.remote_path import RemotePath
 
+#: File with the description of a group or an array.
+DESCRIPTION = "zarr.json"
+
 _CURES = {
     errno.ENOSPC: "the disk is full: free space and run again, finished tiles are kept",
     errno.EDQUOT: "the disk quota is exhausted: free space and run again, finished tiles are kept",

@@ -28,7 +28,7 @@ from pchem_pipeline.commands.apply.source import (
     check_level,
     limits_of,
     open_like_run,
-    share_cut,
+    some_of,
 )
 from pchem_pipeline.commands.apply.tasks import (
     N_SUMS,
@@ -150,12 +150,14 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     sensor = SensorInfo.read(run)
     frames = open_like_run(target, sensor, files, wanted.dataset)
     limits = limits_of(frames, sensor)
-    modes, cut = _modes(run, wanted, sensor.shape), share_cut(frames, limits)
+    some, modes, cut = some_of(frames), _modes(run, wanted, sensor.shape), 0.0
+    if limits is not None:
+        cut = float(np.mean((some <= limits[0]) | (some >= limits[1])))
     kept = ", ".join(modes.removed) if cut > _MOST_CUT else ""
     if kept:
         modes = CommonModes()
     calibration = read_calibration(run, limits=limits or (None, None), removed=modes.removed)
-    remarks = check_camera(frames, sensor) + check_level(frames, calibration)
+    remarks = check_camera(frames, sensor) + check_level(some, calibration, frames.paths[0])
     if kept:
         remarks.append(
             f"{kept} not subtracted: {100 * cut:.0f} % of the samples are at a limit of the ADC, which hides "

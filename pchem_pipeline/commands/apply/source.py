@@ -137,31 +137,24 @@ def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
     return remarks
 
 
-def share_cut(frames: FrameSequence, limits: tuple[int, int] | None) -> float:
-    """Return the share of the samples that lie at a limit of the ADC."""
-    if limits is None:
-        return 0.0
-    some = _some(frames)
-    return float(np.mean((some <= limits[0]) | (some >= limits[1])))
-
-
-def _some(frames: FrameSequence) -> NDArray[np.unsignedinteger[Any]]:
+def some_of(frames: FrameSequence) -> NDArray[np.unsignedinteger[Any]]:
     """Return a few frames spread over all, (frame, y, x), DN."""
     chosen = np.unique(np.linspace(0, frames.shape[0] - 1, 16).astype(int))
     return np.concatenate([frames.read(t, t + 1) for t in chosen.tolist()])
 
 
-def check_level(frames: FrameSequence, calibration: Calibration) -> list[str]:
+def check_level(some: NDArray[Any], calibration: Calibration, name: Path) -> list[str]:
     """Return remarks on a mean level that does not fit the characterisation; none where it does.
 
     Args:
-        frames: to be calibrated.
+        some: of the frames to be calibrated, (frame, y, x), DN.
         calibration: of all pixels.
+        name: of their first file.
 
     Raises:
         InputError: the mean lies so far below the bias that the frames are no frames of these pixels.
     """
-    mean = _some(frames).mean(axis=0, dtype=np.float64)
+    mean = some.mean(axis=0, dtype=np.float64)
     known = calibration.usable
     if not known.any():
         raise InputError("the run has no pixel with a good fit, so it cannot calibrate frames")
@@ -170,7 +163,7 @@ def check_level(frames: FrameSequence, calibration: Calibration) -> list[str]:
     level = float(np.median(above / sigma))
     if level < -3.0:  # standard deviations of a sample
         raise InputError(
-            f"{frames.paths[0]}: mean {-np.median(above):.1f} DN below the bias of the run: frames of "
+            f"{name}: mean {-np.median(above):.1f} DN below the bias of the run: frames of "
             "another sensor, region, offset or temperature"
         )
     signal, usual = float(np.median(above * gain)), float(np.median(calibration.quanta_exposure[known]))

@@ -50,8 +50,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
 
-#: of the maps of a tile
-_PIXEL_BYTES = 40 * 8
 _SUMS = ("integers", "floats")
 _HISTOGRAM = ("origin", "minimum", "maximum")
 
@@ -193,7 +191,7 @@ def run(context: StageContext) -> None:
     bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
     counted = fitted.bins * store.array("histogram/counts").dtype.itemsize
-    held = context.tile_pixels * (2 * counted + _PIXEL_BYTES)
+    held = context.tile_pixels * (2 * counted + 40 * 8)  # with the maps of a tile
     if source is not None:
         highest = max(band.y1 - band.y0 for band in bands)
         held += highest * sensor.nx * (counted + 2 * FRAMES_AT_ONCE * source.dtype.itemsize)
@@ -290,7 +288,12 @@ def _sum_tile(
     maps = [store.read(f"fit/{name}", tile.region) for name in PARAMETERS]
     origin, low, high = _ranges(store, tile.region)
     codes = None if chosen is None else job.codes.get(tile.key)
-    counted = _read_counted(store, tile, origin) if codes is None else _uncounted(origin, job.sensor.n_frames)
+    if codes is None:
+        read = store.read_arrays("histogram", ("counts", "under", "over"), tile.region)
+        counted = PixelHistograms(read["counts"], origin, read["under"] + read["over"])
+    else:  # only the number of the samples matters
+        outside = np.full(origin.shape, job.sensor.n_frames, np.uint32)
+        counted = PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
     errors = _errors(store, tile)
     rows = []
     for part in parts_told(tile.parts(store.array("histogram/counts").shape[2])):
@@ -309,9 +312,9 @@ def _sum_tile(
         rows.append(row)
     integers, floats = (np.sum(each, axis=0) for each in zip(*rows, strict=True))
     if codes is not None:
-        samples, outside = on_axis(codes, job.axes.dn)
+        samples, beyond = on_axis(codes, job.axes.dn)
         integers[job.axes.integers["counts_all"]] = samples
-        integers[job.axes.integers["outside_all"]] = outside
+        integers[job.axes.integers["outside_all"]] = beyond
         floats[job.axes.floats["share_all"]] = samples / job.sensor.n_frames
     return integers, floats
 
@@ -324,18 +327,6 @@ def on_axis(content: dict[str, Any], axis: DnAxis) -> tuple[NDArray[np.int64], i
     found = np.zeros(axis.size, np.int64)
     found[place[inside]] = samples[inside]
     return found, int(samples[~inside].sum()) + int(content["outside"])
-
-
-def _read_counted(store: RunStore, tile: Tile, origin: NDArray[np.int64]) -> PixelHistograms:
-    """Read the histograms of a tile."""
-    found = store.read_arrays("histogram", ("counts", "under", "over"), tile.region)
-    return PixelHistograms(found["counts"], origin, found["under"] + found["over"])
-
-
-def _uncounted(origin: NDArray[np.int64], n_frames: int) -> PixelHistograms:
-    """Return pixels of whose samples only the number is known."""
-    outside = np.full(origin.shape, n_frames, np.uint32)
-    return PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
 
 
 def _ranges(store: RunStore, region: tuple[slice, slice]) -> list[NDArray[np.int64]]:

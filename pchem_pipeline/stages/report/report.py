@@ -17,13 +17,16 @@ from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.effects.framework.compose import model_words
+from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.maps.ordered import median_of
 from pchem_pipeline.planning.frames import frames_needed, precision
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import parse_target
-from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
+from pchem_pipeline.report.data import DiscrepancyData, PixelFit, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.ensemble import case_name
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
@@ -35,7 +38,6 @@ from pchem_pipeline.report.pages.summary import check_sentence
 from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
-from pchem_pipeline.stages.discrepancy.result import verdict_data
 from pchem_pipeline.stages.maps import NO_TIME
 from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
@@ -267,6 +269,27 @@ def report_data(
         plan=None if sensor.samples else plan_section(maps, n_frames),
         discrepancy=None if run.verdict is None else verdict_data(run.verdict, run.discrepancy),
         samples=_samples(run, config),
+    )
+
+
+def verdict_data(found: Verdict, arrays: Mapping[str, NDArray[Any]]) -> DiscrepancyData:
+    """Return what the report shows of a verdict, with the names of effects and statistics.
+
+    Args:
+        found: the verdict.
+        arrays: group ``discrepancy`` of the store.
+    """
+    effects = effect_classes()
+    # those of a search with other statistics are in another order: what its JSON tells is left
+    vectors = ("z_before", "z_after")  # a number for each statistic
+    arrays = {n: array for n, array in arrays.items() if n not in vectors or len(array) == len(STATISTICS)}
+    signs = dict(zip(STATISTICS, arrays.get("z_before", ()), strict=False))
+    return DiscrepancyData(
+        found=found,
+        arrays=arrays,
+        statistics={name: (s.channel, s.says(signs.get(name, 1.0))) for name, s in STATISTICS.items()},
+        titles={tag: effect.title for tag, effect in effects.items() if effect.title},
+        sources={tag: effect.source for tag, effect in effects.items() if effect.source},
     )
 
 
