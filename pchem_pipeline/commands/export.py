@@ -59,7 +59,11 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     images = _images(store) if set(formats) - {"csv", "emva"} else []
     for name in dict.fromkeys(formats):
         if name == "fits":
-            written += write_fits(folder / "maps.fits", images, _header(target, store))
+            sensor = target.sensor(store)
+            frames = sensor.n_frames if sensor.kind == "frames" else None
+            facts: dict[str, Any] = {"CREATOR": "pchem-pipeline", "RUN": store.path.name}
+            facts |= {"NFRAMES": frames, "EXPTIME": sensor.integration_time}
+            written += write_fits(folder / "maps.fits", images, facts)
         elif name == "tiff":
             written += write_tiff(folder, images)
         elif name == "npz":
@@ -76,14 +80,6 @@ def _images(store: RunStore) -> list[MapImage]:
     own = ("fit_status", "likelihood_gap", "goodness_p")
     chosen += [v for v in variables_of("fit") if v.name in own and store.has(v.path)]
     return [MapImage(v.name, store.read(v.path), v.unit, v.long_name) for v in chosen]
-
-
-def _header(target: Target, store: RunStore) -> dict[str, Any]:
-    """Return the keywords of a FITS file."""
-    sensor = target.sensor(store)
-    frames = sensor.n_frames if sensor.kind == "frames" else None
-    facts = {"CREATOR": "pchem-pipeline", "RUN": store.path.name}
-    return {**facts, "NFRAMES": frames, "EXPTIME": sensor.integration_time}
 
 
 def _write_csv(folder: Path, store: RunStore) -> list[Path]:

@@ -169,17 +169,8 @@ def peak_rss_bytes() -> int:
     """Return the largest resident set of this process or of one of its finished children; 0 if not known."""
     if _RESOURCE is None:
         return 0
-    own = _peak_of_this_program()
-    if own is None:
-        own = _unit() * _RESOURCE.getrusage(_RESOURCE.RUSAGE_SELF).ru_maxrss
-    return int(max(own, _unit() * _RESOURCE.getrusage(_RESOURCE.RUSAGE_CHILDREN).ru_maxrss))
-
-
-def _unit() -> int:
-    return 1 if sys.platform == "darwin" else 1024
-
-
-def _peak_of_this_program() -> int | None:
-    """Return the largest resident set since the program began; other counts keep that of who started it."""
-    found = _named(Path("/proc/self/status"), "VmHWM:")
-    return found[0] << 10 if found else None
+    unit = 1 if sys.platform == "darwin" else 1024
+    # since the program began; other counts keep that of who started it
+    own = [kibibytes << 10 for kibibytes in _named(Path("/proc/self/status"), "VmHWM:")]
+    own = own or [unit * _RESOURCE.getrusage(_RESOURCE.RUSAGE_SELF).ru_maxrss]
+    return int(max(*own, unit * _RESOURCE.getrusage(_RESOURCE.RUSAGE_CHILDREN).ru_maxrss))

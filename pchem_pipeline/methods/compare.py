@@ -121,7 +121,9 @@ def _run(
     lacking = method.missing(n_samples)
     if lacking:
         return MethodResult(*head, n_samples, lacking)
-    method.estimate(_first_pixel(used), settings)  # compiled code is loaded before the clock starts
+    # compiled code is loaded before the clock starts
+    first = tuple(Sample(sample.counts[:1], sample.origin[:1]) for sample in used.samples)
+    method.estimate(PixelSamples(first, used.adc_limits), settings)
     start = time.process_time()
     estimates: Estimates = method.estimate(used, settings)
     seconds = (time.process_time() - start) / max(pixels.n_pixels, 1)
@@ -154,11 +156,6 @@ def _medians(parameters: FloatArray) -> dict[str, float | None]:
         name: float(np.median(values)) if values.size else None
         for name, values in zip(COMPARED, known, strict=True)
     }
-
-
-def _first_pixel(pixels: PixelSamples) -> PixelSamples:
-    samples = tuple(Sample(sample.counts[:1], sample.origin[:1]) for sample in pixels.samples)
-    return PixelSamples(samples, pixels.adc_limits)
 
 
 def errors_of(parameters: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:

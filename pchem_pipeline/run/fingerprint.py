@@ -11,8 +11,8 @@ from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.config.load import setting_of, states
 from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.model_versions import model_of_content, model_versions
-from pchem_pipeline.store.files import DESCRIPTION, digest_of
-from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.files import DESCRIPTION, digest_of, fingerprint_of
+from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import RemotePath
 
 if TYPE_CHECKING:

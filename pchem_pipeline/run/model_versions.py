@@ -23,8 +23,7 @@ from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
-from pchem_pipeline.store.files import read_record, write_record
-from pchem_pipeline.store.records import fingerprint_of
+from pchem_pipeline.store.files import fingerprint_of, read_record, write_record
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore

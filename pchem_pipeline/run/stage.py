@@ -1,7 +1,7 @@
 """What a stage is given, and how its units are done.
 
-A stage is a row of :mod:`pchem_pipeline.stages.table` and a module with ``run(context)``; what it computes is a
-pure function, arrays in and arrays out. ``run`` makes its arrays (``context.create``), then calls
+A stage is a row of :mod:`pchem_pipeline.stages.table` and a module with ``run(context)``; what it computes is
+a pure function, arrays in and arrays out. ``run`` makes its arrays (``context.create``), then calls
 ``context.run_units(units, task)``. ``task`` is a picklable callable (a module-level function, or a
 ``functools.partial`` of one) that takes a unit and the store, writes whole chunks and returns a small
 JSON-able summary, or nothing. The marker of a unit is set, in the worker, after its task returned.

@@ -14,8 +14,8 @@ from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.fingerprint import StageState, changed_file, fingerprint_content, rests_on, status
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.table import STAGES
-from pchem_pipeline.store.files import DESCRIPTION, digest_of
-from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.files import DESCRIPTION, digest_of, fingerprint_of
+from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import RemotePath
 
 _LIBRARIES = ("numpy", "scipy", "numba", "zarr", "dask", "tifffile", "astropy", "h5py", "matplotlib")

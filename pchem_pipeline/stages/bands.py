@@ -138,10 +138,8 @@ def tile_bands(
     for tile in tiles:
         if tile.key in todo:
             groups.setdefault(tile.y0 // step, []).append(tile)
-    bands: list[Band | Tile] = [_band(group) for group in groups.values()]
+    bands: list[Band | Tile] = [
+        Band(min(t.y0 for t in group), max(t.y1 for t in group), tuple(t.key for t in group))
+        for group in groups.values()
+    ]
     return bands + [tile for tile in tiles if tile.key not in todo]
-
-
-def _band(tiles: Sequence[Tile]) -> Band:
-    y0, y1 = min(tile.y0 for tile in tiles), max(tile.y1 for tile in tiles)
-    return Band(y0, y1, tuple(tile.key for tile in tiles))

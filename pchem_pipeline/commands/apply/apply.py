@@ -47,7 +47,8 @@ from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.session import Command, with_overrides
 from pchem_pipeline.stages.histogram.memory import band_bytes
-from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.files import fingerprint_of
+from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import local_path, place_of
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import equal_rows
@@ -150,7 +151,11 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     sensor = SensorInfo.read(run)
     frames = open_like_run(target, sensor, files, wanted.dataset)
     limits = limits_of(frames, sensor)
-    some, modes, cut = some_of(frames), _modes(run, wanted, sensor.shape), 0.0
+    version = model_of(run, "fit")
+    modes = CommonModes()
+    if version is not None and wanted.remove:
+        modes = CommonModes.of_model(version.effects, sensor.shape)
+    some, cut = some_of(frames), 0.0
     if limits is not None:
         cut = float(np.mean((some <= limits[0]) | (some >= limits[1])))
     kept = ", ".join(modes.removed) if cut > _MOST_CUT else ""
@@ -186,7 +191,6 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         depth=_chunks(frames.shape)[0],
         expected=numbers and overlap > 0,
     )
-    version = model_of(run, "fit")
     # outputs of versions that did not know it are gone on with
     settings = {name: value for name, value in asdict(wanted).items() if name != "dataset" or value}
     content = {
@@ -200,14 +204,6 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         "settings": {**settings, "kinds": list(wanted.kinds)},
     }
     return _Made(job, content, remarks, calibration, frames)
-
-
-def _modes(run: RunStore, wanted: ApplySettings, shape: tuple[int, int]) -> CommonModes:
-    """Return the offsets that the model of the run names, where they are to be removed."""
-    version = model_of(run, "fit")
-    if version is None or not wanted.remove:
-        return CommonModes()
-    return CommonModes.of_model(version.effects, shape)
 
 
 # -- the output ------------------------------------------------------------------------------------

@@ -55,18 +55,20 @@ def history_rows(
         camera = SensorInfo.read(store).camera
         date = _date(store, camera)
         label = labels[i] if labels else date
+        days = datetime.fromisoformat(date).timestamp() / 86400.0 if date else float("nan")
+        version = model_of(store, "fit")
         rows.append(
             HistoryRow(
                 label,
                 date,
                 camera.temperature,
-                _number(label) if labels else _days(date),
+                _number(label) if labels else days,
                 run,
                 int(states[i].hot.sum()),
                 pairs[i - 1].hot_new if i else (),
                 pairs[i - 1].hot_gone if i else (),
                 states[i].flags(),
-                _effects(store),
+                () if version is None else tuple(effect.tag for effect in version.effects),
                 moved,
                 any_moved,
                 compared,
@@ -86,10 +88,6 @@ def _date(store: RunStore, camera: CameraFacts) -> str:
         return datetime.fromtimestamp(min(known) / 1e9, UTC).isoformat(timespec="seconds")
     record = store.records.read("ingest")
     return "" if record is None else record.started
-
-
-def _days(date: str) -> float:
-    return datetime.fromisoformat(date).timestamp() / 86400.0 if date else float("nan")
 
 
 def _number(label: str) -> float:
@@ -144,11 +142,6 @@ class PixelStates:
             differs = ~(confirm(y, x) > erfc(LIMIT / np.sqrt(2.0)))
             y, x = y[differs], x[differs]
         return tuple(zip(y.tolist(), x.tolist(), strict=True))
-
-
-def _effects(store: RunStore) -> tuple[str, ...]:
-    version = model_of(store, "fit")
-    return () if version is None else tuple(effect.tag for effect in version.effects)
 
 
 def _moved(pair: Pair, one: PixelStates, other: PixelStates) -> tuple[dict[str, int], int, int]:

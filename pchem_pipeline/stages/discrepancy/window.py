@@ -99,7 +99,9 @@ def choose_window(
     if within > pixels:
         height = min(y1 - y0, max(int(np.sqrt(pixels)), pixels // (x1 - x0)))
         width = min(x1 - x0, pixels // height)
-        y0, x0 = _corner(_worst(places or {}, shape[1:]), (y0, y1, x0, x1), (height, width))
+        worst = min((places or {}).values(), key=lambda place: place.p, default=None)
+        mask = None if worst is None else worst.region.mask(shape[1:])
+        y0, x0 = _corner(mask, (y0, y1, x0, x1), (height, width))
         y1, x1 = y0 + height, x0 + width
     numbers = kept
     if frames < n_frames:
@@ -178,13 +180,6 @@ def within_memory(
         settings = settings.model_copy(update={"max_samples": samples, "max_pixels": pixels})
         window = choose_window(shape, settings, roi)
     return settings
-
-
-def _worst(places: Mapping[str, Suspect], shape: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """Return the most significant place as a mask, (y, x)."""
-    if not places:
-        return None
-    return min(places.values(), key=lambda place: place.p).region.mask(shape)
 
 
 def _corner(

@@ -99,16 +99,15 @@ def _end(context: StageContext, areas: Sequence[Band | Tile]) -> None:
     """Do what needs the whole sensor."""
     if context.config.histogram.summaries:
         _write_frame_statistics(context, (context.sensor.n_frames, *context.sensor.shape))
-    if number := sum(_pixels_outside(context, area) for area in areas):
+    number = 0
+    for area in areas:
+        region = (slice(area.y0, area.y1), slice(None)) if isinstance(area, Band) else area.region
+        under, over = (context.store.read(f"histogram/{name}", region) for name in ("under", "over"))
+        number += int(np.count_nonzero(under | over))
+    if number:
         bins = context.store.array("histogram/counts").shape[2]
         words = "pixels have samples outside their" if number > 1 else "pixel has samples outside its"
         context.note(f"{number} {words} histogram of {bins} bins")
-
-
-def _pixels_outside(context: StageContext, area: Band | Tile) -> int:
-    region = (slice(area.y0, area.y1), slice(None)) if isinstance(area, Band) else area.region
-    under, over = (context.store.read(f"histogram/{name}", region) for name in ("under", "over"))
-    return int(np.count_nonzero(under | over))
 
 
 def _decide_bins(context: StageContext, source: FrameSource) -> int:

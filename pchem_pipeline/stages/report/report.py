@@ -189,7 +189,9 @@ def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
 def _inspector(store: RunStore, run: StoredRun, pixels: _Pixels, threads: int) -> InspectorData:
     """Pack maps, and the pixels that are held in full, for the inspector."""
     index, held, shape = pixels.full.index, pixels.histograms, run.sensor.shape
-    maps, exact = read_maps(store, shape, index, _at_hand(run), threads)
+    read = {f"maps/{name}": values for name, values in run.maps.items()}
+    read |= {f"fit/{name}": run.fit[name] for name in ("fit_status", "outlier_share") if name in run.fit}
+    maps, exact = read_maps(store, shape, index, read, threads)
     deciding = deciding_parameters(_parameters(run, index), run.model.at(index))
     sample = PixelSample(index, exact, held.origin, held.counts, deciding, pixels.masses, pixels.full.reasons)
     return inspector_data(run.name, shape, maps, sample)
@@ -198,14 +200,6 @@ def _inspector(store: RunStore, run: StoredRun, pixels: _Pixels, threads: int) -
 def _parameters(run: StoredRun, index: NDArray[np.int64]) -> list[NDArray[np.float64]]:
     """Return (H, g, mu, sigma) of some pixels."""
     return [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
-
-
-def _at_hand(run: StoredRun) -> dict[str, NDArray[Any]]:
-    """Return the maps that were read, as they are stored, by path."""
-    found = {f"maps/{name}": values for name, values in run.maps.items()}
-    return found | {
-        f"fit/{name}": run.fit[name] for name in ("fit_status", "outlier_share") if name in run.fit
-    }
 
 
 def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
