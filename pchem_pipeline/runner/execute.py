@@ -53,22 +53,17 @@ def execute(name: str, context: StageContext) -> StageState:
     prepared = context.prepared.get(name)
     if prepared is not None and prepared.clock is not None:
         clock = prepared.clock
-    return _perform(stage, context, before, restart=context.options.roi is None, clock=clock)
+    return _perform(stage, context, before, clock)
 
 
 def _perform(
-    stage: Stage,
-    context: StageContext,
-    before: StageState,
-    *,
-    restart: bool,
-    clock: tuple[float, float],
+    stage: Stage, context: StageContext, before: StageState, clock: tuple[float, float]
 ) -> StageState:
     """Run a stage that is not up to date, and keep its record whatever happens.
 
     The clock (wall, CPU) started before the state was looked at: hashing the input is part of the work.
     """
-    records = context.store.records
+    records, restart = context.store.records, context.options.roi is None
     content = fingerprint_content(stage, context)
     old = records.known(stage.name)
     # a stage that was stopped before its first unit may lack arrays
