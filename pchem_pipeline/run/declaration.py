@@ -30,8 +30,8 @@ class Stage:
         version: of its algorithm; raised when that changes, which makes old results stale.
         upstream: the stages whose results it needs.
         settings: dotted config keys that it reads; a change of any makes its results stale.
-        reads: arrays or whole groups of the store (``"fit"`` or ``"fit/bias"``).
-        writes: likewise; what it writes is removed when it starts anew.
+        writes: arrays or whole groups of the store (``"fit"`` or ``"fit/bias"``); what it writes is removed
+            when it starts anew.
         files: what it writes beside arrays, in the folder of the run, all or some of them; one that is
             missing or was changed makes the stage stale.
         run: ``"module:function"`` that takes the context and does the stage.
@@ -53,7 +53,6 @@ class Stage:
     version: int
     upstream: tuple[str, ...]
     settings: tuple[str, ...]
-    reads: tuple[str, ...]
     writes: tuple[str, ...]
     run: str
     identity: str | None = None

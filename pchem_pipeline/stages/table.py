@@ -1,4 +1,4 @@
-"""The table of stages: what each needs, reads and writes, which settings decide it, and what does it.
+"""The table of stages: what each needs and writes, which settings decide it, and what does it.
 
 The runner, the session and the command line know the stages from here only. A new stage is a row and a module
 with ``run(context)``. Nothing that computes is imported here, so that ``pchem status`` answers at once.
@@ -43,7 +43,6 @@ _ALL = (
         version=1,
         upstream=(),
         settings=("simulate",),
-        reads=(),
         writes=("truth",),
         run=f"{_HERE}.simulate:run",
         identity=f"{_HERE}.simulate:scene_identity",
@@ -56,7 +55,6 @@ _ALL = (
         upstream=(),
         # not files: their content counts; not integration_time: it changes no frame
         settings=tuple(f"input.{name}" for name in _INPUT_SETTINGS),
-        reads=(),
         writes=("frames",),
         run=f"{_HERE}.ingest:run",
         identity=f"{_HERE}.identities:input_content",
@@ -75,7 +73,6 @@ _ALL = (
             "histogram.summaries",
             "run.tile",
         ),
-        reads=("frames",),
         writes=("histogram", "summary"),
         run=f"{_HERE}.histogram.histogram:run",
         single_pass=f"{_HERE}.histogram.single_pass:count_in_one_pass",
@@ -87,7 +84,6 @@ _ALL = (
         version=9,
         upstream=("histogram",),
         settings=("fit", "run.tile"),
-        reads=("frames/excluded", *(f"histogram/{name}" for name in ("counts", "origin", "under", "over"))),
         writes=("fit", "samples"),
         run=f"{_HERE}.fit.fit:run",
         identity=f"{_HERE}.identities:fit_inputs",
@@ -99,7 +95,6 @@ _ALL = (
         version=5,
         upstream=("fit",),
         settings=("maps", "run.tile"),
-        reads=("fit", "samples"),
         writes=("maps", *(f"samples/{name}" for name in _LINE)),
         run=f"{_HERE}.maps:run",
         identity=f"{_HERE}.identities:integration_time",
@@ -110,7 +105,6 @@ _ALL = (
         version=4,
         upstream=("histogram", "fit"),
         settings=("ensemble", "run.tile"),
-        reads=("frames", "histogram", "fit", "truth"),
         writes=("ensemble", "ensemble_tiles"),
         run=f"{_HERE}.ensemble.ensemble:run",
         summary="Predict the ensemble from the maps and compare it with the data.",
@@ -121,7 +115,6 @@ _ALL = (
         version=5,
         upstream=("histogram", "fit", "maps", "ensemble"),
         settings=("report", "maps", "run.title", "run.allowed_failed_pixels"),
-        reads=("histogram", "summary", "fit", "maps", "ensemble", "discrepancy", "samples", "truth"),
         writes=(),
         run=f"{_HERE}.report.report:run",
         files=("report.html", "report.json", "discrepancy.html"),
@@ -133,7 +126,6 @@ _ALL = (
         version=1,
         upstream=("ingest", "fit"),
         settings=("run.tile",),
-        reads=("frames", "fit"),
         writes=("electrons",),
         run=f"{_HERE}.electrons:run",
         summary="Write the electron number of each sample into the store.",
@@ -144,7 +136,6 @@ _ALL = (
         version=11,
         upstream=("ingest",),
         settings=("discrepancy",),
-        reads=("frames", "summary", "histogram", "fit"),
         writes=("discrepancy",),
         run=f"{_HERE}.discrepancy.discrepancy:run",
         files=("discrepancy.json",),
@@ -157,7 +148,6 @@ _ALL = (
         version=1,
         upstream=("histogram", "fit"),
         settings=("methods",),
-        reads=("histogram", "fit", "truth"),
         writes=("methods",),
         run=f"{_HERE}.methods:run",
         files=("methods.json",),

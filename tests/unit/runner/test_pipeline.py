@@ -56,7 +56,7 @@ def ensemble_run(context):
 
 
 def stage(name, upstream, settings, writes, run):
-    return Stage(name, 1, upstream, settings, (), writes, f"{__name__}:{run.__name__}")
+    return Stage(name, 1, upstream, settings, writes, f"{__name__}:{run.__name__}")
 
 
 FAKES = {
