@@ -18,12 +18,13 @@ from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.input import ingested_identity, keep_identity, known_identity
+from pchem_pipeline.run.stage import allowed_bytes
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.runner.session import Command, run_stages, run_status, working_run
 from pchem_pipeline.stages.fit.fit import keep_fit
 from pchem_pipeline.stages.histogram.arrays import extend_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import allowed_bytes, single_pass_bytes
+from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.histogram.single_pass import PREPARED, hashed_frames, prepared
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import remove_files, write_record

@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from pchem_pipeline.base.errors import InputError, StoreError, error_words
 from pchem_pipeline.base.variables import LENGTHS, VARIABLES
+from pchem_pipeline.compute.environment import available_memory
 from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, Stop
-from pchem_pipeline.compute.memory import affordable
+from pchem_pipeline.compute.memory import BASE_BYTES, affordable
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.model_versions import ModelVersion, model_in_force
 from pchem_pipeline.run.progress import Reporter, telling_parts
@@ -142,6 +143,30 @@ def nothing_left(unit: Any, store: RunStore) -> None:
     """Do nothing: the task of units whose work was done beforehand."""
 
 
+def allowed_bytes(config: RunConfig, workers: int) -> int:
+    """Return the memory that the run may take, in all: the setting, else half of what is free."""
+    if config.compute.max_memory is not None:
+        return config.compute.max_memory << 20
+    bands = BASE_BYTES + workers * (config.histogram.band_memory << 20)
+    return max(bands, (available_memory() or 0) // 2)
+
+
+def band_bytes(config: RunConfig, workers: int, limit: int | None = None) -> int:
+    """Return the memory of a worker that counts a band of rows.
+
+    Args:
+        config: of the run.
+        workers: number of workers.
+        limit: bytes that the process of a worker may take, above which it is killed; None: no limit.
+    """
+    bytes_each = config.histogram.band_memory << 20
+    if limit is not None:
+        bytes_each = min(bytes_each, max(16 << 20, limit - BASE_BYTES))
+    if config.compute.max_memory is None:
+        return bytes_each
+    return min(bytes_each, max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))
+
+
 @dataclass
 class StageContext:
     """All that a stage is given.
@@ -225,6 +250,11 @@ class StageContext:
     def tile_pixels(self) -> int:
         """Pixels of the largest tile."""
         return math.prod(min(size, length) for size, length in zip(self.tile, self.sensor.shape, strict=True))
+
+    @property
+    def band_bytes(self) -> int:
+        """Memory of a worker that takes a band of rows."""
+        return band_bytes(self.config, self.executor.workers, self.executor.memory_limit)
 
     def tiles(self) -> list[Tile]:
         """Return all tiles of the sensor."""

@@ -46,7 +46,6 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.session import Command, with_overrides
-from pchem_pipeline.stages.histogram.memory import band_bytes
 from pchem_pipeline.store.files import fingerprint_of
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import local_path, place_of
@@ -332,8 +331,7 @@ def _rows_of_band(context: StageContext, job: Job, bytes_of_pixel: int) -> int:
     """Return the rows that a worker takes at a time: whole chunks."""
     _, ny, nx = job.source.shape
     rows = _chunks(job.source.shape)[1]
-    allowed = band_bytes(context.config, context.executor.workers, context.executor.memory_limit)
-    fitting = max(1, allowed // (bytes_of_pixel * nx * rows))
+    fitting = max(1, context.band_bytes // (bytes_of_pixel * nx * rows))
     shared = max(1, -(-ny // (rows * context.executor.workers)))  # one for each worker
     return rows * min(fitting, shared)
 

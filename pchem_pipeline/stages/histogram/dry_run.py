@@ -12,8 +12,9 @@ from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.model.histogram.count import most_bins
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+from pchem_pipeline.run.stage import allowed_bytes, band_bytes
 from pchem_pipeline.stages.histogram.histogram import bins_of
-from pchem_pipeline.stages.histogram.memory import allowed_bytes, band_bytes, single_pass_bytes
+from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.store.tiles import tile_grid, tile_shape
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from pchem_pipeline.run.stage import StageContext, Task, nothing_left
 from pchem_pipeline.stages.bands import Band, plan_bands
 from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, create_counts, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import band_bytes, bytes_per_row
+from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore
@@ -39,16 +39,12 @@ if TYPE_CHECKING:
 # -- the stage ----------------------------------------------------------------------------------
 
 
-def _band_bytes(context: StageContext) -> int:
-    return band_bytes(context.config, context.executor.workers, context.executor.memory_limit)
-
-
 def _bands(context: StageContext, source: FrameSource, bins: int) -> list[Band]:
     """Return the bands; say so where even the lowest possible ones need more memory than allowed."""
     settings, tiles = context.config.histogram, context.tiles()
     n_frames, _, columns = source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, bins, settings)
-    most = _band_bytes(context) // row
+    most = context.band_bytes // row
     pending = {tile.key for tile in context.pending(tiles)}
     bands = plan_bands(tiles, pending, most, context.executor.workers, source.rows_per_read)
     highest = max(band.y1 - band.y0 for band in bands)
@@ -114,7 +110,7 @@ def _decide_bins(context: StageContext, source: FrameSource) -> int:
     """Return the number of bins of the sensor, from its first frames."""
     settings, (n_frames, ny, columns) = context.config.histogram, source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
-    most, together = max(ROW_GROUP, _band_bytes(context) // row), min(source.rows_per_read, ny)
+    most, together = max(ROW_GROUP, context.band_bytes // row), min(source.rows_per_read, ny)
     context.stop.check()
     limit = most_bins(settings.max_bins, source.dtype)
     return bins_of(source, settings.window_frames, limit, most // together * together or most)

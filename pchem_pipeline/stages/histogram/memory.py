@@ -1,4 +1,4 @@
-"""The memory that counting takes, and how much the run, and a worker, may have."""
+"""The memory that counting takes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pchem_pipeline.compute.environment import available_memory
 from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.model.histogram.count import counts_dtype
 from pchem_pipeline.model.histogram.settings import HistogramSettings
@@ -52,27 +51,3 @@ def single_pass_bytes(config: RunConfig, shape: tuple[int, int, int], dtype: np.
     """
     n_frames, ny, nx = shape
     return BASE_BYTES + ny * bytes_per_row(nx, n_frames, dtype.itemsize, bins, config.histogram)
-
-
-def allowed_bytes(config: RunConfig, workers: int) -> int:
-    """Return the memory that the run may take, in all: the setting, else half of what is free."""
-    if config.compute.max_memory is not None:
-        return config.compute.max_memory << 20
-    bands = BASE_BYTES + workers * (config.histogram.band_memory << 20)
-    return max(bands, (available_memory() or 0) // 2)
-
-
-def band_bytes(config: RunConfig, workers: int, limit: int | None = None) -> int:
-    """Return the memory of a worker that counts a band of rows.
-
-    Args:
-        config: of the run.
-        workers: number of workers.
-        limit: bytes that the process of a worker may take, above which it is killed; None: no limit.
-    """
-    bytes_each = config.histogram.band_memory << 20
-    if limit is not None:
-        bytes_each = min(bytes_each, max(16 << 20, limit - BASE_BYTES))
-    if config.compute.max_memory is None:
-        return bytes_each
-    return min(bytes_each, max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))

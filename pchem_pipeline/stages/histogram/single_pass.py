@@ -30,12 +30,12 @@ from pchem_pipeline.frames.stream import HashedFrameStream
 from pchem_pipeline.model.histogram.count import choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.run.input import identity_is_new, keep_identity
 from pchem_pipeline.run.progress import whole_mebibytes
-from pchem_pipeline.run.stage import Prepared, StageContext
+from pchem_pipeline.run.stage import Prepared, StageContext, allowed_bytes
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.bands import cut_rows
 from pchem_pipeline.stages.histogram.arrays import create_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import allowed_bytes, single_pass_bytes, single_pass_rows
+from pchem_pipeline.stages.histogram.memory import single_pass_bytes, single_pass_rows
 from pchem_pipeline.stages.table import STAGES
 
 if TYPE_CHECKING:

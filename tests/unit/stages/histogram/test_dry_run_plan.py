@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+from pchem_pipeline.run.stage import allowed_bytes, band_bytes
 from pchem_pipeline.stages.bands import plan_bands
 from pchem_pipeline.stages.histogram.arrays import row_frames
 from pchem_pipeline.stages.histogram.dry_run import make_plan
-from pchem_pipeline.stages.histogram.memory import allowed_bytes, band_bytes, bytes_per_row, single_pass_bytes
+from pchem_pipeline.stages.histogram.memory import bytes_per_row, single_pass_bytes
 from pchem_pipeline.store.tiles import tile_grid
 
 #: counts a run in a process of its own, and prints the memory that it took
