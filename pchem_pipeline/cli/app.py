@@ -5,7 +5,6 @@ Heavy libraries are imported inside the commands, so that ``--help`` answers at 
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import os
 import sys
@@ -136,17 +135,15 @@ def run(
     Stages that are up to date are skipped. stdout has the path of the report, stderr the rest.
     """
     from pchem_pipeline.commands.first_screen import run_to_first_screen
-    from pchem_pipeline.commands.new_run import find_or_start, first_try, unwritten
+    from pchem_pipeline.commands.new_run import find_or_start, run_new
     from pchem_pipeline.runner.session import cropped, up_to
 
-    wanted = command.options
-    target, is_new = find_or_start(targets, store, given, wanted.roi, write=False)
-    text = unwritten(target) if is_new else None
+    target, is_new = find_or_start(targets, store, given, command.options.roi)
     if is_new:
         target, command = cropped(target, command)
     stages = up_to(until, pipeline_of(target.config))
-    with contextlib.nullcontext() if wanted.dry_run else first_try(target, text):
-        run_to_first_screen(target, stages, command, typer.echo, strict=strict)
+    do = run_new if is_new else run_to_first_screen
+    do(target, stages, command, typer.echo, strict=strict)
 
 
 @app.command()
@@ -204,10 +201,12 @@ def joint(
 
     One gain, bias and read noise per pixel; charge rate from the slope of H. Missing histograms are made.
     """
-    from pchem_pipeline.commands.joint import find_joint, run_joint
+    from pchem_pipeline.commands.first_screen import run_to_first_screen
+    from pchem_pipeline.commands.new_run import find_joint, run_new
 
-    target, is_new = find_joint(targets, bias or [], store, against, write=not command.options.dry_run)
-    run_joint(target, command, typer.echo, is_new=is_new, strict=strict)
+    target, is_new = find_joint(targets, bias or [], store, against)
+    do = run_new if is_new else run_to_first_screen
+    do(target, pipeline_of(target.config), command, typer.echo, strict=strict)
 
 
 app.command()(apply)
@@ -363,13 +362,13 @@ def compare(
     Runs on the same frames are compared value by value, others in standard errors.
     """
     from pchem_pipeline.commands.compare.compare import compare_runs
-    from pchem_pipeline.commands.compare.history import HistorySettings
 
     for path in compare_runs(
         runs,
         output,
         tolerance=tolerance,
-        history=HistorySettings(label or (), fdr),
+        labels=label or (),
+        rate=fdr,
         progress=progress,
     ):
         typer.echo(path)

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 from pchem_pipeline.base.errors import InputError, StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds
-from pchem_pipeline.config.memory import allowed_bytes, worker_count
 from pchem_pipeline.frames.identity import digest_of, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.run.fingerprint import setting_values
-from pchem_pipeline.run.input_identity import ingested_identity, keep_identity, known_identity
+from pchem_pipeline.run.input import ingested_identity, keep_identity, known_identity
+from pchem_pipeline.run.stage import allowed_bytes
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.runner.session import Command, run_stages, run_status, working_run
-from pchem_pipeline.stages.fit.start import keep_fit
+from pchem_pipeline.stages.fit.fit import keep_fit
 from pchem_pipeline.stages.histogram.arrays import extend_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
@@ -56,6 +56,8 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
         StoreError: the run is not finished as far as its histograms, or was made with other settings.
     """
     begun = target.store / _BEGUN
+    if command.options.dry_run:
+        return run_stages(target, PREPARED, command)
     if begun.exists() and any(state.state != "complete" for state in run_status(target)[: len(PREPARED)]):
         states = run_stages(target, PREPARED, command)
         remove_files(begun)
@@ -146,7 +148,7 @@ def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path
         )
     bins = context.store.array("histogram/counts").shape[2]
     need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
-    if need > allowed_bytes(context.config, worker_count(context.config)):
+    if need > allowed_bytes(context.config, context.config.compute.count()):
         raise StoreError(
             f"{place}: appending needs {need >> 20} MiB; allow this (--max-memory), or run all again: pchem "
             f"run {quoted(place)}"
@@ -155,7 +157,7 @@ def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path
 
 def _go_on(context: StageContext, frames: FrameSequence, added: list[Path]) -> dict[str, Any]:
     """Count the new frames; return the identity of their files."""
-    config, store, workers = context.config, context.store, worker_count(context.config)
+    config, store, workers = context.config, context.store, context.config.compute.count()
     bins = store.array("histogram/counts").shape[2]
     copies = config.input.mode == "copy"
     job = CountJob(store.path, frames.shape, bins, config.histogram, copies)

@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.fit.result import FitResult
     from pchem_pipeline.run.progress import ProgressMode
 
-_BLOCK_BYTES = 64 << 20
-_WAYS_OUT = "omit these arguments to continue with the settings in the file, or give another store"
-
 
 def characterise(
     frames: Any,
@@ -149,7 +146,8 @@ def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mappin
     content["input"] = {**known, **content.get("input", {})}
     config = make_config(content, "characterise")
     if path.exists():
-        config = settings_there(path, content, _WAYS_OUT)
+        ways = "omit these arguments to continue with the settings in the file, or give another store"
+        config = settings_there(path, content, ways)
     else:
         place.parent.mkdir(parents=True, exist_ok=True)
         write_config(path, dump_config(config))
@@ -185,7 +183,7 @@ def _stored_type(frames: Any) -> np.dtype[Any]:
 def _blocks(frames: Any) -> Iterator[NDArray[Any]]:
     """Yield the frames in blocks that fit into memory."""
     n, rows, columns = frames.shape
-    size = max(1, _BLOCK_BYTES // max(1, rows * columns * np.dtype(frames.dtype).itemsize))
+    size = max(1, (64 << 20) // max(1, rows * columns * np.dtype(frames.dtype).itemsize))
     for first in range(0, n, size):
         yield np.asarray(frames[first : first + size])
 

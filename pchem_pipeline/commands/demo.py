@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, quoted
-from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.base.variables import PARAMETERS, VARIABLES
 from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.config.load import dump_config, write_config
 from pchem_pipeline.config.tree import RunConfig
@@ -29,8 +29,6 @@ from pchem_pipeline.store.run_store import RunStore
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.run.target import Target
-
-_COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 
 
 def run_demo(
@@ -145,7 +143,7 @@ def comparison_table(store: RunStore) -> str:
     columns = ("true median", "estimated", "rms error", "stderr", "error/stderr")
     head = f"{'parameter':<24}" + "".join(f"{column:>14}" for column in columns)
     lines = [head, "-" * len(head)]
-    for name in _COMPARED:
+    for name in (*PARAMETERS[:3], "read_noise_e"):
         truth = store.read(f"truth/{name}")[good]
         estimate = store.read(f"maps/{name}")[good]
         stderr = store.read(f"maps/{name}_stderr")[good]

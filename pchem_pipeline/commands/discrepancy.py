@@ -13,9 +13,6 @@ from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 
-_BEFORE = ("ingest", "histogram")
-_AFTERWARDS = ("fit", "maps", "ensemble", "report")
-
 
 def find_and_add(target: Target, command: Command, *, refit: bool, effort: float | None = None) -> str:
     """Search for effects, add those named to the model, and fit with it; return the verdict as text.
@@ -33,7 +30,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
     if effort is not None:
         target = target.changed("discrepancy", effort=effort)
     add = refit and target.config.discrepancy.add
-    missing = [s.stage for s in run_status(target) if s.stage in _BEFORE and s.state != "complete"]
+    missing = {state.stage for state in run_status(target) if state.state != "complete"}
     if "ingest" in missing:
         run_stages(target, ["ingest"], command)
     counted = ["histogram"] if "histogram" in missing and _of_histograms(target) else []
@@ -47,7 +44,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
             Reporter(command.progress, quiet=command.quiet, log=command.log_json).info(words)
     if refit:
         done = {s.stage for s in run_status(target) if s.state != "missing"}
-        stages = [name for name in _AFTERWARDS if name in done]
+        stages = [name for name in ("fit", "maps", "ensemble", "report") if name in done]
         if stages:
             # --force and --roi were meant for the search alone
             run_stages(target, stages, command.choosing(force=False, roi=None))

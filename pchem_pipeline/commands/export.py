@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import Variable, variables_of
-from pchem_pipeline.commands.figures import warn_if_old
+from pchem_pipeline.commands.figures import check_formats, warn_if_old
 from pchem_pipeline.frames.formats.map_files import MapImage, write_fits, write_npz, write_tiff
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.pages.emva import COLUMNS as EMVA_COLUMNS
@@ -23,7 +22,6 @@ from pchem_pipeline.store.run_store import RunStore
 #: Formats that maps can be exported to, their CSV summary, and a table in the words of EMVA 1288.
 FORMATS = ("fits", "tiff", "npz", "csv", "emva")
 
-_FROM_FIT = ("fit_status", "likelihood_gap", "goodness_p")
 _COLUMNS = (
     "n_valid",
     "n_missing",
@@ -53,10 +51,7 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
         ConfigError: an unknown format, or none.
         StoreError: the run has no maps, or the folder cannot be written.
     """
-    unknown = [name for name in formats if name not in FORMATS]
-    if unknown or not formats:
-        what = f"{', '.join(unknown)} cannot be written" if unknown else "no format"
-        raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
+    check_formats(formats, FORMATS, "written")
     target = find_run(path)
     store = with_maps(target.stored())
     warn_if_old(target, ("maps",), "written in this state")
@@ -64,7 +59,11 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     images = _images(store) if set(formats) - {"csv", "emva"} else []
     for name in dict.fromkeys(formats):
         if name == "fits":
-            written += write_fits(folder / "maps.fits", images, _header(target, store))
+            sensor = target.sensor(store)
+            frames = sensor.n_frames if sensor.kind == "frames" else None
+            facts: dict[str, Any] = {"CREATOR": "pchem-pipeline", "RUN": store.path.name}
+            facts |= {"NFRAMES": frames, "EXPTIME": sensor.integration_time}
+            written += write_fits(folder / "maps.fits", images, facts)
         elif name == "tiff":
             written += write_tiff(folder, images)
         elif name == "npz":
@@ -78,16 +77,9 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
 
 def _images(store: RunStore) -> list[MapImage]:
     chosen: list[Variable] = [v for v in variables_of("maps") if store.has(v.path)]
-    chosen += [v for v in variables_of("fit") if v.name in _FROM_FIT and store.has(v.path)]
+    own = ("fit_status", "likelihood_gap", "goodness_p")
+    chosen += [v for v in variables_of("fit") if v.name in own and store.has(v.path)]
     return [MapImage(v.name, store.read(v.path), v.unit, v.long_name) for v in chosen]
-
-
-def _header(target: Target, store: RunStore) -> dict[str, Any]:
-    """Return the keywords of a FITS file."""
-    sensor = target.sensor(store)
-    frames = sensor.n_frames if sensor.kind == "frames" else None
-    facts = {"CREATOR": "pchem-pipeline", "RUN": store.path.name}
-    return {**facts, "NFRAMES": frames, "EXPTIME": sensor.integration_time}
 
 
 def _write_csv(folder: Path, store: RunStore) -> list[Path]:

@@ -40,6 +40,18 @@ def millimetres(text: str) -> float:
     return length
 
 
+def check_formats(given: Sequence[str], known: Sequence[str], done: str) -> None:
+    """Refuse formats that are not known, or none.
+
+    Raises:
+        ConfigError: there are such, or none at all.
+    """
+    unknown = [name for name in given if name not in known]
+    if unknown or not given:
+        what = f"{', '.join(unknown)} cannot be {done}" if unknown else "no format"
+        raise ConfigError(f"--format: {what}; choose from {', '.join(known)}")
+
+
 def gather_run(target: Target) -> ReportData:
     """Return all that the report of a run shows.
 
@@ -77,10 +89,7 @@ def figures_of_run(
         ConfigError: an unknown format, width or figure.
         StoreError: the run has no maps, or the folder cannot be written.
     """
-    unknown = [name for name in formats if name not in FORMATS]
-    if unknown or not formats:
-        what = f"{', '.join(unknown)} cannot be drawn" if unknown else "no format"
-        raise ConfigError(f"--format: {what}; choose from {', '.join(FORMATS)}")
+    check_formats(formats, FORMATS, "drawn")
     width_mm = None if width is None else millimetres(width)
     target = find_run(path)
     data = gather_run(target)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pchem_pipeline.stages.methods.inputs import METHODS_FILE, open_other_runs, read_methods
-
-if TYPE_CHECKING:
-    from pchem_pipeline.run.target import Target
-    from pchem_pipeline.runner.session import Command
+from pchem_pipeline.report.pages.tables import methods_text
+from pchem_pipeline.run.target import Target
+from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.stages.methods import METHODS_FILE, open_other_runs, read_methods
 
 
 def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) -> str:
@@ -24,8 +23,6 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     Raises:
         PchEmError: the comparison cannot be made.
     """
-    from pchem_pipeline.runner.session import run_stages, run_status
-
     values = dict(given)
     if "with_runs" in values:
         values["with_runs"] = tuple(str(Path(path).resolve()) for path in values["with_runs"])
@@ -43,7 +40,5 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     result = read_methods(target.stored())
     if result is None:
         return ""
-    from pchem_pipeline.report.pages.tables import methods_text
-
     files = [target.store / METHODS_FILE, *([target.store / "report.html"] if reported else [])]
     return "\n".join([methods_text(result), "", *map(str, files)])

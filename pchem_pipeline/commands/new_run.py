@@ -1,4 +1,4 @@
-"""How a run begins: from a template, or straight from camera files."""
+"""How a run begins: from a template, straight from camera files, or from the runs of several exposures."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import glob
 import os
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
 from pchem_pipeline.commands.compare.settings import settings_that_differ
+from pchem_pipeline.commands.first_screen import run_to_first_screen
 from pchem_pipeline.config.load import (
     dump_config,
     load_config,
@@ -25,7 +26,7 @@ from pchem_pipeline.config.load import (
 from pchem_pipeline.config.template import SCHEMA_NAME, commented_config, json_schema
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.target import Target, find_run
-from pchem_pipeline.runner.session import nothing_left_of_a_refusal
+from pchem_pipeline.runner.session import Command, nothing_left_of_a_refusal
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
@@ -35,8 +36,6 @@ _YAML = (".yaml", ".yml")
 #: Settings that differ, as many as a message tells.
 _SHOWN = 4
 _WIDTH = 70  # characters of a setting that differs
-#: A setting as messages name it.
-_SETTING = re.compile(rf"\b(?:{'|'.join(RunConfig.model_fields)})\.[a-z_]+")
 
 
 def write_template(
@@ -65,15 +64,12 @@ def find_or_start(
     store: Path | None,
     given: Mapping[str, Any],
     roi: tuple[int, int, int, int] | None = None,
-    *,
-    write: bool = True,
 ) -> tuple[Target, bool]:
-    """Return the run that ``targets`` name, and whether it was made from camera files.
+    """Return the run that ``targets`` name, and whether they are camera files.
 
-    One YAML file or one store is an existing run. Anything else is camera files: a YAML with the
-    settings in ``given`` and the region ``roi`` is written beside the store (unless
-    ``write`` is off), and used. One that is there and agrees with these is used as it is, whatever
-    else it sets.
+    One YAML file or one store is an existing run. Anything else is camera files, of a run with the settings
+    in ``given`` and the region ``roi``, whose YAML is beside the store. One that is there and agrees with
+    these is used as it is, whatever else it sets.
 
     Raises:
         ConfigError: options do not fit the target, or the YAML exists with other settings.
@@ -93,32 +89,25 @@ def find_or_start(
             f"{missing[0]} does not exist; give camera files, a folder of them, or a config.yaml"
         )
     place = place_of(store or Path("run.zarr")).resolve()
-    remote, path = isinstance(place, RemotePath), settings_of(place)
+    path = settings_of(place)
     region = {} if roi is None else {"roi": roi}
-    stated: dict[str, Any] = {
-        "run": {"store": str(place) if remote else place.name},
-        "input": {"files": _file_list(targets, path.parent), **region, **given},
-    }
-    config = make_config(stated, "the command line")
-    if path.exists() and not _came_to_nothing(place, path):
-        config = settings_there(path, stated, ways_out("run", path))
-    target = Target(config, path.parent, place, path)
-    text = unwritten(target)
-    if write and text is not None:
-        write_config(path, text)
-    return target, True
+    stated = {"files": _file_list(targets, path.parent), **region, **given}
+    return _stated_run(place, stated, "run", anew=path.exists() and _came_to_nothing(place, path)), True
 
 
-def unwritten(target: Target) -> str | None:
-    """Return the text of a run's YAML that is to be written; None where its file has these settings.
-
-    Raises:
-        ConfigError: the YAML is wrong.
-    """
-    path = target.config_path
-    if path is not None and path.exists() and load_config(path) == target.config:
-        return None
-    return dump_config(target.config)
+def _stated_run(place: Path, stated: Mapping[str, Any], command: str, *, anew: bool = False) -> Target:
+    """Return the run with a store and a stated input; a YAML that is there must agree, or is made anew."""
+    path = settings_of(place)
+    store = str(place) if isinstance(place, RemotePath) else place.name
+    content = {"run": {"store": store}, "input": stated}
+    config = make_config(content, "the command line")
+    if path.exists() and not anew:
+        ways = (
+            f"continue with these: pchem {command} {quoted(path)}; or edit the file, or start another run "
+            "with --store NAME.zarr"
+        )
+        config = settings_there(path, content, ways)
+    return Target(config, path.parent, place, path)
 
 
 def settings_of(store: Path) -> Path:
@@ -157,14 +146,6 @@ def settings_there(path: Path, stated: Mapping[str, Any], ways: str) -> RunConfi
     raise ConfigError(f"{path} exists with other settings ({'; '.join([*shown, *more])}); {ways}")
 
 
-def ways_out(command: str, path: Path) -> str:
-    """Say what to do where a command line contradicts the YAML of its run."""
-    return (
-        f"continue with these: pchem {command} {quoted(path)}; or edit the file, or start another run with "
-        "--store NAME.zarr"
-    )
-
-
 def _laid_over(there: Any, stated: Any) -> Any:
     """Return settings with those that are stated in their place, key by key; lists of sections one by one."""
     if isinstance(there, Mapping) and isinstance(stated, Mapping):
@@ -175,21 +156,34 @@ def _laid_over(there: Any, stated: Any) -> Any:
     return stated
 
 
+def run_new(
+    target: Target,
+    stages: Sequence[str],
+    command: Command,
+    say: Callable[[str], None],
+    *,
+    strict: bool = False,
+) -> None:
+    """Write the YAML of a run where it is not there with its settings, and do its stages.
+
+    Raises:
+        PchEmError: a stage cannot be done; the message says why.
+    """
+    with contextlib.nullcontext() if command.options.dry_run else first_try(target):
+        run_to_first_screen(target, stages, command, say, strict=strict)
+
+
 @contextlib.contextmanager
-def first_try(target: Target, text: str | None) -> Iterator[None]:
+def first_try(target: Target) -> Iterator[None]:
     """Write the YAML of a run; where the run is refused before any work, take away what was not there before.
 
     A refusal whose cure is a setting then says where settings are, now that the YAML is gone.
-
-    Args:
-        target: the run.
-        text: of its YAML; None: it has one.
     """
     path = target.config_path
-    had_yaml = text is None or path is None or path.exists()
+    had_yaml = path is None or path.exists()
     had_run = isinstance(target.store, RemotePath) or (target.store / ".pchem").is_dir()
-    if text is not None and path is not None:
-        write_config(path, text)
+    if path is not None and not (path.exists() and load_config(path) == target.config):
+        write_config(path, dump_config(target.config))
     try:
         with nothing_left_of_a_refusal(target.store):
             yield
@@ -199,7 +193,8 @@ def first_try(target: Target, text: str | None) -> Iterator[None]:
         if had_yaml or path is None:
             raise
         path.unlink(missing_ok=True)
-        if _SETTING.search(str(error)) is None or "(--" in str(error):
+        named = re.search(rf"\b(?:{'|'.join(RunConfig.model_fields)})\.[a-z_]+", str(error))
+        if named is None or "(--" in str(error) or target.config.input.samples:
             raise
         name = shlex.quote(path.name)
         raise type(error)(
@@ -227,3 +222,45 @@ def _file_list(targets: Sequence[Path], base_dir: Path) -> list[str]:
         if len(list(targets[0].parent.glob(pattern))) == len(files):
             return [str(Path(glob.escape(str(folders.pop()))) / pattern)]
     return [str(path) for path in files]
+
+
+# -- a run of several exposures --------------------------------------------------------------------
+
+
+def find_joint(
+    targets: Sequence[Path],
+    bias: Sequence[Path] = (),
+    store: Path | None = None,
+    against: str | None = None,
+) -> tuple[Target, bool]:
+    """Return the run of several samples that ``targets`` name, and whether they are those samples.
+
+    One YAML file or store whose input is samples is an existing run. Several runs (YAML files or stores) are
+    the samples of one whose YAML is beside the store.
+
+    Raises:
+        ConfigError: options do not fit the target, or the YAML exists with other settings.
+    """
+    if len(targets) == 1 and not bias:
+        found = find_run(targets[0])
+        if not found.config.input.samples:
+            raise ConfigError(
+                f"{targets[0]} is a single run; a joint fit needs several: give all runs, or a YAML with "
+                "input.samples"
+            )
+        for option, value in (("run.store", store), ("input.against", against)):
+            if value is not None:
+                name = option.partition(".")[2]
+                raise ConfigError(f"--{name}: only with runs; {targets[0]} sets {option}, change it there")
+        return found, False
+    place = place_of(store or Path("joint.zarr")).resolve()
+    runs, folder = [*targets, *bias], settings_of(place).parent
+    samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, folder)} for each in runs]
+    for sample in samples[len(targets) :]:
+        sample["bias"] = True
+    given: dict[str, Any] = {"samples": samples}
+    if against is not None or len(targets) == 1:
+        given["against"] = against or "none"  # a line needs two exposures
+    for each in runs:
+        find_run(each)
+    return _stated_run(place, given, "joint"), True

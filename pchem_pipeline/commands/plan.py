@@ -16,8 +16,6 @@ from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target, parse_target
 from pchem_pipeline.store.files import write_json
 
-_DEFAULT_GAIN = 0.09  # e-/DN, of the cameras that this package was made for
-
 
 @dataclass(frozen=True)
 class PlanRequest:
@@ -65,7 +63,7 @@ def make_plan(request: PlanRequest) -> str:
     if not request.targets and request.frames is None:
         raise ConfigError("--target is missing: give a precision, such as conversion_gain=1%, or --frames")
     exposure = known.get("quanta_exposure") if request.quanta_exposure is None else request.quanta_exposure
-    gain = known.get("conversion_gain", _DEFAULT_GAIN)
+    gain = known.get("conversion_gain", 0.09)  # e-/DN, of the cameras that this package was made for
     if request.conversion_gain is not None:
         gain = request.conversion_gain
     point = Point(1.0 if exposure is None else exposure, noise, gain)

@@ -26,12 +26,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.run.target import Target
 
-#: Bits of the ADC where the run does not say.
-_BIT_DEPTH = 16
-_HEAD = """# Simulated copy of the camera of {run}: pchem run makes its frames and characterises them.
-# The effects of its model are simulated, and are in the model here.
-"""
-
 
 def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int] | None = None) -> Twin:
     """Return the camera of a run.
@@ -64,7 +58,7 @@ def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int]
     settings = SimulateSettings(
         shape=truth.shape,
         n_frames=max(1, sensor.n_frames),
-        bit_depth=sensor.bit_depth or _BIT_DEPTH,
+        bit_depth=sensor.bit_depth or 16,
         effects=fitted_effects(store),
     )
     if (time := sensor.integration_time) is not None:
@@ -123,7 +117,11 @@ def write_twin(
         "n_frames": frames or twin.settings.n_frames,
     }
     named = {"run": {"store": f"{output.stem}.zarr"}, "simulate": given}
-    text = _HEAD.format(run=target.store.name) + _yaml_of(make_config(named, "the twin"))
+    head = (
+        f"# Simulated copy of the camera of {target.store.name}: pchem run makes its frames and "
+        "characterises them.\n# The effects of its model are simulated, and are in the model here.\n"
+    )
+    text = head + _yaml_of(make_config(named, "the twin"))
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **twin.truth.arrays())
     write_atomic(maps, buffer.getvalue())

@@ -10,15 +10,9 @@ from typing import Any
 
 from pchem_pipeline.base.errors import one_line
 from pchem_pipeline.run.fingerprint import StageState
+from pchem_pipeline.run.progress import read_progress
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import run_status
-from pchem_pipeline.store.progress_file import read_progress
-
-_INTERVAL = 1.0
-#: Moves the cursor up so many lines and clears what is below.
-_UP = "\x1b[{}A\x1b[J"
-
-Snapshot = tuple[list[StageState], dict[str, Any] | None]
 
 
 def rows(states: Sequence[StageState], progress: Mapping[str, Any] | None) -> list[str]:
@@ -104,7 +98,8 @@ def watch(
             if as_json or not shown:
                 write("\n".join(lines))
             elif terminal:
-                write(_UP.format(len(shown)) + "\n".join(lines))
+                # the cursor goes up so many lines, and what is below is cleared
+                write(f"\x1b[{len(shown)}A\x1b[J" + "\n".join(lines))
             elif changed := [line for line in lines if line not in shown]:
                 write("\n".join(changed))
             shown = lines
@@ -112,7 +107,9 @@ def watch(
         return
 
 
-def _snapshots(target: Target, follow: bool, sleep: Callable[[float], None]) -> Iterator[Snapshot]:
+def _snapshots(
+    target: Target, follow: bool, sleep: Callable[[float], None]
+) -> Iterator[tuple[list[StageState], dict[str, Any] | None]]:
     """Yield the state of the run, once or until its command ends."""
     while True:
         # before the states: what is done when nobody works is done for good
@@ -120,4 +117,4 @@ def _snapshots(target: Target, follow: bool, sleep: Callable[[float], None]) -> 
         yield run_status(target), progress
         if not follow or progress is None:
             return
-        sleep(_INTERVAL)
+        sleep(1.0)

@@ -7,7 +7,6 @@ import platform
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,19 +16,13 @@ from pchem_pipeline.base.errors import (
     MissingDependencyError,
     install_hint,
 )
-from pchem_pipeline.compute.environment import prepare_environment
-from pchem_pipeline.compute.executor import Notices, OnResult, Outcome, guarded, out_of_memory
+from pchem_pipeline.compute.environment import prepare_environment, versions_of
+from pchem_pipeline.compute.executor import OnResult, Outcome, guarded, out_of_memory
 from pchem_pipeline.compute.settings import ComputeSettings
 
 T = TypeVar("T")
 
-#: libraries that decide the bits of a result, or that must understand each other
-_LIBRARIES = ("pchem-pipeline", "numpy", "scipy", "numba", "zarr", "distributed")
-
-#: seconds between looks for results, between looks at the workers, and without workers before it is said
-_POLL, _LOOK, _SAY = 0.01, 1.0, 5.0
-#: share of a worker's memory above which dask gives it no more work
-_USABLE = 0.8
+_LOOK = 1.0  # s between looks at the workers
 
 
 class OtherVersionsError(ConfigError):
@@ -41,7 +34,13 @@ class DistributedExecutor:
 
     shares_memory = False
 
-    def __init__(self, settings: ComputeSettings, workers: int, notices: Notices) -> None:
+    def __init__(
+        self,
+        settings: ComputeSettings,
+        workers: int,
+        say: Callable[[str], None],
+        check: Callable[[], None],
+    ) -> None:
         """Connect to the cluster, or make it, and wait for its first worker.
 
         Raises:
@@ -77,7 +76,7 @@ class DistributedExecutor:
                 "scheduler"
             ) from error
         self._name = f"the dask scheduler {settings.scheduler or 'of this run'}"
-        self._seconds, self._notices = settings.wait_for_workers, notices
+        self._seconds, self._say, self._check = settings.wait_for_workers, say, check
         self._since: float | None = None
         self._said = False
         try:
@@ -89,7 +88,8 @@ class DistributedExecutor:
         known = self._workers()
         self.workers = max(1, len(known))
         limits = [each["memory_limit"] for each in known if each["memory_limit"]]
-        self.memory_limit = int(_USABLE * min(limits)) if limits else None
+        # dask gives a worker no more work above this share of its memory
+        self.memory_limit = int(0.8 * min(limits)) if limits else None
 
     def _workers(self) -> list[dict[str, Any]]:
         return list(self._client.scheduler_info(n_workers=-1)["workers"].values())
@@ -104,16 +104,16 @@ class DistributedExecutor:
         if any(each["status"] == "running" for each in workers):
             self._since, self._said = None, False
             return True
-        self._notices.check()
+        self._check()
         now = time.monotonic()
         self._since = now if self._since is None else self._since
         seconds, waited = self._seconds, now - self._since
         if waited >= seconds:
             raise IncompleteRunError(self._given_up(workers))
-        if not self._said and waited >= min(_SAY, seconds / 2):
+        if not self._said and waited >= min(5.0, seconds / 2):
             self._said = True
             why = f": all {len(workers)} are paused, memory nearly full" if workers else ""
-            self._notices.say(f"waiting for workers of {self._name}{why}")
+            self._say(f"waiting for workers of {self._name}{why}")
         return False
 
     def _given_up(self, workers: Sequence[dict[str, Any]]) -> str:
@@ -142,7 +142,7 @@ class DistributedExecutor:
             if time.monotonic() - looked > _LOOK:
                 looked = time.monotonic()
                 self._can_work()
-            time.sleep(_POLL)
+            time.sleep(0.01)
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
         """See :class:`Executor`.
@@ -198,14 +198,10 @@ def _address(scheduler: str) -> dict[str, str]:
 
 
 def library_versions() -> dict[str, str]:
-    """Return the versions that must be the same on all machines."""
-    found = {"Python": ".".join(platform.python_version_tuple()[:2])}
-    for name in _LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "none"
-    return found
+    """Return the versions that must be the same on all machines: they decide the bits of a result."""
+    python = ".".join(platform.python_version_tuple()[:2])
+    names = ("pchem-pipeline", "numpy", "scipy", "numba", "zarr", "distributed")
+    return {"Python": python, **dict.fromkeys(names, "none"), **versions_of(*names)}
 
 
 def _alike(expected: dict[str, str], function: Callable[[Any], Any], item: Any) -> Outcome:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import math
 import os
 import sys
 from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +150,15 @@ def _slurm(*names: str) -> int:
         return 0
 
 
+def versions_of(*packages: str) -> dict[str, str]:
+    """Return the versions of those packages that are installed."""
+    found = {}
+    for name in packages:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
 def cpu_seconds() -> float:
     """Return the CPU time of this process and its finished children."""
     times = os.times()
@@ -158,17 +169,8 @@ def peak_rss_bytes() -> int:
     """Return the largest resident set of this process or of one of its finished children; 0 if not known."""
     if _RESOURCE is None:
         return 0
-    own = _peak_of_this_program()
-    if own is None:
-        own = _unit() * _RESOURCE.getrusage(_RESOURCE.RUSAGE_SELF).ru_maxrss
-    return int(max(own, _unit() * _RESOURCE.getrusage(_RESOURCE.RUSAGE_CHILDREN).ru_maxrss))
-
-
-def _unit() -> int:
-    return 1 if sys.platform == "darwin" else 1024
-
-
-def _peak_of_this_program() -> int | None:
-    """Return the largest resident set since the program began; other counts keep that of who started it."""
-    found = _named(Path("/proc/self/status"), "VmHWM:")
-    return found[0] << 10 if found else None
+    unit = 1 if sys.platform == "darwin" else 1024
+    # since the program began; other counts keep that of who started it
+    own = [kibibytes << 10 for kibibytes in _named(Path("/proc/self/status"), "VmHWM:")]
+    own = own or [unit * _RESOURCE.getrusage(_RESOURCE.RUSAGE_SELF).ru_maxrss]
+    return int(max(*own, unit * _RESOURCE.getrusage(_RESOURCE.RUSAGE_CHILDREN).ru_maxrss))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from pchem_pipeline.base.errors import ConfigError, ExitCode, IncompleteRunError, PchEmError
-from pchem_pipeline.compute.environment import available_workers, prepare_environment
+from pchem_pipeline.compute.environment import prepare_environment
 from pchem_pipeline.compute.settings import ComputeSettings
 
 T = TypeVar("T")
@@ -34,19 +34,6 @@ class Outcome:
 
 class Stop(Exception):
     """Raised by ``on_result`` to end the work: nothing new starts, what runs is finished."""
-
-
-@dataclass(frozen=True)
-class Notices:
-    """What an executor that has to wait calls.
-
-    Attributes:
-        say: with one line for people.
-        check: now and then; raises where the wait shall end.
-    """
-
-    say: Callable[[str], None] = lambda text: None
-    check: Callable[[], None] = lambda: None
 
 
 OnResult = Callable[[Any, Outcome], None]
@@ -207,28 +194,32 @@ class PoolExecutor:
         """The pool lives only during :meth:`map`."""
 
 
-def make_executor(settings: ComputeSettings, notices: Notices | None = None) -> Executor:
+def make_executor(
+    settings: ComputeSettings,
+    say: Callable[[str], None] = lambda text: None,
+    check: Callable[[], None] = lambda: None,
+) -> Executor:
     """Return the executor that the settings ask for.
 
     Args:
         settings: the section ``compute``.
-        notices: what to call while waiting for workers.
+        say: takes one line for people while workers are waited for.
+        check: called meanwhile; raises where the wait shall end.
 
     Raises:
         PchEmError: it cannot be had; the message says why.
     """
-    workers = available_workers() if settings.workers == "auto" else settings.workers
-    if workers < 1:
-        raise ConfigError(f"compute.workers: {workers}; give 1 or more, or auto")
+    if settings.workers != "auto" and settings.workers < 1:
+        raise ConfigError(f"compute.workers: {settings.workers}; give 1 or more, or auto")
     match settings.backend:
         case "serial":
             return SerialExecutor()
         case "threads":
-            return PoolExecutor(workers, processes=False)
+            return PoolExecutor(settings.count(), processes=False)
         case "processes":
-            return PoolExecutor(workers, processes=True)
+            return PoolExecutor(settings.count(), processes=True)
         case "distributed":
             from pchem_pipeline.compute.cluster import DistributedExecutor
 
-            return DistributedExecutor(settings, workers, notices or Notices())
+            return DistributedExecutor(settings, settings.count(), say, check)
     raise PchEmError(f"unknown backend {settings.backend}")

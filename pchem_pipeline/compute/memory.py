@@ -20,31 +20,10 @@ LEAST_BYTES = 300 << 20
 #: a process beside it that draws
 SECOND_PROGRAM_BYTES = 400 << 20
 
-#: parameters of mallopt: heaps, the size from which memory comes from the system and goes back to it at once,
-#: and the free end of a heap from which it goes back
-_ARENA_MAX, _MMAP_THRESHOLD, _TRIM_THRESHOLD = -8, -3, -1
-_HEAPS, _LARGE = 2, 1 << 20
-
 
 @functools.cache
 def _libc() -> Any:
     return ctypes.CDLL(None) if sys.platform == "linux" else None
-
-
-def keep_memory_tight() -> None:
-    """Give freed memory back to the system at once, here and in processes started from now on.
-
-    Otherwise each thread keeps a heap of its own, and arrays that were freed stay in it: half as much again
-    as is in use. It costs a twentieth of the CPU time. Only the C library of Linux can do it.
-    """
-    names = ("MALLOC_ARENA_MAX", "MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")
-    for name, value in zip(names, (_HEAPS, _LARGE, _LARGE), strict=True):
-        os.environ.setdefault(name, str(value))
-    os.environ.setdefault(TIGHT_MEMORY, "1")
-    mallopt = getattr(_libc(), "mallopt", None)
-    if mallopt is not None:
-        for parameter, value in ((_ARENA_MAX, _HEAPS), (_MMAP_THRESHOLD, _LARGE), (_TRIM_THRESHOLD, _LARGE)):
-            mallopt(parameter, value)
 
 
 def resident_bytes() -> int:
@@ -62,6 +41,10 @@ def resident_bytes() -> int:
 def keep_to_limit(limit: int | None) -> None:
     """Keep this process, and those that it starts from now on, to a limit, where there is one.
 
+    Freed memory then goes back to the system at once. Otherwise each thread keeps a heap of its own, and
+    arrays that were freed stay in it: half as much again as is in use. It costs a twentieth of the CPU time.
+    Only the C library of Linux can do it.
+
     Args:
         limit: ``compute.max_memory``, MiB.
 
@@ -75,7 +58,17 @@ def keep_to_limit(limit: int | None) -> None:
             f"compute.max_memory (--max-memory): {limit} MiB, but the program needs {LEAST_BYTES >> 20} MiB; "
             "raise it"
         )
-    keep_memory_tight()
+    os.environ.setdefault(TIGHT_MEMORY, "1")
+    mallopt = getattr(_libc(), "mallopt", None)
+    # heaps, the size from which memory comes from the system and goes back to it, the free end of a heap
+    for name, parameter, value in (
+        ("MALLOC_ARENA_MAX", -8, 2),
+        ("MALLOC_MMAP_THRESHOLD_", -3, 1 << 20),
+        ("MALLOC_TRIM_THRESHOLD_", -1, 1 << 20),
+    ):
+        os.environ.setdefault(name, str(value))
+        if mallopt is not None:
+            mallopt(parameter, value)
 
 
 def affordable(executor: Executor, limit: int, unit_bytes: int, what: str) -> Executor:

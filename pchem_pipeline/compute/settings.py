@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from pchem_pipeline.base.settings import Section
+from pchem_pipeline.compute.environment import available_workers
 
 
 class ComputeSettings(Section):
@@ -38,3 +39,9 @@ class ComputeSettings(Section):
     cluster: dict[str, Any] | None = Field(
         default=None, description="of earlier versions; start a cluster yourself, and give its scheduler"
     )
+
+    def count(self) -> int:
+        """Return the workers on this machine that are asked for."""
+        if self.backend == "serial":
+            return 1
+        return available_workers() if self.workers == "auto" else self.workers

@@ -67,24 +67,11 @@ class RunConfig(Section):
     report: ReportSettings = Field(default_factory=ReportSettings, description="report.html")
     compute: ComputeSettings = Field(default_factory=ComputeSettings, description="backend, workers, memory")
 
-    @field_validator(
-        "run",
-        "input",
-        "histogram",
-        "model",
-        "fit",
-        "maps",
-        "ensemble",
-        "discrepancy",
-        "methods",
-        "report",
-        "compute",
-        mode="before",
-    )
+    @field_validator("*", mode="before")
     @classmethod
-    def _empty_section(cls, value: object) -> object:
+    def _empty_section(cls, value: object, info: ValidationInfo) -> object:
         """Take a section of which every line is a comment as a section of defaults."""
-        return {} if value is None else value
+        return {} if value is None and info.field_name != "simulate" else value
 
     @model_validator(mode="before")
     @classmethod

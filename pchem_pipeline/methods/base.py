@@ -1,18 +1,24 @@
-"""What a characterisation method is given, what it returns, and where it is registered.
+"""What a characterisation method is given, what it returns, and which there are.
 
 A method is a subclass of :class:`Method` in a file of this package. Adding one touches no other file.
 """
 
 from __future__ import annotations
 
+import functools
+import importlib
+import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.model.law.pcd import log_pcd
 
@@ -125,19 +131,6 @@ class PixelSamples:
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Numbers that the iterative methods need.
-
-    Attributes:
-        em_iterations: largest number of EM steps of the paper's plain form.
-        em_tolerance: relative change of every parameter below which plain EM stops.
-    """
-
-    em_iterations: int = 1000
-    em_tolerance: float = 1e-6
-
-
-@dataclass(frozen=True)
 class Estimates:
     """What a method says of n pixels.
 
@@ -168,10 +161,6 @@ def no_estimates(n_pixels: int) -> FloatArray:
     return np.full((n_pixels, 4), np.nan)
 
 
-#: methods by name; the modules of this package are imported by `methods.registry`
-_REGISTERED: dict[str, type[Method]] = {}
-
-
 class Method(ABC):
     """A way to estimate the parameters of pixels.
 
@@ -193,20 +182,8 @@ class Method(ABC):
     order: ClassVar[int]
     sensor_wide: ClassVar[bool] = False
 
-    def __init_subclass__(cls) -> None:
-        """Register the method under its name.
-
-        Raises:
-            ValueError: the name is taken.
-        """
-        other = _REGISTERED.setdefault(cls.name, cls)
-        if other.__module__ != cls.__module__:
-            raise ValueError(
-                f"the method {cls.name!r} is registered twice: {other.__module__}, {cls.__module__}"
-            )
-
     @abstractmethod
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return the estimates of every pixel; no pixel raises."""
 
     def missing(self, n_samples: int) -> str:
@@ -215,6 +192,10 @@ class Method(ABC):
         return "" if n_samples >= least else f"needs {self.needs}; this comparison has {n_samples}"
 
 
-def registered() -> dict[str, type[Method]]:
-    """Return the methods registered so far, by name."""
-    return dict(_REGISTERED)
+@functools.cache
+def methods() -> Mapping[str, Method]:
+    """Return every method by name, in the order of tables: the modules of this package are looked at once."""
+    for module in pkgutil.iter_modules([str(Path(__file__).parent)], f"{__package__}."):
+        importlib.import_module(module.name)
+    known = sorted(Method.__subclasses__(), key=lambda method: (method.order, method.name))
+    return MappingProxyType({method.name: method() for method in known})

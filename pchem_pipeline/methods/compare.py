@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample, Settings
-from pchem_pipeline.methods.registry import methods
+from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample, methods
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,
@@ -90,7 +90,7 @@ class MethodResult:
 def compare(
     pixels: PixelSamples,
     reference: FloatArray | None,
-    settings: Settings,
+    settings: MethodsSettings,
     *,
     skip_errors: Sequence[str] = (),
     only: Sequence[str] | None = None,
@@ -113,7 +113,7 @@ def compare(
 
 
 def _run(
-    name: str, method: Method, pixels: PixelSamples, reference: FloatArray | None, settings: Settings
+    name: str, method: Method, pixels: PixelSamples, reference: FloatArray | None, settings: MethodsSettings
 ) -> MethodResult:
     head = (name, method.title, method.source, method.remark)
     used = pixels if method.needs != "one sample" else PixelSamples(pixels.samples[:1], pixels.adc_limits)
@@ -121,7 +121,9 @@ def _run(
     lacking = method.missing(n_samples)
     if lacking:
         return MethodResult(*head, n_samples, lacking)
-    method.estimate(_first_pixel(used), settings)  # compiled code is loaded before the clock starts
+    # compiled code is loaded before the clock starts
+    first = tuple(Sample(sample.counts[:1], sample.origin[:1]) for sample in used.samples)
+    method.estimate(PixelSamples(first, used.adc_limits), settings)
     start = time.process_time()
     estimates: Estimates = method.estimate(used, settings)
     seconds = (time.process_time() - start) / max(pixels.n_pixels, 1)
@@ -154,11 +156,6 @@ def _medians(parameters: FloatArray) -> dict[str, float | None]:
         name: float(np.median(values)) if values.size else None
         for name, values in zip(COMPARED, known, strict=True)
     }
-
-
-def _first_pixel(pixels: PixelSamples) -> PixelSamples:
-    samples = tuple(Sample(sample.counts[:1], sample.origin[:1]) for sample in pixels.samples)
-    return PixelSamples(samples, pixels.adc_limits)
 
 
 def errors_of(parameters: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:

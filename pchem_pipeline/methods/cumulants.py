@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings, no_estimates
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, no_estimates
+from pchem_pipeline.methods.settings import MethodsSettings
 
 
 class Cumulants(Method):
@@ -24,7 +25,7 @@ class Cumulants(Method):
     remark = "for exposures below about 1 e-; far above, the fourth cumulant is too noisy"
     order = 40
 
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return the estimates from the first sample."""
         moments = pixels.samples[0].moments()
         out = no_estimates(pixels.n_pixels)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples
 from pchem_pipeline.methods.plain_em import closed_form_start, run_em
+from pchem_pipeline.methods.settings import MethodsSettings
 
 
 class DarkAndBrightMle(Method):
@@ -25,7 +26,7 @@ class DarkAndBrightMle(Method):
     remark = "biased by electrons in the dark sample"
     order = 20
 
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return the estimates from the darkest and the brightest sample."""
         order = pixels.by_brightness()
         dark, sample = pixels.samples[order[0]].moments(), pixels.samples[order[-1]]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Settings
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.fit.api import fit_histograms
 
 
@@ -21,7 +22,7 @@ class PchEm(Method):
     remark = "above about 0.5 e- read noise one sample does not suffice"
     order = 10
 
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return the fit of the first sample."""
         sample = pixels.samples[0]
         result = fit_histograms(sample.counts, sample.origin)
@@ -43,7 +44,7 @@ class JointPchEm(Method):
     remark = "uses the darkest sample as bias frames"
     order = 12
 
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return the fit of all samples."""
         darkest = pixels.by_brightness()[0]
         result = fit_histograms(

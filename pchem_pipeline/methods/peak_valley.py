@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
-from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Settings, no_estimates
+from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, no_estimates
 from pchem_pipeline.methods.plain_em import closed_form_start
-
-_SMOOTHING = 0.12  # standard deviation of the smoothing in units of the distance of two peaks
+from pchem_pipeline.methods.settings import MethodsSettings
 
 
 class PeakValley(Method):
@@ -33,12 +32,12 @@ class PeakValley(Method):
     remark = "needs resolved peaks (read noise below about 0.3 e-), the lowest at zero electrons"
     order = 41
 
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return the estimates from the first sample."""
         sample = pixels.samples[0]
         spacing = 1.0 / closed_form_start(sample)[:, 1]
         spacing[~(spacing < 0.5 * sample.counts.shape[1])] = np.nan
-        width = np.maximum(_SMOOTHING * spacing, 0.3)
+        width = np.maximum(0.12 * spacing, 0.3)
         found = np.full((pixels.n_pixels, 4), np.nan)
         for pixel in np.flatnonzero(np.isfinite(spacing)):
             found[pixel] = comb(sample.counts[pixel], spacing[pixel], width[pixel])

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Settings, no_estimates
-
-_LINEAR_RANGE = 0.7  # of the saturation, EMVA 1288 release 3.1, section on sensitivity
+from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, no_estimates
+from pchem_pipeline.methods.settings import MethodsSettings
 
 
 class PhotonTransferSeries(Method):
@@ -27,7 +26,7 @@ class PhotonTransferSeries(Method):
     remark = "bias from the mean of the darkest sample, including its electrons"
     order = 31
 
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return the estimates from all samples."""
         return _of_line(pixels, range(len(pixels.samples)))
 
@@ -47,7 +46,7 @@ class TwoSamplePhotonTransfer(Method):
     remark = "bias and read noise from the dark sample, including its electrons"
     order = 30
 
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return the estimates from the darkest and the brightest sample."""
         order = pixels.by_brightness()
         return _of_line(pixels, (order[0], order[-1]))
@@ -71,7 +70,7 @@ class Emva1288(Method):
     order = 32
     sensor_wide = True
 
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return the sensor's K as the gain of every pixel."""
         found = [sample.moments() for sample in pixels.samples]
         # the same pixels in every sample: those that have a variance in all of them
@@ -84,7 +83,7 @@ class Emva1288(Method):
         signal, noise = mean - mean[dark], variance - variance[dark]
         linear = np.ones(mean.size, np.bool_)
         if pixels.adc_limits is not None:
-            linear = signal <= _LINEAR_RANGE * (pixels.adc_limits[1] - mean[dark])
+            linear = signal <= 0.7 * (pixels.adc_limits[1] - mean[dark])
         out = no_estimates(pixels.n_pixels)
         steepness = float((signal * noise)[linear].sum())
         if steepness <= 0:

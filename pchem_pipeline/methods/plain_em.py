@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample, Settings
+from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import pcd_posterior
 
@@ -26,7 +27,7 @@ class PlainEm(Method):
     remark = "does not converge above about 0.4 e- read noise"
     order = 11
 
-    def estimate(self, pixels: PixelSamples, settings: Settings) -> Estimates:
+    def estimate(self, pixels: PixelSamples, settings: MethodsSettings) -> Estimates:
         """Return where EM stops, in the first sample."""
         sample = pixels.samples[0]
         start = closed_form_start(sample)
@@ -45,7 +46,7 @@ def closed_form_start(sample: Sample) -> FloatArray:
 
 
 def run_em(
-    sample: Sample, start: FloatArray, only_light: bool, settings: Settings
+    sample: Sample, start: FloatArray, only_light: bool, settings: MethodsSettings
 ) -> tuple[FloatArray, NDArray[np.int64]]:
     """Run EM from given points.
 

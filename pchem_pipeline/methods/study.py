@@ -13,10 +13,10 @@ import numpy as np
 
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.methods.base import PixelSamples, Sample, Settings
+from pchem_pipeline.methods.base import PixelSamples, Sample, methods
 from pchem_pipeline.methods.compare import MethodResult, compare
 from pchem_pipeline.methods.photon_transfer import gain_variance
-from pchem_pipeline.methods.registry import methods
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,
@@ -53,7 +53,7 @@ class StudyPoint:
     seed: int
 
 
-def study_point(point: StudyPoint, settings: Settings) -> dict[str, Any]:
+def study_point(point: StudyPoint, settings: MethodsSettings) -> dict[str, Any]:
     """Return errors of all methods at one read noise, and the bounds there, as plain data.
 
     Methods that give one gain to the whole sensor are left out: they average over pixels.

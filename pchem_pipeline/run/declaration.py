@@ -22,20 +22,6 @@ def imported(place: str) -> Callable[..., Any]:
 
 
 @dataclass(frozen=True)
-class SinglePass:
-    """Several stages whose work can be done in one pass over the input.
-
-    Attributes:
-        stages: their names, in order.
-        run: ``"module:function"`` that takes the context of the run, does the work where that is possible,
-            and then sets ``context.prepared``.
-    """
-
-    stages: tuple[str, ...]
-    run: str
-
-
-@dataclass(frozen=True)
 class Stage:
     """A stage of a run.
 
@@ -44,8 +30,8 @@ class Stage:
         version: of its algorithm; raised when that changes, which makes old results stale.
         upstream: the stages whose results it needs.
         settings: dotted config keys that it reads; a change of any makes its results stale.
-        reads: arrays or whole groups of the store (``"fit"`` or ``"fit/bias"``).
-        writes: likewise; what it writes is removed when it starts anew.
+        writes: arrays or whole groups of the store (``"fit"`` or ``"fit/bias"``); what it writes is removed
+            when it starts anew.
         files: what it writes beside arrays, in the folder of the run, all or some of them; one that is
             missing or was changed makes the stage stale.
         run: ``"module:function"`` that takes the context and does the stage.
@@ -56,7 +42,8 @@ class Stage:
         may_write_nothing: it may be complete without the first of what it ``writes``.
         follows: stages that write the files which this one reads as input.
         reads_input: it looks at the camera files, or at the runs of the samples, as they are now.
-        single_pass: what does its work, and that of the stages after it, in one pass over the input.
+        single_pass: ``"module:function"`` that takes the context and, where that is possible, does its work
+            and that of its upstream stages in one pass over the input; it sets ``context.prepared``.
         plan: ``"module:function"`` that takes (configuration, folder, stages to be done) and returns lines
             which say what the stage will take.
         status_words: array of status words that it writes; too many failed pixels end a command in an error.
@@ -66,7 +53,6 @@ class Stage:
     version: int
     upstream: tuple[str, ...]
     settings: tuple[str, ...]
-    reads: tuple[str, ...]
     writes: tuple[str, ...]
     run: str
     identity: str | None = None
@@ -77,6 +63,6 @@ class Stage:
     may_write_nothing: bool = False
     follows: tuple[str, ...] = ()
     reads_input: bool = False
-    single_pass: SinglePass | None = None
+    single_pass: str | None = None
     plan: str | None = None
     status_words: str | None = None

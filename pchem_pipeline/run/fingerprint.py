@@ -11,17 +11,15 @@ from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.config.load import setting_of, states
 from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.model_versions import model_of_content, model_versions
-from pchem_pipeline.store.files import digest_of
-from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.files import DESCRIPTION, digest_of, fingerprint_of
+from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import RemotePath
-from pchem_pipeline.store.run_store import DESCRIPTION
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
 
-_TILE = "run.tile"
 _NEWS = {f"input.{name}": f"new result of pchem {name}" for name in ("discrepancy", "methods")}
 
 
@@ -69,9 +67,9 @@ def fingerprint_content(stage: Stage, context: StageContext) -> dict[str, Any]:
 def setting_values(stage: Stage, context: StageContext) -> dict[str, Any]:
     """Return the settings that a stage reads, as JSON data; of the tiles what they are."""
     found = {key: setting_of(context.config, key) for key in stage.settings}
-    if found.get(_TILE) == "auto":
+    if found.get("run.tile") == "auto":
         rows, columns = context.tile
-        found[_TILE] = rows if rows == columns else [rows, columns]
+        found["run.tile"] = rows if rows == columns else [rows, columns]
     return found
 
 

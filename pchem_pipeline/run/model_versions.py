@@ -23,8 +23,7 @@ from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
-from pchem_pipeline.store.files import read_record, write_record
-from pchem_pipeline.store.records import fingerprint_of
+from pchem_pipeline.store.files import fingerprint_of, read_record, write_record
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
@@ -61,6 +60,10 @@ class AddedArrays:
             return None
         rows, columns = (tuple(values[name]) for name in ("rows", "columns"))
         return cls(group, rows, columns, tuple(values["effects"]), values["digest"])
+
+    def attributes(self) -> dict[str, Any]:
+        """Return what stands with the arrays, of which :meth:`of_group` makes it again."""
+        return {name: value for name, value in asdict(self).items() if name != "group"}
 
 
 @dataclass(frozen=True)
@@ -236,20 +239,11 @@ def _keep(store: RunStore, version: ModelVersion) -> ModelVersion:
     if version.added is not None and not version.added.group.startswith(f"{_GROUP}/"):
         for array in (_WEIGHT, _EXPOSURE):
             values = store.read(f"{version.added.group}/{array}")
-            store.write_array(f"{name}/{array}", values, _attributes(version.added))
+            store.write_array(f"{name}/{array}", values, version.added.attributes())
         version = replace(version, added=replace(version.added, group=name))
     version = replace(version, made=datetime.now(UTC).isoformat(timespec="seconds"))
     write_record(store.path / f"{name}.json", asdict(version))
     return version
-
-
-def _attributes(added: AddedArrays) -> dict[str, Any]:
-    return {
-        "rows": list(added.rows),
-        "columns": list(added.columns),
-        "effects": list(added.effects),
-        "digest": added.digest,
-    }
 
 
 # -- what results rest on ------------------------------------------------------------------------
@@ -307,14 +301,11 @@ def write_added_exposure(
         return
     arrays = [np.ascontiguousarray(values, np.float64) for values in added]
     digest = hashlib.sha256(b"".join(values.tobytes() for values in arrays)).hexdigest()
-    adding = tuple(e.model_dump(mode="json") for e in effects if _adds(e))
+    adding = [e for e in effects if type(e).added_exposure is not Effect.added_exposure]
+    kept = tuple(e.model_dump(mode="json") for e in adding)
     store.write_array(f"{group}/{_WEIGHT}", arrays[1])
-    facts = AddedArrays(group, rows, columns, adding, digest)
-    store.write_array(f"{group}/{_EXPOSURE}", arrays[0], _attributes(facts))
-
-
-def _adds(effect: Effect) -> bool:
-    return type(effect).added_exposure is not Effect.added_exposure
+    facts = AddedArrays(group, rows, columns, kept, digest)
+    store.write_array(f"{group}/{_EXPOSURE}", arrays[0], facts.attributes())
 
 
 def read_added_exposure(

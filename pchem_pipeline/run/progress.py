@@ -1,4 +1,7 @@
-"""What a run says while it works: progress and one line per stage on stderr, JSON lines in a file."""
+"""What a run says while it works: progress and one line per stage on stderr, JSON lines in a file.
+
+Other processes read how far it is in a small file of the run.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,21 @@ import contextlib
 import contextvars
 import json
 import os
+import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, Protocol, TextIO, TypeVar
 
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError, StoreError, one_line
+from pchem_pipeline.base.kernel_cache import cache_folder, is_writable, listening
 from pchem_pipeline.base.units import typeset
-from pchem_pipeline.store.progress_file import ProgressFile
+from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.lock import is_locked
 
 T = TypeVar("T")
 ProgressMode = Literal["auto", "on", "off"]
@@ -149,9 +155,45 @@ class Reporter:
                 self._end_log()
                 self._line(f"warning: --log-json: no further events written: {error.strerror or error}")
 
-    def compiling(self, spent: float) -> None:
-        """Take note of how long kernels were compiled so far in this stage, s: no work is done meanwhile."""
-        self._compiled = spent
+    @contextmanager
+    def compilation(self, stage: str, limit: int | None = None) -> Iterator[None]:
+        """Say when a stage compiles kernels, or waits for another process that does: how many, and how long.
+
+        Args:
+            stage: its name.
+            limit: memory that the run may take, MiB: where compiling takes more, that is a warning.
+        """
+        seconds: list[float] = []
+        most = 490  # MiB of this process while it compiles
+
+        def listener(kernel: str, took: float | None) -> None:
+            if took is not None:
+                seconds.append(took)
+            elif not seconds:
+                self.info(f"{stage}: compiling kernels (once after an installation or update)")
+                if limit is not None and limit < most:
+                    self.warning(
+                        f"{stage}: compiling takes up to {most} MiB, more than compute.max_memory "
+                        f"(--max-memory) allows ({limit} MiB); later work stays within the limit"
+                    )
+            self._compiled = sum(seconds)  # no work is done meanwhile
+            self.event("compiling", stage=stage, kernel=kernel, seconds=took)
+
+        try:
+            with listening(listener):
+                yield
+        finally:
+            self._compiled = 0.0
+        if not seconds:
+            return
+        self.info(
+            f"{stage}: {len(seconds)} kernel{'s' * (len(seconds) > 1)} compiled in {sum(seconds):.0f} s"
+        )
+        if not is_writable(cache_folder()):
+            self.warning(
+                f"{stage}: {cache_folder()} is not writable, so every command compiles its kernels again; "
+                "set NUMBA_CACHE_DIR to another folder"
+            )
 
     @contextmanager
     def phases(self, stage: str) -> Iterator[Callable[[str], None]]:
@@ -256,3 +298,60 @@ def _short(count: float) -> float:
     """Return a count of units for people: whole where it is, else with two digits."""
     rounded = round(count, 2)
     return int(rounded) if rounded == int(rounded) else rounded
+
+
+class ProgressFile:
+    """The file ``.pchem/progress.json`` of a run; it is there while a command works on the run.
+
+    A disk that cannot take it stops nothing: progress is not a result.
+    """
+
+    def __init__(self, store: Path) -> None:
+        self._path = _place(store)
+        self._shown = False
+
+    def show(self, pace: Mapping[str, Any]) -> None:
+        """Write how far the work is."""
+        content = {
+            **pace,
+            "time": datetime.now(UTC).isoformat(timespec="seconds"),
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+        }
+        with contextlib.suppress(StoreError):
+            write_atomic(self._path, (json.dumps(content) + "\n").encode(), sync=False)
+            self._shown = True
+
+    def remove(self) -> None:
+        """Remove the file, if this process wrote it and no other has begun since."""
+        if self._shown:
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+                if json.loads(self._path.read_text(encoding="utf-8"))["pid"] == os.getpid():
+                    self._path.unlink()
+
+
+def read_progress(store: Path) -> dict[str, Any] | None:
+    """Return what the command that works on a run tells, or None where none does: its lock decides.
+
+    Numbers and words of other types, and control characters, do not get through.
+    """
+    place = _place(store)
+    try:
+        content = json.loads(place.read_bytes())
+        if not isinstance(content, dict) or not is_locked(store, place.parent):
+            return None
+    except (OSError, ValueError, RecursionError):
+        return None
+    words_of = ("stage", "unit", "time", "host")
+    numbers_of = ("done", "total", "elapsed", "rate", "remaining", "pid")
+    words = {name: one_line(text) for name in words_of if isinstance(text := content.get(name), str)}
+    numbers = {name: value for name in numbers_of if _is_number(value := content.get(name))}
+    return {**words, **numbers}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value < 1e15
+
+
+def _place(store: Path) -> Path:
+    return store / ".pchem" / "progress.json"

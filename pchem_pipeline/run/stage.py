@@ -1,7 +1,7 @@
 """What a stage is given, and how its units are done.
 
-A stage is a row of :mod:`pchem_pipeline.stages.table` and a module with a pure ``*_tile`` function, arrays in
-and arrays out, and ``run(context)``. That makes its arrays (``context.create``), then calls
+A stage is a row of :mod:`pchem_pipeline.stages.table` and a module with ``run(context)``; what it computes is
+a pure function, arrays in and arrays out. ``run`` makes its arrays (``context.create``), then calls
 ``context.run_units(units, task)``. ``task`` is a picklable callable (a module-level function, or a
 ``functools.partial`` of one) that takes a unit and the store, writes whole chunks and returns a small
 JSON-able summary, or nothing. The marker of a unit is set, in the worker, after its task returned.
@@ -23,8 +23,9 @@ from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from pchem_pipeline.base.errors import InputError, StoreError, error_words
 from pchem_pipeline.base.variables import LENGTHS, VARIABLES
+from pchem_pipeline.compute.environment import available_memory
 from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, Stop
-from pchem_pipeline.compute.memory import affordable
+from pchem_pipeline.compute.memory import BASE_BYTES, affordable
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.model_versions import ModelVersion, model_in_force
 from pchem_pipeline.run.progress import Reporter, telling_parts
@@ -142,6 +143,30 @@ def nothing_left(unit: Any, store: RunStore) -> None:
     """Do nothing: the task of units whose work was done beforehand."""
 
 
+def allowed_bytes(config: RunConfig, workers: int) -> int:
+    """Return the memory that the run may take, in all: the setting, else half of what is free."""
+    if config.compute.max_memory is not None:
+        return config.compute.max_memory << 20
+    bands = BASE_BYTES + workers * (config.histogram.band_memory << 20)
+    return max(bands, (available_memory() or 0) // 2)
+
+
+def band_bytes(config: RunConfig, workers: int, limit: int | None = None) -> int:
+    """Return the memory of a worker that counts a band of rows.
+
+    Args:
+        config: of the run.
+        workers: number of workers.
+        limit: bytes that the process of a worker may take, above which it is killed; None: no limit.
+    """
+    bytes_each = config.histogram.band_memory << 20
+    if limit is not None:
+        bytes_each = min(bytes_each, max(16 << 20, limit - BASE_BYTES))
+    if config.compute.max_memory is None:
+        return bytes_each
+    return min(bytes_each, max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))
+
+
 @dataclass
 class StageContext:
     """All that a stage is given.
@@ -226,6 +251,11 @@ class StageContext:
         """Pixels of the largest tile."""
         return math.prod(min(size, length) for size, length in zip(self.tile, self.sensor.shape, strict=True))
 
+    @property
+    def band_bytes(self) -> int:
+        """Memory of a worker that takes a band of rows."""
+        return band_bytes(self.config, self.executor.workers, self.executor.memory_limit)
+
     def tiles(self) -> list[Tile]:
         """Return all tiles of the sensor."""
         return tile_grid(self.sensor.shape, self.tile)
@@ -284,14 +314,16 @@ class StageContext:
         chosen = {tile.key for tile in roi_tiles(self.options.roi, self.tiles())}
         return [unit for unit in units if unit is WHOLE or chosen & set(markers(unit))]
 
-    def pending(self, units: Sequence[AnyUnit], *, by_tiles: bool = True) -> list[AnyUnit]:
-        """Return the chosen units that are not done; with ``--force`` all the chosen ones.
+    def pending(
+        self, units: Sequence[AnyUnit], *, by_tiles: bool = True, resumes: bool = False
+    ) -> list[AnyUnit]:
+        """Return the chosen units that are not done; with ``--force`` all, unless the stage ``resumes``.
 
         Units that are no tiles (``by_tiles=False``) are always chosen, and not forced by a choice of tiles.
         """
         done = self.store.records.done(self.stage, self.fingerprint)
         chosen = self.selected(units) if by_tiles else list(units)
-        if self.options.force and (by_tiles or self.options.roi is None):
+        if self.options.force and not resumes and (by_tiles or self.options.roi is None):
             return chosen
         return [unit for unit in chosen if not set(markers(unit)) <= done]
 
@@ -325,7 +357,7 @@ class StageContext:
         """
         self.begin()
         self._know_total(sum(len(markers(unit)) for unit in units) if total is None else total)
-        todo = self._ready(self._pending_of(units, by_tiles, total), needs)
+        todo = self._ready(self.pending(units, by_tiles=by_tiles, resumes=total is not None), needs)
         self.store.records.unmark(
             self.stage, self.fingerprint, (key for unit in todo for key in markers(unit))
         )
@@ -333,7 +365,9 @@ class StageContext:
         shown = len(self.selected(units) if by_tiles else units)
         undivided = list(units) == [WHOLE]
         # what is not divided is done here, and tells its own steps
-        executor = self._affordable(SerialExecutor() if undivided else self.executor, unit_bytes)
+        executor = SerialExecutor() if undivided else self.executor
+        if (limit := self.config.compute.max_memory) is not None and unit_bytes:
+            executor = affordable(executor, limit << 20, unit_bytes, f"stage {self.stage}")
         with self.reporter.progress(
             self.stage, shown, unit_name, shown - len(todo), hidden=undivided
         ) as advance:
@@ -373,18 +407,6 @@ class StageContext:
         for name, stage in self.created.items():
             if stage == self.stage and "frame" not in VARIABLES[name].dims:
                 self.store.fill(name)
-
-    def _affordable(self, executor: Executor, unit_bytes: int) -> Executor:
-        limit = self.config.compute.max_memory
-        if limit is None or not unit_bytes:
-            return executor
-        return affordable(executor, limit << 20, unit_bytes, f"stage {self.stage}")
-
-    def _pending_of(self, units: Sequence[AnyUnit], by_tiles: bool, total: int | None) -> list[AnyUnit]:
-        if total is None:
-            return self.pending(units, by_tiles=by_tiles)
-        done = self.store.records.done(self.stage, self.fingerprint)
-        return [unit for unit in units if not set(markers(unit)) <= done]
 
     def _know_total(self, n_keys: int) -> None:
         """Record how many markers the stage will have, before the first is set: a kill must not lose it."""

@@ -6,19 +6,17 @@ import platform
 import time
 from dataclasses import replace
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from pchem_pipeline.base.errors import StoreError, quoted
-from pchem_pipeline.compute.environment import cpu_seconds, peak_rss_bytes
+from pchem_pipeline.compute.environment import cpu_seconds, peak_rss_bytes, versions_of
 from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.fingerprint import StageState, changed_file, fingerprint_content, rests_on, status
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.table import STAGES
-from pchem_pipeline.store.files import digest_of
-from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.files import DESCRIPTION, digest_of, fingerprint_of
+from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import RemotePath
-from pchem_pipeline.store.run_store import DESCRIPTION
 
 _LIBRARIES = ("numpy", "scipy", "numba", "zarr", "dask", "tifffile", "astropy", "h5py", "matplotlib")
 
@@ -44,9 +42,6 @@ def execute(name: str, context: StageContext) -> StageState:
             raise StoreError(f"{name} needs {upstream} first; run: pchem {upstream} {place}")
     if stage.upstream:
         context.selected(())
-    if context.options.dry_run:
-        context.reporter.info(f"{name}: {before.words()} -> would run")
-        return before
     for upstream in stage.upstream:
         record = context.store.records.known(upstream)
         if record is not None and (file := changed_file(record, context.store)):
@@ -58,22 +53,17 @@ def execute(name: str, context: StageContext) -> StageState:
     prepared = context.prepared.get(name)
     if prepared is not None and prepared.clock is not None:
         clock = prepared.clock
-    return _perform(stage, context, before, restart=context.options.roi is None, clock=clock)
+    return _perform(stage, context, before, clock)
 
 
 def _perform(
-    stage: Stage,
-    context: StageContext,
-    before: StageState,
-    *,
-    restart: bool,
-    clock: tuple[float, float],
+    stage: Stage, context: StageContext, before: StageState, clock: tuple[float, float]
 ) -> StageState:
     """Run a stage that is not up to date, and keep its record whatever happens.
 
     The clock (wall, CPU) started before the state was looked at: hashing the input is part of the work.
     """
-    records = context.store.records
+    records, restart = context.store.records, context.options.roi is None
     content = fingerprint_content(stage, context)
     old = records.known(stage.name)
     # a stage that was stopped before its first unit may lack arrays
@@ -94,7 +84,7 @@ def _perform(
         content,
         keys=old.keys if resumes and old is not None else 0,
         started=datetime.now(UTC).isoformat(timespec="seconds"),
-        versions=_versions(),
+        versions={"python": platform.python_version(), **versions_of("pchem-pipeline", *_LIBRARIES)},
     )
     record = replace(record, model=rests_on(record, context.store))
     records.write(record)
@@ -165,15 +155,3 @@ def written_files(stage: Stage, folder: Path) -> dict[str, str]:
                 places += [description, description.parent]
     found = {place.relative_to(folder).as_posix(): digest_of(place) for place in places}
     return {name: digest for name, digest in found.items() if digest is not None}
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version(), "pchem-pipeline": _version("pchem-pipeline")}
-    return found | {name: text for name in _LIBRARIES if (text := _version(name))}
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return ""

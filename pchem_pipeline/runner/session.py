@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputError, StoreError
-from pchem_pipeline.compute.executor import Notices, make_executor
+from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.load import dump_config, effects_file, found_model
-from pchem_pipeline.run.compilation import announced
 from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.model_versions import keep_in_force, model_in_force
-from pchem_pipeline.run.progress import ProgressMode, Reporter
+from pchem_pipeline.run.progress import ProgressFile, ProgressMode, Reporter
 from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.run.target import Target
@@ -25,7 +24,6 @@ from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.samples import SAMPLES_UNTIL, check_samples, sample_targets
 from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.files import write_record
-from pchem_pipeline.store.progress_file import ProgressFile
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
 
@@ -145,11 +143,11 @@ def _bring_samples(target: Target, stages: Sequence[str], command: Command) -> N
 
 def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageState:
     """Bring a stage up to date; with those after it, where one pass does the work of all."""
-    single_pass = STAGES[name].single_pass
     of_files = not context.config.input.samples
-    with announced(context.reporter, name, context.config.compute.max_memory):
-        if of_files and single_pass is not None and set(single_pass.stages) <= set(stages):
-            imported(single_pass.run)(context)
+    passes = [STAGES[later].single_pass for later in stages if name in STAGES[later].upstream]
+    with context.reporter.compilation(name, context.config.compute.max_memory):
+        for single_pass in filter(None, passes if of_files else ()):
+            imported(single_pass)(context)
         return execute(name, context)
 
 
@@ -172,13 +170,19 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         )
         stack.callback(reporter.close)
         stack.enter_context(store.locked())
-        _tell_model(target, reporter)
+        if (path := target.config_path) is not None:
+            found = found_model(path)
+            if found is not None and found.model == target.config.model:
+                file = effects_file(path).name
+                reporter.info(f"the model is that of {file}, instead of the one in {path.name}")
         progress_file.show({"stage": ""})
         stop = stack.enter_context(stop_on_signals())
         store.write_config(dump_config(own))  # what a single command was given is no setting of the run
         keep_in_force(store, model_in_force(store, target.config.model))
-        write_record(store.path / ".pchem" / "location.json", _location(target))
-        executor = make_executor(target.config.compute, Notices(reporter.warning, stop.check))
+        yaml = {} if target.config_path is None else {"config": str(target.config_path)}
+        location = {"base_dir": str(target.base_dir), **yaml}  # to which its paths refer
+        write_record(store.path / ".pchem" / "location.json", location)
+        executor = make_executor(target.config.compute, reporter.warning, stop.check)
         stack.callback(executor.close)
         yield StageContext(
             target.config,
@@ -190,20 +194,6 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
             options=command.options,
             config_path=target.config_path,
         )
-
-
-def _tell_model(target: Target, reporter: Reporter) -> None:
-    """Say where the model of a run is not that of its YAML."""
-    path = target.config_path
-    found = None if path is None else found_model(path)
-    if path is not None and found is not None and found.model == target.config.model:
-        reporter.info(f"the model is that of {effects_file(path).name}, instead of the one in {path.name}")
-
-
-def _location(target: Target) -> dict[str, Any]:
-    """Return where the run's paths refer to, and its YAML file."""
-    place = {"base_dir": str(target.base_dir)}
-    return place if target.config_path is None else {**place, "config": str(target.config_path)}
 
 
 def run_status(target: Target, options: Options | None = None) -> list[StageState]:
@@ -235,29 +225,20 @@ def run_status(target: Target, options: Options | None = None) -> list[StageStat
 
 
 def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[StageState]:
-    """Say what would be done, without writing anything."""
+    """Say what would be done and, as far as stages can tell, what it takes, without writing anything."""
     chosen = Options(settings=command.options.settings)
-    states = {state.stage: state for state in run_status(target, chosen)}
+    known = {state.stage: state for state in run_status(target, chosen)}
+    states = [known.get(name, StageState(name, "missing")) for name in stages]
     reporter = Reporter("off", quiet=command.quiet)
-    for name in stages:
-        state = states.get(name, StageState(name, "missing"))
-        runs = _is_to_do(states, name, command)
-        reporter.info(f"{name}: {state.words()}" + (" -> would run" if runs else " -> nothing to do"))
-    todo = [name for name in stages if _is_to_do(states, name, command)]
-    for line in _plan(target, todo, command):
-        reporter.info(line)
-    return [states.get(name, StageState(name, "missing")) for name in stages]
-
-
-def _is_to_do(states: Mapping[str, StageState], name: str, command: Command) -> bool:
-    return name not in states or states[name].state != "complete" or command.options.force
-
-
-def _plan(target: Target, todo: Sequence[str], command: Command) -> list[str]:
-    """Say what the stages that are to be done will take, as far as they can tell."""
+    todo = [state.stage for state in states if state.state != "complete" or command.options.force]
+    for state in states:
+        words = "would run" if state.stage in todo else "nothing to do"
+        reporter.info(f"{state.stage}: {state.words()} -> {words}")
     target = with_overrides(target, command)
-    plans = [plan for plan in (STAGES[name].plan for name in todo) if plan is not None]
-    return [line for plan in plans for line in imported(plan)(target.config, target.base_dir, todo)]
+    for plan in filter(None, (STAGES[name].plan for name in todo)):
+        for line in imported(plan)(target.config, target.base_dir, todo):
+            reporter.info(line)
+    return states
 
 
 def _check_failed_pixels(context: StageContext, name: str) -> None:

@@ -14,8 +14,6 @@ from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.tiles import Tile, equal_rows
 
-#: bands for each worker: enough to keep all busy to the end
-_BANDS_PER_WORKER = 4
 #: bytes of frames, or of histograms, of a band that are worked on at once
 BAND_BYTES = 64 << 20
 #: frames that are read at a time
@@ -107,7 +105,8 @@ def cut_rows(ny: int, step: int, workers: int) -> list[tuple[int, int]]:
     Returns:
         First row and end of each band, from top to bottom.
     """
-    return equal_rows(ny, step * max(1, -(-ny // step) // (_BANDS_PER_WORKER * workers)))
+    # four for each: enough to keep all busy to the end
+    return equal_rows(ny, step * max(1, -(-ny // step) // (4 * workers)))
 
 
 def tile_bands(
@@ -139,10 +138,8 @@ def tile_bands(
     for tile in tiles:
         if tile.key in todo:
             groups.setdefault(tile.y0 // step, []).append(tile)
-    bands: list[Band | Tile] = [_band(group) for group in groups.values()]
+    bands: list[Band | Tile] = [
+        Band(min(t.y0 for t in group), max(t.y1 for t in group), tuple(t.key for t in group))
+        for group in groups.values()
+    ]
     return bands + [tile for tile in tiles if tile.key not in todo]
-
-
-def _band(tiles: Sequence[Tile]) -> Band:
-    y0, y1 = min(tile.y0 for tile in tiles), max(tile.y1 for tile in tiles)
-    return Band(y0, y1, tuple(tile.key for tile in tiles))

@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from pchem_pipeline.run.input_identity import known_identity
+from pydantic_core import to_jsonable_python
+
+from pchem_pipeline.run.input import known_identity
 from pchem_pipeline.run.model_versions import model_versions, with_digest
 
 if TYPE_CHECKING:
+    from pchem_pipeline.methods.settings import MethodsSettings
     from pchem_pipeline.run.stage import StageContext
+    from pchem_pipeline.store.run_store import RunStore
 
 
 def input_content(context: StageContext) -> dict[str, Any]:
@@ -70,23 +74,67 @@ def integration_time(context: StageContext) -> dict[str, Any]:
 
 def verdict(context: StageContext) -> dict[str, str] | None:
     """Return what the report depends on beside its upstream stages: a verdict, a comparison of methods."""
-    from pchem_pipeline.stages.discrepancy.result import discrepancy_state
-
-    state = discrepancy_state(context.store)
+    state, records = discrepancy_state(context.store), context.store.records
     found = {} if state is None else {"discrepancy": state}
-    compared = context.store.records.known("methods")
+    compared = records.known("methods")
     if compared is not None and compared.finished:
         found["methods"] = f"{compared.fingerprint[:8]}, {compared.started}"
     return found or None
 
 
-def other_samples(context: StageContext) -> dict[str, Any]:
-    """Return which other runs join a comparison of methods, their state, and what the command line chose."""
-    from pchem_pipeline.stages.methods import inputs
+def discrepancy_state(store: RunStore) -> str | None:
+    """Return in words which verdict a run has, None without one that can be read.
 
-    given = inputs.chosen_settings(context)
-    content = {**adc_limits(context), "with_runs": inputs.other_samples(context)}
-    return {**content, "chosen": given} if given else content
+    It changes whenever the verdict was redone.
+    """
+    from pchem_pipeline.base.errors import StoreError
+    from pchem_pipeline.discrepancy.verdict import read_verdict
+
+    try:
+        found = read_verdict(store.path)
+    except StoreError:  # the stage that wrote it is stale
+        return None
+    if found is None:
+        return None
+    record = store.records.known("discrepancy")
+    when = f" ({record.fingerprint[:8]}, {record.started})" if record is not None else ""
+    return f"{found.verdict}{when}"
+
+
+def methods_settings(context: StageContext) -> MethodsSettings:
+    """Return the settings of a comparison of methods, those of the command line in place of the section's."""
+    section = context.config.methods
+    return type(section).model_validate({**section.model_dump(), **_chosen(context)})
+
+
+def _chosen(context: StageContext) -> dict[str, Any]:
+    """Return what the command line chooses, as JSON data; unasked, what it chose for the last result.
+
+    The result of a command with ``--pixels`` is thereby up to date until another one is asked for, whatever
+    the YAML says.
+    """
+    if context.options.settings is not None:
+        chosen: dict[str, Any] = to_jsonable_python(dict(context.options.settings))
+        return chosen
+    record = context.store.records.known("methods")
+    kept = {} if record is None else record.content.get("input") or {}
+    return dict(kept.get("chosen", {}))
+
+
+def other_samples(context: StageContext) -> dict[str, Any]:
+    """Return which histograms of other runs join a comparison of methods, and what the command line chose."""
+    from pchem_pipeline.base.errors import StoreError
+    from pchem_pipeline.store.run_store import RunStore
+
+    found: dict[str, Any] = {}
+    for name in methods_settings(context).with_runs:
+        try:
+            record = RunStore.open(context.base_dir / name).records.read("histogram")
+        except StoreError:
+            record = None
+        found[name] = None if record is None else record.fingerprint
+    given = _chosen(context)
+    return {**adc_limits(context), "with_runs": found, **({"chosen": given} if given else {})}
 
 
 def search_start(context: StageContext) -> dict[str, Any]:

@@ -9,16 +9,15 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pchem_pipeline.frames.first_look import limits_in
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.open import open_frames
-from pchem_pipeline.run.input_identity import keep_ingested, known_identity, shortened
+from pchem_pipeline.run.input import keep_ingested, listed_identity
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, StageContext, Task, nothing_left
 from pchem_pipeline.stages.samples import check_samples, sample_sensor
@@ -51,11 +50,6 @@ class CopyUnit:
         return f"frames-{self.t0}-{self.t1 - 1}-rows-{self.y0}-{self.y1 - 1}"
 
 
-def frames_tile(reader: FrameReader, unit: CopyUnit) -> NDArray[Any]:
-    """Return the frames of a unit (frame, y, x)."""
-    return reader.read(unit.t0, unit.t1, unit.y0, unit.y1)
-
-
 def run(context: StageContext) -> None:
     """Record the input, and copy the frames if ``input.mode`` says so.
 
@@ -82,7 +76,7 @@ def run(context: StageContext) -> None:
         (context.note if reader.integration_time is None else context.reporter.info)(reader.time_words)
     if message := reader.report.message():
         context.note(message)
-    sensor_of(reader, context, shortened(known_identity(context))).write(context.store)
+    sensor_of(reader, context, listed_identity(context)).write(context.store)
     if reader.excluded is not None:
         context.create("frames/excluded", lengths=dict(zip(("y", "x"), reader.shape[1:], strict=True)))
         context.store.write("frames/excluded", (slice(None),) * 2, reader.excluded.astype(np.uint8))
@@ -167,9 +161,9 @@ def _copy(unit: CopyUnit, store: RunStore, *, reader: FrameReader) -> None:
     """Read the frames of a unit and write them into the store, a row of chunks at a time."""
     rows = store.array("frames/dn").chunks[1]
     for y in range(unit.y0, unit.y1, rows):
-        part = replace(unit, y0=y, y1=min(y + rows, unit.y1))
-        region = (slice(part.t0, part.t1), slice(part.y0, part.y1), slice(None))
-        store.write("frames/dn", region, frames_tile(reader, part))
+        end = min(y + rows, unit.y1)
+        region = (slice(unit.t0, unit.t1), slice(y, end), slice(None))
+        store.write("frames/dn", region, reader.read(unit.t0, unit.t1, y, end))
 
 
 def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:
@@ -208,7 +202,7 @@ def _record_histograms(context: StageContext) -> None:
         seen_limits=limits_in(given.counts, given.origin),
         integration_time=None,
         mode="reference",
-        identity=shortened(known_identity(context)),
+        identity=listed_identity(context),
         names=given.names,
         reader="histogram",
     ).write(context.store)

@@ -31,15 +31,8 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
 
-_OF_FIT = ("correlation", "fit_status", "likelihood_gap")
-_RESIDUALS = ("linearity_residual", "linearity_residual_stderr", "linearity_chi2", "linearity_p")
-_SUMMARISED = (*PARAMETERS, "read_noise_e", "analog_read_noise_e")
-#: of the arrays of a tile that are read and made
-_PIXEL_BYTES = 80 * 8
 #: Why there is no charge rate.
 NO_TIME = "unknown integration time: no charge rate. Set input.integration_time (--integration-time), s"
-#: Relative; times are written with few digits.
-_SAME_TIME = 1e-3
 #: Where the width of the law alone tells the number of electrons, and the window cuts it, H has no error.
 _CUT = int(FitStatus.BIAS_AMBIGUOUS | FitStatus.OUTSIDE_WINDOW)
 
@@ -49,7 +42,7 @@ def _tell_time(context: StageContext) -> None:
     time, stated = context.sensor.integration_time, SensorInfo.read(context.store).integration_time
     if time is None:
         context.note(NO_TIME)
-    elif stated is not None and abs(time - stated) > _SAME_TIME * stated:
+    elif stated is not None and abs(time - stated) > 1e-3 * stated:
         context.note(f"integration time {time:g} s from input.integration_time; the files state {stated:g} s")
 
 
@@ -100,14 +93,15 @@ def run(context: StageContext) -> None:
     """
     time, line = context.sensor.integration_time, _line(context)
     of_time = (context.charge_rate,) if time is not None and line is None else ()
-    names = [*_SUMMARISED, *(of_time if line is None else line.names)]
+    names = [*PARAMETERS, "read_noise_e", "analog_read_noise_e", *(of_time if line is None else line.names)]
     context.create(*(f"maps/{name}" for each in names for name in (each, f"{each}_stderr")))
     ends = [path for each in (*INTERVALS, *of_time) for path in interval_names(each)]
     if context.store.has(f"fit/{ends[0]}"):
         context.create(*(f"maps/{name}" for name in ends))
     context.create("maps/quality", "maps/goodness_q")
     if line is not None:
-        context.create(*(f"samples/{name}" for name in _RESIDUALS), lengths={"sample": len(line.x)})
+        residuals = ("residual", "residual_stderr", "chi2", "p")
+        context.create(*(f"samples/linearity_{name}" for name in residuals), lengths={"sample": len(line.x)})
     elif not context.sensor.samples:
         _tell_time(context)
     task = functools.partial(
@@ -117,7 +111,8 @@ def run(context: StageContext) -> None:
         line=line,
         n_frames=None if context.sensor.samples else context.sensor.n_frames,
     )
-    context.run_units(context.tiles(), task, needs="fit", unit_bytes=context.tile_pixels * _PIXEL_BYTES)
+    held = context.tile_pixels * 80 * 8  # arrays that are read and made
+    context.run_units(context.tiles(), task, needs="fit", unit_bytes=held)
     _summarise(context, names)
 
 
@@ -146,7 +141,8 @@ def _do_tile(
     line: Line | None,
     n_frames: int | None,
 ) -> None:
-    needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS), *_OF_FIT]
+    needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS)]
+    needed += ["correlation", "fit_status", "likelihood_gap"]
     needed += [path for name in INTERVALS for path in interval_names(name) if store.has(f"fit/{path}")]
     fit = store.read_arrays("fit", needed, tile.region)
     store.write_arrays("maps", maps_tile(fit, integration_time, rate, n_frames), tile.region)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.frames.camera import shared_facts
-from pchem_pipeline.run.input_identity import LISTED_FILES
+from pchem_pipeline.run.input import LISTED_FILES
 from pchem_pipeline.run.sensor import Sample, SensorInfo
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.store.run_store import RunStore
@@ -116,30 +116,20 @@ def check_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
 def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
     """Compare a sample with those before it."""
     first = others[0]
-    if mine.sensor.shape != first.sensor.shape:
-        sizes = [f"{each.sensor.ny} x {each.sensor.nx}" for each in (mine, first)]
-        raise ConfigError(
-            f"{mine.where} has {sizes[0]} pixels, {first.where} {sizes[1]}; "
-            "all samples must show the same region of one sensor"
-        )
-    depths = [each.sensor.bit_depth for each in (mine, first)]
-    if None not in depths and depths[0] != depths[1]:
-        raise ConfigError(
-            f"{mine.where} has {depths[0]} bits, {first.where} {depths[1]}; all samples must come from one "
-            "sensor with the same settings"
-        )
-    cameras = [each.sensor.camera.serial for each in (mine, first)]
-    if None not in cameras and cameras[0] != cameras[1]:
-        raise ConfigError(
-            f"{mine.where} has camera serial number {cameras[0]}, {first.where} {cameras[1]}; all samples "
-            "must come from one sensor"
-        )
-    regions = [each.target.config.input.roi for each in (mine, first)]
-    if regions[0] != regions[1]:
-        raise ConfigError(
-            f"{mine.where} is cropped to {regions[0]} (input.roi), {first.where} to {regions[1]}; "
-            "all samples must show the same region of one sensor"
-        )
+    here, there = mine.sensor, first.sensor
+    sizes = [f"{each.ny} x {each.nx}" for each in (here, there)]
+    regions = [str(each.target.config.input.roi) for each in (mine, first)]
+    same_region = "all samples must show the same region of one sensor"
+    same_sensor = "all samples must come from one sensor"
+    for facts, words, others_words, rule in (
+        (sizes, "has {} pixels", "{}", same_region),
+        ((here.bit_depth, there.bit_depth), "has {} bits", "{}", f"{same_sensor} with the same settings"),
+        ((here.camera.serial, there.camera.serial), "has camera serial number {}", "{}", same_sensor),
+        (regions, "is cropped to {} (input.roi)", "to {}", same_region),
+    ):
+        if None not in facts and facts[0] != facts[1]:
+            found = f"{mine.where} {words.format(facts[0])}, {first.where} {others_words.format(facts[1])}"
+            raise ConfigError(f"{found}; {rule}")
     for other in others:
         if mine.shares_frames(other):
             raise ConfigError(f"{mine.where} has the same frames as {other.where}; list each sample once")

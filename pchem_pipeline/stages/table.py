@@ -1,8 +1,7 @@
-"""The table of stages: what each needs, reads and writes, which settings decide it, and what does it.
+"""The table of stages: what each needs and writes, which settings decide it, and what does it.
 
 The runner, the session and the command line know the stages from here only. A new stage is a row and a module
-with a pure ``*_tile`` function and ``run(context)``. Nothing that computes is imported here, so that ``pchem
-status`` answers at once.
+with ``run(context)``. Nothing that computes is imported here, so that ``pchem status`` answers at once.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from pchem_pipeline.run.declaration import SinglePass, Stage
+from pchem_pipeline.run.declaration import Stage
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
@@ -37,8 +36,6 @@ _INPUT_SETTINGS = (
 
 _LINE = ("linearity_residual", "linearity_residual_stderr", "linearity_chi2", "linearity_p")
 
-_SINGLE_PASS = SinglePass(("ingest", "histogram"), f"{_HERE}.histogram.single_pass:count_in_one_pass")
-
 
 _ALL = (
     Stage(
@@ -46,7 +43,6 @@ _ALL = (
         version=1,
         upstream=(),
         settings=("simulate",),
-        reads=(),
         writes=("truth",),
         run=f"{_HERE}.simulate:run",
         identity=f"{_HERE}.simulate:scene_identity",
@@ -59,13 +55,11 @@ _ALL = (
         upstream=(),
         # not files: their content counts; not integration_time: it changes no frame
         settings=tuple(f"input.{name}" for name in _INPUT_SETTINGS),
-        reads=(),
         writes=("frames",),
         run=f"{_HERE}.ingest:run",
         identity=f"{_HERE}.identities:input_content",
         follows=("simulate",),
         reads_input=True,
-        single_pass=_SINGLE_PASS,
     ),
     Stage(
         "histogram",
@@ -79,9 +73,9 @@ _ALL = (
             "histogram.summaries",
             "run.tile",
         ),
-        reads=("frames",),
         writes=("histogram", "summary"),
         run=f"{_HERE}.histogram.histogram:run",
+        single_pass=f"{_HERE}.histogram.single_pass:count_in_one_pass",
         summary="Make the histogram of each pixel, and sums in time and space.",
         plan=f"{_HERE}.histogram.dry_run:plan_lines",
     ),
@@ -90,7 +84,6 @@ _ALL = (
         version=9,
         upstream=("histogram",),
         settings=("fit", "run.tile"),
-        reads=("frames/excluded", *(f"histogram/{name}" for name in ("counts", "origin", "under", "over"))),
         writes=("fit", "samples"),
         run=f"{_HERE}.fit.fit:run",
         identity=f"{_HERE}.identities:fit_inputs",
@@ -102,7 +95,6 @@ _ALL = (
         version=5,
         upstream=("fit",),
         settings=("maps", "run.tile"),
-        reads=("fit", "samples"),
         writes=("maps", *(f"samples/{name}" for name in _LINE)),
         run=f"{_HERE}.maps:run",
         identity=f"{_HERE}.identities:integration_time",
@@ -113,7 +105,6 @@ _ALL = (
         version=4,
         upstream=("histogram", "fit"),
         settings=("ensemble", "run.tile"),
-        reads=("frames", "histogram", "fit", "truth"),
         writes=("ensemble", "ensemble_tiles"),
         run=f"{_HERE}.ensemble.ensemble:run",
         summary="Predict the ensemble from the maps and compare it with the data.",
@@ -124,7 +115,6 @@ _ALL = (
         version=5,
         upstream=("histogram", "fit", "maps", "ensemble"),
         settings=("report", "maps", "run.title", "run.allowed_failed_pixels"),
-        reads=("histogram", "summary", "fit", "maps", "ensemble", "discrepancy", "samples", "truth"),
         writes=(),
         run=f"{_HERE}.report.report:run",
         files=("report.html", "report.json", "discrepancy.html"),
@@ -136,9 +126,8 @@ _ALL = (
         version=1,
         upstream=("ingest", "fit"),
         settings=("run.tile",),
-        reads=("frames", "fit"),
         writes=("electrons",),
-        run=f"{_HERE}.electrons.electrons:run",
+        run=f"{_HERE}.electrons:run",
         summary="Write the electron number of each sample into the store.",
         on_demand=True,
     ),
@@ -147,7 +136,6 @@ _ALL = (
         version=11,
         upstream=("ingest",),
         settings=("discrepancy",),
-        reads=("frames", "summary", "histogram", "fit"),
         writes=("discrepancy",),
         run=f"{_HERE}.discrepancy.discrepancy:run",
         files=("discrepancy.json",),
@@ -160,9 +148,8 @@ _ALL = (
         version=1,
         upstream=("histogram", "fit"),
         settings=("methods",),
-        reads=("histogram", "fit", "truth"),
         writes=("methods",),
-        run=f"{_HERE}.methods.methods:run",
+        run=f"{_HERE}.methods:run",
         files=("methods.json",),
         identity=f"{_HERE}.identities:other_samples",
         on_demand=True,

@@ -18,6 +18,9 @@ from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.remote_path import RemotePath
 
+#: File with the description of a group or an array.
+DESCRIPTION = "zarr.json"
+
 _CURES = {
     errno.ENOSPC: "the disk is full: free space and run again, finished tiles are kept",
     errno.EDQUOT: "the disk quota is exhausted: free space and run again, finished tiles are kept",
@@ -192,11 +195,6 @@ def link_out_of(folder: Path) -> Path | None:
     return None
 
 
-def canonical_json(value: Any) -> bytes:
-    """Return the one JSON text of a value: sorted keys, no spaces, no NaN."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-
-
 def write_json(path: Path, value: Any) -> None:
     """Write a value as indented JSON, atomically; see `write_atomic`."""
     write_atomic(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
@@ -289,7 +287,7 @@ def with_digest(content: dict[str, Any], *, inside: bool = False) -> dict[str, A
     content = json.loads(json.dumps(content))  # as it will be read: keys are text
     holder = content.setdefault("attributes", {}) if inside else content
     holder.pop(_DIGEST, None)
-    holder[_DIGEST] = _digest(content)
+    holder[_DIGEST] = fingerprint_of(content)
     return content
 
 
@@ -303,7 +301,7 @@ def checked(data: bytes, path: Path, cure: str, *, inside: bool = False) -> tupl
         content = json.loads(data)
         holder = content.get("attributes", {}) if inside else content
         digest = holder.pop(_DIGEST, None)
-        same = digest is None or digest == _digest(content)
+        same = digest is None or digest == fingerprint_of(content)
     except (ValueError, RecursionError, AttributeError, TypeError) as error:
         raise StoreError(f"{path} is damaged ({error}); {cure}") from error
     if not same:
@@ -311,5 +309,6 @@ def checked(data: bytes, path: Path, cure: str, *, inside: bool = False) -> tupl
     return content, digest is not None
 
 
-def _digest(content: dict[str, Any]) -> str:
+def fingerprint_of(content: dict[str, Any]) -> str:
+    """Return the SHA-256 of the one JSON text of ``content``: sorted keys, no spaces."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

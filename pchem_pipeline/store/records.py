@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import time
 from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
@@ -13,7 +12,6 @@ from typing import Any
 
 from pchem_pipeline.base.errors import LockedError, StoreError, quoted
 from pchem_pipeline.store.files import (
-    canonical_json,
     read_record,
     remove_files,
     remove_folder,
@@ -62,11 +60,6 @@ def check_work(path: Path) -> None:
     if record is None or record.fingerprint != work.fingerprint:
         raise LockedError(f"{path}: a later pchem command has taken over; this one stops writing")
     work.looked = time.monotonic()
-
-
-def fingerprint_of(content: dict[str, Any]) -> str:
-    """Return the SHA-256 of the canonical JSON of ``content``."""
-    return hashlib.sha256(canonical_json(content)).hexdigest()
 
 
 @dataclass(frozen=True)

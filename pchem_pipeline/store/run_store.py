@@ -34,6 +34,7 @@ from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
 from pchem_pipeline.base.variables import variable_at
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.files import (
+    DESCRIPTION,
     cure_of,
     link_out_of,
     remove_files,
@@ -52,7 +53,6 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 1
 
 _PRIVATE = ".pchem"
-DESCRIPTION = "zarr.json"
 _DIGEST_LINE = "# sha256 of the rest: "
 #: what zarr and its codecs raise over wrong content
 _DAMAGE = (ValueError, RuntimeError, TypeError, AttributeError, AssertionError, IndexError)

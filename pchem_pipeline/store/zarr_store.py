@@ -19,10 +19,8 @@ from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.store import disk
-from pchem_pipeline.store.files import checked, cure_of, with_digest, write_atomic
+from pchem_pipeline.store.files import DESCRIPTION, checked, cure_of, with_digest, write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
-
-_DESCRIPTION = "zarr.json"
 
 #: codecs that only turn bytes into numbers; others (pickle, ...) may run code of whoever wrote them
 _PLAIN = frozenset(
@@ -47,7 +45,7 @@ class DiskStore(LocalStore):
         self._check_writable()
         path = self.root / key
         # the root must not be lost, nor an older description with the new one; a new array may be
-        described = path.name == _DESCRIPTION and (key == _DESCRIPTION or path.exists())
+        described = path.name == DESCRIPTION and (key == DESCRIPTION or path.exists())
         write_atomic(path, value.as_numpy_array().data, sync=described)
 
     async def delete(self, key: str) -> None:
@@ -85,12 +83,12 @@ class CheckedStore(WrapperStore[Store]):
             StoreError: a chunk is missing, or a description was changed.
         """
         found = await self._store.get(key, prototype, byte_range)
-        if key.endswith(_DESCRIPTION) and found is not None:
+        if key.endswith(DESCRIPTION) and found is not None:
             content, _ = self._description(key, found)
             return prototype.buffer.from_bytes(json.dumps(content).encode())
         array, chunk, _ = key.partition("/c/")
         if found is None and chunk and not self._begins:
-            place = f"{array}/{_DESCRIPTION}"
+            place = f"{array}/{DESCRIPTION}"
             description = await self._store.get(place, default_buffer_prototype())
             if description is not None and self._description(place, description)[1]:
                 raise StoreError(
@@ -103,12 +101,12 @@ class CheckedStore(WrapperStore[Store]):
         """Return a description without its digest, and whether it had one."""
         path = self._path / key
         return checked(
-            found.to_bytes(), path, cure_of(self._path, key.removesuffix(_DESCRIPTION)), inside=True
+            found.to_bytes(), path, cure_of(self._path, key.removesuffix(DESCRIPTION)), inside=True
         )
 
     async def set(self, key: str, value: Buffer) -> None:
         """Store a value, a description with its digest."""
-        if key.endswith(_DESCRIPTION):
+        if key.endswith(DESCRIPTION):
             content = with_digest(json.loads(value.to_bytes()), inside=True)
             value = type(value).from_bytes(json.dumps(content, indent=2).encode())
         await self._store.set(key, value)

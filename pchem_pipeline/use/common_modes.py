@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect, SharedOffset
 
 _AXES = ("frame", "row", "column")
-_LEAST_SCENE = 0.02  # e-
-_LEAST_INFORMATION = 0.05  # of that of a sample whose electron number is known
-_ROUNDS, _PRECISION = 5, 1e-6  # expansions in the offsets; relative, of their solution
 
 
 @dataclass(frozen=True)
@@ -129,7 +126,7 @@ def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
         calibration: of these pixels.
     """
     signal = (mean - calibration.bias) * calibration.conversion_gain
-    return np.where(calibration.usable, np.maximum(signal, _LEAST_SCENE), np.nan)
+    return np.where(calibration.usable, np.maximum(signal, 0.02), np.nan)
 
 
 @dataclass(frozen=True)
@@ -208,7 +205,7 @@ class _Design:
         curvature = LinearOperator(
             (size, size), lambda z: z + self.sums(form[1] * self.offsets(*self.unpacked(z))), dtype=float
         )
-        return np.asarray(cg(curvature, self.sums(form[0]), x0=near, rtol=_PRECISION)[0])
+        return np.asarray(cg(curvature, self.sums(form[0]), x0=near, rtol=1e-6)[0])
 
     def left(self, weight: FloatArray) -> FloatArray:
         """Return the variance of a sample's offset that stays unknown, DN^2, shape (part,)."""
@@ -252,14 +249,14 @@ def estimate_offsets(
         weight = np.nan_to_num(1.0 / (known * step**2 + sigma**2))
         form = np.stack([weight * np.nan_to_num(frame - calibration.bias - known * step), weight])
         z = design.top(form, np.zeros_like(design.sums(weight)))
-        for _ in range(_ROUNDS - 1):
+        for _ in range(4):
             offset = design.offsets(*design.unpacked(z))
             given = pcd_posterior(
                 frame - calibration.bias - offset, known, calibration.conversion_gain, 0.0, sigma
             )
             # what is left open of the electron number takes from what a sample tells of its offset
             open_part = (given.ee - given.e**2) / sigma**2
-            information = np.maximum(1.0 - open_part, _LEAST_INFORMATION) / sigma**2
+            information = np.maximum(1.0 - open_part, 0.05) / sigma**2
             score = given.e / sigma**2 + information * offset  # of the offset itself, not of its change
             form = np.nan_to_num(np.stack([score, information]))
             z = design.top(form, z)

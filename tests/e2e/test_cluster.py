@@ -13,7 +13,7 @@ from helpers.commands import assert_same_results
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError
 from pchem_pipeline.compute import cluster
-from pchem_pipeline.compute.executor import Notices, make_executor
+from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.run.signals import InterruptedRunError
 from pchem_pipeline.store.run_store import RunStore
@@ -121,7 +121,7 @@ def test_a_scheduler_without_workers_is_said_and_given_up(processes):
     with pytest.raises(
         IncompleteRunError, match=r"had no worker for 1 s \(compute.wait_for_workers\)"
     ) as caught:
-        make_executor(settings, Notices(heard.lines.append, heard.check))
+        make_executor(settings, heard.lines.append, heard.check)
     assert heard.lines == [f"waiting for workers of the dask scheduler {file}"]
     assert heard.asked > 3
     assert str(file) in str(caught.value)
@@ -132,7 +132,7 @@ def test_workers_that_all_leave_are_waited_for_and_given_up(processes, tmp_path)
     file, (_, *workers) = processes
     settings = ComputeSettings(backend="distributed", scheduler=str(file), wait_for_workers=3)
     heard = Counted()
-    executor = make_executor(settings, Notices(heard.lines.append, heard.check))
+    executor = make_executor(settings, heard.lines.append, heard.check)
     executor._client.wait_for_workers(2, timeout=60)
     found = []
 
@@ -160,13 +160,14 @@ def test_a_signal_ends_the_wait_for_workers(processes):
         raise InterruptedRunError(signal.SIGTERM)
 
     with pytest.raises(InterruptedRunError, match="stopped by SIGTERM"):
-        make_executor(ComputeSettings(backend="distributed", scheduler=str(file)), Notices(check=check))
+        make_executor(ComputeSettings(backend="distributed", scheduler=str(file)), check=check)
 
 
 def test_paused_workers_are_not_waited_for_forever(monkeypatch):
     lines = []
     executor = cluster.DistributedExecutor.__new__(cluster.DistributedExecutor)
-    executor._name, executor._seconds, executor._notices = "the dask scheduler x", 0.05, Notices(lines.append)
+    executor._name, executor._seconds = "the dask scheduler x", 0.05
+    executor._say, executor._check = lines.append, lambda: None
     executor._since, executor._said = None, False
     workers = [{"status": "paused", "memory_limit": 300 << 20}] * 2
     monkeypatch.setattr(executor, "_workers", lambda: workers)

@@ -14,7 +14,7 @@ from helpers.report_material import report_data
 
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
 from pchem_pipeline.commands.compare.compare import compare_runs, comparison_of
-from pchem_pipeline.commands.compare.history import HistorySettings, history_csv
+from pchem_pipeline.commands.compare.history import history_csv
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.figures.compare import history_figures
@@ -178,7 +178,8 @@ def test_the_history_of_a_camera(shell, copies, finished):
         compare_runs(
             [shell.folder / f"{name}.zarr" for name in "abc"],
             shell.folder / "history",
-            history=HistorySettings(labels, rate=0.05),
+            labels=labels,
+            rate=0.05,
             progress="off",
         )
     with (shell.folder / "history" / "history.csv").open() as file:
@@ -218,7 +219,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
                 [shell.folder / "a.zarr", shell.folder / "b.zarr"],
                 1e-12,
                 Reporter("off"),
-                HistorySettings(**each),
+                **each,
             )
 
 
@@ -230,7 +231,7 @@ def test_the_history_has_date_and_temperature_of_the_files(shell, copies, finish
         sensor = SensorInfo.read(store)
         replace(sensor, camera=CameraFacts("Camera <X>", "7", temperature, taken)).write(store)
     paths = [shell.folder / "a.zarr", shell.folder / "b.zarr"]
-    found = comparison_of(paths, 1e-12, Reporter("off"), HistorySettings(["-20 °C", "-5.5 °C"]))
+    found = comparison_of(paths, 1e-12, Reporter("off"), ["-20 °C", "-5.5 °C"])
     assert [row.place for row in found.history] == [-20.0, -5.5]
     assert found.history[0].date.startswith("2025-06-15T")
     text = history_csv(found.history).splitlines()

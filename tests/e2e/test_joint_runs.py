@@ -10,7 +10,7 @@ from helpers.commands import Shell
 from helpers.places import ROOT
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
-from pchem_pipeline.commands.joint import find_joint, run_joint
+from pchem_pipeline.commands.new_run import find_joint, run_new
 from pchem_pipeline.commands.notebook import open_run
 from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.discrepancy.verdict import read_verdict
@@ -18,10 +18,11 @@ from pchem_pipeline.run.stage import Options
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status, up_to
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
-from pchem_pipeline.stages.table import pipeline_of
+from pchem_pipeline.stages.table import pipeline, pipeline_of
 from pchem_pipeline.store.run_store import RunStore
 
 QUIET = Command(Options(), quiet=True, progress="off")
+PIPELINE = pipeline()[1:]
 
 CAMERA = """
 run: {{store: {name}.zarr, tile: 8}}
@@ -137,7 +138,7 @@ def test_nothing_is_done_twice_and_tiles_do_not_matter(joint):
     target, is_new = find_joint([joint / "dark.zarr"])
     assert not is_new
     record = store.records.read("fit")
-    run_joint(target, QUIET, print)
+    run_stages(target, pipeline_of(target.config), QUIET)
     assert store.records.read("fit") == record
     four = [("dark_1s.zarr", ""), ("dark_2s.zarr", ""), ("dark_5s.zarr", ""), ("bias.zarr", "bias: true")]
     other = fit(write(joint, "wide", four, tile=16))
@@ -269,7 +270,7 @@ def test_samples_that_do_not_belong_together_get_one_line(joint, samples, settin
         (joint / f"{name}.yaml").write_text(f"run: {{store: {name}.zarr, tile: 8}}\n{text}\n")
     path = write(joint, "bad", samples, **settings)
     with pytest.raises(PchEmError) as caught:
-        run_joint(find_joint([path])[0], QUIET, print)
+        run_stages(find_joint([path])[0], PIPELINE, QUIET)
     message = str(caught.value)
     assert words in message
     assert "\n" not in message
@@ -279,13 +280,13 @@ def test_samples_that_do_not_belong_together_get_one_line(joint, samples, settin
 def test_a_refused_list_leaves_its_name_free(joint):
     store = joint / "refused.zarr"
     for runs in (["dark_2s.yaml", "dark_1s.yaml"], ["dark_1s.yaml", "dark_1s.zarr"]):
-        target, is_new = find_joint([joint / run for run in runs], store=store)
+        target, _ = find_joint([joint / run for run in runs], store=store)
         with pytest.raises(ConfigError, match=r"is not above|is the run of"):
-            run_joint(target, QUIET, print, is_new=is_new)
+            run_new(target, PIPELINE, QUIET, print)
         assert not store.with_suffix(".yaml").exists()
     kept = write(joint, "kept", [("dark_2s.zarr", ""), ("dark_1s.zarr", "")])
     with pytest.raises(ConfigError):
-        run_joint(find_joint([kept])[0], QUIET, print)
+        run_new(find_joint([kept])[0], PIPELINE, QUIET, print)
     assert kept.exists()
 
 
@@ -301,7 +302,7 @@ def test_what_is_no_joint_fit_says_so(joint):
     with pytest.raises(ConfigError, match=r"--against: only with runs; .*input\.against"):
         find_joint([joint / "dark.yaml"], against="none")
     runs = [joint / "dark_1s.yaml", joint / "dark_2s.yaml"]
-    target, _ = find_joint(runs, store=joint / "unordered.zarr", against="none", write=False)
+    target, _ = find_joint(runs, store=joint / "unordered.zarr", against="none")
     assert target.config.input.against == "none"
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.commands import Shell
 
-from pchem_pipeline.methods.registry import methods
+from pchem_pipeline.methods.base import methods
 from pchem_pipeline.store.run_store import RunStore
 
 

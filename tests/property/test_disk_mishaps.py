@@ -58,7 +58,7 @@ def page_run(context):
 
 
 def stage(name, upstream, settings, writes, run):
-    return Stage(name, 1, upstream, settings, (), writes, f"{__name__}:{run.__name__}")
+    return Stage(name, 1, upstream, settings, writes, f"{__name__}:{run.__name__}")
 
 
 STAGES = {

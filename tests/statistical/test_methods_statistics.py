@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from helpers.plain_law import pcd_mass
 
-from pchem_pipeline.methods.base import PixelSamples, Sample, Settings
+from pchem_pipeline.methods.base import PixelSamples, Sample, methods
 from pchem_pipeline.methods.photon_transfer import gain_variance
-from pchem_pipeline.methods.registry import methods
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,
@@ -30,7 +30,7 @@ def pixels(exposures, noise, n_pixels, n_frames=N, seed=1, gain=GAIN):
 
 def log_errors(name, given, truth, settings=None):
     """ln(g / g_true) of the pixels with an answer."""
-    found = methods()[name].estimate(given, settings or Settings()).parameters
+    found = methods()[name].estimate(given, settings or MethodsSettings()).parameters
     errors = np.log(found[:, 1] / truth[:, 1])
     return errors[np.isfinite(errors)], found
 
@@ -84,7 +84,7 @@ def test_emva_gives_the_sensor_one_gain():
 @pytest.mark.parametrize(("exposure", "noise"), [(2.0, 0.3), (2.0, 0.6), (6.0, 0.4)])
 def test_likelihood_with_a_dark_sample_beats_photon_transfer_and_no_bound(exposure, noise):
     given, truth = pixels((exposure, 0.0), noise, 400)
-    errors, _ = log_errors("dark_and_bright_mle", given, truth, Settings(em_tolerance=1e-7))
+    errors, _ = log_errors("dark_and_bright_mle", given, truth, MethodsSettings(em_tolerance=1e-7))
     shared = N * (shared_information(exposure, noise) + shared_information(0.0, noise))
     bound = np.sqrt(inverse_information(shared)[0, 0])
     transfer = np.sqrt(gain_variance(exposure, 0.0, noise, N, N))
@@ -97,7 +97,7 @@ def test_likelihood_with_a_dark_sample_beats_photon_transfer_and_no_bound(exposu
 
 def test_plain_em_ends_at_the_maximum():
     given, truth = pixels((2.0,), 0.25, 200)
-    plain, _ = log_errors("plain_em", given, truth, Settings(em_tolerance=1e-9))
+    plain, _ = log_errors("plain_em", given, truth, MethodsSettings(em_tolerance=1e-9))
     full, _ = log_errors("pchem_em", given, truth)
     np.testing.assert_allclose(plain, full, atol=1e-5)
 
@@ -116,7 +116,7 @@ def test_peaks_give_gain_and_noise_where_they_are_resolved():
     limits = {}
     for noise in (0.2, 0.35, 0.45, 0.55):
         one = PixelSamples((expected_sample(2.0, noise),))
-        found = methods()["peak_valley"].estimate(one, Settings()).parameters[0]
+        found = methods()["peak_valley"].estimate(one, MethodsSettings()).parameters[0]
         limits[noise] = np.log(found[1] / truth[0, 1]), found[1] * found[3] / noise - 1, found[2]
     assert abs(limits[0.2][0]) < 2e-3
     assert abs(limits[0.2][1]) < 0.02

@@ -21,15 +21,14 @@ from pchem_pipeline.commands.apply.characterisation import (
     read_calibration,
     with_moments,
 )
-from pchem_pipeline.commands.apply.files import write_files
-from pchem_pipeline.commands.apply.finish import finish_maps
+from pchem_pipeline.commands.apply.finish import finish_maps, write_files
 from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
 from pchem_pipeline.commands.apply.source import (
     check_camera,
     check_level,
     limits_of,
     open_like_run,
-    share_cut,
+    some_of,
 )
 from pchem_pipeline.commands.apply.tasks import (
     N_SUMS,
@@ -38,18 +37,17 @@ from pchem_pipeline.commands.apply.tasks import (
     moments_piece,
     offsets_piece,
 )
-from pchem_pipeline.compute.executor import Notices, make_executor
+from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
-from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.effects.framework.compose import model_words
-from pchem_pipeline.run.compilation import announced
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.session import Command, with_overrides
-from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.files import fingerprint_of
+from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import local_path, place_of
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import equal_rows
@@ -67,16 +65,9 @@ _VERSION = 4
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
-#: Frames that tell the scene while offsets are found, and codes in a DN once they are taken away.
-_SCENE_FRAMES, _PARTS = 256, 4
 #: Share of the samples at a limit of the ADC beyond which offsets cannot be told: with 6 % of them the stated
 #: probabilities of electron numbers are as right as without, with 32 % they are 0.1 too high.
 _MOST_CUT = 0.2
-#: Frames that tell how wide the histograms are.
-_SEEN_FRAMES = 64
-#: Bytes that a code of a pixel takes while numbers are looked up.
-_BYTES_OF_CODE = 24
-_EXPOSURE = ("exposure", "exposure_stderr", "exposure_stderr_counting", "exposure_stderr_calibration")
 
 
 def apply_to_frames(
@@ -107,7 +98,7 @@ def apply_to_frames(
     reporter = Reporter(command.progress, quiet=command.quiet, log=command.log_json)
     with contextlib.ExitStack() as stack:
         stack.callback(reporter.close)
-        stack.enter_context(announced(reporter, STAGE, target.config.compute.max_memory))
+        stack.enter_context(reporter.compilation(STAGE, target.config.compute.max_memory))
         made = _make_job(run, target, files, wanted)
         output = place_of(output) if wanted.format == "zarr" else local_path(output)
         place = output if wanted.format == "zarr" else output.with_name(f".{output.name}.unfinished.zarr")
@@ -117,7 +108,7 @@ def apply_to_frames(
         store, fresh = _output_store(place, made.content, force=command.options.force)
         stack.enter_context(store.locked())
         stop = stack.enter_context(stop_on_signals())
-        executor = make_executor(target.config.compute, Notices(reporter.warning, stop.check))
+        executor = make_executor(target.config.compute, reporter.warning, stop.check)
         stack.callback(executor.close)
         context = StageContext(
             target.config, target.base_dir, store, executor, reporter, stop, stage=STAGE, fresh=fresh
@@ -159,12 +150,18 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
     sensor = SensorInfo.read(run)
     frames = open_like_run(target, sensor, files, wanted.dataset)
     limits = limits_of(frames, sensor)
-    modes, cut = _modes(run, wanted, sensor.shape), share_cut(frames, limits)
+    version = model_of(run, "fit")
+    modes = CommonModes()
+    if version is not None and wanted.remove:
+        modes = CommonModes.of_model(version.effects, sensor.shape)
+    some, cut = some_of(frames), 0.0
+    if limits is not None:
+        cut = float(np.mean((some <= limits[0]) | (some >= limits[1])))
     kept = ", ".join(modes.removed) if cut > _MOST_CUT else ""
     if kept:
         modes = CommonModes()
     calibration = read_calibration(run, limits=limits or (None, None), removed=modes.removed)
-    remarks = check_camera(frames, sensor) + check_level(frames, calibration)
+    remarks = check_camera(frames, sensor) + check_level(some, calibration, frames.paths[0])
     if kept:
         remarks.append(
             f"{kept} not subtracted: {100 * cut:.0f} % of the samples are at a limit of the ADC, which hides "
@@ -193,7 +190,6 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         depth=_chunks(frames.shape)[0],
         expected=numbers and overlap > 0,
     )
-    version = model_of(run, "fit")
     # outputs of versions that did not know it are gone on with
     settings = {name: value for name, value in asdict(wanted).items() if name != "dataset" or value}
     content = {
@@ -207,14 +203,6 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         "settings": {**settings, "kinds": list(wanted.kinds)},
     }
     return _Made(job, content, remarks, calibration, frames)
-
-
-def _modes(run: RunStore, wanted: ApplySettings, shape: tuple[int, int]) -> CommonModes:
-    """Return the offsets that the model of the run names, where they are to be removed."""
-    version = model_of(run, "fit")
-    if version is None or not wanted.remove:
-        return CommonModes()
-    return CommonModes.of_model(version.effects, shape)
 
 
 # -- the output ------------------------------------------------------------------------------------
@@ -343,8 +331,7 @@ def _rows_of_band(context: StageContext, job: Job, bytes_of_pixel: int) -> int:
     """Return the rows that a worker takes at a time: whole chunks."""
     _, ny, nx = job.source.shape
     rows = _chunks(job.source.shape)[1]
-    allowed = band_bytes(context.config, context.executor.workers, context.executor.memory_limit)
-    fitting = max(1, allowed // (bytes_of_pixel * nx * rows))
+    fitting = max(1, context.band_bytes // (bytes_of_pixel * nx * rows))
     shared = max(1, -(-ny // (rows * context.executor.workers)))  # one for each worker
     return rows * min(fitting, shared)
 
@@ -371,7 +358,8 @@ def _with_moments(context: StageContext, job: Job, made: _Made) -> tuple[Job, _M
 def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
     """Find the offsets of frames, rows and columns; return the job that takes them away."""
     n, ny, nx = job.source.shape
-    chosen = np.unique(np.linspace(0, n - 1, _SCENE_FRAMES).astype(int)).tolist()
+    # some frames tell the scene
+    chosen = np.unique(np.linspace(0, n - 1, 256).astype(int)).tolist()
     mean = sum(made.frames.read(t, t + 1)[0].astype(np.float64) for t in chosen) / len(chosen)
     job = replace(job, scene=scene_of(np.asarray(mean), made.calibration))
     parts = job.modes.parts
@@ -398,10 +386,10 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
     found = [summary for key, summary in done.items() if key.startswith("offsets-")]
     left = sum((np.array(each["left"]) for each in found), start=np.zeros(len(parts))) / n
     lift = int(np.ceil(max(float(each["largest"]) for each in found))) + 1 if found else 0
-    # codes are cut to parts of a DN: their own rounding is part of what is not known
-    variance = np.tensordot(left, parts, 1) + QUANTISATION_VARIANCE / _PARTS**2
+    # codes are cut to quarters of a DN: their own rounding is part of what is not known
+    variance = np.tensordot(left, parts, 1) + QUANTISATION_VARIANCE / 4**2
     reached = (any(each["reached"][0] for each in found), any(each["reached"][1] for each in found))
-    return replace(job, parts=_PARTS, lift=lift, offset_variance=variance, reached=reached)
+    return replace(job, parts=4, lift=lift, offset_variance=variance, reached=reached)
 
 
 def _counted(context: StageContext, job: Job, made: _Made) -> Job:
@@ -411,9 +399,11 @@ def _counted(context: StageContext, job: Job, made: _Made) -> Job:
 
     n, ny, _ = job.source.shape
     most = context.config.histogram.max_bins
-    bins = job.parts * bins_of(job.source, _SEEN_FRAMES, most // job.parts, _CHUNK_ROWS)
+    # the first 64 frames tell how wide the histograms are
+    bins = job.parts * bins_of(job.source, 64, most // job.parts, _CHUNK_ROWS)
     job = replace(job, bins=min(most, bins), window=min(job.window, n))
-    names = [f"applied/{name}" for name in _EXPOSURE] if "exposure" in job.kinds else []
+    ends = ("", "_stderr", "_stderr_counting", "_stderr_calibration")
+    names = [f"applied/exposure{end}" for end in ends] if "exposure" in job.kinds else []
     names += ["applied_parts/prior"] if job.learns_prior else []
     _create(context, job, "applied_parts/range", *names, lengths={"end": 2})
     bytes_of_pixel = 10 * job.bins + 2 * job.window * made.frames.dtype.itemsize + 200
@@ -447,7 +437,7 @@ def _converted(context: StageContext, job: Job) -> None:
     if "numbers" in job.kinds:
         ends = context.store.read("applied_parts/range")
         codes = int(np.ceil((ends[1] - ends[0] + 1).mean()))
-    bytes_of_pixel = job.depth * 24 + _BYTES_OF_CODE * codes + 400
+    bytes_of_pixel = 24 * (job.depth + codes) + 400
     step = _rows_of_band(context, job, bytes_of_pixel)
     # independent of the workers, so that the sums are, too
     rows = _chunks(job.source.shape)[1]

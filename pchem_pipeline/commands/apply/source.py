@@ -22,15 +22,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.settings import InputSettings
     from pchem_pipeline.run.target import Target
 
-#: Frames that are looked at before anything is done.
-_SEEN = 16
-#: Standard deviations of a sample below the bias at which the bias is another.
-_FAR_BELOW = 3.0
-#: Times the exposure of the characterisation beyond which a gain is extrapolated.
-_FAR_ABOVE = 30.0
-#: Kelvin between frames and characterisation beyond which offset and dark current are others.
-_OTHER_TEMPERATURE = 2.0
-
 
 def open_like_run(
     target: Target, sensor: SensorInfo, files: Sequence[str | Path], dataset: str | None = None
@@ -137,7 +128,7 @@ def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
         remarks.append(f"camera {here.name}, but {there.name} in the run")
     if here.temperature is not None and there.temperature is not None:
         warmer = here.temperature - there.temperature
-        if abs(warmer) > _OTHER_TEMPERATURE:
+        if abs(warmer) > 2.0:  # K: offset and dark current are others
             remarks.append(
                 f"sensor temperature {here.temperature:.4g} °C, but {there.temperature:.4g} °C in the "
                 "characterisation: offset, gain and hot pixels may differ; use a characterisation at the "
@@ -146,40 +137,33 @@ def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
     return remarks
 
 
-def share_cut(frames: FrameSequence, limits: tuple[int, int] | None) -> float:
-    """Return the share of the samples that lie at a limit of the ADC."""
-    if limits is None:
-        return 0.0
-    some = _some(frames)
-    return float(np.mean((some <= limits[0]) | (some >= limits[1])))
-
-
-def _some(frames: FrameSequence) -> NDArray[np.unsignedinteger[Any]]:
-    """Return frames spread over all, (frame, y, x), DN."""
-    chosen = np.unique(np.linspace(0, frames.shape[0] - 1, _SEEN).astype(int))
+def some_of(frames: FrameSequence) -> NDArray[np.unsignedinteger[Any]]:
+    """Return a few frames spread over all, (frame, y, x), DN."""
+    chosen = np.unique(np.linspace(0, frames.shape[0] - 1, 16).astype(int))
     return np.concatenate([frames.read(t, t + 1) for t in chosen.tolist()])
 
 
-def check_level(frames: FrameSequence, calibration: Calibration) -> list[str]:
+def check_level(some: NDArray[Any], calibration: Calibration, name: Path) -> list[str]:
     """Return remarks on a mean level that does not fit the characterisation; none where it does.
 
     Args:
-        frames: to be calibrated.
+        some: of the frames to be calibrated, (frame, y, x), DN.
         calibration: of all pixels.
+        name: of their first file.
 
     Raises:
         InputError: the mean lies so far below the bias that the frames are no frames of these pixels.
     """
-    mean = _some(frames).mean(axis=0, dtype=np.float64)
+    mean = some.mean(axis=0, dtype=np.float64)
     known = calibration.usable
     if not known.any():
         raise InputError("the run has no pixel with a good fit, so it cannot calibrate frames")
     above = (mean - calibration.bias)[known]
     sigma, gain = calibration.read_noise_dn[known], calibration.conversion_gain[known]
     level = float(np.median(above / sigma))
-    if level < -_FAR_BELOW:
+    if level < -3.0:  # standard deviations of a sample
         raise InputError(
-            f"{frames.paths[0]}: mean {-np.median(above):.1f} DN below the bias of the run: frames of "
+            f"{name}: mean {-np.median(above):.1f} DN below the bias of the run: frames of "
             "another sensor, region, offset or temperature"
         )
     signal, usual = float(np.median(above * gain)), float(np.median(calibration.quanta_exposure[known]))
@@ -189,7 +173,7 @@ def check_level(frames: FrameSequence, calibration: Calibration) -> list[str]:
             f"mean {-np.median(above):.2f} DN below the bias of the run: the offset has changed; use a "
             "characterisation at the same temperature"
         )
-    if signal > _FAR_ABOVE * max(usual, 0.1):
+    if signal > 30.0 * max(usual, 0.1):
         remarks.append(
             f"mean signal {signal:.3g} e-, but {usual:.3g} e- in the characterisation; the same gain is "
             "assumed"

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import string
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ChangedError, ConfigError
-from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
-from pchem_pipeline.commands.compare.arrays import compare_arrays
-from pchem_pipeline.commands.compare.history import (
-    HISTORY_CSV,
-    HistorySettings,
-    PixelStates,
-    history_csv,
-    history_rows,
-)
+from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS, VARIABLES
+from pchem_pipeline.commands.compare.history import PixelStates, history_csv, history_rows
 from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
 from pchem_pipeline.commands.figures import warn_if_old
 from pchem_pipeline.model.checks.run_differences import (
+    BlockDifference,
     CommonFit,
     common_fit_p,
+    compare_blocks,
     compare_maps,
     reasons_of_change,
 )
@@ -59,15 +56,13 @@ _ENSEMBLE = (
 )
 
 
-_BY_DATE = HistorySettings()
-
-
 def compare_runs(
     paths: Sequence[Path],
     folder: Path,
     *,
     tolerance: float = 1e-12,
-    history: HistorySettings = _BY_DATE,
+    labels: Sequence[str] = (),
+    rate: float = 0.01,
     progress: ProgressMode = "auto",
 ) -> list[Path]:
     """Compare runs with the first of them and write ``compare.html``, ``compare.json`` and ``history.csv``.
@@ -76,7 +71,9 @@ def compare_runs(
         paths: stores, or the YAML files that made them; two or more.
         folder: where to write; made if needed.
         tolerance: relative difference that counts as rounding, where the frames are the same.
-        history: labels of the runs, and when a pixel counts as moved.
+        labels: of the runs, in their order, such as setpoints, which the history draws them against by the
+            numbers that these begin with; none: the dates.
+        rate: false-discovery rate at which a pixel counts as moved since the first run.
         progress: auto | on | off.
 
     Returns:
@@ -88,9 +85,9 @@ def compare_runs(
         StoreError: a run has no maps, or the folder cannot be written.
     """
     reporter = Reporter(progress)
-    found = comparison_of(paths, tolerance, reporter, history)
+    found = comparison_of(paths, tolerance, reporter, labels, rate)
     page, numbers = render_comparison(found, draw_and_say(reporter, "figures"))
-    files = {COMPARE_PAGE: page, COMPARE_JSON: numbers, HISTORY_CSV: history_csv(found.history)}
+    files = {COMPARE_PAGE: page, COMPARE_JSON: numbers, "history.csv": history_csv(found.history)}
     for name, text in files.items():
         write_atomic(folder / name, text.encode())
     if found.changed:
@@ -103,15 +100,16 @@ def comparison_of(
     paths: Sequence[Path],
     tolerance: float,
     reporter: Reporter,
-    history: HistorySettings = _BY_DATE,
+    labels: Sequence[str] = (),
+    rate: float = 0.01,
 ) -> Comparison:
     """Return how the runs differ from the first of them; see :func:`compare_runs`."""
     if len(paths) < 2:
         raise ConfigError("compare: give two runs or more")
     if not 0 <= tolerance < 1:
         raise ConfigError(f"--tolerance {tolerance:g}: give a relative difference from 0 to below 1")
-    if not 0.0 < history.rate < 1.0:
-        raise ConfigError(f"--fdr {history.rate:g}: give a rate between 0 and 1, such as 0.01")
+    if not 0.0 < rate < 1.0:
+        raise ConfigError(f"--fdr {rate:g}: give a rate between 0 and 1, such as 0.01")
     targets = [find_run(path) for path in paths]
     stores = [with_maps(target.stored()) for target in targets]
     for target, store in zip(targets, stores, strict=True):
@@ -123,9 +121,9 @@ def comparison_of(
     ]
     runs = list(map(_facts, _letters(len(names)), names, stores, states))
     sides = list(zip(runs, targets, stores, states, strict=True))
-    pairs = [_pair(sides[0], side, tolerance, history.rate, reporter) for side in sides[1:]]
-    rows = history_rows(runs, stores, pairs, history, states)
-    return Comparison(runs, pairs, tolerance, rows, bool(history.labels), history.rate)
+    pairs = [_pair(sides[0], side, tolerance, rate, reporter) for side in sides[1:]]
+    rows = history_rows(runs, stores, pairs, labels, states)
+    return Comparison(runs, pairs, tolerance, rows, bool(labels), rate)
 
 
 def _letters(n: int) -> list[str]:
@@ -193,7 +191,7 @@ def _pair(first: _Side, second: _Side, tolerance: float, rate: float, reporter: 
         in_both = (name for name in MAPS if one_store.has(f"maps/{name}") and other_store.has(f"maps/{name}"))
         read = ((name, _value(one_store, name), _value(other_store, name)) for name in in_both)
         maps = compare_maps(read, good, same_data=same_data, rate=rate, confirm=confirm)
-    arrays = compare_arrays(one_store, other_store, tolerance, reporter) if same_data else []
+    arrays = _compared_arrays(one_store, other_store, tolerance, reporter) if same_data else []
     reasons = {} if same_data else {name: reasons_of_change(found) for name, found in maps.items()}
     words = _words(one, other, arrays, maps, reasons)
     new, gone = now.new_since(before, confirm), before.new_since(now, confirm)
@@ -260,3 +258,84 @@ def _array_words(row: ArrayRow) -> str:
         return row.why
     share = f"{count(row.n_beyond, 'value')} of {row.n_values:,} changed"
     return f"{share}, by up to {short(row.largest)}"
+
+
+# -- arrays, value by value ------------------------------------------------------------------------
+
+
+def _compared_arrays(one: RunStore, other: RunStore, tolerance: float, reporter: Reporter) -> list[ArrayRow]:
+    """Compare all arrays that either store has.
+
+    Args:
+        one: a run.
+        other: a run on the same frames.
+        tolerance: difference that counts as rounding, relative to the largest value of an array.
+        reporter: hears of each array.
+
+    Returns:
+        A row for each array, in the order of the registry.
+    """
+    # frames have the same digest, electrons follow from them and the maps, sums depend on the tiling
+    left_out = ("frames", "electrons", "ensemble_tiles")
+    names = [
+        name
+        for name, variable in VARIABLES.items()
+        if variable.group not in left_out and (one.has(name) or other.has(name))
+    ]
+    rows = []
+    with reporter.progress("compare", len(names), "array") as advance:
+        for name in names:
+            rows.append(_row(name, one, other, tolerance))
+            advance()
+    return rows
+
+
+def _row(name: str, one: RunStore, other: RunStore, tolerance: float) -> ArrayRow:
+    counts = name != "fit/n_iterations"  # of a computation, no result
+    here = one if one.has(name) else other
+    array = here.array(name)
+    dtype, shape = str(array.dtype), tuple(array.shape)
+    if not (one.has(name) and other.has(name)):
+        state: Any = "lost" if here is one else "new"
+        return ArrayRow(name, state, counts, dtype, shape)
+    if shape != tuple(other.array(name).shape):
+        why = f"shape {shape} before, {tuple(other.array(name).shape)} now"
+        return ArrayRow(name, "changed", counts, dtype, shape, why=why)
+    digests, scales = zip(*(_digest(store, name) for store in (one, other)), strict=True)
+    n_values = int(np.prod(shape))
+    if digests[0] == digests[1] and str(other.array(name).dtype) == dtype:
+        return ArrayRow(name, "identical", counts, dtype, shape, n_values, scale=scales[0], sha256=digests)
+    scale = max(scales)
+    found = BlockDifference(0, 0, 0, 0.0)
+    for a, b in zip(_blocks(one, name), _blocks(other, name), strict=True):
+        found += compare_blocks(a, b, scale=scale, tolerance=tolerance)
+    return ArrayRow(
+        name, "changed" if found.n_beyond else "equal", counts, dtype, shape, found.n_values,
+        found.n_different, found.n_beyond, found.largest, scale, digests,
+    )  # fmt: skip
+
+
+def _digest(store: RunStore, name: str) -> tuple[str, float]:
+    """Return the SHA-256 of an array's values in C order, and their largest absolute value."""
+    digest, scale = hashlib.sha256(), 0.0
+    for block in _blocks(store, name):
+        digest.update(np.ascontiguousarray(block).data)
+        if block.size:
+            size = np.abs(block.astype(np.float64, copy=False))
+            scale = max(scale, float(np.max(size, initial=0.0, where=np.isfinite(size))))
+    return digest.hexdigest(), scale
+
+
+def _blocks(store: RunStore, name: str) -> Iterator[NDArray[Any]]:
+    """Read an array in blocks along its first axis, the same ones for every store."""
+    array = store.array(name)
+    shape = tuple(array.shape)
+    if not shape:
+        yield store.read(name)
+        return
+    row_bytes = max(1, int(np.prod(shape[1:])) * array.dtype.itemsize)
+    chunk = int(array.chunks[0])
+    rows = max(1, (1 << 25) // row_bytes)
+    rows = max(rows // chunk, 1) * chunk if chunk <= 4 * rows else rows
+    for start in range(0, shape[0], rows):
+        yield store.read(name, (slice(start, min(start + rows, shape[0])),))

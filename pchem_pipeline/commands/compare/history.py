@@ -25,31 +25,12 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.run_store import RunStore
 
-#: Name of the file.
-HISTORY_CSV = "history.csv"
-
-_NUMBER = re.compile(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)")
-
-
-@dataclass(frozen=True)
-class HistorySettings:
-    """What a history shows.
-
-    Attributes:
-        labels: of the runs, in their order, such as setpoints, which they are drawn against by the numbers
-            that these begin with; none: the dates.
-        rate: false-discovery rate at which a pixel counts as moved since the first run.
-    """
-
-    labels: Sequence[str] = ()
-    rate: float = 0.01
-
 
 def history_rows(
     runs: Sequence[RunFacts],
     stores: Sequence[RunStore],
     pairs: Sequence[Pair],
-    wanted: HistorySettings,
+    labels: Sequence[str],
     states: Sequence[PixelStates],
 ) -> list[HistoryRow]:
     """Return a row for each run, in the order given.
@@ -58,13 +39,12 @@ def history_rows(
         runs: the runs.
         stores: of them.
         pairs: the first with each of the others.
-        wanted: labels, and what they are drawn against.
+        labels: of the runs; none: their dates.
         states: of the pixels of each run.
 
     Raises:
         ConfigError: there are labels, but not one for each run.
     """
-    labels = wanted.labels
     if labels and len(labels) != len(runs):
         raise ConfigError(
             f"--label: {len(labels)} labels for {len(runs)} runs; give one per run, in the same order"
@@ -75,18 +55,20 @@ def history_rows(
         camera = SensorInfo.read(store).camera
         date = _date(store, camera)
         label = labels[i] if labels else date
+        days = datetime.fromisoformat(date).timestamp() / 86400.0 if date else float("nan")
+        version = model_of(store, "fit")
         rows.append(
             HistoryRow(
                 label,
                 date,
                 camera.temperature,
-                _number(label) if labels else _days(date),
+                _number(label) if labels else days,
                 run,
                 int(states[i].hot.sum()),
                 pairs[i - 1].hot_new if i else (),
                 pairs[i - 1].hot_gone if i else (),
                 states[i].flags(),
-                _effects(store),
+                () if version is None else tuple(effect.tag for effect in version.effects),
                 moved,
                 any_moved,
                 compared,
@@ -108,13 +90,9 @@ def _date(store: RunStore, camera: CameraFacts) -> str:
     return "" if record is None else record.started
 
 
-def _days(date: str) -> float:
-    return datetime.fromisoformat(date).timestamp() / 86400.0 if date else float("nan")
-
-
 def _number(label: str) -> float:
     """Return the number that a label begins with; NaN where it begins with none."""
-    match = _NUMBER.match(label)
+    match = re.match(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)", label)
     return float(match[1]) if match else float("nan")
 
 
@@ -164,11 +142,6 @@ class PixelStates:
             differs = ~(confirm(y, x) > erfc(LIMIT / np.sqrt(2.0)))
             y, x = y[differs], x[differs]
         return tuple(zip(y.tolist(), x.tolist(), strict=True))
-
-
-def _effects(store: RunStore) -> tuple[str, ...]:
-    version = model_of(store, "fit")
-    return () if version is None else tuple(effect.tag for effect in version.effects)
 
 
 def _moved(pair: Pair, one: PixelStates, other: PixelStates) -> tuple[dict[str, int], int, int]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import error_words
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
@@ -30,13 +31,6 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
-
-#: Frames in the pictures of the row and column means.
-_SHOWN_FRAMES = 96
-#: Rows of the sensor, and frames at a time, from which the path of a named effect is computed.
-_PATH_ROWS, _PATH_FRAMES = 4, 256
-#: Maps that effects are given.
-_TRUTH = ("quanta_exposure", "conversion_gain", "bias", "analog_read_noise_e")
 
 
 def evidence_arrays(
@@ -121,7 +115,7 @@ def _time_arrays(evidence: Evidence, time: TimeSeries) -> dict[str, NDArray[Any]
             scaled = np.stack([charge / sd[0], readout / sd[1]])
         scaled[~np.isfinite(scaled)] = np.nan
         found[f"{line}_rms"] = np.sqrt(np.mean(scaled.astype(np.float64) ** 2, axis=1))
-        found[f"{line}_image"] = _single(scaled[:, :_SHOWN_FRAMES])
+        found[f"{line}_image"] = _single(scaled[:, :96])
     return found
 
 
@@ -187,12 +181,13 @@ def _path(
     from pchem_pipeline.simulate.streams import KeyedStreams
 
     ny, nx = evidence.maps.usable.shape
-    rows = np.unique(np.linspace(0, ny - 1, _PATH_ROWS).astype(np.int64))
+    rows = np.unique(np.linspace(0, ny - 1, 4).astype(np.int64))
     whole = truth_of(evidence.maps)
-    truth = {name: getattr(whole, name)[rows] for name in _TRUTH}
-    parts = []
-    for start in range(0, time.frames.size, _PATH_FRAMES):
-        frames = np.asarray(time.frames[start : start + _PATH_FRAMES], dtype=np.int64)
+    names = (*PARAMETERS[:3], "analog_read_noise_e")
+    truth = {name: getattr(whole, name)[rows] for name in names}
+    parts, step = [], 256
+    for start in range(0, time.frames.size, step):
+        frames = np.asarray(time.frames[start : start + step], dtype=np.int64)
         context = EffectContext(
             frames=frames,
             n_frames=time.n_run,

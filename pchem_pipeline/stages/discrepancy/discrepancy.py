@@ -30,7 +30,7 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.operators.curve import Clipping
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.model.histogram.odd_frames import frame_words
-from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, Named, StageContext, nothing_left
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
@@ -46,10 +46,6 @@ from pchem_pipeline.stages.samples import open_samples
 from pchem_pipeline.store.run_store import RunStore
 
 _STAGE = "discrepancy"
-#: Settings that the memory, or a clear disagreement, may lower.
-_TAKEN = ("max_samples", "max_pixels", "replicates", "extended_replicates")
-_REACHED = 0.01  # share of the pixels with samples at a limit of the ADC from which it is in the model
-_USUAL_CODES = 128.0  # of the law of a pixel, where there are no histograms yet
 
 
 def run(context: StageContext) -> None:
@@ -194,7 +190,7 @@ def _surveyed(
     if known is None:
         limit = context.config.compute.max_memory
         if limit is not None:
-            codes = mean_codes(store) if store.has("histogram/counts") else _USUAL_CODES
+            codes = mean_codes(store) if store.has("histogram/counts") else 128.0
             less = within_memory(settings, source.shape, roi, codes, limit << 20)
             if less != settings:
                 context.note(
@@ -223,7 +219,9 @@ def _surveyed(
 
 
 def _taken_of(settings: DiscrepancySettings) -> dict[str, int]:
-    return {name: getattr(settings, name) for name in _TAKEN}
+    """Return the settings that the memory, or a clear disagreement, may lower."""
+    names = ("max_samples", "max_pixels", "replicates", "extended_replicates")
+    return {name: getattr(settings, name) for name in names}
 
 
 def _survey(context: StageContext, source: FrameSource, settings: DiscrepancySettings) -> Survey:
@@ -243,8 +241,9 @@ def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...
     sensor, store = context.sensor, context.store
     (low, high), ends = sensor.seen_limits, sensor.adc_limits
     if ends is not None and store.has("histogram/minimum"):
-        low = ends[0] if (store.read("histogram/minimum") <= ends[0]).mean() > _REACHED else low
-        high = ends[1] if (store.read("histogram/maximum") >= ends[1]).mean() > _REACHED else high
+        share = 0.01  # of the pixels, from which a limit that samples reach is in the model
+        low = ends[0] if (store.read("histogram/minimum") <= ends[0]).mean() > share else low
+        high = ends[1] if (store.read("histogram/maximum") >= ends[1]).mean() > share else high
     if (low is None and high is None) or any(effect.tag == "clipping" for effect in model):
         return ()
     return (Clipping(low=low, high=high),)

@@ -25,8 +25,6 @@ from pchem_pipeline.report.style.wording import fitted_or_chosen
 _WIDTH = 100
 #: Longer lists end with a count.
 _MOST_PLACES, _MOST_CANDIDATES, _MOST_LEFT = 3, 5, 4
-_LEAD = "where: "
-_DEFECT = "DEFECT: candidate {} failed and was not compared: {}"
 # no line break between a number and its unit
 _HELD = "\u00a0"
 _BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|DN|e⁻|sigma\b|nats)")
@@ -56,7 +54,8 @@ def verdict_text(found: Verdict) -> str:
         lines += _wrapped(f"not tested, and no sizes in e-: {found.doubt}")
     if found.unexplained:
         lines += _places("unexplained: ", found.unexplained, _MOST_LEFT)
-    lines += [line for tag, why in found.defects.items() for line in _wrapped(_DEFECT.format(tag, why))]
+    for tag, why in found.defects.items():
+        lines += _wrapped(f"DEFECT: candidate {tag} failed and was not compared: {why}")
     if found.untestable:
         lines += _listed("not testable with such frames", list(found.untestable), 0)
     return "\n".join(lines)
@@ -75,7 +74,7 @@ def _listed(words: str, items: Sequence[str], more: int) -> list[str]:
 
 def _places(title: str, places: Sequence[Place], most: int) -> list[str]:
     lines = []
-    indent = " " * len(_LEAD)
+    indent = " " * len("where: ")
     for i, place in enumerate(places[:most]):
         spots = _spots(place)
         words = f"{place.sentence or place.statistic} ({sigma_text(place.z)}{f'; {spots}' if spots else ''})"

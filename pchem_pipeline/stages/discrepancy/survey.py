@@ -54,15 +54,10 @@ IntArray = NDArray[np.int64]
 _MOST_CODES, _FEWEST_ROWS = 1 << 26, 8
 #: Bytes of a band for each code of a law, for each pixel, and for each sample that is looked at at once.
 _CODE_BYTES, _PIXEL_BYTES, _SAMPLE_BYTES = 20, 800, 28
-#: Codes of a law: so many times those between the smallest and the largest sample, and some more.
-_SUPPORT, _PEAK_CODES = 1.2, 8
 #: Such samples at most.
 _MOST_AT_ONCE = 1 << 22
 #: Samples whose pairs are summed at most: some five minutes.
 _MOST_SAMPLES = 1 << 31
-_WRITTEN = ("p", "inside", "outside")  # of a place, beside its region
-_FRAMES = ("left_out", "copied")  # of a survey
-_FEWEST_SAMPLES = 50  # of a histogram that is compared with its law
 
 SUMS, SHAPES, PAIRS = (
     "neighbours, successive frames, levels",
@@ -96,10 +91,15 @@ class Survey:
     def numbers(self) -> dict[str, Any]:
         """Return it as JSON data, of which :meth:`of_numbers` makes it again."""
         places = {
-            name: {"region": each.region.numbers()} | {key: getattr(each, key) for key in _WRITTEN}
+            name: {
+                "region": each.region.numbers(),
+                "p": each.p,
+                "inside": each.inside,
+                "outside": each.outside,
+            }
             for name, each in self.places.items()
         }
-        frames = {name: list(getattr(self, name)) for name in _FRAMES}
+        frames = {"left_out": list(self.left_out), "copied": list(self.copied)}
         return {"places": places, "shares": dict(self.shares), **frames}
 
     @classmethod
@@ -116,7 +116,7 @@ class Survey:
             )
             for name, each in numbers["places"].items()
         }
-        return cls(places, numbers["shares"], *(tuple(numbers[name]) for name in _FRAMES))
+        return cls(places, numbers["shares"], tuple(numbers["left_out"]), tuple(numbers["copied"]))
 
     def told(self, verdict: Verdict, share: float) -> Verdict:
         """Return a verdict that says on what share of the samples it rests, and on what else."""
@@ -268,7 +268,7 @@ def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> t
 def mean_codes(store: RunStore) -> float:
     """Return how many codes the law of a pixel has, on average in the row with the most."""
     span = store.read("histogram/maximum") - store.read("histogram/minimum")
-    return float(span.mean(axis=1).max()) * _SUPPORT + _PEAK_CODES
+    return float(span.mean(axis=1).max()) * 1.2 + 8
 
 
 def _spread_frames(n: int, most: int) -> IntArray:
@@ -286,7 +286,7 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
     counts, *outside = (store.read(f"histogram/{name}", part) for name in ("counts", "under", "over"))
     usable = (store.read("fit/fit_status", part) & int(UNTRUSTWORTHY)) == 0
     usable &= np.isfinite(values).all(axis=0)
-    usable &= counts.sum(axis=2) >= np.maximum(_FEWEST_SAMPLES, 100.0 * sum(outside))
+    usable &= counts.sum(axis=2) >= np.maximum(50, 100.0 * sum(outside))
     maps = PixelMaps(values[0], values[1], values[2], values[3], usable)
     laws = pixel_laws(
         PixelHistograms(

@@ -27,11 +27,6 @@ from pchem_pipeline.frames.stream import FrameSource, FrameStream
 if TYPE_CHECKING:
     from pchem_pipeline.stages.discrepancy.survey import Survey
 
-# frames tell more than pixels about what happens in time; pixels more about what is rare
-_FRAMES_WANTED = 6000
-_SHARED = 0.5  # of two windows, the most that may be the same for the one to say something of the other
-#: Windows tried along each edge of the sensor.
-_TRIED = 64
 #: Bytes of a search: with its program and kernels, however small the window; of a sample; of a pixel, and of
 #: each code of its law. Measured with one worker, 256 to 8190 pixels and 1000 to 6000 frames.
 _PROGRAM_BYTES, _SAMPLE_BYTES, _PIXEL_BYTES, _CODE_BYTES = 290 << 20, 8, 12 << 10, 75
@@ -41,11 +36,6 @@ _FEWEST_PIXELS, _SMALLER = 256, 0.9
 #: all kinds none more than 20), as without simulations their statistics are not quite standard normal: of
 #: these less is compared, with simulations that tell.
 _CLEAR = 15.0
-#: Replicates that are enough where much is wrong, of the plain model and of one with effects.
-_REPLICATES, _EXTENDED = 24, 12
-#: Share of the pixels whose bias may be off by an electron, from which on only those statistics count that do
-#: not rest on the pixels' parameters.
-_DOUBTFUL = 0.1
 
 
 @dataclass(frozen=True)
@@ -103,12 +93,15 @@ def choose_window(
     n_frames, ny, nx = kept.size, *shape[1:]
     y0, y1, x0, x1 = roi or (0, ny, 0, nx)
     within = (y1 - y0) * (x1 - x0)
-    frames = min(n_frames, max(_FRAMES_WANTED, settings.max_samples // max(within, 1)))
+    # frames tell more than pixels about what happens in time; pixels more about what is rare
+    frames = min(n_frames, max(6000, settings.max_samples // max(within, 1)))
     pixels = max(min(settings.max_samples // frames, settings.max_pixels), 1)
     if within > pixels:
         height = min(y1 - y0, max(int(np.sqrt(pixels)), pixels // (x1 - x0)))
         width = min(x1 - x0, pixels // height)
-        y0, x0 = _corner(_worst(places or {}, shape[1:]), (y0, y1, x0, x1), (height, width))
+        worst = min((places or {}).values(), key=lambda place: place.p, default=None)
+        mask = None if worst is None else worst.region.mask(shape[1:])
+        y0, x0 = _corner(mask, (y0, y1, x0, x1), (height, width))
         y1, x1 = y0 + height, x0 + width
     numbers = kept
     if frames < n_frames:
@@ -138,7 +131,7 @@ def other_window(window: Window, shape: tuple[int, int, int], roi: Sequence[int]
         for first, end, size in ((y0, y1, height), (x0, x1, width))
     )
     y, x = max(itertools.product(sorted(rows), sorted(columns)), key=away)
-    if -away((y, x))[0] > _SHARED * height * width:
+    if -away((y, x))[0] > 0.5 * height * width:
         return None
     return replace(window, rows=(y, y + height), columns=(x, x + width))
 
@@ -189,13 +182,6 @@ def within_memory(
     return settings
 
 
-def _worst(places: Mapping[str, Suspect], shape: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """Return the most significant place as a mask, (y, x)."""
-    if not places:
-        return None
-    return min(places.values(), key=lambda place: place.p).region.mask(shape)
-
-
 def _corner(
     place: NDArray[np.bool_] | None, within: tuple[int, int, int, int], size: tuple[int, int]
 ) -> tuple[int, int]:
@@ -211,7 +197,7 @@ def _corner(
     if place is None or not place[y0:y1, x0:x1].any():
         return middle
     ys, xs = (
-        np.unique(np.linspace(first, last - length, _TRIED).astype(np.int64))
+        np.unique(np.linspace(first, last - length, 64).astype(np.int64))
         for first, last, length in ((y0, y1, size[0]), (x0, x1, size[1]))
     )
     inside = box_sums(cumulative(place.astype(np.float64)), (1, 1), (ys, ys + size[0]), (xs, xs + size[1]))
@@ -283,9 +269,9 @@ def fewer_samples(
         length = block_length(window.numbers.size, settings.block_frames)
         frames = read_window(source, window)
         if is_clear(frames, window.times, n_run=source.shape[0], block_frames=length):
-            lower = {
-                "replicates": min(settings.replicates, _REPLICATES),
-                "extended_replicates": min(settings.extended_replicates, _EXTENDED),
+            lower = {  # enough where much is wrong
+                "replicates": min(settings.replicates, 24),
+                "extended_replicates": min(settings.extended_replicates, 12),
             }
             return few.model_copy(update=lower)
         samples *= 2
@@ -308,6 +294,6 @@ def is_clear(
     except PchEmError:  # those who compare the frames say what is wrong with them
         return False
     z = np.abs(np.array(list(evidence.z.values())))
-    if evidence.ambiguous > _DOUBTFUL:
+    if evidence.ambiguous > 0.1:  # of the pixels, whose bias may be off by an electron
         z = z[free_of_parameters(tuple(evidence.z), evidence.maps)]
     return bool(z.max(initial=0.0) > _CLEAR)

@@ -31,13 +31,12 @@ from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, Ense
 from pchem_pipeline.model.fit.status import flags_of
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
-from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext, markers, nothing_left
 from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
-from pchem_pipeline.stages.electrons.electrons import read_tables
+from pchem_pipeline.stages.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
-from pchem_pipeline.stages.fit.code_sums import on_axis
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_effects, fitted_satellites
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of, uncounted_frames
 
@@ -51,8 +50,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.store.run_store import RunStore
     from pchem_pipeline.store.tiles import Tile
 
-#: of the maps of a tile
-_PIXEL_BYTES = 40 * 8
 _SUMS = ("integers", "floats")
 _HISTOGRAM = ("origin", "minimum", "maximum")
 
@@ -67,7 +64,7 @@ class _Job:
         axes: axes of the ensemble.
         tiles: number and place of each tile by its key.
         frames: the chosen frames (first, end), or None where there are none to choose from.
-        codes: by tile the samples of all frames, where the fit has counted them; see `CodeSums`.
+        codes: by tile the samples of all frames, where the fit has counted them; see `code_sums`.
         source: where frames come from, if any are read.
         truth: first row, first column and first frame of the input in the true electron numbers, or None.
         effects: with which the maps were fitted.
@@ -194,7 +191,7 @@ def run(context: StageContext) -> None:
     bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
     counted = fitted.bins * store.array("histogram/counts").dtype.itemsize
-    held = context.tile_pixels * (2 * counted + _PIXEL_BYTES)
+    held = context.tile_pixels * (2 * counted + 40 * 8)  # with the maps of a tile
     if source is not None:
         highest = max(band.y1 - band.y0 for band in bands)
         held += highest * sensor.nx * (counted + 2 * FRAMES_AT_ONCE * source.dtype.itemsize)
@@ -291,7 +288,12 @@ def _sum_tile(
     maps = [store.read(f"fit/{name}", tile.region) for name in PARAMETERS]
     origin, low, high = _ranges(store, tile.region)
     codes = None if chosen is None else job.codes.get(tile.key)
-    counted = _read_counted(store, tile, origin) if codes is None else _uncounted(origin, job.sensor.n_frames)
+    if codes is None:
+        read = store.read_arrays("histogram", ("counts", "under", "over"), tile.region)
+        counted = PixelHistograms(read["counts"], origin, read["under"] + read["over"])
+    else:  # only the number of the samples matters
+        outside = np.full(origin.shape, job.sensor.n_frames, np.uint32)
+        counted = PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
     errors = _errors(store, tile)
     rows = []
     for part in parts_told(tile.parts(store.array("histogram/counts").shape[2])):
@@ -310,23 +312,21 @@ def _sum_tile(
         rows.append(row)
     integers, floats = (np.sum(each, axis=0) for each in zip(*rows, strict=True))
     if codes is not None:
-        samples, outside = on_axis(codes, job.axes.dn)
+        samples, beyond = on_axis(codes, job.axes.dn)
         integers[job.axes.integers["counts_all"]] = samples
-        integers[job.axes.integers["outside_all"]] = outside
+        integers[job.axes.integers["outside_all"]] = beyond
         floats[job.axes.floats["share_all"]] = samples / job.sensor.n_frames
     return integers, floats
 
 
-def _read_counted(store: RunStore, tile: Tile, origin: NDArray[np.int64]) -> PixelHistograms:
-    """Read the histograms of a tile."""
-    found = store.read_arrays("histogram", ("counts", "under", "over"), tile.region)
-    return PixelHistograms(found["counts"], origin, found["under"] + found["over"])
-
-
-def _uncounted(origin: NDArray[np.int64], n_frames: int) -> PixelHistograms:
-    """Return pixels of whose samples only the number is known."""
-    outside = np.full(origin.shape, n_frames, np.uint32)
-    return PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
+def on_axis(content: dict[str, Any], axis: DnAxis) -> tuple[NDArray[np.int64], int]:
+    """Return the samples at each DN of an axis, and those beyond it; see `code_sums`."""
+    place = np.array(content["dn"], np.int64) - axis.start
+    samples = np.array(content["samples"], np.int64)
+    inside = (place >= 0) & (place < axis.size)
+    found = np.zeros(axis.size, np.int64)
+    found[place[inside]] = samples[inside]
+    return found, int(samples[~inside].sum()) + int(content["outside"])
 
 
 def _ranges(store: RunStore, region: tuple[slice, slice]) -> list[NDArray[np.int64]]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,30 +12,34 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.base.variables import (
+    FREE_SATELLITES,
+    INTERVALS,
+    PARAMETERS,
+    VARIABLES,
+    interval_names,
+    variables_of,
+)
 from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding
-from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.model.law.parameters import usable_pixels
+from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
 from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.stages.fit.arrays import TileArrays, create_fit_arrays
-from pchem_pipeline.stages.fit.code_sums import CodeSums
 from pchem_pipeline.stages.fit.fitted_model import pixel_places
-from pchem_pipeline.stages.fit.start import drop_fit, kept_fit
 from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
 from pchem_pipeline.stages.fit.together import judge_sensor
 from pchem_pipeline.stages.samples import sample_targets
+from pchem_pipeline.stages.table import STAGES
+from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.tiles import Tile
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
-#: what the summaries of the tiles count
-_COUNTED = ("pixels", "poor", "rounded")
-_SUSPICIOUS_SHARE = 0.2  # of pixels in poor agreement, from which the samples themselves are in doubt
-#: of all that is kept of a pixel of a tile until it is written, twice
-_PIXEL_BYTES = 2 * 40 * 8
 
 
 def run(context: StageContext) -> None:
@@ -44,7 +49,7 @@ def run(context: StageContext) -> None:
         StoreError: the histograms are missing, or the store refuses.
     """
     samples, store, model = context.sensor.samples, context.store, context.model
-    create_fit_arrays(context)
+    _create(context)
     how = TileFit(
         context.config.fit,
         context.sensor.adc_limits,
@@ -57,7 +62,8 @@ def run(context: StageContext) -> None:
     counts = [each.array("histogram/counts") for each in ([RunStore.open(run) for run in runs] or [store])]
     if not context.executor.shares_memory:
         _compile(how, counts[0].dtype)
-    pixel_bytes = 2 * sum(each.shape[2] * each.dtype.itemsize for each in counts) + _PIXEL_BYTES
+    # of a pixel the histograms, and all that is kept of it until it is written, twice
+    pixel_bytes = 2 * (sum(each.shape[2] * each.dtype.itemsize for each in counts) + 40 * 8)
     done = context.run_units(
         context.tiles(),
         functools.partial(_do_tile, samples=runs, how=how, model=model),
@@ -67,9 +73,10 @@ def run(context: StageContext) -> None:
     if not samples:
         judge_sensor(context)
         if len(done) == context.n_keys:
-            drop_fit(store.path)
-    pixels, poor, biased = (sum(tile.get(key, 0) for tile in done.values()) for key in _COUNTED)
-    if poor > _SUSPICIOUS_SHARE * pixels:
+            _start_file(store.path).unlink(missing_ok=True)
+    counted = ("pixels", "poor", "rounded")
+    pixels, poor, biased = (sum(tile.get(key, 0) for tile in done.values()) for key in counted)
+    if poor > 0.2 * pixels:
         context.note(
             f"{100 * poor / pixels:.0f} % of the pixels disagree with common g, mu and sigma for all "
             "samples: check that all have the same sensor, gain, offset and temperature"
@@ -90,6 +97,24 @@ def _compile(how: TileFit, dtype: np.dtype[Any]) -> None:
     fit_tile([histogram] * max(1, len(how.bias)), replace(how, effects=everywhere, adc_limits=None))
 
 
+def _create(context: StageContext) -> None:
+    """Make the arrays that the fit will have; the words of its status are explained with them."""
+    left_out = {"fit_status", *(() if context.model.effects else FREE_SATELLITES)}
+    if context.config.fit.intervals == "normal":
+        left_out |= {path for name in INTERVALS for path in interval_names(name)}
+    context.create(*(v.path for v in variables_of("fit") if v.name not in left_out))
+    context.create(
+        "fit/fit_status",
+        flag_masks=[int(bit) for bit in MEANINGS],
+        flag_meanings=" ".join(str(bit.name).lower() for bit in MEANINGS),
+        flag_sentences={str(bit.name).lower(): sentence for bit, sentence in MEANINGS.items()},
+    )
+    if n := len(context.sensor.samples):
+        names = ("quanta_exposure", "quanta_exposure_stderr", "mean", "variance", "covariance")
+        lengths = {"sample": n, "sample_parameter": n + 3, "sample_parameter_2": n + 3}
+        context.create(*(f"samples/{name}" for name in names), lengths=lengths)
+
+
 def _do_tile(
     tile: Tile, store: RunStore, *, samples: Sequence[Path], how: TileFit, model: ModelVersion
 ) -> dict[str, Any]:
@@ -104,12 +129,11 @@ def _do_tile(
     """
     runs = [RunStore.open(path) for path in samples] or [store]
     histograms = [each.read_arrays("histogram", _HISTOGRAM, tile.region) for each in runs]
-    start = added = codes = None
+    start = added = None
     bins = sum(each["counts"].shape[2] for each in histograms)
     if not samples:
         start, added = kept_fit(store.path, tile.region), read_added_exposure(store, model, tile.region)
-        codes = CodeSums(histograms[0]["origin"], bins)
-    arrays = TileArrays(tile)
+    arrays: dict[str, NDArray[Any]] = {}
     for part in parts_told(tile.parts(bins)):
         some = [{name: values[part] for name, values in each.items()} for each in histograms]
         found = fit_tile(
@@ -119,24 +143,108 @@ def _do_tile(
             None if added is None else added.of(part),
             pixel_places(store, tile.within(part)),
         )
-        if codes is not None:
-            codes.add(some[0], found["fit"])
-        arrays.add(part, found)
+        for group, values_of in found.items():
+            for name, values in values_of.items():
+                variable = VARIABLES[f"{group}/{name}"]
+                y = variable.dims.index("y")
+                shape = (*values.shape[:y], *tile.shape, *values.shape[y + 2 :])
+                whole = arrays.setdefault(variable.path, np.empty(shape, values.dtype))
+                whole[variable.index(part)] = values
     for each in runs:
         if each.has("frames/excluded"):
-            arrays.leave_out(each.read("frames/excluded", tile.region) != 0)
-    arrays.write(store)
-    fit = arrays.values["fit"]
-    words = fit["fit_status"]
+            _leave_out(arrays, each.read("frames/excluded", tile.region) != 0)
+    for path, values in arrays.items():
+        store.write(path, VARIABLES[path].index(tile.region), values)
+    words = arrays["fit/fit_status"]
     summary: dict[str, Any] = {
         "pixels": int(words.size),
         "failed": int(np.count_nonzero(words & np.uint16(int(FAILED & ~FitStatus.EXCLUDED)))),
     }
-    if codes is None:
+    if samples:
         return {**summary, "poor": int(np.count_nonzero(words & np.uint16(int(FitStatus.POOR_FIT))))}
-    summary["codes"] = codes.content()
+    maps = [arrays[f"fit/{name}"] for name in PARAMETERS]
+    summary["codes"] = code_sums(histograms[0], maps)
     if how.settings.likelihood == "density" and not how.effects:
         frames = histograms[0]["counts"].sum(axis=2, dtype=np.float64)
-        maps = [fit[name].ravel() for name in PARAMETERS]
-        summary["rounded"] = int(np.count_nonzero(biased_by_rounding(maps, frames.ravel())))
+        biased = biased_by_rounding([values.ravel() for values in maps], frames.ravel())
+        summary["rounded"] = int(np.count_nonzero(biased))
     return summary
+
+
+def _leave_out(arrays: Mapping[str, NDArray[Any]], excluded: NDArray[np.bool_]) -> None:
+    """Take the values of excluded pixels (y, x) out of the arrays of a tile, and give them their word."""
+    for path, values in arrays.items():
+        if values.dtype.kind == "f":
+            before = VARIABLES[path].dims.index("y")
+            values[(slice(None),) * before + (excluded,)] = np.nan
+    arrays["fit/fit_status"][excluded] = int(FitStatus.EXCLUDED)
+
+
+def code_sums(histogram: Mapping[str, NDArray[Any]], maps: Sequence[NDArray[Any]]) -> dict[str, Any]:
+    """Return the samples of each code over the pixels that have a value, as JSON data for their marker.
+
+    The ensemble compares all frames with the model, and would decode every histogram again for it.
+
+    Args:
+        histogram: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x).
+        maps: (H, g, mu, sigma), (y, x) each; NaN without a value.
+
+    Returns:
+        The codes that occur (``dn``), the ``samples`` of each, and those ``outside`` of the histograms.
+    """
+    usable, counts, origin = usable_pixels(*maps), histogram["counts"], histogram["origin"]
+    start = int(origin.min())
+    samples = np.zeros(int(origin.max()) - start + counts.shape[2], np.int64)
+    for first in np.unique(origin[usable]):  # few: windows begin at round numbers
+        place = int(first) - start
+        some = counts[usable & (origin == first)].sum(axis=0, dtype=np.int64)
+        samples[place : place + some.size] += some
+    occupied = np.flatnonzero(samples)
+    return {
+        "dn": (start + occupied).tolist(),
+        "samples": samples[occupied].tolist(),
+        "outside": sum(int(histogram[name][usable].sum(dtype=np.int64)) for name in ("under", "over")),
+    }
+
+
+# -- the answer of an earlier fit, from which that of more frames starts ---------------------------
+#
+# It lies among the private files of the run, is kept when frames are appended and forgotten once it has been
+# used. It is no part of the fingerprint: the maximum does not depend on where the climb to it starts.
+
+
+def _start_file(store: Path) -> Path:
+    return store / ".pchem" / "fit_start.npy"
+
+
+def keep_fit(context: StageContext) -> None:
+    """Keep the pixels that were fitted well, unless the fit had other settings or another model.
+
+    The file holds (H, g, mu, sigma, likelihood gap), float64, (y, x, 5); NaN for pixels without a start.
+    """
+    store, record = context.store, context.store.records.read("fit")
+    known = None if record is None or not record.finished else record.content
+    if (
+        known is None
+        or known["settings"] != setting_values(STAGES["fit"], context)
+        or known["input"]["model"] != context.model.digest
+    ):
+        _start_file(store.path).unlink(missing_ok=True)
+        return
+    start = np.stack([store.read(f"fit/{name}") for name in (*PARAMETERS, "likelihood_gap")], axis=-1)
+    start[store.read("fit/fit_status") != 0] = np.nan
+    buffer = io.BytesIO()
+    np.save(buffer, start)
+    write_atomic(_start_file(store.path), buffer.getvalue())
+
+
+def kept_fit(store: Path, region: tuple[slice, slice]) -> NDArray[np.float64] | None:
+    """Return what `keep_fit` kept of a tile, or None."""
+    place = _start_file(store)
+    if not place.exists():
+        return None
+    if isinstance(place, RemotePath):
+        whole = np.load(io.BytesIO(place.read_bytes()), allow_pickle=False)
+    else:
+        whole = np.load(place, mmap_mode="r", allow_pickle=False)
+    return np.array(whole[region])

@@ -26,9 +26,6 @@ from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-#: Pixels of which effects are told nothing: no value, or one electron off.
-_UNUSABLE = FAILED | AMBIGUOUS
-
 
 @dataclass(frozen=True)
 class TileFit:
@@ -133,7 +130,8 @@ def _laws(
     places: PixelPlaces | None,
 ) -> SampleLaw | list[SampleLaw]:
     """Return the law that the effects compose after the plain fit, or a list of one for each sample."""
-    usable = (plain.fit_status & int(_UNUSABLE)) == 0
+    # not those without a value, or one electron off
+    usable = (plain.fit_status & int(FAILED | AMBIGUOUS)) == 0
     shared = [getattr(plain, name) for name in PARAMETERS[1:]]
     if plain.quanta_exposure.ndim == 1:
         return sample_law(effects, pixel_maps([plain.quanta_exposure, *shared], usable), added, places)

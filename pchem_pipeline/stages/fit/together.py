@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
 from pchem_pipeline.model.fit.status import FitStatus, moves_gain
@@ -13,17 +14,6 @@ from pchem_pipeline.store.tiles import equal_rows
 
 _LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
 _LARGEST_KEPT = 2**22  # pixels, 24 bytes each
-_GAIN, _SIGMA = 1, 3  # places in ``variables.PARAMETERS``
-_READ = (
-    "conversion_gain",
-    "read_noise_dn",
-    "conversion_gain_stderr",
-    "read_noise_dn_stderr",
-    "likelihood_gap",
-)
-_PAIR = CORRELATION_PAIRS.index((_GAIN, _SIGMA))
-
-_Region = tuple[slice, slice]
 
 
 def judge_sensor(context: StageContext) -> int:
@@ -67,9 +57,12 @@ def judge_sensor(context: StageContext) -> int:
     return found
 
 
-def _judged(store: RunStore, band: _Region) -> Judged:
+def _judged(store: RunStore, band: tuple[slice, slice]) -> Judged:
     """Return the pixels of a band, in order; NaN where they are not fitted."""
-    fit = store.read_arrays("fit", _READ, band)
+    names = ("conversion_gain", "read_noise_dn")
+    read = (*names, *(f"{name}_stderr" for name in names), "likelihood_gap")
+    fit = store.read_arrays("fit", read, band)
+    pair = CORRELATION_PAIRS.index(tuple(map(PARAMETERS.index, names)))
     gain, sigma, of_gain, of_sigma, gap = (values.ravel() for values in fit.values())
-    together = store.read("fit/correlation", (*band, slice(_PAIR, _PAIR + 1))).ravel()
+    together = store.read("fit/correlation", (*band, slice(pair, pair + 1))).ravel()
     return Judged(*noise_of(gain, sigma, of_gain, of_sigma, together), gap)

@@ -27,13 +27,12 @@ from pchem_pipeline.model.histogram.summaries import (
     line_sums,
 )
 from pchem_pipeline.run.stage import open_store
-from pchem_pipeline.stages.histogram.arrays import with_block_length
+from pchem_pipeline.stages.histogram.arrays import MAPS, with_block_length
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.stream import Block, Rows
     from pchem_pipeline.model.histogram.settings import HistogramSettings
 
-_HISTOGRAMS = ("counts", "origin", "under", "over", "minimum", "maximum")
 _ALONG_TIME = ("block_sum", "block_sum_square", "row_sum", "row_sum_square", "column_sum")
 _OPEN = ("open_sums", "open_covariances")
 
@@ -182,7 +181,7 @@ class _BandCounter:
         """Go on behind the frames that the run has counted, see `StackCounter.resume`."""
         opened, self._spectrum = open_store(self._store), None  # that of the first frames is there
         region = self._rows, slice(None)
-        held = RowHistograms(**opened.read_arrays("histogram", _HISTOGRAMS, region))
+        held = RowHistograms(**opened.read_arrays("histogram", ("counts", *MAPS), region))
         self._histograms = HistogramAccumulator.resumed(held, self._shape[0])
         if self._summaries is None:
             return

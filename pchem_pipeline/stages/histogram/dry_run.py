@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pchem_pipeline.compute.memory import BASE_BYTES
-from pchem_pipeline.config.memory import allowed_bytes, band_bytes, worker_count
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.model.histogram.count import most_bins
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+from pchem_pipeline.run.stage import allowed_bytes, band_bytes
 from pchem_pipeline.stages.histogram.histogram import bins_of
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.store.tiles import tile_grid, tile_shape
@@ -101,7 +101,7 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
 
     frames = open_frames(config.input, base_dir)
     n, ny, nx = frames.shape
-    workers = worker_count(config)
+    workers = config.compute.count()
     size = sum(file_size(path) for path in input_paths(config.input, base_dir))
     limit = most_bins(config.histogram.max_bins, frames.dtype)
     rows = min(ny, math.lcm(ROW_GROUP, min(frames.rows_per_read, ny)))

@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pchem_pipeline.config.memory import band_bytes
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_scores, odd_frames
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, frame_statistics
-from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.stage import StageContext, Task, nothing_left
 from pchem_pipeline.stages.bands import Band, plan_bands
 from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, create_counts, row_frames
@@ -40,16 +39,12 @@ if TYPE_CHECKING:
 # -- the stage ----------------------------------------------------------------------------------
 
 
-def _band_bytes(context: StageContext) -> int:
-    return band_bytes(context.config, context.executor.workers, context.executor.memory_limit)
-
-
 def _bands(context: StageContext, source: FrameSource, bins: int) -> list[Band]:
     """Return the bands; say so where even the lowest possible ones need more memory than allowed."""
     settings, tiles = context.config.histogram, context.tiles()
     n_frames, _, columns = source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, bins, settings)
-    most = _band_bytes(context) // row
+    most = context.band_bytes // row
     pending = {tile.key for tile in context.pending(tiles)}
     bands = plan_bands(tiles, pending, most, context.executor.workers, source.rows_per_read)
     highest = max(band.y1 - band.y0 for band in bands)
@@ -100,23 +95,22 @@ def _end(context: StageContext, areas: Sequence[Band | Tile]) -> None:
     """Do what needs the whole sensor."""
     if context.config.histogram.summaries:
         _write_frame_statistics(context, (context.sensor.n_frames, *context.sensor.shape))
-    if number := sum(_pixels_outside(context, area) for area in areas):
+    number = 0
+    for area in areas:
+        region = (slice(area.y0, area.y1), slice(None)) if isinstance(area, Band) else area.region
+        under, over = (context.store.read(f"histogram/{name}", region) for name in ("under", "over"))
+        number += int(np.count_nonzero(under | over))
+    if number:
         bins = context.store.array("histogram/counts").shape[2]
         words = "pixels have samples outside their" if number > 1 else "pixel has samples outside its"
         context.note(f"{number} {words} histogram of {bins} bins")
-
-
-def _pixels_outside(context: StageContext, area: Band | Tile) -> int:
-    region = (slice(area.y0, area.y1), slice(None)) if isinstance(area, Band) else area.region
-    under, over = (context.store.read(f"histogram/{name}", region) for name in ("under", "over"))
-    return int(np.count_nonzero(under | over))
 
 
 def _decide_bins(context: StageContext, source: FrameSource) -> int:
     """Return the number of bins of the sensor, from its first frames."""
     settings, (n_frames, ny, columns) = context.config.histogram, source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, 0, settings)
-    most, together = max(ROW_GROUP, _band_bytes(context) // row), min(source.rows_per_read, ny)
+    most, together = max(ROW_GROUP, context.band_bytes // row), min(source.rows_per_read, ny)
     context.stop.check()
     limit = most_bins(settings.max_bins, source.dtype)
     return bins_of(source, settings.window_frames, limit, most // together * together or most)

@@ -1,4 +1,4 @@
-"""The memory that counting takes, and how much of it the run may have."""
+"""The memory that counting takes."""
 
 from __future__ import annotations
 

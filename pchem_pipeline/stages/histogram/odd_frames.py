@@ -15,7 +15,7 @@ from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.odd_frames import KINDS, FloatArray, IntArray, left_out, odd_words
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
-from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.input import open_source
 from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
 from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
 from pchem_pipeline.store.tiles import equal_rows

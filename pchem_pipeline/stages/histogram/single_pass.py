@@ -22,16 +22,15 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.compute.environment import cpu_seconds
 from pchem_pipeline.compute.executor import call_all
-from pchem_pipeline.config.memory import allowed_bytes, worker_count
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.frames.identity import file_size, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.frames.stream import HashedFrameStream
 from pchem_pipeline.model.histogram.count import choose_bins, most_bins, pixels_by_range
-from pchem_pipeline.run.input_identity import identity_is_new, keep_identity
+from pchem_pipeline.run.input import identity_is_new, keep_identity
 from pchem_pipeline.run.progress import whole_mebibytes
-from pchem_pipeline.run.stage import Prepared, StageContext
+from pchem_pipeline.run.stage import Prepared, StageContext, allowed_bytes
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.bands import cut_rows
 from pchem_pipeline.stages.histogram.arrays import create_arrays
@@ -95,7 +94,7 @@ def hashed_frames(
         files: that are read.
         first: frame that they begin with.
     """
-    workers = worker_count(context.config)
+    workers = context.config.compute.count()
     rows = single_pass_rows(context.config, frames.shape, frames.dtype)
     total = sum(file_size(path) for path in files) >> 20
     with (
@@ -135,12 +134,12 @@ def _blocks_are_chunks(context: StageContext, frames: FrameSequence) -> bool:
 def _fits(context: StageContext, frames: FrameSequence, bins: int) -> bool:
     """Tell whether the memory allowed is enough."""
     need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
-    return need <= allowed_bytes(context.config, worker_count(context.config))
+    return need <= allowed_bytes(context.config, context.config.compute.count())
 
 
 def _count(context: StageContext, frames: FrameSequence, stream: HashedFrameStream) -> bool:
     """Count all frames; tell whether memory was enough for the bins that the first ones show."""
-    config, workers = context.config, worker_count(context.config)
+    config, workers = context.config, context.config.compute.count()
     blocks = iter(stream)
     first = next(blocks)
     context.stop.check()
@@ -161,7 +160,7 @@ def _choose_bins(context: StageContext, parts: Sequence[NDArray[Any]]) -> int:
     """Return the number of bins of the sensor, from its first frames."""
     limit = most_bins(context.config.histogram.max_bins, parts[0].dtype)
     tasks = [functools.partial(pixels_by_range, part, limit) for part in parts]
-    found = call_all(tasks, worker_count(context.config))
+    found = call_all(tasks, context.config.compute.count())
     return choose_bins(np.sum(found, axis=0), limit)
 
 

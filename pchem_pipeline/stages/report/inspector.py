@@ -41,10 +41,8 @@ if TYPE_CHECKING:
 #: Bytes of base64 for the maps of a sensor of 512 x 512 pixels; larger ones get more, by the power 0.9, and
 #: at most so many: what does not fit is shown by ``pchem view`` and, of all pixels, in the figures.
 _MAPS_BUDGET, _MAPS_POWER, _MOST_BYTES = 2.8e6, 0.9, 6.8e6
-_PAPER_PIXELS = 512 * 512
-#: Steps of a map's codes: an eighth of a pixel's standard error, and 4 % of a standard error itself; so many
-#: times that for sensors of more pixels, with how true the values are then.
-_STEPS_PER_ERROR, _STEP_OF_ERRORS = 8.0, 0.04
+#: Steps of a map's codes are an eighth of a pixel's standard error, and 4 % of a standard error itself; for
+#: sensors of more pixels so many times that, with how true the values are then.
 _COARSE = (
     (4_000_000, 16.0, "a standard error"),
     (1_000_000, 4.0, "a quarter of a standard error"),
@@ -83,7 +81,6 @@ _FIRST = (
 #: Groups in the order of the list; what a group of ``fit`` repeats of ``maps`` is left out.
 _GROUPS = ("maps", "fit", "discrepancy", "summary", "histogram", "truth")
 _MANY_PIXELS = 1_000_000
-_WORDS = re.compile(r"(\d+) ([^,;:]+)")
 
 
 def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[MapEntry]:
@@ -118,7 +115,8 @@ def _entry(variable: Variable, attributes: Mapping[str, Any]) -> MapEntry:
     elif "flag_values" in attributes:
         kind, words = "words", _flag_texts(attributes, "flag_values")
     elif variable.dtype == "uint8":
-        words = {int(number): text.strip() for number, text in _WORDS.findall(variable.long_name)}
+        found = re.findall(r"(\d+) ([^,;:]+)", variable.long_name)
+        words = {int(number): text.strip() for number, text in found}
         kind = "words" if words else "value"
     elif variable.name.endswith("_stderr"):
         kind = "stderr"
@@ -194,7 +192,7 @@ def read_maps(
         StoreError: an array is missing or corrupt.
     """
     maps, listed, n = StoredMaps(store, loaded), listed_maps(store, shape), shape[0] * shape[1]
-    budget = min(_MAPS_BUDGET * max(1.0, n / _PAPER_PIXELS) ** _MAPS_POWER, _MOST_BYTES)
+    budget = min(_MAPS_BUDGET * max(1.0, n / 512**2) ** _MAPS_POWER, _MOST_BYTES)
     order = sorted(listed, key=lambda entry: _importance(entry.path))
     found: dict[str, MapEntry] = {}
     exact: dict[str, NDArray[np.float64]] = {}
@@ -255,9 +253,9 @@ def packed_map(maps: StoredMaps, path: str) -> PackedMap:
     coarse, _ = _coarse(values.size)
     step = 0.0
     if path.endswith("_stderr"):
-        step = _STEP_OF_ERRORS * _median(values)
+        step = 0.04 * _median(values)
     elif maps.has(f"{path}_stderr"):
-        step = _median(maps.read(f"{path}_stderr")) / _STEPS_PER_ERROR
+        step = _median(maps.read(f"{path}_stderr")) / 8.0
     return pack_map(values, choose_scale(values, step=step, coarse=coarse))
 
 

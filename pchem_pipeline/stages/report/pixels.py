@@ -25,11 +25,6 @@ from pchem_pipeline.store.tiles import MAX_BINS
 
 #: Pixels for each reason: a flag, a poor fit, an extreme value, a large standard error.
 _FLAGGED, _POOR, _EXTREME, _UNSURE = 40, 60, 12, 8
-_SEED = 20_231
-#: Ranks, of 1, about those that are sought among which a pixel is looked for first.
-_REACH = 0.02
-#: Sensors with fewer pixels have all of them in the file; of a larger one so many.
-_ALL_PIXELS, _SOME_PIXELS = 4096, 2400
 
 #: Labels of the four shown pixels, and the ranks of read noise and quanta exposure at which they lie.
 _CORNERS = (
@@ -88,7 +83,7 @@ def _nearest(
 
     Looked at are the pixels with ranks about these, twice as far until the nearest lies among them.
     """
-    reach = _REACH
+    reach = 0.02
     while True:
         inside = free.copy()
         for values, known, rank in zip(maps, ordered, ranks, strict=True):
@@ -196,8 +191,8 @@ def choose_inspected(
     suspects: Sequence[tuple[int, int]] = (),
     *,
     bins: int = 1,
-    everything: int = _ALL_PIXELS,
-    most: int = _SOME_PIXELS,
+    everything: int = 4096,
+    most: int = 2400,
 ) -> ChosenPixels:
     """Choose the pixels that are in the report in full.
 
@@ -213,7 +208,7 @@ def choose_inspected(
     status = np.asarray(fit["fit_status"])
     ny, nx = status.shape
     everything, most = (min(n, MAX_BINS // bins) for n in (everything, most))
-    rng, p = np.random.default_rng(_SEED), fit.get("goodness_p", np.full(status.shape, np.nan))
+    rng, p = np.random.default_rng(20_231), fit.get("goodness_p", np.full(status.shape, np.nan))
     reasons = [
         ("shown in the report", _places(shown, nx)),
         ("from the search for missing effects", _places(suspects, nx)),

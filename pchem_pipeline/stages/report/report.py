@@ -13,18 +13,20 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
-from pchem_pipeline.compute.environment import available_workers
 from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.effects.framework.compose import model_words
+from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.maps.ordered import median_of
 from pchem_pipeline.planning.frames import frames_needed, precision
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import parse_target
-from pchem_pipeline.report.data import PixelFit, ReportData, Sample, Samples
+from pchem_pipeline.report.data import DiscrepancyData, PixelFit, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.ensemble import case_name
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
@@ -36,7 +38,6 @@ from pchem_pipeline.report.pages.summary import check_sentence
 from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
-from pchem_pipeline.stages.discrepancy.result import verdict_data
 from pchem_pipeline.stages.maps import NO_TIME
 from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
@@ -59,17 +60,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.store.records import StageRecord
 
-#: Where a version of the model comes from, in words.
-_SOURCES = {"config": "from the configuration", "verdict": "from the search for missing effects"}
-#: All channels of a line of so few are shown.
-_FEW_CHANNELS = 12
-#: Pixels in full that have the mass of a model with effects.
-_SOME_MASSES = 300
-#: Memory that a pixel takes: the maps are held as a whole. Measured at 2048 x 1152, 940 MiB in all.
-_PIXEL_BYTES = 300
-#: Precisions whose frames the report tells, at the median pixel.
-_TARGETS = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
-
 
 def run(context: StageContext) -> None:
     """Write the report.
@@ -91,7 +81,8 @@ def run(context: StageContext) -> None:
         stages=_stage_rows(context),
         draw=draw_and_say(context.reporter, context.stage),
     )
-    done = context.run_units([WHOLE], task, unit_name="report", unit_bytes=ny * nx * _PIXEL_BYTES)
+    held = 300 * ny * nx  # the maps as a whole; measured at 2048 x 1152, 940 MiB in all
+    done = context.run_units([WHOLE], task, unit_name="report", unit_bytes=held)
     for text in done.get(WHOLE.key, {}).get("warnings", ()):
         context.note(text)
 
@@ -187,7 +178,8 @@ def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
     full = choose_inspected(run.maps, run.fit, places, suspects, bins=bins)
     index = np.concatenate([pixel_index(shown, run.sensor.shape), full.index])
     histograms = read_histograms(store, index, run.sensor.shape)
-    drawn, held, some = slice(0, len(shown)), slice(len(shown), None), slice(0, len(shown) + _SOME_MASSES)
+    drawn, held = slice(0, len(shown)), slice(len(shown), None)
+    some = slice(0, len(shown) + 300)  # those with the mass of a model with effects
     masses = bin_masses(_parameters(run, index[some]), histograms.of(some), run.model.at(index[some]))
     channel = run.sensor.kind == "histograms"
     fits = pixel_fits(shown, run.maps, run.fit, histograms.of(drawn), masses[drawn], channel=channel)
@@ -197,7 +189,9 @@ def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
 def _inspector(store: RunStore, run: StoredRun, pixels: _Pixels, threads: int) -> InspectorData:
     """Pack maps, and the pixels that are held in full, for the inspector."""
     index, held, shape = pixels.full.index, pixels.histograms, run.sensor.shape
-    maps, exact = read_maps(store, shape, index, _at_hand(run), threads)
+    read = {f"maps/{name}": values for name, values in run.maps.items()}
+    read |= {f"fit/{name}": run.fit[name] for name in ("fit_status", "outlier_share") if name in run.fit}
+    maps, exact = read_maps(store, shape, index, read, threads)
     deciding = deciding_parameters(_parameters(run, index), run.model.at(index))
     sample = PixelSample(index, exact, held.origin, held.counts, deciding, pixels.masses, pixels.full.reasons)
     return inspector_data(run.name, shape, maps, sample)
@@ -208,18 +202,10 @@ def _parameters(run: StoredRun, index: NDArray[np.int64]) -> list[NDArray[np.flo
     return [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
 
 
-def _at_hand(run: StoredRun) -> dict[str, NDArray[Any]]:
-    """Return the maps that were read, as they are stored, by path."""
-    found = {f"maps/{name}": values for name, values in run.maps.items()}
-    return found | {
-        f"fit/{name}": run.fit[name] for name in ("fit_status", "outlier_share") if name in run.fit
-    }
-
-
 def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
     """Return the pixels that stand for the sensor."""
     chosen: list[Chosen] = [("", y, x) for y, x in config.report.pixels]
-    if not chosen and run.sensor.names and run.sensor.nx <= _FEW_CHANNELS:
+    if not chosen and run.sensor.names and run.sensor.nx <= 12:
         chosen = [(short_name(name), 0, x) for x, name in enumerate(run.sensor.names)]
     if not chosen:
         chosen = choose_pixels(run.maps["read_noise_e"], run.maps["quanta_exposure"], run.fit["fit_status"])
@@ -280,6 +266,27 @@ def report_data(
     )
 
 
+def verdict_data(found: Verdict, arrays: Mapping[str, NDArray[Any]]) -> DiscrepancyData:
+    """Return what the report shows of a verdict, with the names of effects and statistics.
+
+    Args:
+        found: the verdict.
+        arrays: group ``discrepancy`` of the store.
+    """
+    effects = effect_classes()
+    # those of a search with other statistics are in another order: what its JSON tells is left
+    vectors = ("z_before", "z_after")  # a number for each statistic
+    arrays = {n: array for n, array in arrays.items() if n not in vectors or len(array) == len(STATISTICS)}
+    signs = dict(zip(STATISTICS, arrays.get("z_before", ()), strict=False))
+    return DiscrepancyData(
+        found=found,
+        arrays=arrays,
+        statistics={name: (s.channel, s.says(signs.get(name, 1.0))) for name, s in STATISTICS.items()},
+        titles={tag: effect.title for tag, effect in effects.items() if effect.title},
+        sources={tag: effect.source for tag, effect in effects.items() if effect.source},
+    )
+
+
 def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict[str, Any] | None:
     """Return the frames that precisions need at the median pixel, or None where no pixel has a value.
 
@@ -296,9 +303,10 @@ def plan_section(maps: Mapping[str, NDArray[Any]], n_frames: int | None) -> dict
         point = Point(exposure, noise, gain)
     except ConfigError:
         return None
+    targets = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
     rows = [
         {"target": str(target), "name": target.name, "frames": frames_needed(target, point)}
-        for target in map(parse_target, _TARGETS)
+        for target in map(parse_target, targets)
     ]
     reached = {} if n_frames is None else precision(point, n_frames)
     return {"rows": rows, "reached": reached, "exposure": exposure, "read_noise": noise}
@@ -333,7 +341,8 @@ def _run_facts(run: StoredRun, config: RunConfig) -> dict[str, Any]:
     if version is not None and version.effects:
         facts["model"] = model_words(version.effects)
     if version is not None:
-        facts["version of the model"] = f"{version.number} ({_SOURCES[version.source]})"
+        source = "search for missing effects" if version.source == "verdict" else "configuration"
+        facts["version of the model"] = f"{version.number} (from the {source})"
     if run.record is not None:
         facts["report made (UTC)"] = run.record.started
         facts["versions"] = run.record.versions
@@ -396,7 +405,7 @@ def _missing(run: StoredRun, maps: Mapping[str, NDArray[Any]]) -> dict[str, str]
 
 def _workers(settings: ComputeSettings) -> int:
     """Return how many may work on a report at a time."""
-    workers = available_workers() if settings.workers == "auto" else settings.workers
+    workers = settings.count()
     if settings.max_memory is not None:
         workers = min(workers, max(1, ((settings.max_memory << 20) - BASE_BYTES) // SECOND_PROGRAM_BYTES))
     return workers

@@ -23,7 +23,7 @@ from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
-from pchem_pipeline.stages.methods.inputs import read_methods
+from pchem_pipeline.stages.methods import read_methods
 
 if TYPE_CHECKING:
     from pchem_pipeline.store.records import StageRecord

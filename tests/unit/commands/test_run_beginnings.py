@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.cli.app import app
-from pchem_pipeline.commands.joint import find_joint
-from pchem_pipeline.commands.new_run import find_or_start, first_try, unwritten
+from pchem_pipeline.commands.new_run import find_joint, find_or_start, first_try
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
@@ -52,6 +51,13 @@ def test_what_files_do_not_say_of_themselves_has_an_option(tmp_path, monkeypatch
     assert RunStore.open(tmp_path / "run.zarr").read("histogram/origin").min() < 140
 
 
+def begun(find, *given, **more):
+    """Return the run that was found, its YAML written as by a command that does something."""
+    target, is_new = find(*given, **more)
+    with first_try(target):
+        return target, is_new
+
+
 def test_a_dry_run_writes_no_yaml(tmp_path, file, monkeypatch):
     tifffile.imwrite(file, np.full((9, 8, 8), 100, np.uint16), photometric="minisblack")
     monkeypatch.chdir(tmp_path)
@@ -63,10 +69,10 @@ def test_a_dry_run_writes_no_yaml(tmp_path, file, monkeypatch):
 
 def test_options_can_be_corrected_until_a_stage_is_finished(tmp_path, file):
     place = tmp_path / "run.zarr"
-    target, _ = find_or_start([file], place, {"bit_depth": 8})
+    target, _ = begun(find_or_start, [file], place, {"bit_depth": 8})
     store = RunStore.create(place)
     store.write_config(dump_config(target.config))
-    again, _ = find_or_start([file], place, {"bit_depth": 14})
+    again, _ = begun(find_or_start, [file], place, {"bit_depth": 14})
     assert load_config(tmp_path / "run.yaml") == again.config
     store.write_config(dump_config(again.config))
     store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
@@ -83,7 +89,7 @@ def test_a_folder_of_files_is_one_pattern_wherever_the_store_is(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     files = sorted(Path("frames 1").glob("*.tif"))
     for _ in range(2):
-        target, _ = find_or_start(files, Path("new/run.zarr"), {})
+        target, _ = begun(find_or_start, files, Path("new/run.zarr"), {})
         assert target.config.input.files == ("../frames 1/*.tif",)
     (tmp_path / "frames 1" / "f.tif").touch()
     store = RunStore.create(target.store)
@@ -96,7 +102,7 @@ def test_a_folder_of_files_is_one_pattern_wherever_the_store_is(tmp_path, monkey
 
 def test_an_edited_yaml_is_never_replaced(tmp_path, file):
     place = tmp_path / "run.zarr"
-    target, _ = find_or_start([file], place, {})
+    target, _ = begun(find_or_start, [file], place, {})
     RunStore.create(place).write_config(dump_config(target.config))
     edited = (tmp_path / "run.yaml").read_text().replace("bit_shift: null", "bit_shift: 4")
     (tmp_path / "run.yaml").write_text(edited)
@@ -109,17 +115,17 @@ def test_the_same_command_goes_on_with_a_yaml_that_says_more(tmp_path, file, mon
     """What a search names is written into the YAML, what a user sets too; the command that began goes on."""
     monkeypatch.chdir(tmp_path)
     place = tmp_path / "run.zarr"
-    find_or_start([file], place, {"bit_depth": 12}, (0, 8, 8, 16))
+    begun(find_or_start, [file], place, {"bit_depth": 12}, (0, 8, 8, 16))
     RunStore.create(place).records.write(StageRecord("ingest", 1, "f", {}, finished=True))
     path = tmp_path / "run.yaml"
     effects = "effects: [{tag: row_noise, row_noise_dn: 1.0}]  # named"
     edited = path.read_text().replace("effects: []", effects).replace("tail_guard: 0.001", "tail_guard: 0")
     path.write_text(edited)
     for given, roi in (({"bit_depth": 12}, (0, 8, 8, 16)), ({}, None)):
-        again, is_new = find_or_start([file], place, given, roi)
+        again, is_new = begun(find_or_start, [file], place, given, roi)
         assert (is_new, again.config.fit.tail_guard, again.config.input.bit_depth) == (True, 0.0, 12)
         assert [effect.tag for effect in again.config.model.effects] == ["row_noise"]
-        assert unwritten(again) is None
+        assert path.read_text() == edited
     with pytest.raises(ConfigError, match=r"\(input\.bit_depth 12 in the file, 14 here\); continue"):
         find_or_start([file], place, {"bit_depth": 14})
     with pytest.raises(ConfigError, match=r"\(input\.roi \[0, 8, 8, 16\] in the file, \[0, 8, 0, 8\] here\)"):
@@ -133,12 +139,11 @@ def test_a_joint_fit_goes_on_with_its_edited_yaml(tmp_path, monkeypatch):
     for name in ("a", "b"):
         Path(f"{name}.yaml").write_text(f"run: {{store: {name}.zarr}}\ninput: {{files: [{name}.tif]}}\n")
     runs = [Path("a.yaml"), Path("b.yaml")]
-    _, is_new = find_joint(runs, store=Path("j.zarr"))
-    assert is_new
+    begun(find_joint, runs, store=Path("j.zarr"))
     edited = Path("j.yaml").read_text().replace("integration_time: null", "integration_time: 2.0", 1)
     Path("j.yaml").write_text(edited)
-    again, is_new = find_joint(runs, store=Path("j.zarr"))
-    assert not is_new
+    again, _ = begun(find_joint, runs, store=Path("j.zarr"))
+    assert Path("j.yaml").read_text() == edited
     assert again.config.input.samples[0].integration_time == 2.0
     with pytest.raises(ConfigError, match="exists with other settings"):
         find_joint(runs[::-1], store=Path("j.zarr"))
@@ -176,13 +181,13 @@ def test_a_first_try_that_is_refused_leaves_nothing_behind(tmp_path, file, monke
 
 
 def test_a_try_that_was_refused_later_keeps_what_was_done(tmp_path, file):
-    target, _ = find_or_start([file], tmp_path / "run.zarr", {}, write=False)
+    target, _ = find_or_start([file], tmp_path / "run.zarr", {})
 
     def lose_a_file():
         RunStore.create(target.store).records.write(StageRecord("ingest", 1, "f", {}, keys=4))
         raise InputError("a file is gone")
 
-    with pytest.raises(InputError), first_try(target, dump_config(target.config)):
+    with pytest.raises(InputError), first_try(target):
         lose_a_file()
     assert target.store.exists()
     assert (tmp_path / "run.yaml").exists()

@@ -6,11 +6,11 @@ from helpers import reference_pchem
 from helpers.drawn_pixels import draw, samples
 from scipy.stats import kstat
 
-from pchem_pipeline.methods.base import PixelSamples, Sample, Settings, sample_moments
+from pchem_pipeline.methods.base import PixelSamples, Sample, methods, sample_moments
 from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, summarise_errors
 from pchem_pipeline.methods.peak_valley import comb, read_noise_of_valley
 from pchem_pipeline.methods.plain_em import run_em
-from pchem_pipeline.methods.registry import methods
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 
@@ -52,7 +52,7 @@ def test_moments_are_k_statistics():
 
 def test_photon_transfer_is_that_of_raw_samples():
     bright, dark = sample(2.0), sample(0.0)
-    found = methods()["photon_transfer"].estimate(PixelSamples((bright, dark)), Settings()).parameters
+    found = methods()["photon_transfer"].estimate(PixelSamples((bright, dark)), MethodsSettings()).parameters
     for pixel in range(3):
         b, d = (samples(s.counts[pixel], s.origin[pixel]) for s in (bright, dark))
         gain = (b.mean() - d.mean()) / (b.var(ddof=1) - d.var(ddof=1))
@@ -62,8 +62,8 @@ def test_photon_transfer_is_that_of_raw_samples():
 
 def test_the_series_of_two_samples_is_the_two_sample_method():
     pixels = PixelSamples((sample(2.0), sample(0.0)))
-    pair = methods()["photon_transfer"].estimate(pixels, Settings()).parameters
-    line = methods()["photon_transfer_series"].estimate(pixels, Settings()).parameters
+    pair = methods()["photon_transfer"].estimate(pixels, MethodsSettings()).parameters
+    line = methods()["photon_transfer_series"].estimate(pixels, MethodsSettings()).parameters
     np.testing.assert_allclose(line, pair, rtol=1e-9)
 
 
@@ -71,9 +71,9 @@ def test_emva_leaves_out_what_nears_saturation():
     dark, half, bright = sample(0.0), sample(1.0), sample(8.0, noise=0.9)
     method = methods()["emva1288"]
     top = int(bright.moments().mean.mean())
-    whole = method.estimate(PixelSamples((half, dark, bright)), Settings()).parameters
-    inside = method.estimate(PixelSamples((half, dark, bright), (0, top)), Settings()).parameters
-    two = method.estimate(PixelSamples((half, dark)), Settings()).parameters
+    whole = method.estimate(PixelSamples((half, dark, bright)), MethodsSettings()).parameters
+    inside = method.estimate(PixelSamples((half, dark, bright), (0, top)), MethodsSettings()).parameters
+    two = method.estimate(PixelSamples((half, dark)), MethodsSettings()).parameters
     np.testing.assert_allclose(inside, two)
     assert abs(whole[0, 1] / two[0, 1] - 1) > 1e-6
     assert np.unique(inside[:, 1]).size == 1
@@ -86,7 +86,7 @@ def test_one_em_step_is_that_of_the_paper(noise):
     start = reference_pchem.Theta(1.2, 0.1, 100.0 - origin, 4.0)
     expected = reference_pchem.em_step(raw, start)
     at = np.array([[start.exposure, start.gain, start.bias, start.sigma]])
-    one_step = Settings(em_iterations=1, em_tolerance=1e-12)
+    one_step = MethodsSettings(em_iterations=1, em_tolerance=1e-12)
     found, steps = run_em(Sample(drawn.counts, np.zeros(1, int)), at, False, one_step)
     assert steps.tolist() == [1]
     np.testing.assert_allclose(found[0], expected, rtol=1e-9)
@@ -96,7 +96,7 @@ def test_em_with_known_bias_and_noise_is_a_maximum():
     """At the end of the steps no small change of H or g makes the bright sample likelier."""
     bright, dark = sample(1.5, noise=0.4), sample(0.0, noise=0.4)
     pixels = PixelSamples((bright, dark))
-    found = methods()["dark_and_bright_mle"].estimate(pixels, Settings(em_tolerance=1e-10)).parameters
+    found = methods()["dark_and_bright_mle"].estimate(pixels, MethodsSettings(em_tolerance=1e-10)).parameters
     raw = samples(bright.counts[0], bright.origin[0])
     exposure, gain, bias, sigma = found[0]
 
@@ -117,7 +117,9 @@ def test_em_with_known_bias_and_noise_is_a_maximum():
 def test_peaks_need_no_luck_with_their_first_distance(exposure, noise, gain):
     """No pixel takes every second peak, or half a peak: the rms error of g is the spread of all."""
     one = sample(exposure, noise=noise, n_pixels=150, n_frames=1500, gain=gain)
-    error = methods()["peak_valley"].estimate(PixelSamples((one,)), Settings()).parameters[:, 1] / gain - 1
+    error = (
+        methods()["peak_valley"].estimate(PixelSamples((one,)), MethodsSettings()).parameters[:, 1] / gain - 1
+    )
     assert np.isfinite(error).all()
     assert np.abs(error).max() < 0.05
     assert np.sqrt(np.mean(error**2)) < 2 * 1.4826 * np.median(np.abs(error - np.median(error)))
@@ -154,13 +156,13 @@ def spikes(*bins):
 def test_no_pixel_stops_a_method(counts):
     one = Sample(counts, np.array([100]))
     for other in (one, sample(2.0, n_pixels=1)):
-        for result in compare(PixelSamples((one, other, one)), None, Settings()):
+        for result in compare(PixelSamples((one, other, one)), None, MethodsSettings()):
             assert result.missing == ""
             assert result.estimates.shape == (1, 4)
 
 
 def test_methods_say_which_samples_they_lack():
-    results = {r.name: r for r in compare(PixelSamples((sample(1.0),)), None, Settings())}
+    results = {r.name: r for r in compare(PixelSamples((sample(1.0),)), None, MethodsSettings())}
     assert results["photon_transfer"].missing == "needs a dark and a bright sample; this comparison has 1"
     assert results["photon_transfer_series"].missing.startswith("needs a series")
     assert results["pchem_em"].missing == ""

@@ -31,8 +31,8 @@ from pchem_pipeline.run.model_versions import (
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.table import STAGES
-from pchem_pipeline.store.files import read_record, write_record
-from pchem_pipeline.store.records import StageRecord, fingerprint_of
+from pchem_pipeline.store.files import fingerprint_of, read_record, write_record
+from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.run_store import RunStore
 
 QUIET = Command(quiet=True)

@@ -9,11 +9,16 @@ import pytest
 
 from pchem_pipeline.base import kernel_cache
 from pchem_pipeline.commands.watch import rows
-from pchem_pipeline.run import compilation
-from pchem_pipeline.run.compilation import announced
+from pchem_pipeline.run import progress
 from pchem_pipeline.run.fingerprint import StageState
-from pchem_pipeline.run.progress import Reporter, paced, parts_told, telling_parts
-from pchem_pipeline.store.progress_file import ProgressFile, read_progress
+from pchem_pipeline.run.progress import (
+    ProgressFile,
+    Reporter,
+    paced,
+    parts_told,
+    read_progress,
+    telling_parts,
+)
 from pchem_pipeline.store.run_store import RunStore
 
 
@@ -54,13 +59,13 @@ def test_a_bar_moves_within_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_the_time_of_compiling_is_no_part_of_the_rate(tmp_path: Path) -> None:
     reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
-    with reporter.progress("fit", 1000, "tile") as advance:
-        reporter.compiling(1e4)
+    with reporter.compilation("fit"), reporter.progress("fit", 1000, "tile") as advance:
+        heard(("one", None), ("one", 1e4))
         for _ in range(1000):
             advance()
     reporter.close()
     events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
-    assert events[-1]["rate"] == pytest.approx(1e6)
+    assert [each["rate"] for each in events if each["event"] == "progress"][-1] == pytest.approx(1e6)
 
 
 def test_phases_are_named_and_named_again_where_nothing_else_is_heard(
@@ -177,21 +182,21 @@ def test_the_terminal_says_what_is_compiled(tmp_path, capsys, monkeypatch):
     def said():
         return capsys.readouterr().err.splitlines()
 
-    monkeypatch.setattr(compilation, "cache_folder", lambda: tmp_path)
-    with announced(Reporter("off"), "fit"):
+    monkeypatch.setattr(progress, "cache_folder", lambda: tmp_path)
+    with Reporter("off").compilation("fit"):
         pass
     assert said() == []
-    with announced(Reporter("off"), "fit"):
+    with Reporter("off").compilation("fit"):
         heard(("one", None), ("one", 1.5), ("two", None), ("two", 2.5))
     assert said() == [
         "fit: compiling kernels (once after an installation or update)",
         "fit: 2 kernels compiled in 4 s",
     ]
-    with announced(Reporter("off"), "maps", 400):
+    with Reporter("off").compilation("maps", 400):
         heard(("one", None), ("one", 1.0))
     assert "490 MiB, more than compute.max_memory (--max-memory) allows (400 MiB)" in said()[1]
-    monkeypatch.setattr(compilation, "cache_folder", lambda: Path("/proc/nowhere"))
-    with announced(Reporter("off"), "maps", 600):
+    monkeypatch.setattr(progress, "cache_folder", lambda: Path("/proc/nowhere"))
+    with Reporter("off").compilation("maps", 600):
         heard(("one", None), ("one", 1.0))
     assert said()[1:] == [
         "maps: 1 kernel compiled in 1 s",

@@ -16,9 +16,9 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.run import input_identity
+from pchem_pipeline.run import input as run_input
 from pchem_pipeline.run.fingerprint import StageState, status
-from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
@@ -139,13 +139,13 @@ def test_stop_and_resume(tmp_path: Path, small_chunks: None, monkeypatch: pytest
 def test_identity_is_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_stack(tmp_path / "cam")
     hashed: list[list[str]] = []
-    real = input_identity.content_identity
+    real = run_input.content_identity
 
     def content(paths: list[Path], advance: Any) -> dict[str, Any]:
         hashed.append([path.name for path in paths])
         return real(paths, advance)
 
-    monkeypatch.setattr(input_identity, "content_identity", content)
+    monkeypatch.setattr(run_input, "content_identity", content)
     run(make_context(tmp_path))
     assert len(hashed) == 1
     again = make_context(tmp_path)

@@ -7,7 +7,8 @@ import pytest
 import xarray as xr
 
 from pchem_pipeline.base.errors import LockedError, StoreError
-from pchem_pipeline.store.records import Records, fingerprint_of
+from pchem_pipeline.store.files import fingerprint_of
+from pchem_pipeline.store.records import Records
 from pchem_pipeline.store.run_store import RunStore
 
 

@@ -494,7 +494,8 @@ def test_the_page_of_a_run(tmp_path: Path) -> None:
     """From the files of a run: JSON and arrays written, read back, and the same."""
     from pchem_pipeline.base.errors import StoreError
     from pchem_pipeline.run.sensor import SensorInfo
-    from pchem_pipeline.stages.discrepancy.result import discrepancy_state, verdict_data
+    from pchem_pipeline.stages.identities import discrepancy_state
+    from pchem_pipeline.stages.report.report import verdict_data
     from pchem_pipeline.stages.report.stored import read_run
     from pchem_pipeline.store.run_store import RunStore
 
@@ -526,7 +527,7 @@ def test_pixels_that_are_not_identified_are_said_beside_a_name() -> None:
 
 
 def test_a_statistic_of_the_report_says_what_its_sign_says() -> None:
-    from pchem_pipeline.stages.discrepancy.result import verdict_data
+    from pchem_pipeline.stages.report.report import verdict_data
 
     found = discrepancy_data("named").found
     names = list(verdict_data(found, {}).statistics)

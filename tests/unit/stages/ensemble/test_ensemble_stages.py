@@ -28,7 +28,8 @@ from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
-from pchem_pipeline.stages.fit.code_sums import CodeSums, on_axis
+from pchem_pipeline.stages.ensemble.ensemble import on_axis
+from pchem_pipeline.stages.fit.fit import code_sums
 from pchem_pipeline.stages.report.report import report_data
 from pchem_pipeline.stages.report.stored import read_run
 from pchem_pipeline.stages.table import STAGES
@@ -321,10 +322,7 @@ def test_samples_that_the_fit_counted_need_no_histograms(
     for tile in context.tiles():
         read = {name: store.read(f"histogram/{name}", tile.region) for name in HISTOGRAM}
         fit = {name: store.read(f"fit/{name}", tile.region) for name in PARAMETERS}
-        codes = CodeSums(read["origin"], read["counts"].shape[2])
-        for rows in (slice(0, 7), slice(7, None)):
-            codes.add(*({name: values[rows] for name, values in each.items()} for each in (read, fit)))
-        store.records.mark("fit", "truth", tile.key, {"codes": codes.content()})
+        store.records.mark("fit", "truth", tile.key, {"codes": code_sums(read, list(fit.values()))})
     plain_read = RunStore.read
 
     def read_little(self: RunStore, name: str, *region: Any) -> Any:
@@ -343,10 +341,8 @@ def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis()
     counts = np.arange(12, dtype=np.uint16).reshape(1, 3, 4)
     origin = np.array([[100, 100, 102]], np.int32)
     outside = {"under": np.array([[1, 10, 100]], np.uint32), "over": np.array([[0, 1, 0]], np.uint32)}
-    fit = {name: np.array([[1.0, np.nan, 1.0]]) for name in PARAMETERS}
-    codes = CodeSums(origin, 4)
-    codes.add({"counts": counts, "origin": origin, **outside}, fit)
-    content = codes.content()
+    maps = [np.array([[1.0, np.nan, 1.0]])] * 4
+    content = code_sums({"counts": counts, "origin": origin, **outside}, maps)
     assert content == {"dn": [101, 102, 103, 104, 105], "samples": [1, 10, 12, 10, 11], "outside": 101}
     samples, beyond = on_axis(content, DnAxis(102, 3))
     assert samples.tolist() == [10, 12, 10]

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pchem_pipeline.compute.memory import BASE_BYTES
-from pchem_pipeline.config.memory import allowed_bytes, band_bytes
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
+from pchem_pipeline.run.stage import allowed_bytes, band_bytes
 from pchem_pipeline.stages.bands import plan_bands
 from pchem_pipeline.stages.histogram.arrays import row_frames
 from pchem_pipeline.stages.histogram.dry_run import make_plan

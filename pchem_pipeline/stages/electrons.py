@@ -8,21 +8,17 @@ large as the stack.
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.electrons.electrons import (
     LARGEST_NUMBER,
     NO_NUMBER,
-    KnownPixels,
     NumberTables,
     number_tables,
 )
-from pchem_pipeline.run.frame_source import open_source
+from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import BAND_BYTES, tile_bands
 from pchem_pipeline.stages.fit.fitted_model import fitted_pixels
@@ -36,24 +32,12 @@ if TYPE_CHECKING:
 _CHUNK_FRAMES, _CHUNK_COLUMNS = 256, 128
 
 
-def electrons_tile(
-    minimum: NDArray[np.integer[Any]], maximum: NDArray[np.integer[Any]], pixels: KnownPixels
-) -> NumberTables:
-    """Return the electron number of each code that some pixels have shown, the fitted H being the prior.
-
-    Args:
-        minimum: smallest DN, shape (y, x).
-        maximum: largest DN, likewise.
-        pixels: what the fit says of them.
-    """
-    return number_tables(minimum, maximum, pixels.exposure, pixels)
-
-
 def read_tables(store: RunStore, rows: slice) -> NumberTables:
-    """Return the electron numbers of the codes of some rows of a run."""
+    """Return the electron numbers of the codes that some rows have shown, the fitted H being the prior."""
     region = rows, slice(None)
-    ends = store.read_arrays("histogram", ("minimum", "maximum"), region)
-    return electrons_tile(**ends, pixels=fitted_pixels(store, region))
+    low, high = (store.read(f"histogram/{name}", region) for name in ("minimum", "maximum"))
+    pixels = fitted_pixels(store, region)
+    return number_tables(low, high, pixels.exposure, pixels)
 
 
 def run(context: StageContext) -> None:

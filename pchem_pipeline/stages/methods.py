@@ -8,51 +8,96 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.methods.base import FloatArray, PixelSamples, Sample, Settings
-from pchem_pipeline.methods.compare import MethodResult, compare
-from pchem_pipeline.methods.registry import methods
-from pchem_pipeline.methods.settings import MethodsSettings
+from pchem_pipeline.methods.base import FloatArray, PixelSamples, Sample, methods
+from pchem_pipeline.methods.compare import compare
 from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
+from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Named, StageContext
-from pchem_pipeline.stages.methods.inputs import METHODS_FILE, methods_settings, open_other_runs
+from pchem_pipeline.stages.identities import methods_settings
+from pchem_pipeline.store.files import read_json
+from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
-    from pchem_pipeline.store.run_store import RunStore
+    from pchem_pipeline.methods.settings import MethodsSettings
 
-#: Pixels whose fit is no reference: no value, or a bias that may be one electron off.
-_NO_REFERENCE = FAILED | AMBIGUOUS
-_DARK_LIMIT = 0.01  # e-: more electrons in the dark sample are remarked
-
-
+#: File of the result in the folder of a run.
+METHODS_FILE = "methods.json"
 #: The run's pixels (None), or one read noise of the simulation.
 _Unit = Named[StudyPoint | None]
 
 
-@dataclass(frozen=True)
-class _Task:
-    """Does a unit."""
+def read_methods(store: RunStore) -> dict[str, Any] | None:
+    """Return the content of ``methods.json`` of a run, or None where there is none.
 
-    others: tuple[Path, ...]
-    settings: MethodsSettings
-    adc_limits: tuple[int, int] | None
+    Raises:
+        StoreError: it cannot be read.
+    """
+    result = read_json(store.path / METHODS_FILE)
+    if result is not None and not (isinstance(result, dict) and "study" in result):
+        raise StoreError(f"{store.path / METHODS_FILE} is damaged; run pchem methods with --force")
+    return result
 
-    def __call__(self, unit: _Unit, store: RunStore) -> dict[str, Any]:
-        """Compare the methods and return the numbers as plain data."""
-        numbers = Settings(self.settings.em_iterations, self.settings.em_tolerance)
-        if unit.content is not None:
-            return study_point(unit.content, numbers)
-        return _compare_run(store, self, numbers)
+
+def open_other_runs(store: RunStore, base_dir: Path, names: tuple[str, ...]) -> list[RunStore]:
+    """Return the stores of other runs.
+
+    Args:
+        store: the run that they are compared with.
+        base_dir: folder to which relative names refer.
+        names: as in ``methods.with_runs``.
+
+    Raises:
+        ConfigError: a run is listed twice, or is the run itself.
+        InputError: a run is of other pixels or another ADC, or holds the same frames as another.
+        StoreError: a run is missing or has no histograms.
+    """
+    here = SensorInfo.read(store)
+    seen: dict[str, str] = {here.identity.get("digest", ""): store.path.name}
+    paths = {store.path.resolve()}
+    found = []
+    for name in names:
+        path = base_dir / name
+        if path.resolve() in paths:
+            what = "is the run itself" if path.resolve() == store.path.resolve() else "is listed twice"
+            raise ConfigError(f"methods.with_runs: {name} {what}; give each sample once")
+        paths.add(path.resolve())
+        other = RunStore.open(path)
+        if not other.has("histogram/counts"):
+            raise StoreError(f"{path} has no histograms yet; run: pchem histogram {quoted(path)}")
+        there = SensorInfo.read(other)
+        _same_pixels(here, there, name)
+        digest = there.identity.get("digest", "")
+        if digest and digest in seen:
+            raise InputError(
+                f"{name} has the same frames as {seen[digest]}; give a sample at another exposure"
+            )
+        seen[digest] = name
+        found.append(other)
+    return found
+
+
+def _same_pixels(here: SensorInfo, there: SensorInfo, name: str) -> None:
+    """Refuse samples of other sensors."""
+    if here.shape != there.shape:
+        raise InputError(
+            f"{name} has {there.ny} x {there.nx} pixels, this run {here.ny} x {here.nx}; samples must have "
+            "the same pixels (see input.roi)"
+        )
+    if None not in (here.bit_depth, there.bit_depth) and here.bit_depth != there.bit_depth:
+        raise InputError(
+            f"{name} has {there.bit_depth} bits, this run {here.bit_depth}; samples must be from the same "
+            "sensor"
+        )
 
 
 def choose(shape: tuple[int, int], n_pixels: int, seed: int) -> NDArray[np.int64]:
@@ -69,20 +114,6 @@ def choose(shape: tuple[int, int], n_pixels: int, seed: int) -> NDArray[np.int64
     total = shape[0] * shape[1]
     chosen = np.random.default_rng(seed).permutation(total)[: min(n_pixels, total)]
     return np.sort(chosen).astype(np.int64)
-
-
-def methods_tile(
-    pixels: PixelSamples, reference: FloatArray | None, settings: Settings, *, ours: bool
-) -> list[MethodResult]:
-    """Return what every method makes of some pixels; pure.
-
-    Args:
-        pixels: their samples.
-        reference: (H, g, mu, sigma) held for true, shape (n, 4), or None.
-        settings: of the methods.
-        ours: the reference is the fit of the run itself, against which PCH-EM cannot err.
-    """
-    return compare(pixels, reference, settings, skip_errors=("pchem_em",) if ours else ())
 
 
 def run(context: StageContext) -> None:
@@ -106,7 +137,12 @@ def run(context: StageContext) -> None:
     context.create("methods/pixel_y", "methods/pixel_x", lengths=lengths)
     context.create(*(f"methods/{name}" for name in PARAMETERS), lengths=lengths, methods=names)
     units = [_Unit("run", None), *_study_units(context, settings)]
-    task = _Task(tuple(o.path for o in others), settings, context.sensor.adc_limits)
+    task = functools.partial(
+        _do,
+        stores=[context.store.path, *(other.path for other in others)],
+        settings=settings,
+        adc_limits=context.sensor.adc_limits,
+    )
     found = context.run_units(units, task, unit_name="part", by_tiles=False)
     if not {unit.key for unit in units} <= found.keys():
         return
@@ -149,37 +185,39 @@ def _study_units(context: StageContext, settings: MethodsSettings) -> list[_Unit
     ]
 
 
-def _compare_run(store: RunStore, task: _Task, numbers: Settings) -> dict[str, Any]:
-    """Compare the methods on the run's pixels, and store their estimates."""
+def _do(
+    unit: _Unit,
+    store: RunStore,
+    *,
+    stores: Sequence[Path],
+    settings: MethodsSettings,
+    adc_limits: tuple[int, int] | None,
+) -> dict[str, Any]:
+    """Compare the methods on simulated pixels, or on those of the run, whose estimates are stored."""
+    if unit.content is not None:
+        return study_point(unit.content, settings)
     shape = store.array("fit/bias").shape
-    place = choose((shape[0], shape[1]), task.settings.pixels, task.settings.seed)
-    stores = [store, *(_readable(path) for path in task.others)]
-    samples = tuple(_sample(each, (shape[0], shape[1]), place) for each in stores)
-    reference, words = _reference(store, place)
-    pixels = PixelSamples(samples, task.adc_limits)
-    results = methods_tile(pixels, reference, numbers, ours=words == "fit")
+    place = choose((shape[0], shape[1]), settings.pixels, settings.seed)
+    samples = tuple(_sample(RunStore.open(path), (shape[0], shape[1]), place) for path in stores)
+    reference, source = _reference(store, place)
+    # against its own fit PCH-EM cannot err
+    skipped = ("pchem_em",) if source == "fit" else ()
+    results = compare(PixelSamples(samples, adc_limits), reference, settings, skip_errors=skipped)
     y, x = np.divmod(place, shape[1])
-    everything = (slice(None),)
-    store.write("methods/pixel_y", everything, y.astype(np.int32))
-    store.write("methods/pixel_x", everything, x.astype(np.int32))
+    store.write("methods/pixel_y", (slice(None),), y.astype(np.int32))
+    store.write("methods/pixel_x", (slice(None),), x.astype(np.int32))
     blank = np.full((place.size, 4), np.nan)
     estimates = np.stack([blank if r.estimates is None else r.estimates for r in results])
     for column, name in enumerate(PARAMETERS):
         store.write(f"methods/{name}", (slice(None), slice(None)), estimates[:, :, column])
+    words = _sample_words([path.name for path in stores], samples, reference)
     return {
         "pixels": int(place.size),
-        "reference": words,
-        "samples": _sample_words(stores, samples, reference),
-        "remarks": _remarks(stores, samples, reference),
+        "reference": source,
+        "samples": words,
+        "remarks": _remarks(words),
         "methods": [result.as_json() for result in results],
     }
-
-
-@functools.lru_cache(maxsize=8)
-def _readable(path: Path) -> RunStore:
-    from pchem_pipeline.store.run_store import RunStore
-
-    return RunStore.open(path)
 
 
 def _sample(store: RunStore, shape: tuple[int, int], place: NDArray[np.int64]) -> Sample:
@@ -199,22 +237,23 @@ def _reference(store: RunStore, place: NDArray[np.int64]) -> tuple[FloatArray, s
         columns = [truth["quanta_exposure"], truth["conversion_gain"], truth["bias"], noise]
         return np.stack(columns, axis=1).astype(np.float64), "truth"
     fit = np.stack([store.read(f"fit/{name}").ravel()[place] for name in PARAMETERS], axis=1)
-    fit[(store.read("fit/fit_status").ravel()[place] & int(_NO_REFERENCE)) != 0] = np.nan
+    # no value, or a bias that may be one electron off
+    fit[(store.read("fit/fit_status").ravel()[place] & int(FAILED | AMBIGUOUS)) != 0] = np.nan
     return fit, "fit"
 
 
 def _sample_words(
-    stores: Sequence[RunStore], samples: Sequence[Sample], reference: FloatArray
+    names: Sequence[str], samples: Sequence[Sample], reference: FloatArray
 ) -> list[dict[str, Any]]:
     """Describe the samples: name, frames, and the median exposure that the reference gives them."""
     found = []
-    for store, sample in zip(stores, samples, strict=True):
+    for name, sample in zip(names, samples, strict=True):
         moments = sample.moments()
         exposure = reference[:, 1] * (moments.mean - reference[:, 2])
         known = exposure[np.isfinite(exposure)]
         found.append(
             {
-                "run": store.path.name,
+                "run": name,
                 "n_frames": int(np.median(moments.n_frames)),
                 "quanta_exposure": float(np.median(known)) if known.size else None,
             }
@@ -222,21 +261,18 @@ def _sample_words(
     return found
 
 
-def _remarks(stores: Sequence[RunStore], samples: Sequence[Sample], reference: FloatArray) -> list[str]:
+def _remarks(samples: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say what the comparison lacks."""
     if len(samples) == 1:
         return [
             "one sample: methods that need dark frames or a series are omitted; add runs of the same pixels "
             "at other exposures with --with"
         ]
-    words = _sample_words(stores, samples, reference)
-    darkest = min(
-        words, key=lambda each: np.inf if each["quanta_exposure"] is None else each["quanta_exposure"]
-    )
-    exposure = darkest["quanta_exposure"]
-    if exposure is not None and exposure > _DARK_LIMIT:
-        return [
-            f"the darkest sample, {darkest['run']}, has electrons (H = {exposure:.3g} e-): methods that use "
-            "it as bias are off by this amount"
-        ]
-    return []
+    known = [each for each in samples if each["quanta_exposure"] is not None]
+    darkest = min(known, key=lambda each: each["quanta_exposure"], default=None)
+    if darkest is None or darkest["quanta_exposure"] <= 0.01:
+        return []
+    return [
+        f"the darkest sample, {darkest['run']}, has electrons (H = {darkest['quanta_exposure']:.3g} e-): "
+        "methods that use it as bias are off by this amount"
+    ]

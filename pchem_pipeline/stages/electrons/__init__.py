@@ -1,1 +1,0 @@
-"""Stage ``electrons``: the stack of electron numbers."""

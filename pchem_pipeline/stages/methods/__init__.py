@@ -1,1 +1,0 @@
-"""Stage ``methods``: other characterisation methods on the same pixels."""
