@@ -37,7 +37,7 @@ class PeakValley(Method):
         sample = pixels.samples[0]
         spacing = 1.0 / closed_form_start(sample)[:, 1]
         spacing[~(spacing < 0.5 * sample.counts.shape[1])] = np.nan
-        width = np.maximum(0.12 * spacing, 0.3)
+        width = np.maximum(0.12 * spacing, 0.3)  # of the smoothing, a share of the distance of two peaks
         found = np.full((pixels.n_pixels, 4), np.nan)
         for pixel in np.flatnonzero(np.isfinite(spacing)):
             found[pixel] = comb(sample.counts[pixel], spacing[pixel], width[pixel])

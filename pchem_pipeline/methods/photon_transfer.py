@@ -83,6 +83,7 @@ class Emva1288(Method):
         signal, noise = mean - mean[dark], variance - variance[dark]
         linear = np.ones(mean.size, np.bool_)
         if pixels.adc_limits is not None:
+            # of the saturation: EMVA 1288 release 3.1, section on sensitivity
             linear = signal <= 0.7 * (pixels.adc_limits[1] - mean[dark])
         out = no_estimates(pixels.n_pixels)
         steepness = float((signal * noise)[linear].sum())

@@ -42,7 +42,7 @@ def _tell_time(context: StageContext) -> None:
     time, stated = context.sensor.integration_time, SensorInfo.read(context.store).integration_time
     if time is None:
         context.note(NO_TIME)
-    elif stated is not None and abs(time - stated) > 1e-3 * stated:
+    elif stated is not None and abs(time - stated) > 1e-3 * stated:  # times are written with few digits
         context.note(f"integration time {time:g} s from input.integration_time; the files state {stated:g} s")
 
 

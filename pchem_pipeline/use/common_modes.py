@@ -126,7 +126,7 @@ def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
         calibration: of these pixels.
     """
     signal = (mean - calibration.bias) * calibration.conversion_gain
-    return np.where(calibration.usable, np.maximum(signal, 0.02), np.nan)
+    return np.where(calibration.usable, np.maximum(signal, 0.02), np.nan)  # e-, at least
 
 
 @dataclass(frozen=True)
@@ -249,12 +249,13 @@ def estimate_offsets(
         weight = np.nan_to_num(1.0 / (known * step**2 + sigma**2))
         form = np.stack([weight * np.nan_to_num(frame - calibration.bias - known * step), weight])
         z = design.top(form, np.zeros_like(design.sums(weight)))
-        for _ in range(4):
+        for _ in range(4):  # expansions in the offsets
             offset = design.offsets(*design.unpacked(z))
             given = pcd_posterior(
                 frame - calibration.bias - offset, known, calibration.conversion_gain, 0.0, sigma
             )
             # what is left open of the electron number takes from what a sample tells of its offset
+            # but for a twentieth of what one tells whose electron number is known
             open_part = (given.ee - given.e**2) / sigma**2
             information = np.maximum(1.0 - open_part, 0.05) / sigma**2
             score = given.e / sigma**2 + information * offset  # of the offset itself, not of its change

@@ -173,7 +173,7 @@ def check_level(some: NDArray[Any], calibration: Calibration, name: Path) -> lis
             f"mean {-np.median(above):.2f} DN below the bias of the run: the offset has changed; use a "
             "characterisation at the same temperature"
         )
-    if signal > 30.0 * max(usual, 0.1):
+    if signal > 30.0 * max(usual, 0.1):  # beyond it a gain is extrapolated
         remarks.append(
             f"mean signal {signal:.3g} e-, but {usual:.3g} e- in the characterisation; the same gain is "
             "assumed"

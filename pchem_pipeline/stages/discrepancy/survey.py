@@ -268,6 +268,7 @@ def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> t
 def mean_codes(store: RunStore) -> float:
     """Return how many codes the law of a pixel has, on average in the row with the most."""
     span = store.read("histogram/maximum") - store.read("histogram/minimum")
+    # the law reaches a little beyond the smallest and the largest sample
     return float(span.mean(axis=1).max()) * 1.2 + 8
 
 

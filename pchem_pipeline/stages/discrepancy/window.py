@@ -131,6 +131,7 @@ def other_window(window: Window, shape: tuple[int, int, int], roi: Sequence[int]
         for first, end, size in ((y0, y1, height), (x0, x1, width))
     )
     y, x = max(itertools.product(sorted(rows), sorted(columns)), key=away)
+    # of windows that share more the one says little of the other
     if -away((y, x))[0] > 0.5 * height * width:
         return None
     return replace(window, rows=(y, y + height), columns=(x, x + width))

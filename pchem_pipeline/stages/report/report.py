@@ -205,7 +205,7 @@ def _parameters(run: StoredRun, index: NDArray[np.int64]) -> list[NDArray[np.flo
 def _shown(run: StoredRun, config: RunConfig) -> list[Chosen]:
     """Return the pixels that stand for the sensor."""
     chosen: list[Chosen] = [("", y, x) for y, x in config.report.pixels]
-    if not chosen and run.sensor.names and run.sensor.nx <= 12:
+    if not chosen and run.sensor.names and run.sensor.nx <= 12:  # so few are all shown
         chosen = [(short_name(name), 0, x) for x, name in enumerate(run.sensor.names)]
     if not chosen:
         chosen = choose_pixels(run.maps["read_noise_e"], run.maps["quanta_exposure"], run.fit["fit_status"])
