@@ -17,8 +17,8 @@ from pchem_pipeline.discrepancy.build_verdict import (
     Addition,
     largest_pulls,
 )
-from pchem_pipeline.discrepancy.by_likelihood.comb import electrons_of, find_residuals, set_aside_residual
-from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap, carried_over
+from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals, places_of, set_aside_residual
+from pchem_pipeline.discrepancy.by_likelihood.gap import Distance, on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet
@@ -41,24 +41,30 @@ class AddedSets:
         parts: train, test and final histograms, shape (n, B) each.
         found: what the search came to.
         plain: the fit without effects to train and test.
-        replicates: behind expectation and floor of a gap.
-        rng: their random numbers.
     """
 
     parts: tuple[IntArray, ...]
     found: Explanation
     plain: FittedSet
-    replicates: int
-    rng: np.random.Generator
 
     def __post_init__(self) -> None:
-        """Prepare the gap: codes that are set aside keep what they have under the plain model."""
-        kept = self.found.kept
-        carried = 0.0 if kept.all() else carried_over(self.plain.log_masses, self.parts[2], kept)
-        old = self.found.sets
+        """Add train and test part: what is added is fitted to both."""
         self.both = self.parts[0] + self.parts[1]
-        self.sets = replace(old.on(kept, old.start), train=self.both)
-        self.gaps = LikelihoodGap(self.parts[2], kept, carried, self.replicates, self.rng)
+        self.sets = replace(self.found.sets.on(self.found.kept, self.found.sets.start), train=self.both)
+
+    def gap(self, fitted: FittedSet) -> Gap:
+        """Return the gap of a fit on the final part.
+
+        Codes that are set aside keep what they have under the plain model: what is not understood does not
+        count as closed.
+        """
+        masses = on_all_codes(fitted.log_masses, self.found.kept, self.plain.log_masses)
+        return self.distance(fitted, np.ones_like(self.found.kept), masses).gap
+
+    def distance(self, fitted: FittedSet, kept: NDArray[np.bool_], log_masses: FloatArray) -> Distance:
+        """Return the distance of the final part from a fit among some codes."""
+        share = float(self.parts[2].sum() / self.both.sum())
+        return Distance.of(self.parts[2], kept, log_masses, fitted.n_parameters, share)
 
     def close(
         self, before: Gap, nulls: tuple[NullModel, NullModel], z: Measured, still: bool
@@ -79,7 +85,7 @@ class AddedSets:
         for named in self.found.named:
             members = (*members, named.member)
             extended = self._refit(members)
-            after = self.gaps.gap(self.sets.problem(members), extended.fit)
+            after = self.gap(extended)
             addition = self._addition(named, members, (gap, after), (fitted, extended))
             additions.append(replace(addition, pulls=moved))
             gap, fitted = after, extended
@@ -90,7 +96,7 @@ class AddedSets:
             nearest=self.found.nearest,
             stand_ins=tuple(m.tag for m in self.found.unsteady),
             residuals=self.residuals(fitted) if still or not gap.at_floor else (),
-            set_aside=tuple((i.low, i.high) for i in self.found.set_aside),
+            set_aside=self.found.set_aside,
         )
         return added, fitted
 
@@ -99,22 +105,15 @@ class AddedSets:
         counts, kept = self.both.astype(np.float64), self.found.kept
         expected = self._expected(fitted)
         parameters = fitted.fit.parameters
-        electrons = electrons_of(self.sets.origin, counts.shape[1], parameters)
+        electrons = places_of(self.sets.origin, counts.shape[1], parameters)
         found = find_residuals(
             np.where(kept, counts, 0.0), np.where(kept, expected, 0.0), electrons, parameters
         )
-        peak = self.found.peak
-        if peak is not None:
-            total = self.gaps.gap(self.sets.problem(fitted.members), fitted.fit).value * self.gaps.n_samples
-            aside = set_aside_residual(
-                peak.low,
-                peak.high,
-                float(np.where(kept, 0.0, counts).sum()),
-                float(np.where(kept, 0.0, expected).sum()),
-                parameters,
-                self.gaps.carried / max(total, 1e-12),
-            )
-            found.insert(0, aside)
+        for low, high in self.found.set_aside:
+            seen, wanted = (float(np.where(kept, 0.0, values).sum()) for values in (counts, expected))
+            among = self.distance(fitted, kept, fitted.log_masses).gap.value * self.parts[2][kept].sum()
+            share = 1.0 - float(among / (self.gap(fitted).value * self.parts[2].sum()))
+            found.insert(0, set_aside_residual(low, high, seen, wanted, parameters, share))
         return tuple(found)
 
     def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
@@ -155,15 +154,15 @@ class AddedSets:
         candidates = self._candidates(named, member.effect)
         if named.equals:
             candidates = tuple(c for c in candidates if c.effect in (member.tag, *named.equals))
-        chance = self.gaps.chance(self.sets.problem(extended.members), extended.fit)
-        rivals = self._rivals(named, members, chance)
+        rivals = self._rivals(named, members)
         kin = {member.tag, *type(member.effect).separate}
         return Addition(
             effect=member.effect,
             alone=not named.equals,
             against=member.effect.stuck_words(),
             candidates=candidates,
-            strength_stderr=_stderr(extended, member, named.apart),
+            # of the fit, and what the choice of the codes makes of it
+            strength_stderr=float(np.hypot(extended.stderr(member), named.apart)),
             before=gaps[0],
             after=gaps[1],
             rivals=rivals[:MOST_RIVALS],
@@ -182,7 +181,7 @@ class AddedSets:
             for (e, score, error), w in zip(scored, weights, strict=True)
         )
 
-    def _rivals(self, named: Named, members: tuple[Member, ...], chance: float) -> tuple[Rival, ...]:
+    def _rivals(self, named: Named, members: tuple[Member, ...]) -> tuple[Rival, ...]:
         """Return what could stand in the place of an effect, refitted, with its gap, the best first."""
         others = tuple(m for m in members if m.tag != named.member.tag)
         found = []
@@ -193,20 +192,11 @@ class AddedSets:
                 fitted = self._refit((*others, other))
             except ValueError:
                 continue
-            gap = self.gaps.value(self.sets.problem(fitted.members), fitted.fit, chance)
             why = f"it predicts unseen samples worse, by {-behind:.3g} ± {error:.2g}"
             if other.tag in named.equals:
                 why = "it predicts unseen samples as well: these histograms do not decide"
-            found.append(Rival(effect=other.tag, gap_after=gap, behind=behind, why=why))
+            found.append(Rival(effect=other.tag, gap_after=self.gap(fitted).value, behind=behind, why=why))
         return tuple(sorted(found, key=lambda rival: -rival.behind))
-
-
-def _stderr(extended: FittedSet, member: Member, apart: float) -> float:
-    """Return the standard error of a strength: of the fit, and what the choice of the codes makes of it."""
-    if not member.effect.strength:
-        return float("nan")
-    value, error = (float(v[0]) for v in extended.coordinates(member.tag))
-    return float(np.hypot(member.coordinates[0].error(value, error), apart))
 
 
 def _moved(before: FittedSet, after: FittedSet) -> dict[str, dict[str, Any]]:

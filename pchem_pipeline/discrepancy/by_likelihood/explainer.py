@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_likelihood.additions import AddedSets
-from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
+from pchem_pipeline.discrepancy.by_likelihood.gap import Distance, on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_members
 from pchem_pipeline.discrepancy.by_likelihood.observed import ObservedHistograms, SampleHistograms
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
@@ -39,7 +38,6 @@ from pchem_pipeline.model.fit.shared import Samples
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_FEWEST_REPLICATES = 40
 _SPURIOUS = SpuriousCharge.model_fields["tag"].default
 
 
@@ -200,17 +198,14 @@ class HistogramExplainer(Explainer[Explanation]):
 
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap of the likelihood on the final part."""
-        return self._without_effects
-
-    @cached_property
-    def _without_effects(self) -> Gap:
-        """The gap of the model before anything was added."""
-        whole = LikelihoodGap(self.observed.parts[2], self.sets.kept, 0.0, self._count, self.replicates.rng)
-        return whole.gap(self.sets.problem((), self.observed.both), self.plain.fit)
+        train, test, final = self.observed.parts
+        share = float(final.sum() / (train.sum() + test.sum()))
+        own = self.plain.log_masses, self.plain.n_parameters
+        return Distance.of(final, self.sets.kept, *own, share).gap
 
     def suspects(self, null: NullModel) -> bool:
         """Tell whether several samples fit badly together although no statistic of one deviates."""
-        return self.observed.joint and not self._without_effects.at_floor
+        return self.observed.joint and not self.gap(null).at_floor
 
     def explain(self, null: NullModel, disagreed: bool) -> Explanation | None:
         """Find the set of effects that best predicts the test part, on the codes that are understood.
@@ -221,7 +216,7 @@ class HistogramExplainer(Explainer[Explanation]):
         tried = self.replicates.effort.tried
         tried.clear()
         try:
-            found = explain(self.sets, self.members, self._count, self.replicates.rng)
+            found = explain(self.sets, self.members)
         except EffortSpentError as spent:
             tags = dict.fromkeys(m.tag for m in self.members)
             raise EffortSpentError(spent.doing, (t for t in tags if t not in tried)) from spent
@@ -236,14 +231,16 @@ class HistogramExplainer(Explainer[Explanation]):
 
     def add(self, explanation: Explanation, null: NullModel) -> NullModel:
         """Put the named effects into the model, and observe histograms drawn from it."""
-        vectors = self.replicates.drawn(_with_effects(explanation))
+        vectors = self.replicates.drawn(
+            on_all_codes(explanation.best.log_masses, explanation.kept, explanation.plain.log_masses)
+        )
         return NullModel.from_replicates(null.names, as_matrix(null.names, vectors), effects=True)
 
     def close(self, before: Gap, null: NullModel, disagreed: bool) -> Added:
         """Fit train and test part together with each effect, and measure the gap on the final part."""
         if self.found is None:
             return Added((), before)
-        closing = AddedSets(self.observed.parts, self.found, self.plain, self._count, self.replicates.rng)
+        closing = AddedSets(self.observed.parts, self.found, self.plain)
         added, self.final = closing.close(before, (self.prepared.first, null), self.prepared.z, disagreed)
         self.code = closing.codes(self.final, self.observed.evidence)
         self.effects = along_chain(self.sets.present, [each.effect for each in added.additions])
@@ -252,10 +249,6 @@ class HistogramExplainer(Explainer[Explanation]):
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the parameters of the rows looked at, NaN elsewhere, shape (1, n) or (n, J)."""
         return Fitted(self.observed.maps(self.final.fit.parameters), self.code)
-
-    @property
-    def _count(self) -> int:
-        return max(self.prepared.settings.extended_replicates, _FEWEST_REPLICATES)
 
 
 def _sets(observed: ObservedHistograms, present: tuple[Effect, ...], effort: Effort) -> SetComparison:
@@ -284,12 +277,3 @@ def _on_a_line(
     straight = replace(free, samples=line, failed={}, _known={})
     best = straight.fit([Member.of(SpuriousCharge.typical()[0])])
     return None if free.beats(free.fit(()), best) else straight
-
-
-def _with_effects(found: Explanation) -> FloatArray:
-    """Return the log masses of all codes: the plain law where codes are set aside, else with effects."""
-    judged = replace(found.sets, kept=found.kept)
-    best = judged.problem(found.best.members).log_masses(found.best.fit.theta, found.best.fit.shared)
-    plain = found.plain.log_masses
-    share = np.log(np.where(found.kept, np.exp(plain), 0.0).sum(axis=1, keepdims=True))
-    return np.where(found.kept, best + share, plain)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.discrepancy.by_likelihood.sets import split_samples
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import REACH
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY, observe_histograms
 from pchem_pipeline.discrepancy.verdict import Examined
@@ -77,7 +76,7 @@ class ObservedHistograms:
         _check(samples)
         layout = Samples(tuple(sample.bias for sample in samples))
         counts, origin = _rows(samples)
-        parts = split_samples(counts, 3, rng)
+        parts = _split(counts, 3, rng)
         together = None
         if layout.n > 1:
             together = _fitted_together(parts[0], origin, layout)
@@ -123,6 +122,22 @@ class ObservedHistograms:
         shape = (self.n_pixels, self.layout.n) if self.joint else (1, self.n_pixels)
         maps = columns.reshape(4, *shape)
         return PixelMaps.known(maps, np.isfinite(maps[0]))
+
+
+def _split(counts: NDArray[np.integer], parts: int, rng: np.random.Generator) -> tuple[IntArray, ...]:
+    """Split the samples of histograms (n, B) into equal parts at random, without replacement."""
+    left = counts.astype(np.int64)
+    found = []
+    for remaining in range(parts, 1, -1):
+        drawn = np.stack(
+            [
+                rng.multivariate_hypergeometric(row, int(row.sum()) // remaining, method="marginals")
+                for row in left
+            ]
+        )
+        found.append(drawn.astype(np.int64))
+        left = left - found[-1]
+    return (*found, left)
 
 
 def _check(samples: Sequence[SampleHistograms]) -> None:
