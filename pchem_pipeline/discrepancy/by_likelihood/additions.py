@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from pchem_pipeline.discrepancy.build_verdict import (
     LARGEST_REST,
@@ -17,12 +17,12 @@ from pchem_pipeline.discrepancy.build_verdict import (
     Addition,
     largest_pulls,
 )
-from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals, places_of, set_aside_residual
+from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals, places_of
 from pchem_pipeline.discrepancy.by_likelihood.gap import Distance, on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import UNITS
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import UNITS, change_of
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
@@ -59,12 +59,8 @@ class AddedSets:
         count as closed.
         """
         masses = on_all_codes(fitted.log_masses, self.found.kept, self.plain.log_masses)
-        return self.distance(fitted, np.ones_like(self.found.kept), masses).gap
-
-    def distance(self, fitted: FittedSet, kept: NDArray[np.bool_], log_masses: FloatArray) -> Distance:
-        """Return the distance of the final part from a fit among some codes."""
         share = float(self.parts[2].sum() / self.both.sum())
-        return Distance.of(self.parts[2], kept, log_masses, fitted.n_parameters, share)
+        return Distance.of(self.parts[2], masses, fitted.n_parameters, share=share).gap
 
     def close(
         self, before: Gap, nulls: tuple[NullModel, NullModel], z: Measured, still: bool
@@ -81,12 +77,10 @@ class AddedSets:
         moved = largest_pulls(nulls[0].names, pulls[0], pulls[0], pulls[1])
         gap, fitted = before, self.plain
         additions: list[Addition] = []
-        members: tuple[Member, ...] = ()
         for named in self.found.named:
-            members = (*members, named.member)
-            extended = self._refit(members)
+            extended = self._refit((*fitted.members, named.member))
             after = self.gap(extended)
-            addition = self._addition(named, members, (gap, after), (fitted, extended))
+            addition = self._addition(named, (gap, after), (fitted, extended))
             additions.append(replace(addition, pulls=moved))
             gap, fitted = after, extended
         left = "" if self.found.rest <= LARGEST_REST or gap.at_floor else LEAVES_TOO_MUCH
@@ -102,19 +96,10 @@ class AddedSets:
 
     def residuals(self, fitted: FittedSet) -> tuple[Place, ...]:
         """Return the codes that the model does not account for, a peak that was set aside first."""
-        counts, kept = self.both.astype(np.float64), self.found.kept
-        expected = self._expected(fitted)
         parameters = fitted.fit.parameters
-        electrons = places_of(self.sets.origin, counts.shape[1], parameters)
-        found = find_residuals(
-            np.where(kept, counts, 0.0), np.where(kept, expected, 0.0), electrons, parameters
-        )
-        for low, high in self.found.set_aside:
-            seen, wanted = (float(np.where(kept, 0.0, values).sum()) for values in (counts, expected))
-            among = self.distance(fitted, kept, fitted.log_masses).gap.value * self.parts[2][kept].sum()
-            share = 1.0 - float(among / (self.gap(fitted).value * self.parts[2].sum()))
-            found.insert(0, set_aside_residual(low, high, seen, wanted, parameters, share))
-        return tuple(found)
+        electrons = places_of(self.sets.origin, self.both.shape[1], parameters)
+        expected, aside = self._expected(fitted), self.found.set_aside
+        return tuple(find_residuals(self.both.astype(np.float64), expected, electrons, parameters, aside))
 
     def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
         """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""
@@ -123,11 +108,9 @@ class AddedSets:
         expected, origin = self._expected(fitted)[illuminated], self.sets.origin[illuminated]
         if evidence.maps.usable.sum() != expected.shape[0]:
             return None
-        found = np.zeros(code.observed.size)
-        for row, first in zip(expected, origin - code.first, strict=True):
-            at = first + np.arange(row.size)
-            within = (at >= 0) & (at < found.size)
-            np.add.at(found, at[within], row[within])
+        at = (origin - code.first)[:, None] + np.arange(expected.shape[1])
+        within, size = (at >= 0) & (at < code.observed.size), code.observed.size
+        found = np.bincount(at[within], expected[within], minlength=size)
         return np.asarray(found * code.observed.sum() / max(float(self.both[illuminated].sum()), 1.0))
 
     def _expected(self, fitted: FittedSet) -> FloatArray:
@@ -140,78 +123,53 @@ class AddedSets:
     def _refit(self, members: Sequence[Member]) -> FittedSet:
         return self.sets.fit(members, self.found.best.fit.parameters)
 
-    def _addition(
-        self,
-        named: Named,
-        members: tuple[Member, ...],
-        gaps: tuple[Gap, Gap],
-        fits: tuple[FittedSet, FittedSet],
-    ) -> Addition:
+    def _addition(self, named: Named, gaps: tuple[Gap, Gap], fits: tuple[FittedSet, FittedSet]) -> Addition:
         """Return an effect with the gaps and the fits without and with it, and with rivals in its place."""
-        extended = fits[1]
-        member = extended.member(named.member.tag)
-        assert member is not None  # it was just fitted
-        candidates = self._candidates(named, member.effect)
-        if named.equals:
-            candidates = tuple(c for c in candidates if c.effect in (member.tag, *named.equals))
-        rivals = self._rivals(named, members)
+        before, after = fits
+        member = after.members[-1]
+        compared = [(member, 0.0, 0.0), *named.rivals]
+        weights = special.softmax([min(score, 0.0) for _, score, _ in compared])
+        rivals = self._rivals(named, before)
         kin = {member.tag, *type(member.effect).separate}
         return Addition(
             effect=member.effect,
             alone=not named.equals,
             against=member.effect.stuck_words(),
-            candidates=candidates,
+            candidates=tuple(
+                Candidate.of(each.effect, score, error, float(weight))
+                for (each, score, error), weight in zip(compared, weights, strict=True)
+                if not named.equals or each.tag in (member.tag, *named.equals)
+            ),
             # of the fit, and what the choice of the codes makes of it
-            strength_stderr=float(np.hypot(extended.stderr(member), named.apart)),
+            strength_stderr=float(np.hypot(after.stderr(member), named.apart)),
             before=gaps[0],
             after=gaps[1],
             rivals=rivals[:MOST_RIVALS],
             placebo=next((r for r in rivals[1:] if r.effect not in kin), None),
             pulls=(),
-            moved=_moved(*fits),
+            moved={
+                name: change_of(change, error, unit)
+                for (name, unit), change, error in zip(
+                    UNITS.items(),
+                    (after.fit.parameters - before.fit.parameters).T,
+                    after.fit.stderr.T,
+                    strict=True,
+                )
+            },
         )
 
-    def _candidates(self, named: Named, effect: Effect) -> tuple[Candidate, ...]:
-        """Return the effect and what could stand in its place, with held-out scores."""
-        scored = [(effect, 0.0, 0.0), *((other.effect, score, error) for other, score, error in named.rivals)]
-        weights = np.exp([min(score, 0.0) for _, score, _ in scored])
-        weights /= weights.sum()
-        return tuple(
-            Candidate.of(e, score, error, float(w))
-            for (e, score, error), w in zip(scored, weights, strict=True)
-        )
-
-    def _rivals(self, named: Named, members: tuple[Member, ...]) -> tuple[Rival, ...]:
+    def _rivals(self, named: Named, before: FittedSet) -> tuple[Rival, ...]:
         """Return what could stand in the place of an effect, refitted, with its gap, the best first."""
-        others = tuple(m for m in members if m.tag != named.member.tag)
         found = []
         for other, behind, error in named.rivals:
-            if any(other.excludes(m) for m in others):
+            if any(other.excludes(m) for m in before.members):
                 continue
             try:
-                fitted = self._refit((*others, other))
+                gap = self.gap(self._refit((*before.members, other)))
             except ValueError:
                 continue
             why = f"it predicts unseen samples worse, by {-behind:.3g} ± {error:.2g}"
             if other.tag in named.equals:
                 why = "it predicts unseen samples as well: these histograms do not decide"
-            found.append(Rival(effect=other.tag, gap_after=self.gap(fitted).value, behind=behind, why=why))
+            found.append(Rival(effect=other.tag, gap_after=gap.value, behind=behind, why=why))
         return tuple(sorted(found, key=lambda rival: -rival.behind))
-
-
-def _moved(before: FittedSet, after: FittedSet) -> dict[str, dict[str, Any]]:
-    """Return how far the parameters of the pixels moved: median over the rows, and in standard errors."""
-    change = after.fit.parameters - before.fit.parameters
-    h, g, _, sigma = after.fit.parameters.T
-    slopes = np.stack([h, g, np.ones_like(h), 0.5 * np.exp(after.fit.row_theta[:, 3]) / sigma], axis=1)
-    error = np.sqrt(np.maximum(after.fit.row_variance, 0.0)) * np.abs(slopes)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(error > 0, change / error, np.nan)
-    return {
-        name: {
-            "median": float(np.median(change[:, i])),
-            "in_stderr": float(np.nanmedian(ratio[:, i])),
-            "unit": unit,
-        }
-        for i, (name, unit) in enumerate(UNITS.items())
-    }

@@ -167,25 +167,27 @@ class HistogramExplainer(Explainer[Explanation]):
             rng: all random numbers.
         """
         effort = Effort(settings.effort)
-        sets = _sets(observed, model, effort)
+        train, test, _ = observed.parts
+        every = np.ones(train.shape, np.bool_)
+        own = observed.origin, every, model, observed.start, observed.layout
+        sets = SetComparison(train, test, *own, effort=effort)
         line = _on_a_line(sets, settings, times)
         if line is not None:
             sets, classes = line, {**classes, _SPURIOUS: SpuriousCharge}
         members, untestable, defects = find_members(classes, observed.evidence, model)
-        always = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
-        found = {tag: why for tag, why in (always | untestable).items() if tag not in classes}
+        always = {t: c.untestable for t, c in effect_classes().items() if c.untestable and t not in classes}
         plain = sets.fit(())
         bare = replace(sets, present=(), start=plain.fit.parameters)
         replicates = HistogramReplicates(observed, bare, settings.replicates, rng, effort)
-        own = [replicates.statistics(part) for part in observed.parts]
+        seen = [replicates.statistics(part) for part in observed.parts]
         vectors = replicates.drawn(plain.log_masses)
-        common = set(STATISTICS).intersection(*vectors, *own)
+        common = set(STATISTICS).intersection(*vectors, *seen)
         names = tuple(name for name in STATISTICS if name in common)
         both = sets.fit((), plain.fit.parameters, observed.both)
         effort.begin()
         first = NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model))
-        z = Measured(*(as_matrix(names, [row])[0] for row in own))
-        untestable = dict(sorted((found | untestable).items()))
+        z = Measured(*(as_matrix(names, [row])[0] for row in seen))
+        untestable = dict(sorted((always | untestable).items()))
         data = observed.evidence, observed.examined(), first, z, effort
         # what the parameters bend is no evidence against them: each candidate is fitted with them
         prepared = Prepared(settings, "histograms", *data, untestable, defects=defects)
@@ -198,10 +200,9 @@ class HistogramExplainer(Explainer[Explanation]):
 
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap of the likelihood on the final part."""
-        train, test, final = self.observed.parts
-        share = float(final.sum() / (train.sum() + test.sum()))
-        own = self.plain.log_masses, self.plain.n_parameters
-        return Distance.of(final, self.sets.kept, *own, share).gap
+        final = self.observed.parts[2]
+        share = float(final.sum() / self.observed.both.sum())
+        return Distance.of(final, self.plain.log_masses, self.plain.n_parameters, share=share).gap
 
     def suspects(self, null: NullModel) -> bool:
         """Tell whether several samples fit badly together although no statistic of one deviates."""
@@ -249,14 +250,6 @@ class HistogramExplainer(Explainer[Explanation]):
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the parameters of the rows looked at, NaN elsewhere, shape (1, n) or (n, J)."""
         return Fitted(self.observed.maps(self.final.fit.parameters), self.code)
-
-
-def _sets(observed: ObservedHistograms, present: tuple[Effect, ...], effort: Effort) -> SetComparison:
-    """Return what fits the rows, begun at the fit that they were observed with."""
-    train, test, _ = observed.parts
-    every = np.ones(train.shape, np.bool_)
-    found = SetComparison(train, test, observed.origin, every, present, observed.start, observed.layout)
-    return replace(found, effort=effort)
 
 
 def _on_a_line(

@@ -42,19 +42,20 @@ class Distance:
     def of(
         cls,
         counts: NDArray[np.integer],
-        kept: NDArray[np.bool_],
         log_masses: FloatArray,
         n_parameters: int,
+        *,
         share: float,
+        kept: NDArray[np.bool_] | bool = True,
     ) -> Distance:
-        """Compute it among the codes that are kept.
+        """Compute it.
 
         Args:
             counts: histograms, shape (n, B).
-            kept: codes that are compared, shape (n, B).
             log_masses: of the codes under the fit, given that they are kept, shape (n, B).
             n_parameters: of the fit.
             share: samples here for each sample that was fitted.
+            kept: codes that are compared, shape (n, B); True: all.
         """
         seen = np.where(kept, counts, 0).astype(np.float64)
         total = np.maximum(seen.sum(axis=1, keepdims=True), 1.0)

@@ -178,9 +178,7 @@ class SetComparison:
             self.failed[members[-1].tag] = error_words(error)
             return None
 
-    def extended(
-        self, base: FittedSet, candidates: Sequence[Member], most: int = _FITTED
-    ) -> list[FittedSet]:
+    def extended(self, base: FittedSet, candidates: Sequence[Member], most: int = _FITTED) -> list[FittedSet]:
         """Fit a set with each of the most promising candidates, the best start of each, the best first."""
         found: dict[str, FittedSet] = {}
         for member in self.promising(base, candidates):
@@ -216,7 +214,7 @@ class SetComparison:
 
     def distance(self, found: FittedSet) -> Distance:
         """Return the distance of the scored part from a set."""
-        return Distance.of(self.test, self.kept, found.log_masses, found.n_parameters, 1.0)
+        return Distance.of(self.test, found.log_masses, found.n_parameters, share=1.0, kept=self.kept)
 
     def promising(self, base: FittedSet, candidates: Sequence[Member]) -> list[Member]:
         """Return candidates, each moved by a first-order step, by the rise that this step promises (Rao 1948)."""
