@@ -21,12 +21,11 @@ from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals, places
 from pchem_pipeline.discrepancy.by_likelihood.gap import Distance, on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
-from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet
+from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import UNITS, change_of
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
-from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 
 FloatArray = NDArray[np.float64]
@@ -38,19 +37,19 @@ class AddedSets:
     """Fits the models of the steps to train and test together, and measures their gaps on the final part.
 
     Attributes:
-        parts: train, test and final histograms, shape (n, B) each.
         found: what the search came to.
-        plain: the fit without effects to train and test.
+        sets: fits them, and scores them by the final part.
+        plain: the fit without effects.
     """
 
-    parts: tuple[IntArray, ...]
     found: Explanation
+    sets: SetComparison
     plain: FittedSet
 
-    def __post_init__(self) -> None:
-        """Add train and test part: what is added is fitted to both."""
-        self.both = self.parts[0] + self.parts[1]
-        self.sets = replace(self.found.sets.on(self.found.kept, self.found.sets.start), train=self.both)
+    @classmethod
+    def of(cls, found: Explanation, whole: SetComparison) -> AddedSets:
+        """Prepare it on the codes that were compared; ``whole`` has all, of train and test part together."""
+        return cls(found, whole.on(found.kept, whole.start), whole.plain)
 
     def gap(self, fitted: FittedSet) -> Gap:
         """Return the gap of a fit on the final part.
@@ -59,8 +58,8 @@ class AddedSets:
         count as closed.
         """
         masses = on_all_codes(fitted.log_masses, self.found.kept, self.plain.log_masses)
-        share = float(self.parts[2].sum() / self.both.sum())
-        return Distance.of(self.parts[2], masses, fitted.n_parameters, share=share).gap
+        share = float(self.sets.test.sum() / self.sets.train.sum())
+        return Distance.of(self.sets.test, masses, fitted.n_parameters, share=share).gap
 
     def close(
         self, before: Gap, nulls: tuple[NullModel, NullModel], z: Measured, still: bool
@@ -88,7 +87,7 @@ class AddedSets:
             additions=tuple(replace(each, against=left or each.against) for each in additions),
             after=gap,
             nearest=self.found.nearest,
-            stand_ins=tuple(m.tag for m in self.found.unsteady),
+            stand_ins=self.found.stand_ins,
             residuals=self.residuals(fitted) if still or not gap.at_floor else (),
             set_aside=self.found.set_aside,
         )
@@ -97,25 +96,29 @@ class AddedSets:
     def residuals(self, fitted: FittedSet) -> tuple[Place, ...]:
         """Return the codes that the model does not account for, a peak that was set aside first."""
         parameters = fitted.fit.parameters
-        electrons = places_of(self.sets.origin, self.both.shape[1], parameters)
+        electrons = places_of(self.sets.origin, self.sets.train.shape[1], parameters)
         expected, aside = self._expected(fitted), self.found.set_aside
-        return tuple(find_residuals(self.both.astype(np.float64), expected, electrons, parameters, aside))
+        return tuple(
+            find_residuals(self.sets.train.astype(np.float64), expected, electrons, parameters, aside)
+        )
 
     def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
         """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""
         code = evidence.code
-        illuminated = np.tile(~np.array(self.sets.samples.dark), self.both.shape[0] // self.sets.samples.n)
+        illuminated = np.tile(
+            ~np.array(self.sets.samples.dark), self.sets.train.shape[0] // self.sets.samples.n
+        )
         expected, origin = self._expected(fitted)[illuminated], self.sets.origin[illuminated]
         if evidence.maps.usable.sum() != expected.shape[0]:
             return None
         at = (origin - code.first)[:, None] + np.arange(expected.shape[1])
         within, size = (at >= 0) & (at < code.observed.size), code.observed.size
         found = np.bincount(at[within], expected[within], minlength=size)
-        return np.asarray(found * code.observed.sum() / max(float(self.both[illuminated].sum()), 1.0))
+        return np.asarray(found * code.observed.sum() / max(float(self.sets.train[illuminated].sum()), 1.0))
 
     def _expected(self, fitted: FittedSet) -> FloatArray:
         """Return the samples of train and test expected at each code given those in codes that are kept."""
-        counts, kept = self.both.astype(np.float64), self.found.kept
+        counts, kept = self.sets.train.astype(np.float64), self.found.kept
         mass = self.sets.problem(fitted.members).masses(fitted.fit.theta, fitted.fit.shared)
         inside = np.where(kept, mass, 0.0).sum(axis=1, keepdims=True)
         return np.asarray(mass / inside * np.where(kept, counts, 0.0).sum(axis=1, keepdims=True))

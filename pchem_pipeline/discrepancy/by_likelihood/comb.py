@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
 
@@ -34,30 +33,30 @@ def places_of(origin: NDArray[np.int64], width: int, parameters: FloatArray) -> 
     return electrons_of(origin, width, parameters[:, 1], parameters[:, 2])
 
 
-def doubtful_peaks(sets: SetComparison, electrons: FloatArray) -> list[Interval]:
+def doubtful_peaks(counts: NDArray[np.integer], electrons: FloatArray) -> list[Interval]:
     """Return peaks of few samples: each alone, and each with all above it.
 
     Args:
-        sets: with all codes.
+        counts: histograms, shape (n, B).
         electrons: place of every code, e-, shape (n, B).
     """
     peaks: list[Interval] = [(None, 0.5)]
     for k in range(1, _last(electrons) + 1):
         peaks += [(k - 0.5, k + 0.5), (k - 0.5, None)]
-    return [each for each in peaks if _LEAST_SHARE < _share(sets, (each,), electrons) < _MOST_SHARE]
+    return [each for each in peaks if _LEAST_SHARE < _share(counts, (each,), electrons) < _MOST_SHARE]
 
 
-def valleys(sets: SetComparison, electrons: FloatArray, sigma_e: float) -> tuple[Interval, ...]:
+def valleys(counts: NDArray[np.integer], electrons: FloatArray, sigma_e: float) -> tuple[Interval, ...]:
     """Return the codes between the peaks; none where peaks are not resolved or little would be left."""
     if sigma_e > _RESOLVED:
         return ()
     found = tuple((k + _HALF_PEAK, k + 1.0 - _HALF_PEAK) for k in range(-1, _last(electrons) + 1))
-    return found if _share(sets, found, electrons) < _MOST_SHARE else ()
+    return found if _share(counts, found, electrons) < _MOST_SHARE else ()
 
 
-def _share(sets: SetComparison, intervals: Sequence[Interval], electrons: FloatArray) -> float:
+def _share(counts: NDArray[np.integer], intervals: Sequence[Interval], electrons: FloatArray) -> float:
     """Return the share of the samples in intervals."""
-    return float(sets.train[inside(intervals, electrons)].sum()) / float(sets.train.sum())
+    return float(counts[inside(intervals, electrons)].sum() / counts.sum())
 
 
 def _last(electrons: FloatArray) -> int:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_likelihood.additions import AddedSets
-from pchem_pipeline.discrepancy.by_likelihood.gap import Distance, on_all_codes
+from pchem_pipeline.discrepancy.by_likelihood.gap import on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_members
 from pchem_pipeline.discrepancy.by_likelihood.observed import ObservedHistograms, SampleHistograms
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
@@ -105,7 +105,7 @@ class HistogramReplicates:
 
     def statistics(self, counts: IntArray) -> Mapping[str, float]:
         """Return the statistics of histograms of the rows, fitted with the PCD alone."""
-        parameters = self.bare.fit((), None, counts).fit.parameters if self.observed.joint else None
+        parameters = replace(self.bare, train=counts).plain.fit.parameters if self.observed.joint else None
         return self.observed.statistics(counts, parameters)
 
     def drawn(self, log_masses: FloatArray) -> list[Mapping[str, float]]:
@@ -126,8 +126,8 @@ class HistogramExplainer(Explainer[Explanation]):
         prepared: the histograms, split, and the model, drawn.
         observed: the rows that are looked at.
         replicates: draws replicates of them.
-        sets: fits and scores sets of effects.
-        plain: the fit without them to train and test part.
+        sets: fits sets of effects to the train part, and scores them by the test part.
+        whole: fits them to both, and scores them by the final part.
         members: the candidates.
         effects: of the model; those that were there before, and those added since.
         final: the fit of the final model to train and test part.
@@ -139,7 +139,7 @@ class HistogramExplainer(Explainer[Explanation]):
     observed: ObservedHistograms
     replicates: HistogramReplicates
     sets: SetComparison
-    plain: FittedSet
+    whole: SetComparison
     members: Sequence[Member]
     effects: tuple[Effect, ...]
     final: FittedSet
@@ -167,23 +167,23 @@ class HistogramExplainer(Explainer[Explanation]):
             rng: all random numbers.
         """
         effort = Effort(settings.effort)
-        train, test, _ = observed.parts
+        train, test, final = observed.parts
         every = np.ones(train.shape, np.bool_)
         own = observed.origin, every, model, observed.start, observed.layout
-        sets = SetComparison(train, test, *own, effort=effort)
+        defects: dict[str, str] = {}
+        sets = SetComparison(train, test, *own, defects, effort)
         line = _on_a_line(sets, settings, times)
         if line is not None:
             sets, classes = line, {**classes, _SPURIOUS: SpuriousCharge}
-        members, untestable, defects = find_members(classes, observed.evidence, model)
+        members, untestable = find_members(classes, observed.evidence, model, defects)
         always = {t: c.untestable for t, c in effect_classes().items() if c.untestable and t not in classes}
-        plain = sets.fit(())
-        bare = replace(sets, present=(), start=plain.fit.parameters)
+        bare = replace(sets, present=(), start=sets.plain.fit.parameters)
         replicates = HistogramReplicates(observed, bare, settings.replicates, rng, effort)
         seen = [replicates.statistics(part) for part in observed.parts]
-        vectors = replicates.drawn(plain.log_masses)
+        vectors = replicates.drawn(sets.plain.log_masses)
         common = set(STATISTICS).intersection(*vectors, *seen)
         names = tuple(name for name in STATISTICS if name in common)
-        both = sets.fit((), plain.fit.parameters, observed.both)
+        whole = replace(sets, start=bare.start, train=train + test, test=final)
         effort.begin()
         first = NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model))
         z = Measured(*(as_matrix(names, [row])[0] for row in seen))
@@ -191,7 +191,7 @@ class HistogramExplainer(Explainer[Explanation]):
         data = observed.evidence, observed.examined(), first, z, effort
         # what the parameters bend is no evidence against them: each candidate is fitted with them
         prepared = Prepared(settings, "histograms", *data, untestable, defects=defects)
-        return cls(prepared, observed, replicates, sets, both, members, model, both)
+        return cls(prepared, observed, replicates, sets, whole, members, model, whole.plain)
 
     @property
     def model(self) -> tuple[Effect, ...]:
@@ -200,9 +200,7 @@ class HistogramExplainer(Explainer[Explanation]):
 
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap of the likelihood on the final part."""
-        final = self.observed.parts[2]
-        share = float(final.sum() / self.observed.both.sum())
-        return Distance.of(final, self.plain.log_masses, self.plain.n_parameters, share=share).gap
+        return self.whole.distance(self.whole.plain).gap
 
     def suspects(self, null: NullModel) -> bool:
         """Tell whether several samples fit badly together although no statistic of one deviates."""
@@ -221,19 +219,16 @@ class HistogramExplainer(Explainer[Explanation]):
         except EffortSpentError as spent:
             tags = dict.fromkeys(m.tag for m in self.members)
             raise EffortSpentError(spent.doing, (t for t in tags if t not in tried)) from spent
-        defects = self.prepared.defects
-        defects |= self.sets.failed | found.sets.failed
-        if not disagreed:
-            rise, error = found.sets.difference(found.judged, found.sets.fit(()))
-            if not found.named or rise < max(CONVINCING, CLEAR * error):
-                return None
+        rise, error = found.rise
+        if not disagreed and (not found.named or rise < max(CONVINCING, CLEAR * error)):
+            return None
         self.found = found
         return found if found.named else None
 
     def add(self, explanation: Explanation, null: NullModel) -> NullModel:
         """Put the named effects into the model, and observe histograms drawn from it."""
         vectors = self.replicates.drawn(
-            on_all_codes(explanation.best.log_masses, explanation.kept, explanation.plain.log_masses)
+            on_all_codes(explanation.best.log_masses, explanation.kept, self.sets.plain.log_masses)
         )
         return NullModel.from_replicates(null.names, as_matrix(null.names, vectors), effects=True)
 
@@ -241,7 +236,7 @@ class HistogramExplainer(Explainer[Explanation]):
         """Fit train and test part together with each effect, and measure the gap on the final part."""
         if self.found is None:
             return Added((), before)
-        closing = AddedSets(self.observed.parts, self.found, self.plain)
+        closing = AddedSets.of(self.found, self.whole)
         added, self.final = closing.close(before, (self.prepared.first, null), self.prepared.z, disagreed)
         self.code = closing.codes(self.final, self.observed.evidence)
         self.effects = along_chain(self.sets.present, [each.effect for each in added.additions])
@@ -267,6 +262,6 @@ def _on_a_line(
     if _SPURIOUS in {effect.tag for effect in free.present}:
         return None
     line = Samples(dark, tuple(time or 0.0 for time in times))
-    straight = replace(free, samples=line, failed={}, _known={})
+    straight = replace(free, samples=line, _known={})
     best = straight.fit([Member.of(SpuriousCharge.typical()[0])])
-    return None if free.beats(free.fit(()), best) else straight
+    return None if free.beats(free.plain, best) else straight

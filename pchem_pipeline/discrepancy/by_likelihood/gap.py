@@ -68,6 +68,11 @@ class Distance:
         return cls(value, mean, float(np.sqrt(max(square, 0.0))), variance, float(total.sum()))
 
     @property
+    def excess(self) -> float:
+        """What is beyond chance, nats."""
+        return self.value - self.expected
+
+    @property
     def gap(self) -> Gap:
         """What is beyond chance, per sample."""
         chance = self.expected + self.scatter * _QUANTILES

@@ -73,9 +73,9 @@ class Member:
         """Find the fields to fit: the strength, and other real numbers with limits."""
         names = [effect.strength] if effect.strength else []
         for name, value in effect.model_dump().items():
-            if isinstance(value, float) and name not in names and len(names) <= _MOST_EXTRA and names:
-                if np.isfinite(_limits(effect, name)).all():
-                    names.append(name)
+            more = isinstance(value, float) and name not in names and 0 < len(names) <= _MOST_EXTRA
+            if more and np.isfinite(_limits(effect, name)).all():
+                names.append(name)
         found = []
         for name in names:
             power = effect.power if name == effect.strength else 1.0
@@ -198,21 +198,24 @@ def leads_in_histograms(effect: type[Effect]) -> bool:
 
 
 def find_members(
-    classes: Mapping[str, type[Effect]], evidence: Evidence, present: Sequence[Effect]
-) -> tuple[list[Member], dict[str, str], dict[str, str]]:
+    classes: Mapping[str, type[Effect]],
+    evidence: Evidence,
+    present: Sequence[Effect],
+    failed: dict[str, str],
+) -> tuple[list[Member], dict[str, str]]:
     """Return the candidates that change a pixel's own histogram, at one or more starts each.
 
     Args:
         classes: candidates by tag.
         evidence: of the histograms, from which some estimate themselves.
         present: effects of the model; they are not candidates.
+        failed: candidates that failed, and why; more come to them.
 
     Returns:
-        Members; effects that histograms cannot show and why; effects that failed and why.
+        Members; effects that histograms cannot show and why.
     """
     members: list[Member] = []
     untestable: dict[str, str] = {}
-    failed: dict[str, str] = {}
     have = {effect.tag for effect in present}
     for tag, effect in classes.items():
         if tag in have:
@@ -233,7 +236,7 @@ def find_members(
         if starts and not found:
             untestable[tag] = f"{NO_ORDER}: {_SAME_LAW}"
         members += found[:_MOST_STARTS]
-    return members, untestable, failed
+    return members, untestable
 
 
 def _distinct(effects: Sequence[Effect]) -> list[Effect]:

@@ -82,7 +82,7 @@ class ObservedHistograms:
             together = _fitted_together(parts[0], origin, layout)
             parts, origin = _widened(parts, origin, together)
         evidence = _observe(parts[0], origin, layout, together)
-        start = _parameters(evidence.maps) if together is None else together
+        start = np.stack([m.ravel() for m in evidence.maps.maps], axis=1) if together is None else together
         chosen = _choose(start, counts.sum(axis=1), layout.n)
         some = tuple(part[chosen] for part in parts)
         n_pixels = samples[0].counts.shape[0]
@@ -92,11 +92,6 @@ class ObservedHistograms:
     def joint(self) -> bool:
         """Whether there are several samples of a pixel."""
         return self.layout.n > 1
-
-    @property
-    def both(self) -> IntArray:
-        """Train and test samples together, shape (r, B)."""
-        return np.asarray(self.parts[0] + self.parts[1])
 
     def examined(self) -> Examined:
         """Return what is looked at."""
@@ -196,12 +191,6 @@ def _widened(
     high = np.nanmax(mu + (h + REACH * (np.sqrt(h) + 1.0)) / g + REACH * sigma - last)
     left, right = (max(int(np.ceil(more)), 0) for more in (low, high))
     return tuple(np.pad(part, ((0, 0), (left, right))) for part in parts), origin - left
-
-
-def _parameters(maps: PixelMaps) -> FloatArray:
-    """Return (H, g, mu, sigma), (n, 4), NaN where not usable."""
-    columns = maps.maps
-    return np.stack([values.ravel() for values in columns], axis=1)
 
 
 def _choose(parameters: FloatArray, total: NDArray[np.integer], n_samples: int) -> NDArray[np.intp]:

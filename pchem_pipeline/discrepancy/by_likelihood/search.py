@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,28 +50,24 @@ class Explanation:
     """What the search came to.
 
     Attributes:
-        sets: fitted and scored on the codes on which effects were compared.
         kept: codes that the gap compares, shape (n, B): all but a peak set aside.
         set_aside: codes that the fit leaves out.
-        plain: the fit without effects to all codes.
         best: the named effects, fitted to the codes that the gap compares.
-        judged: the set in which they were compared, perhaps with unsteady members.
-        named: its effects, the weightiest first.
-        unsteady: effects that fit in one view and not in another: stand-ins of something unknown.
+        named: its effects, the weightiest first, compared on perhaps fewer codes, perhaps beside others.
+        stand_ins: tags of effects that fit in one view and not in another, for something unknown.
         nearest: tags of the best single effects on all codes.
-        rest: share of the gap that the judged set leaves among the codes of the sets.
+        rest: share of the gap that is left among the codes on which effects were compared.
+        rise: by how much the set of them predicts these better than none, nats, and the standard error.
     """
 
-    sets: SetComparison
     kept: NDArray[np.bool_]
     set_aside: tuple[Interval, ...]
-    plain: FittedSet
     best: FittedSet
-    judged: FittedSet
     named: tuple[Named, ...]
-    unsteady: tuple[Member, ...]
+    stand_ins: tuple[str, ...]
     nearest: tuple[str, ...]
     rest: float
+    rise: tuple[float, float]
 
 
 def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
@@ -81,23 +77,21 @@ def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
         sets: with all codes.
         candidates: effects at their starts.
     """
-    plain = sets.fit(())
-    nearest = tuple(m.tag for one in sets.extended(plain, candidates) for m in one.members)
+    nearest = tuple(one.members[0].tag for one in sets.extended(sets.plain, candidates))
     for pool in (candidates, [c for c in candidates if not c.tabulated]):
         best = select(sets, pool)
-        gap, rest = sets.distance(best).gap, _rest(sets, best, plain)
-        if best.members and (gap.at_floor or rest <= LARGEST_REST):
-            named = _named(sets, best, candidates)
-            return Explanation(sets, sets.kept, (), plain, best, best, named, (), nearest, rest)
-    fixed_in_dn = combs_coincide(plain.fit.parameters)
+        rest, rise = _rest(sets, best), sets.difference(best, sets.plain)
+        if best.members and (rest <= LARGEST_REST or sets.distance(best).gap.at_floor):
+            named = tuple(_named(sets, best, candidates))
+            return Explanation(sets.kept, (), best, named, (), nearest, rest, rise)
+    fixed_in_dn = combs_coincide(sets.plain.fit.parameters)
     pool = [c for c in pool if not (fixed_in_dn and c.law.edge_shift.size)]
-    return _narrowed(sets, pool, plain, best, nearest)
+    return _narrowed(sets, pool, sets.distance(best).excess, nearest)
 
 
-def _rest(sets: SetComparison, best: FittedSet, plain: FittedSet) -> float:
+def _rest(sets: SetComparison, best: FittedSet) -> float:
     """Return the share of the gap of the plain law that a set leaves."""
-    left, whole = (sets.distance(one).gap.value for one in (best, plain))
-    return left / max(whole, 1e-12)
+    return sets.distance(best).excess / max(sets.distance(sets.plain).excess, 1e-12)
 
 
 def combs_coincide(parameters: FloatArray) -> bool:
@@ -111,59 +105,55 @@ def combs_coincide(parameters: FloatArray) -> bool:
 
 
 def _narrowed(
-    sets: SetComparison,
-    candidates: Sequence[Member],
-    plain: FittedSet,
-    whole: FittedSet,
-    nearest: tuple[str, ...],
+    sets: SetComparison, candidates: Sequence[Member], excess: float, nearest: tuple[str, ...]
 ) -> Explanation:
-    """Select on the codes that are understood, and keep what is selected on more of them, too."""
-    parameters = plain.fit.parameters
+    """Select on the codes that are understood, and keep what is selected on more of them, too.
+
+    Args:
+        sets: with all codes.
+        candidates: effects at their starts.
+        excess: gap that is left where they are selected on all codes, nats.
+        nearest: see :class:`Explanation`.
+    """
+    parameters = sets.plain.fit.parameters
     electrons = places_of(sets.origin, sets.train.shape[1], parameters)
-    peak = _cut_peak(sets, electrons, candidates, whole)
-    between = valleys(sets, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
-    wide = sets.on(~inside(peak, electrons), parameters)
-    view = sets.on(~inside((*peak, *between), electrons), parameters)
+
+    def excluding(*intervals: Interval) -> SetComparison:
+        return sets.on(~inside(intervals, electrons), parameters)
+
+    peak = _cut_peak({p: excluding(p) for p in doubtful_peaks(sets.train, electrons)}, candidates, excess)
+    between = valleys(sets.train, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
+    wide, view = excluding(*peak), excluding(*peak, *between)
     judged = select(view, candidates)
     there = wide.attempt(judged.members, judged.fit.parameters)
-    there = (
-        wide.fit((), parameters)
-        if there is None
-        else select(wide, candidates, there, largest=len(there.members), least=0.0)
-    )
-    steady = [m for m in judged.members if (other := there.member(m.tag)) and _alike(m, other)]
-    unsteady = tuple(m for m in judged.members if m not in steady)
-    best = wide.fit([there.member(m.tag) or m for m in steady], parameters)
-    again = view.fit(best.members, parameters)
-    named = [
+    there = select(wide, candidates, there, largest=len(judged.members), least=0.0)
+    steady = [other for m in judged.members if (other := there.member(m.tag)) and _alike(m, other)]
+    best = wide.attempt(steady, judged.fit.parameters) or wide.plain
+    again = view.attempt(best.members, judged.fit.parameters) or judged
+    named = tuple(
         replace(one, member=fitted, apart=_apart(fitted, other))
         for one in _named(view, judged, candidates)
         if (fitted := best.member(one.member.tag)) and (other := again.member(one.member.tag))
-    ]
-    rest = _rest(view, judged, view.fit(()))
-    return Explanation(view, wide.kept, peak, plain, best, judged, tuple(named), unsteady, nearest, rest)
+    )
+    stand_ins = tuple(m.tag for m in judged.members if best.member(m.tag) is None)
+    rest, rise = _rest(view, judged), view.difference(judged, view.plain)
+    return Explanation(wide.kept, peak, best, named, stand_ins, nearest, rest, rise)
 
 
 def _cut_peak(
-    sets: SetComparison, electrons: FloatArray, candidates: Sequence[Member], whole: FittedSet
+    views: Mapping[Interval, SetComparison], candidates: Sequence[Member], excess: float
 ) -> tuple[Interval, ...]:
-    """Return the peak without which known effects explain far more, if there is one."""
-    views = [
-        (sets.on(~inside([peak], electrons), whole.fit.parameters), peak)
-        for peak in doubtful_peaks(sets, electrons)
-    ]
-    views.sort(key=lambda pair: _nats(pair[0], pair[0].fit(())))
-    least, found = _PAYS * _nats(sets, whole), None
-    for view, peak in views[:_PEAKS_TRIED]:
-        left = _nats(view, select(view, candidates, largest=1))
-        if left < least:
-            least, found = left, peak
-    return () if found is None else (found,)
+    """Return the peak without which a known effect explains far more, if there is one.
 
-
-def _nats(sets: SetComparison, found: FittedSet) -> float:
-    """Return the gap that a set leaves, of all samples together."""
-    return sets.distance(found).gap.value * sets.n_test
+    Args:
+        views: by the peak that each leaves out.
+        candidates: effects at their starts.
+        excess: gap that is left with all peaks, nats.
+    """
+    likely = sorted(views, key=lambda peak: views[peak].distance(views[peak].plain).excess)[:_PEAKS_TRIED]
+    left = {p: views[p].distance(select(views[p], candidates, largest=1)).excess for p in likely}
+    best = min(left, key=lambda peak: left[peak], default=None)
+    return () if best is None or left[best] >= _PAYS * excess else (best,)
 
 
 def _apart(member: Member, there: Member) -> float:
@@ -182,15 +172,14 @@ def _alike(one: Member, other: Member) -> bool:
     return a * b > 0 and max(abs(a), abs(b)) < FARTHEST * min(abs(a), abs(b))
 
 
-def _named(sets: SetComparison, best: FittedSet, candidates: Sequence[Member]) -> tuple[Named, ...]:
+def _named(sets: SetComparison, best: FittedSet, candidates: Sequence[Member]) -> list[Named]:
     """Return the members of a set with what could stand in their places, the weightiest first."""
     found = []
     for member in best.members:
-        without = sets.without(best, member.tag)
-        if without is None:
-            found.append(Named(member, 0.0, ()))
-            continue
         others = [c for c in candidates if c.tag != member.tag]
-        rivals = [(one.members[-1], *sets.difference(one, best)) for one in sets.extended(without, others)]
-        found.append(Named(member, best.score - without.score, tuple(rivals)))
-    return tuple(sorted(found, key=lambda n: -n.weight))
+        without = sets.without(best, member.tag)
+        instead = [] if without is None else sets.extended(without, others)
+        weight = 0.0 if without is None else best.score - without.score
+        rivals = tuple((one.members[-1], *sets.difference(one, best)) for one in instead)
+        found.append(Named(member, weight, rivals))
+    return sorted(found, key=lambda n: -n.weight)

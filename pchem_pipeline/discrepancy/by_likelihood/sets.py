@@ -7,6 +7,7 @@ error of a difference of scores is that of a mean of independent samples (Vuong 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -82,7 +83,7 @@ class SetComparison:
         present: effects that the model has.
         start: (H, g, mu, sigma), shape (n, 4).
         samples: which rows are of one pixel.
-        failed: candidates that could not be fitted, and why.
+        failed: candidates that could not be fitted, and why; more come to them.
         effort: counts the masses, and ends the search at its limit.
     """
 
@@ -104,20 +105,20 @@ class SetComparison:
             kept: codes that count, shape (n, B).
             start: (H, g, mu, sigma), shape (n, 4).
         """
-        return replace(self, kept=kept, start=start, failed=dict(self.failed), _known={})
+        return replace(self, kept=kept, start=start, _known={})
 
     def of(self, rows: slice, start: FloatArray) -> SetComparison:
         """Return the same of some of the rows, begun elsewhere: ``start`` has shape (n, 4)."""
         taken = {name: getattr(self, name)[rows] for name in ("train", "test", "origin", "kept")}
-        return replace(self, **taken, start=start[rows], failed=dict(self.failed), _known={})
+        return replace(self, **taken, start=start[rows], _known={})
 
-    @property
-    def n_test(self) -> float:
-        """Samples that count in the scored part."""
-        return float(np.where(self.kept, self.test, 0).sum())
+    @functools.cached_property
+    def plain(self) -> FittedSet:
+        """The fit without candidates."""
+        return self.fit(())
 
-    def problem(self, members: Sequence[Member], counts: IntArray | None = None) -> SharedProblem:
-        """Return what a set is fitted to: the train part, or other histograms."""
+    def problem(self, members: Sequence[Member]) -> SharedProblem:
+        """Return what a set is fitted to."""
         tags = [m.tag for m in members]
 
         def law(shared: FloatArray, own: FloatArray) -> SampleLaw:
@@ -127,7 +128,7 @@ class SetComparison:
 
         coordinates = [c for m in members for c in m.coordinates]
         return SharedProblem(
-            self.train if counts is None else counts,
+            self.train,
             self.origin,
             self.kept,
             law,
@@ -136,24 +137,17 @@ class SetComparison:
             self.samples,
         )
 
-    def fit(
-        self, members: Sequence[Member], start: FloatArray | None = None, counts: IntArray | None = None
-    ) -> FittedSet:
-        """Fit a set from the starts of its members.
+    def fit(self, members: Sequence[Member], start: FloatArray | None = None) -> FittedSet:
+        """Fit a set from the starts of its members, and from (H, g, mu, sigma) of another one, shape (n, 4).
 
         Raises:
             Exception: whatever an effect raises.
         """
-        problem = self.problem(members, counts)
+        problem = self.problem(members)
         shared = np.concatenate([np.zeros(0), *(m.start for m in members)])
-        tolerance = max(_TOLERANCE, _TOLERANCE_PER_SAMPLE * self.n_test)
-        fit = fit_shared(
-            problem,
-            self.start if start is None else start,
-            shared,
-            tolerance=tolerance,
-            max_steps=_MOST_STEPS,
-        )
+        tolerance = max(_TOLERANCE, _TOLERANCE_PER_SAMPLE * float(np.where(self.kept, self.test, 0).sum()))
+        own = self.start if start is None else start
+        fit = fit_shared(problem, own, shared, tolerance=tolerance, max_steps=_MOST_STEPS)
         parts = split_coordinates(members, fit.shared)
         moved = tuple(m.moved(part) for m, part in zip(members, parts, strict=True))
         log_masses = problem.log_masses(fit.theta, fit.shared)
@@ -203,7 +197,7 @@ class SetComparison:
         rise, error = self.difference(one, part)
         price = PRICE
         if least and not self.distance(one).gap.at_floor:
-            price = max(price, least * self.difference(one, self.fit(()))[0])
+            price = max(price, least * self.difference(one, self.plain)[0])
         return rise > max(CLEAR * error, price)
 
     def difference(self, one: FittedSet, other: FittedSet) -> tuple[float, float]:
@@ -214,10 +208,11 @@ class SetComparison:
 
     def distance(self, found: FittedSet) -> Distance:
         """Return the distance of the scored part from a set."""
-        return Distance.of(self.test, found.log_masses, found.n_parameters, share=1.0, kept=self.kept)
+        share = float(self.test.sum() / self.train.sum())
+        return Distance.of(self.test, found.log_masses, found.n_parameters, share=share, kept=self.kept)
 
     def promising(self, base: FittedSet, candidates: Sequence[Member]) -> list[Member]:
-        """Return candidates, each moved by a first-order step, by the rise that this step promises (Rao 1948)."""
+        """Return candidates, each moved by a first-order step, by the rise that this promises (Rao 1948)."""
         tangent = Tangent.at(
             self.problem(base.members), self.samples.theta(base.fit.parameters), base.fit.shared
         )
@@ -274,7 +269,7 @@ def select(
         largest: number of effects.
         least: of what a set that misfits explains, share that each of its effects must.
     """
-    best, passed = start or sets.fit(()), set[frozenset[str]]()
+    best, passed = start or sets.plain, set[frozenset[str]]()
     while best.kinds not in passed:
         passed.add(best.kinds)
         others = [c for c in candidates if c.kind not in best.kinds]

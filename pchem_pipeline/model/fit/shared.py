@@ -206,7 +206,7 @@ class SharedFit:
         found = np.einsum("jap,npq,jaq->nja", slopes, self.own_covariance, slopes, optimize=True)
         h, g, _, sigma = self.parameters.T
         per = np.stack([h, g, np.ones_like(h), 0.5 * np.exp(self.row_theta[:, 3]) / sigma], axis=1)
-        return np.sqrt(np.maximum(found.reshape(-1, 4), 0.0)) * per
+        return np.asarray(np.sqrt(np.maximum(found.reshape(-1, 4), 0.0)) * per)
 
 
 def to_parameters(theta: FloatArray) -> FloatArray:
