@@ -17,7 +17,7 @@ from pchem_pipeline.discrepancy.build_verdict import (
     Addition,
     largest_pulls,
 )
-from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals, places_of
+from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals
 from pchem_pipeline.discrepancy.by_likelihood.gap import Distance, on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
@@ -95,12 +95,9 @@ class AddedSets:
 
     def residuals(self, fitted: FittedSet) -> tuple[Place, ...]:
         """Return the codes that the model does not account for, a peak that was set aside first."""
-        parameters = fitted.fit.parameters
-        electrons = places_of(self.sets.origin, self.sets.train.shape[1], parameters)
-        expected, aside = self._expected(fitted), self.found.set_aside
-        return tuple(
-            find_residuals(self.sets.train.astype(np.float64), expected, electrons, parameters, aside)
-        )
+        counts, expected = self.sets.train.astype(np.float64), self._expected(fitted)
+        own = self.sets.origin, fitted.fit.parameters, self.found.set_aside
+        return tuple(find_residuals(counts, expected, *own))
 
     def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
         """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""

@@ -28,11 +28,6 @@ _MOST_RESIDUALS = 6
 _SIGNIFICANT = 0.005
 
 
-def places_of(origin: NDArray[np.int64], width: int, parameters: FloatArray) -> FloatArray:
-    """Return ``(x - mu) g`` of every code, e-, shape (n, B), of pixels with (H, g, mu, sigma)."""
-    return electrons_of(origin, width, parameters[:, 1], parameters[:, 2])
-
-
 def doubtful_peaks(counts: NDArray[np.integer], electrons: FloatArray) -> list[Interval]:
     """Return peaks of few samples: each alone, and each with all above it.
 
@@ -81,7 +76,7 @@ def place_words(low: float, high: float) -> str:
 def find_residuals(
     seen: FloatArray,
     expected: FloatArray,
-    electrons: FloatArray,
+    origin: NDArray[np.int64],
     parameters: FloatArray,
     peaks: Sequence[Interval] = (),
 ) -> list[Place]:
@@ -93,10 +88,11 @@ def find_residuals(
     Args:
         seen: samples, shape (n, B).
         expected: the same under the model.
-        electrons: place of every code, e-, shape (n, B).
+        origin: DN of bin 0, shape (n,).
         parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
         peaks: that were set aside; they come first, and their codes in no quarter.
     """
+    electrons = electrons_of(origin, seen.shape[1], parameters[:, 1], parameters[:, 2])
     gain, bias = float(np.median(parameters[:, 1])), float(np.median(parameters[:, 2]))
     width = max(_CELL, gain)
     index = np.floor(electrons / width).astype(np.int64)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,6 @@ from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.model.fit.shared import Samples
-from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
@@ -29,7 +27,6 @@ _MOST_STARTS = 6  # of one effect
 _UNLIMITED = {True: 10.0, False: 1e4}  # of a strength, of another field
 FARTHEST = 4.0  # factor by which other fields than the strength may move
 _LONGEST_LIST = 8
-_LEAST_CHANGE = 1e-12
 _LONGEST_STEP = 50.0  # times the strength of the start
 
 
@@ -228,8 +225,9 @@ def find_members(
             continue
         # an effect of a plug-in may raise anything: the others are compared all the same
         try:
-            starts = [*effect.typical(), *effect.estimate(evidence)]
-            found = [Member.of(start) for start in _distinct(starts) if _changes(start, evidence)]
+            starts = _distinct([*effect.typical(), *effect.estimate(evidence)])
+            found = [Member.of(start) for start in starts]
+            found = [m for m in found if not (m.law.neutral or m.law.free_satellites)]
         except Exception as error:
             failed[tag] = error_words(error)
             continue
@@ -241,25 +239,11 @@ def find_members(
 
 def _distinct(effects: Sequence[Effect]) -> list[Effect]:
     """Leave out starts that differ in nothing but their strength, sign included."""
-    kept: dict[str, Effect] = {}
+    kept: dict[tuple[str, float], Effect] = {}
     for effect in effects:
-        values: dict[str, Any] = effect.model_dump(mode="json")
-        value = values.pop(effect.strength, 0.0)
-        kept.setdefault(f"{values} {np.sign(value)}", effect)
+        sign = float(np.sign(getattr(effect, effect.strength, 0.0)))
+        kept.setdefault((effect.model_dump_json(exclude={effect.strength}), sign), effect)
     return list(kept.values())
-
-
-def _changes(effect: Effect, evidence: Evidence) -> bool:
-    """Tell whether an effect changes the law of the pixels in more than the width of its read noise."""
-    usable = np.flatnonzero(evidence.maps.usable.ravel())[:4]
-    columns = [np.asarray(values, np.float64).ravel()[usable] for values in evidence.maps.maps]
-    maps = pixel_maps(columns, np.ones(usable.size, np.bool_))
-    law = sample_law([effect], maps)
-    low = int((maps.bias - 8.0 * maps.read_noise_dn).min())
-    high = int((maps.bias + (maps.quanta_exposure * 3.0 + 8.0) / maps.conversion_gain).max())
-    codes = np.arange(low, high + 1)
-    change = np.abs(sample_mass(law, maps, codes) - sample_mass(SampleLaw(), maps, codes)).max()
-    return bool(change > _LEAST_CHANGE)
 
 
 def _limits(effect: Effect, name: str) -> tuple[float, float]:

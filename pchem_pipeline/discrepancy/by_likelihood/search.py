@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST
-from pchem_pipeline.discrepancy.by_likelihood.comb import doubtful_peaks, places_of, valleys
+from pchem_pipeline.discrepancy.by_likelihood.comb import doubtful_peaks, valleys
 from pchem_pipeline.discrepancy.by_likelihood.members import FARTHEST, Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison, select
 from pchem_pipeline.model.arithmetic.significance import CLEAR
-from pchem_pipeline.model.fit.excluding_codes import Interval, inside
+from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
 
 FloatArray = NDArray[np.float64]
 
@@ -78,15 +78,14 @@ def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
         candidates: effects at their starts.
     """
     nearest = tuple(one.members[0].tag for one in sets.extended(sets.plain, candidates))
-    for pool in (candidates, [c for c in candidates if not c.tabulated]):
-        best = select(sets, pool)
-        rest, rise = _rest(sets, best), sets.difference(best, sets.plain)
-        if best.members and (rest <= LARGEST_REST or sets.distance(best).gap.at_floor):
-            named = tuple(_named(sets, best, candidates))
-            return Explanation(sets.kept, (), best, named, (), nearest, rest, rise)
+    best = select(sets, candidates)
+    rest, rise = _rest(sets, best), sets.difference(best, sets.plain)
+    if best.members and (rest <= LARGEST_REST or sets.distance(best).gap.at_floor):
+        named = tuple(_named(sets, best, candidates))
+        return Explanation(sets.kept, (), best, named, (), nearest, rest, rise)
     fixed_in_dn = combs_coincide(sets.plain.fit.parameters)
-    pool = [c for c in pool if not (fixed_in_dn and c.law.edge_shift.size)]
-    return _narrowed(sets, pool, sets.distance(best).excess, nearest)
+    pool = [c for c in candidates if not (c.tabulated or (fixed_in_dn and c.law.edge_shift.size))]
+    return _narrowed(sets, pool, nearest)
 
 
 def _rest(sets: SetComparison, best: FittedSet) -> float:
@@ -104,23 +103,15 @@ def combs_coincide(parameters: FloatArray) -> bool:
     return bool(np.ptp(np.quantile(bias, [0.1, 0.9])) * gain < _COINCIDE)
 
 
-def _narrowed(
-    sets: SetComparison, candidates: Sequence[Member], excess: float, nearest: tuple[str, ...]
-) -> Explanation:
-    """Select on the codes that are understood, and keep what is selected on more of them, too.
-
-    Args:
-        sets: with all codes.
-        candidates: effects at their starts.
-        excess: gap that is left where they are selected on all codes, nats.
-        nearest: see :class:`Explanation`.
-    """
+def _narrowed(sets: SetComparison, candidates: Sequence[Member], nearest: tuple[str, ...]) -> Explanation:
+    """Select on the codes that are understood, and keep what is selected on more of them, too."""
     parameters = sets.plain.fit.parameters
-    electrons = places_of(sets.origin, sets.train.shape[1], parameters)
+    electrons = electrons_of(sets.origin, sets.train.shape[1], parameters[:, 1], parameters[:, 2])
 
     def excluding(*intervals: Interval) -> SetComparison:
         return sets.on(~inside(intervals, electrons), parameters)
 
+    excess = sets.distance(select(sets, candidates)).excess
     peak = _cut_peak({p: excluding(p) for p in doubtful_peaks(sets.train, electrons)}, candidates, excess)
     between = valleys(sets.train, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
     wide, view = excluding(*peak), excluding(*peak, *between)
