@@ -49,7 +49,7 @@ class AddedSets:
     @classmethod
     def of(cls, found: Explanation, whole: SetComparison) -> AddedSets:
         """Prepare it on the codes that were compared; ``whole`` has all, of train and test part together."""
-        return cls(found, whole.on(found.kept, whole.start), whole.plain)
+        return cls(found, replace(whole, kept=found.kept), whole.plain)
 
     def gap(self, fitted: FittedSet) -> Gap:
         """Return the gap of a fit on the final part.
@@ -102,9 +102,7 @@ class AddedSets:
     def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
         """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""
         code = evidence.code
-        illuminated = np.tile(
-            ~np.array(self.sets.samples.dark), self.sets.train.shape[0] // self.sets.samples.n
-        )
+        illuminated = self.sets.samples.illuminated(self.sets.train.shape[0])
         expected, origin = self._expected(fitted)[illuminated], self.sets.origin[illuminated]
         if evidence.maps.usable.sum() != expected.shape[0]:
             return None

@@ -262,6 +262,6 @@ def _on_a_line(
     if _SPURIOUS in {effect.tag for effect in free.present}:
         return None
     line = Samples(dark, tuple(time or 0.0 for time in times))
-    straight = replace(free, samples=line, _known={})
+    straight = replace(free, samples=line)
     best = straight.fit([Member.of(SpuriousCharge.typical()[0])])
     return None if free.beats(free.plain, best) else straight

@@ -184,8 +184,8 @@ def law_of(
     effects = [*present, *(m.at(part) for m, part in zip(members, parts, strict=True))]
     law = sample_law(effects, pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
     if any(samples.dark) and law.added_exposure.any():
-        illuminated = ~np.tile(np.array(samples.dark), own.shape[0] // samples.n)
-        law = replace(law, added_exposure=np.where(illuminated[:, None], law.added_exposure, 0.0))
+        some = samples.illuminated(own.shape[0])[:, None]
+        law = replace(law, added_exposure=np.where(some, law.added_exposure, 0.0))
     return law
 
 

@@ -162,7 +162,7 @@ def _fitted_together(counts: IntArray, origin: IntArray, layout: Samples) -> Flo
 
 def _observe(counts: IntArray, origin: IntArray, layout: Samples, parameters: FloatArray | None) -> Evidence:
     """Observe the rows with electrons; the others say nothing about how electrons come and are read."""
-    illuminated = np.tile(~np.array(layout.dark), origin.size // layout.n)
+    illuminated = layout.illuminated(origin.size)
     known = None if parameters is None else parameters[illuminated]
     return observe_histograms(counts[illuminated].astype(np.uint32), origin[illuminated], parameters=known)
 

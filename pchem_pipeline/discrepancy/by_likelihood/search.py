@@ -109,7 +109,7 @@ def _narrowed(sets: SetComparison, candidates: Sequence[Member], nearest: tuple[
     electrons = electrons_of(sets.origin, sets.train.shape[1], parameters[:, 1], parameters[:, 2])
 
     def excluding(*intervals: Interval) -> SetComparison:
-        return sets.on(~inside(intervals, electrons), parameters)
+        return replace(sets, kept=~inside(intervals, electrons), start=parameters)
 
     excess = sets.distance(select(sets, candidates)).excess
     peak = _cut_peak({p: excluding(p) for p in doubtful_peaks(sets.train, electrons)}, candidates, excess)

@@ -54,7 +54,7 @@ class FittedSet:
     @property
     def n_parameters(self) -> int:
         """Number of fitted parameters, those of the pixels included."""
-        return self.fit.theta.size + self.fit.shared.size
+        return int(self.fit.theta.shape[0] * self.fit.samples.n_free + self.fit.shared.size)
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -96,21 +96,12 @@ class SetComparison:
     samples: Samples = field(default_factory=Samples)
     failed: dict[str, str] = field(default_factory=dict)
     effort: Effort = field(default_factory=lambda: Effort(None))
-    _known: dict[frozenset[str], FittedSet] = field(default_factory=dict)
-
-    def on(self, kept: NDArray[np.bool_], start: FloatArray) -> SetComparison:
-        """Return the same on other codes, begun elsewhere.
-
-        Args:
-            kept: codes that count, shape (n, B).
-            start: (H, g, mu, sigma), shape (n, 4).
-        """
-        return replace(self, kept=kept, start=start, _known={})
+    _known: dict[frozenset[str], FittedSet] = field(default_factory=dict, init=False)
 
     def of(self, rows: slice, start: FloatArray) -> SetComparison:
         """Return the same of some of the rows, begun elsewhere: ``start`` has shape (n, 4)."""
         taken = {name: getattr(self, name)[rows] for name in ("train", "test", "origin", "kept")}
-        return replace(self, **taken, start=start[rows], _known={})
+        return replace(self, **taken, start=start[rows])
 
     @functools.cached_property
     def plain(self) -> FittedSet:

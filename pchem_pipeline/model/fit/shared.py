@@ -56,6 +56,10 @@ class Samples:
         """Number of samples of a pixel, J."""
         return len(self.dark)
 
+    def illuminated(self, n_rows: int) -> NDArray[np.bool_]:
+        """Tell which rows are of samples with electrons, shape (n_rows,)."""
+        return np.asarray(np.tile(~np.array(self.dark), n_rows // self.n))
+
     @property
     def n_exposures(self) -> int:
         """Own parameters that are exposures."""
