@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from pchem_pipeline.discrepancy.build_verdict import (
     largest_pulls,
 )
 from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals
-from pchem_pipeline.discrepancy.by_likelihood.gap import Distance, on_all_codes
+from pchem_pipeline.discrepancy.by_likelihood.gap import on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
@@ -38,28 +38,26 @@ class AddedSets:
 
     Attributes:
         found: what the search came to.
-        sets: fits them, and scores them by the final part.
-        plain: the fit without effects.
+        whole: fits them on all codes, and scores them by the final part.
+        sets: the same on the codes that are compared.
     """
 
     found: Explanation
-    sets: SetComparison
-    plain: FittedSet
+    whole: SetComparison
+    sets: SetComparison = field(init=False)
 
-    @classmethod
-    def of(cls, found: Explanation, whole: SetComparison) -> AddedSets:
-        """Prepare it on the codes that were compared; ``whole`` has all, of train and test part together."""
-        return cls(found, replace(whole, kept=found.kept), whole.plain)
+    def __post_init__(self) -> None:
+        """Leave out the codes that were set aside."""
+        self.sets = replace(self.whole, kept=self.found.kept)
 
     def gap(self, fitted: FittedSet) -> Gap:
-        """Return the gap of a fit on the final part.
+        """Return the gap of a fit.
 
         Codes that are set aside keep what they have under the plain model: what is not understood does not
         count as closed.
         """
-        masses = on_all_codes(fitted.log_masses, self.found.kept, self.plain.log_masses)
-        share = float(self.sets.test.sum() / self.sets.train.sum())
-        return Distance.of(self.sets.test, masses, fitted.n_parameters, share=share).gap
+        masses = on_all_codes(fitted.log_masses, self.found.kept, self.whole.plain.log_masses)
+        return self.whole.distance(replace(fitted, log_masses=masses)).gap
 
     def close(
         self, before: Gap, nulls: tuple[NullModel, NullModel], z: Measured, still: bool
@@ -74,7 +72,7 @@ class AddedSets:
         """
         pulls = [null.pulls(z.both, splits=2) for null in nulls]
         moved = largest_pulls(nulls[0].names, pulls[0], pulls[0], pulls[1])
-        gap, fitted = before, self.plain
+        gap, fitted = before, self.whole.plain
         additions: list[Addition] = []
         for named in self.found.named:
             extended = self._refit((*fitted.members, named.member))

@@ -86,48 +86,16 @@ def find_in_histograms(
 
 
 @dataclass
-class HistogramReplicates:
-    """Draws histograms from a law, and observes them.
-
-    Attributes:
-        observed: the rows that are drawn.
-        bare: fits them without effects.
-        count: of the replicates of a law.
-        rng: all random numbers of the search.
-        effort: counts the work.
-    """
-
-    observed: ObservedHistograms
-    bare: SetComparison
-    count: int
-    rng: np.random.Generator
-    effort: Effort
-
-    def statistics(self, counts: IntArray) -> Mapping[str, float]:
-        """Return the statistics of histograms of the rows, fitted with the PCD alone."""
-        parameters = replace(self.bare, train=counts).plain.fit.parameters if self.observed.joint else None
-        return self.observed.statistics(counts, parameters)
-
-    def drawn(self, log_masses: FloatArray) -> list[Mapping[str, float]]:
-        """Return the statistics of histograms drawn from masses of the codes, (r, B), refit included."""
-        mass = np.exp(log_masses)
-        mass /= mass.sum(axis=1, keepdims=True)
-        total = self.observed.parts[0].sum(axis=1)
-        self.effort.replicates += self.count
-        self.effort.simulate(0, total.size, self.count)
-        return [self.statistics(self.rng.multinomial(total, mass)) for _ in range(self.count)]
-
-
-@dataclass
 class HistogramExplainer(Explainer[Explanation]):
     """Tells effects apart in histograms.
 
     Attributes:
         prepared: the histograms, split, and the model, drawn.
         observed: the rows that are looked at.
-        replicates: draws replicates of them.
         sets: fits sets of effects to the train part, and scores them by the test part.
         whole: fits them to both, and scores them by the final part.
+        bare: fits the rows without any effects.
+        rng: all random numbers of the search.
         members: the candidates.
         effects: of the model; those that were there before, and those added since.
         final: the fit of the final model to train and test part.
@@ -137,9 +105,10 @@ class HistogramExplainer(Explainer[Explanation]):
 
     prepared: Prepared
     observed: ObservedHistograms
-    replicates: HistogramReplicates
     sets: SetComparison
     whole: SetComparison
+    bare: SetComparison
+    rng: np.random.Generator
     members: Sequence[Member]
     effects: tuple[Effect, ...]
     final: FittedSet
@@ -178,9 +147,8 @@ class HistogramExplainer(Explainer[Explanation]):
         members, untestable = find_members(classes, observed.evidence, model, defects)
         always = {t: c.untestable for t, c in effect_classes().items() if c.untestable and t not in classes}
         bare = replace(sets, present=(), start=sets.plain.fit.parameters)
-        replicates = HistogramReplicates(observed, bare, settings.replicates, rng, effort)
-        seen = [replicates.statistics(part) for part in observed.parts]
-        vectors = replicates.drawn(sets.plain.log_masses)
+        seen = [observed.statistics(part, bare) for part in observed.parts]
+        vectors = observed.drawn(sets.plain.log_masses, bare, settings.replicates, rng)
         common = set(STATISTICS).intersection(*vectors, *seen)
         names = tuple(name for name in STATISTICS if name in common)
         whole = replace(sets, start=bare.start, train=train + test, test=final)
@@ -191,7 +159,7 @@ class HistogramExplainer(Explainer[Explanation]):
         data = observed.evidence, observed.examined(), first, z, effort
         # what the parameters bend is no evidence against them: each candidate is fitted with them
         prepared = Prepared(settings, "histograms", *data, untestable, defects=defects)
-        return cls(prepared, observed, replicates, sets, whole, members, model, whole.plain)
+        return cls(prepared, observed, sets, whole, bare, rng, members, model, whole.plain)
 
     @property
     def model(self) -> tuple[Effect, ...]:
@@ -212,7 +180,7 @@ class HistogramExplainer(Explainer[Explanation]):
         Raises:
             EffortSpentError: the work is at its limit; nothing was found.
         """
-        tried = self.replicates.effort.tried
+        tried = self.prepared.effort.tried
         tried.clear()
         try:
             found = explain(self.sets, self.members)
@@ -227,16 +195,15 @@ class HistogramExplainer(Explainer[Explanation]):
 
     def add(self, explanation: Explanation, null: NullModel) -> NullModel:
         """Put the named effects into the model, and observe histograms drawn from it."""
-        vectors = self.replicates.drawn(
-            on_all_codes(explanation.best.log_masses, explanation.kept, self.sets.plain.log_masses)
-        )
+        masses = on_all_codes(explanation.best.log_masses, explanation.kept, self.sets.plain.log_masses)
+        vectors = self.observed.drawn(masses, self.bare, self.prepared.settings.replicates, self.rng)
         return NullModel.from_replicates(null.names, as_matrix(null.names, vectors), effects=True)
 
     def close(self, before: Gap, null: NullModel, disagreed: bool) -> Added:
         """Fit train and test part together with each effect, and measure the gap on the final part."""
         if self.found is None:
             return Added((), before)
-        closing = AddedSets.of(self.found, self.whole)
+        closing = AddedSets(self.found, self.whole)
         added, self.final = closing.close(before, (self.prepared.first, null), self.prepared.z, disagreed)
         self.code = closing.codes(self.final, self.observed.evidence)
         self.effects = along_chain(self.sets.present, [each.effect for each in added.additions])

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import REACH
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY, observe_histograms
 from pchem_pipeline.discrepancy.verdict import Examined
@@ -106,9 +107,21 @@ class ObservedHistograms:
             final=sizes[2],
         )
 
-    def statistics(self, counts: IntArray, parameters: FloatArray | None) -> Mapping[str, float]:
-        """Return the statistics of such rows; ``parameters`` where the samples of a pixel share them."""
+    def statistics(self, counts: IntArray, bare: SetComparison) -> Mapping[str, float]:
+        """Return the statistics of histograms of the rows, fitted with the PCD alone, as ``bare`` does."""
+        parameters = replace(bare, train=counts).plain.fit.parameters if self.joint else None
         return _observe(counts, self.origin, self.layout, parameters).z
+
+    def drawn(
+        self, log_masses: FloatArray, bare: SetComparison, count: int, rng: np.random.Generator
+    ) -> list[Mapping[str, float]]:
+        """Return the statistics of histograms drawn from masses of the codes, (r, B), refit included."""
+        mass = np.exp(log_masses)
+        mass /= mass.sum(axis=1, keepdims=True)
+        total = self.parts[0].sum(axis=1)
+        bare.effort.replicates += count
+        bare.effort.simulate(0, total.size, count)
+        return [self.statistics(rng.multinomial(total, mass), bare) for _ in range(count)]
 
     def maps(self, parameters: FloatArray) -> PixelMaps:
         """Return parameters of the rows, (r, 4), as maps, NaN elsewhere, shape (1, n) or (n, J)."""
