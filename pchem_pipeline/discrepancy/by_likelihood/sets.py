@@ -26,8 +26,8 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_LARGEST_SET = 4
-_LEAST_SHARE = 0.05
+_LARGEST_SET = 4  # effects
+_LEAST_SHARE = 0.05  # of what a set that misfits explains, that each of its effects must
 _FITTED = 3  # candidates fitted in full, of those that a first-order step promises most of
 _TOLERANCE = 0.02  # nats; of a misfit more, since it is known no better
 _TOLERANCE_PER_SAMPLE = 1e-6
