@@ -58,7 +58,6 @@ class Gap:
         n_samples: float,
         *,
         variance: float,
-        carried: float = 0.0,
         families: Mapping[str, float] | None = None,
         standing_out: tuple[str, ...] = (),
     ) -> Gap:
@@ -69,13 +68,12 @@ class Gap:
             chance: distances of replicates of the model, nats, shape (b,).
             n_samples: number of samples of the distance.
             variance: additional variance of the distance, nats^2.
-            carried: additional part of the gap, nats.
             families: contributions, nats per sample; None: all of family "shape".
             standing_out: significant families.
         """
         expected = float(chance.mean())
         spread = float(np.sqrt(chance.var(ddof=1) + variance))
-        total = distance - expected + carried
+        total = distance - expected
         value = total / n_samples
         ends = (total - _INTERVAL * spread) / n_samples, (total + _INTERVAL * spread) / n_samples
         # unbiased for few replicates: one more exceeds it with probability 0.05

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from pchem_pipeline.discrepancy.build_verdict import (
     LARGEST_REST,
@@ -17,16 +17,15 @@ from pchem_pipeline.discrepancy.build_verdict import (
     Addition,
     largest_pulls,
 )
-from pchem_pipeline.discrepancy.by_likelihood.comb import electrons_of, find_residuals, set_aside_residual
-from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap, carried_over
+from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals
+from pchem_pipeline.discrepancy.by_likelihood.gap import on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
-from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import UNITS
+from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import UNITS, change_of
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
-from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 
 FloatArray = NDArray[np.float64]
@@ -38,27 +37,27 @@ class AddedSets:
     """Fits the models of the steps to train and test together, and measures their gaps on the final part.
 
     Attributes:
-        parts: train, test and final histograms, shape (n, B) each.
         found: what the search came to.
-        plain: the fit without effects to train and test.
-        replicates: behind expectation and floor of a gap.
-        rng: their random numbers.
+        whole: fits them on all codes, and scores them by the final part.
+        sets: the same on the codes that are compared.
     """
 
-    parts: tuple[IntArray, ...]
     found: Explanation
-    plain: FittedSet
-    replicates: int
-    rng: np.random.Generator
+    whole: SetComparison
+    sets: SetComparison = field(init=False)
 
     def __post_init__(self) -> None:
-        """Prepare the gap: codes that are set aside keep what they have under the plain model."""
-        kept = self.found.kept
-        carried = 0.0 if kept.all() else carried_over(self.plain.log_masses, self.parts[2], kept)
-        old = self.found.sets
-        self.both = self.parts[0] + self.parts[1]
-        self.sets = replace(old.on(kept, old.start), train=self.both)
-        self.gaps = LikelihoodGap(self.parts[2], kept, carried, self.replicates, self.rng)
+        """Leave out the codes that were set aside."""
+        self.sets = replace(self.whole, kept=self.found.kept)
+
+    def gap(self, fitted: FittedSet) -> Gap:
+        """Return the gap of a fit.
+
+        Codes that are set aside keep what they have under the plain model: what is not understood does not
+        count as closed.
+        """
+        masses = on_all_codes(fitted.log_masses, self.found.kept, self.whole.plain.log_masses)
+        return self.whole.distance(replace(fitted, log_masses=masses)).gap
 
     def close(
         self, before: Gap, nulls: tuple[NullModel, NullModel], z: Measured, still: bool
@@ -73,14 +72,12 @@ class AddedSets:
         """
         pulls = [null.pulls(z.both, splits=2) for null in nulls]
         moved = largest_pulls(nulls[0].names, pulls[0], pulls[0], pulls[1])
-        gap, fitted = before, self.plain
+        gap, fitted = before, self.whole.plain
         additions: list[Addition] = []
-        members: tuple[Member, ...] = ()
         for named in self.found.named:
-            members = (*members, named.member)
-            extended = self._refit(members)
-            after = self.gaps.gap(self.sets.problem(members), extended.fit)
-            addition = self._addition(named, members, (gap, after), (fitted, extended))
+            extended = self._refit((*fitted.members, named.member))
+            after = self.gap(extended)
+            addition = self._addition(named, (gap, after), (fitted, extended))
             additions.append(replace(addition, pulls=moved))
             gap, fitted = after, extended
         left = "" if self.found.rest <= LARGEST_REST or gap.at_floor else LEAVES_TOO_MUCH
@@ -88,52 +85,33 @@ class AddedSets:
             additions=tuple(replace(each, against=left or each.against) for each in additions),
             after=gap,
             nearest=self.found.nearest,
-            stand_ins=tuple(m.tag for m in self.found.unsteady),
+            stand_ins=self.found.stand_ins,
             residuals=self.residuals(fitted) if still or not gap.at_floor else (),
-            set_aside=tuple((i.low, i.high) for i in self.found.set_aside),
+            set_aside=self.found.set_aside,
         )
         return added, fitted
 
     def residuals(self, fitted: FittedSet) -> tuple[Place, ...]:
         """Return the codes that the model does not account for, a peak that was set aside first."""
-        counts, kept = self.both.astype(np.float64), self.found.kept
-        expected = self._expected(fitted)
-        parameters = fitted.fit.parameters
-        electrons = electrons_of(self.sets.origin, counts.shape[1], parameters)
-        found = find_residuals(
-            np.where(kept, counts, 0.0), np.where(kept, expected, 0.0), electrons, parameters
-        )
-        peak = self.found.peak
-        if peak is not None:
-            total = self.gaps.gap(self.sets.problem(fitted.members), fitted.fit).value * self.gaps.n_samples
-            aside = set_aside_residual(
-                peak.low,
-                peak.high,
-                float(np.where(kept, 0.0, counts).sum()),
-                float(np.where(kept, 0.0, expected).sum()),
-                parameters,
-                self.gaps.carried / max(total, 1e-12),
-            )
-            found.insert(0, aside)
-        return tuple(found)
+        counts, expected = self.sets.train.astype(np.float64), self._expected(fitted)
+        own = self.sets.origin, fitted.fit.parameters, self.found.set_aside
+        return tuple(find_residuals(counts, expected, *own))
 
     def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
         """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""
         code = evidence.code
-        illuminated = np.tile(~np.array(self.sets.samples.dark), self.both.shape[0] // self.sets.samples.n)
+        illuminated = self.sets.samples.illuminated(self.sets.train.shape[0])
         expected, origin = self._expected(fitted)[illuminated], self.sets.origin[illuminated]
         if evidence.maps.usable.sum() != expected.shape[0]:
             return None
-        found = np.zeros(code.observed.size)
-        for row, first in zip(expected, origin - code.first, strict=True):
-            at = first + np.arange(row.size)
-            within = (at >= 0) & (at < found.size)
-            np.add.at(found, at[within], row[within])
-        return np.asarray(found * code.observed.sum() / max(float(self.both[illuminated].sum()), 1.0))
+        at = (origin - code.first)[:, None] + np.arange(expected.shape[1])
+        within, size = (at >= 0) & (at < code.observed.size), code.observed.size
+        found = np.bincount(at[within], expected[within], minlength=size)
+        return np.asarray(found * code.observed.sum() / max(float(self.sets.train[illuminated].sum()), 1.0))
 
     def _expected(self, fitted: FittedSet) -> FloatArray:
         """Return the samples of train and test expected at each code given those in codes that are kept."""
-        counts, kept = self.both.astype(np.float64), self.found.kept
+        counts, kept = self.sets.train.astype(np.float64), self.found.kept
         mass = self.sets.problem(fitted.members).masses(fitted.fit.theta, fitted.fit.shared)
         inside = np.where(kept, mass, 0.0).sum(axis=1, keepdims=True)
         return np.asarray(mass / inside * np.where(kept, counts, 0.0).sum(axis=1, keepdims=True))
@@ -141,87 +119,53 @@ class AddedSets:
     def _refit(self, members: Sequence[Member]) -> FittedSet:
         return self.sets.fit(members, self.found.best.fit.parameters)
 
-    def _addition(
-        self,
-        named: Named,
-        members: tuple[Member, ...],
-        gaps: tuple[Gap, Gap],
-        fits: tuple[FittedSet, FittedSet],
-    ) -> Addition:
+    def _addition(self, named: Named, gaps: tuple[Gap, Gap], fits: tuple[FittedSet, FittedSet]) -> Addition:
         """Return an effect with the gaps and the fits without and with it, and with rivals in its place."""
-        extended = fits[1]
-        member = extended.member(named.member.tag)
-        assert member is not None  # it was just fitted
-        candidates = self._candidates(named, member.effect)
-        if named.equals:
-            candidates = tuple(c for c in candidates if c.effect in (member.tag, *named.equals))
-        chance = self.gaps.chance(self.sets.problem(extended.members), extended.fit)
-        rivals = self._rivals(named, members, chance)
+        before, after = fits
+        member = after.members[-1]
+        compared = [(member, 0.0, 0.0), *named.rivals]
+        weights = special.softmax([min(score, 0.0) for _, score, _ in compared])
+        rivals = self._rivals(named, before)
         kin = {member.tag, *type(member.effect).separate}
         return Addition(
             effect=member.effect,
             alone=not named.equals,
             against=member.effect.stuck_words(),
-            candidates=candidates,
-            strength_stderr=_stderr(extended, member, named.apart),
+            candidates=tuple(
+                Candidate.of(each.effect, score, error, float(weight))
+                for (each, score, error), weight in zip(compared, weights, strict=True)
+                if not named.equals or each.tag in (member.tag, *named.equals)
+            ),
+            # of the fit, and what the choice of the codes makes of it
+            strength_stderr=float(np.hypot(after.stderr(member), named.apart)),
             before=gaps[0],
             after=gaps[1],
             rivals=rivals[:MOST_RIVALS],
             placebo=next((r for r in rivals[1:] if r.effect not in kin), None),
             pulls=(),
-            moved=_moved(*fits),
+            moved={
+                name: change_of(change, error, unit)
+                for (name, unit), change, error in zip(
+                    UNITS.items(),
+                    (after.fit.parameters - before.fit.parameters).T,
+                    after.fit.stderr.T,
+                    strict=True,
+                )
+            },
         )
 
-    def _candidates(self, named: Named, effect: Effect) -> tuple[Candidate, ...]:
-        """Return the effect and what could stand in its place, with held-out scores."""
-        scored = [(effect, 0.0, 0.0), *((other.effect, score, error) for other, score, error in named.rivals)]
-        weights = np.exp([min(score, 0.0) for _, score, _ in scored])
-        weights /= weights.sum()
-        return tuple(
-            Candidate.of(e, score, error, float(w))
-            for (e, score, error), w in zip(scored, weights, strict=True)
-        )
-
-    def _rivals(self, named: Named, members: tuple[Member, ...], chance: float) -> tuple[Rival, ...]:
+    def _rivals(self, named: Named, before: FittedSet) -> tuple[Rival, ...]:
         """Return what could stand in the place of an effect, refitted, with its gap, the best first."""
-        others = tuple(m for m in members if m.tag != named.member.tag)
         found = []
         for other, behind, error in named.rivals:
-            if any(other.excludes(m) for m in others):
+            if any(other.excludes(m) for m in before.members):
                 continue
             try:
-                fitted = self._refit((*others, other))
+                gap = self.gap(self._refit((*before.members, other)))
             except ValueError:
                 continue
-            gap = self.gaps.value(self.sets.problem(fitted.members), fitted.fit, chance)
             why = f"it predicts unseen samples worse, by {-behind:.3g} ± {error:.2g}"
             if other.tag in named.equals:
                 why = "it predicts unseen samples as well: these histograms do not decide"
-            found.append(Rival(effect=other.tag, gap_after=gap, behind=behind, why=why))
+            found.append(Rival(effect=other.tag, gap_after=gap.value, behind=behind, why=why))
         return tuple(sorted(found, key=lambda rival: -rival.behind))
-
-
-def _stderr(extended: FittedSet, member: Member, apart: float) -> float:
-    """Return the standard error of a strength: of the fit, and what the choice of the codes makes of it."""
-    if not member.effect.strength:
-        return float("nan")
-    value, error = (float(v[0]) for v in extended.coordinates(member.tag))
-    return float(np.hypot(member.coordinates[0].error(value, error), apart))
-
-
-def _moved(before: FittedSet, after: FittedSet) -> dict[str, dict[str, Any]]:
-    """Return how far the parameters of the pixels moved: median over the rows, and in standard errors."""
-    change = after.fit.parameters - before.fit.parameters
-    h, g, _, sigma = after.fit.parameters.T
-    slopes = np.stack([h, g, np.ones_like(h), 0.5 * np.exp(after.fit.row_theta[:, 3]) / sigma], axis=1)
-    error = np.sqrt(np.maximum(after.fit.row_variance, 0.0)) * np.abs(slopes)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(error > 0, change / error, np.nan)
-    return {
-        name: {
-            "median": float(np.median(change[:, i])),
-            "in_stderr": float(np.nanmedian(ratio[:, i])),
-            "unit": unit,
-        }
-        for i, (name, unit) in enumerate(UNITS.items())
-    }

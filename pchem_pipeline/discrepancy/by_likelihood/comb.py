@@ -8,91 +8,50 @@ bump), and what is named must be found in all of these views. What is left is lo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison, saturated
 from pchem_pipeline.discrepancy.verdict import Place
+from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
 
 FloatArray = NDArray[np.float64]
 
 _RESOLVED = 0.3  # e-: read noise above which there are no valleys
 _HALF_PEAK = 0.25  # e-: half width of what counts as a peak
+_CELL = 0.125  # e-
 _MOST_SHARE = 0.3  # of the samples that may be set aside
 _LEAST_SHARE = 1e-3
-_WIDEST_RESIDUAL = 1.0  # e-
 _MOST_RESIDUALS = 6
 _SIGNIFICANT = 0.005
 
 
-@dataclass(frozen=True)
-class Interval:
-    """Codes by their place on a pixel's comb, e-; None: no limit."""
-
-    low: float | None
-    high: float | None
-
-    def holds(self, electrons: FloatArray) -> NDArray[np.bool_]:
-        """Tell which places lie in it."""
-        found = np.ones(electrons.shape, np.bool_)
-        if self.low is not None:
-            found &= electrons >= self.low
-        if self.high is not None:
-            found &= electrons < self.high
-        return found
-
-
-def electrons_of(origin: NDArray[np.int64], width: int, parameters: FloatArray) -> FloatArray:
-    """Return ``(x - mu) g`` of every code, e-, shape (n, B), of pixels with (H, g, mu, sigma)."""
-    codes = origin[:, None] + np.arange(width)
-    return np.asarray((codes - parameters[:, 2:3]) * parameters[:, 1:2])
-
-
-def inside(intervals: tuple[Interval, ...], electrons: FloatArray) -> NDArray[np.bool_]:
-    """Tell which codes lie in one of the intervals, shape (n, B)."""
-    found = np.zeros(electrons.shape, np.bool_)
-    for interval in intervals:
-        found |= interval.holds(electrons)
-    return found
-
-
-def doubtful_peaks(sets: SetComparison, electrons: FloatArray) -> list[Interval]:
-    """Return peaks of few samples, those first without which the plain law fits best.
+def doubtful_peaks(counts: NDArray[np.integer], electrons: FloatArray) -> list[Interval]:
+    """Return peaks of few samples: each alone, and each with all above it.
 
     Args:
-        sets: with all codes.
+        counts: histograms, shape (n, B).
         electrons: place of every code, e-, shape (n, B).
     """
-    total = float(sets.train.sum())
-    cumulative = [float(sets.train[electrons < k + 0.5].sum()) / total for k in range(_last(electrons) + 1)]
-    ranked: list[tuple[float, Interval]] = []
-    for k, below in enumerate(cumulative):
-        before = cumulative[k - 1] if k else 0.0
-        candidates = {Interval(None if k == 0 else k - 0.5, k + 0.5): below - before}
-        if k:
-            candidates[Interval(k - 0.5, None)] = 1.0 - before
-        for interval, share in candidates.items():
-            if _LEAST_SHARE < share < _MOST_SHARE:
-                ranked.append((_gap(sets, sets.kept & ~interval.holds(electrons)), interval))
-    return [interval for _, interval in sorted(ranked, key=lambda pair: pair[0])]
+    peaks: list[Interval] = [(None, 0.5)]
+    for k in range(1, _last(electrons) + 1):
+        peaks += [(k - 0.5, k + 0.5), (k - 0.5, None)]
+    return [each for each in peaks if _LEAST_SHARE < _share(counts, (each,), electrons) < _MOST_SHARE]
 
 
-def valleys(sets: SetComparison, electrons: FloatArray, sigma_e: float) -> tuple[Interval, ...]:
+def valleys(counts: NDArray[np.integer], electrons: FloatArray, sigma_e: float) -> tuple[Interval, ...]:
     """Return the codes between the peaks; none where peaks are not resolved or little would be left."""
     if sigma_e > _RESOLVED:
         return ()
-    found = tuple(Interval(k + _HALF_PEAK, k + 1.0 - _HALF_PEAK) for k in range(-1, _last(electrons) + 1))
-    share = float(sets.train[inside(found, electrons)].sum()) / float(sets.train.sum())
-    return found if share < _MOST_SHARE else ()
+    found = tuple((k + _HALF_PEAK, k + 1.0 - _HALF_PEAK) for k in range(-1, _last(electrons) + 1))
+    return found if _share(counts, found, electrons) < _MOST_SHARE else ()
 
 
-def _gap(sets: SetComparison, kept: NDArray[np.bool_]) -> float:
-    """Return the gap of the plain law among some codes, nats per sample of all."""
-    view = replace(sets.on(kept, sets.start), test=sets.train)
-    return float(saturated(view.train, kept).sum() - view.fit(()).score) / float(sets.train.sum())
+def _share(counts: NDArray[np.integer], intervals: Sequence[Interval], electrons: FloatArray) -> float:
+    """Return the share of the samples in intervals."""
+    return float(counts[inside(intervals, electrons)].sum() / counts.sum())
 
 
 def _last(electrons: FloatArray) -> int:
@@ -115,99 +74,56 @@ def place_words(low: float, high: float) -> str:
 
 
 def find_residuals(
-    observed: FloatArray, expected: FloatArray, electrons: FloatArray, parameters: FloatArray
+    seen: FloatArray,
+    expected: FloatArray,
+    origin: NDArray[np.int64],
+    parameters: FloatArray,
+    peaks: Sequence[Interval] = (),
 ) -> list[Place]:
-    """Scan for windows of codes that hold too many or too few samples, the most significant first.
+    """Return where on the comb are too many or too few samples, the most significant first.
 
-    As in a bump hunt (Choudalakis 2011), windows of every place and width are tried, and each p-value counts
-    the trials. The codes of pixels are lined up by their place on the comb.
+    The codes of pixels are lined up by their place on the comb, and parted in quarters of an electron: either
+    half of a peak, and of a valley. Each p-value counts all of these.
 
     Args:
-        observed: samples, shape (n, B); 0 in codes that are not compared.
+        seen: samples, shape (n, B).
         expected: the same under the model.
-        electrons: place of every code, e-, shape (n, B).
+        origin: DN of bin 0, shape (n,).
         parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
+        peaks: that were set aside; they come first, and their codes in no quarter.
     """
+    electrons = electrons_of(origin, seen.shape[1], parameters[:, 1], parameters[:, 2])
     gain, bias = float(np.median(parameters[:, 1])), float(np.median(parameters[:, 2]))
-    index = np.floor((electrons + 0.5 * gain) / gain).astype(np.int64)
-    first = int(index.min())
-    seen, wanted = (
-        np.bincount((index - first).ravel(), values.ravel()).astype(np.float64)
-        for values in (observed, expected)
-    )
-    sums = [np.concatenate([[0.0], np.cumsum(values)]) for values in (seen, wanted)]
-    widest = max(int(_WIDEST_RESIDUAL / gain), 1)
-    windows: list[tuple[float, int, int]] = []
-    for width in range(1, min(widest, seen.size) + 1):
-        o, e = (total[width:] - total[:-width] for total in sums)
-        roots = _signed_root(o, np.maximum(e, 1e-9))
-        windows += [(float(roots[i]), int(i), width) for i in np.argsort(-np.abs(roots))[:40]]
-    windows.sort(key=lambda item: -abs(item[0]))
-    taken = np.zeros(seen.size, np.bool_)
-    found: list[Place] = []
-    whole = max(float(_contribution(seen, wanted).sum()), 1e-12)
-    for z, start, width in windows:
-        place = slice(start, start + width)
-        p = float(min(1.0, 2.0 * special.ndtr(-abs(z)) * widest * seen.size))
-        if p > _SIGNIFICANT or len(found) == _MOST_RESIDUALS:
-            break
-        if taken[place].any():
-            continue
-        taken[place] = True
-        low, high = (first + start - 0.5) * gain, (first + start + width - 0.5) * gain
-        dn = int(np.ceil(bias + low / gain)), int(np.floor(bias + high / gain))
-        share = float(_contribution(seen[place], wanted[place]).sum()) / whole
+    width = max(_CELL, gain)
+    index = np.floor(electrons / width).astype(np.int64)
+    ends = [
+        (-0.5 if low is None else low, (low or 0.0) + 1.0 if high is None else high) for low, high in peaks
+    ]
+    masks = [inside([peak], electrons) for peak in peaks]
+    left = ~inside(peaks, electrons)
+    for cell in np.unique(index[left & (expected + seen > 0.0)]):
+        ends.append((cell * width, (cell + 1) * width))
+        masks.append(left & (index == cell))
+    o, e = (np.array([values[mask].sum() for mask in masks]) for values in (seen, expected))
+    deviance = special.kl_div(o, np.maximum(e, 1e-9))
+    z = np.sign(o - e) * np.sqrt(2.0 * deviance)
+    p = np.minimum(2.0 * special.ndtr(-np.abs(z)) * len(masks), 1.0)
+    order = [*range(len(peaks)), *(len(peaks) + np.argsort(-deviance[len(peaks) :]))]
+    found = []
+    for i in [i for i in order if p[i] < _SIGNIFICANT or i < len(peaks)][:_MOST_RESIDUALS]:
+        dn = int(np.ceil(bias + ends[i][0] / gain)), int(np.floor(bias + ends[i][1] / gain))
+        words = (
+            f"{'more' if z[i] > 0 else 'fewer'} samples than expected {place_words(*ends[i])} "
+            f"(DN {dn[0]} to {dn[1]}: {o[i]:.3g} seen, {e[i]:.3g} expected)"
+        )
+        numbers = {
+            "z": z[i],
+            "p": p[i],
+            "seen": o[i],
+            "expected": e[i],
+            "share_of_gap": deviance[i] / deviance.sum(),
+        }
         found.append(
-            _residual(low, high, dn, float(seen[place].sum()), float(wanted[place].sum()), z, p, share)
+            Place.of("code.smooth", sentence=words, dn=dn, **{k: float(v) for k, v in numbers.items()})
         )
     return found
-
-
-def set_aside_residual(
-    low: float | None, high: float | None, seen: float, expected: float, parameters: FloatArray, share: float
-) -> Place:
-    """Return what a peak that was set aside holds, against what the model that fits the rest expects in it.
-
-    Args:
-        low: lower limit, e-; None: no limit.
-        high: upper limit, e-; None: no limit.
-        seen: samples that it holds.
-        expected: samples that the model expects.
-        parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
-        share: of the remaining gap.
-    """
-    gain, bias = float(np.median(parameters[:, 1])), float(np.median(parameters[:, 2]))
-    ends = (-0.5 if low is None else low, (low or 0.0) + 1.0 if high is None else high)
-    dn = tuple(int(np.round(bias + end / gain)) for end in ends)
-    z = float(_signed_root(np.array([seen]), np.array([max(expected, 1e-9)]))[0])
-    return _residual(ends[0], ends[1], (dn[0], dn[1]), seen, expected, z, 0.0, share)
-
-
-def _residual(
-    low: float,
-    high: float,
-    dn: tuple[int, int],
-    seen: float,
-    expected: float,
-    z: float,
-    p: float,
-    share: float,
-) -> Place:
-    more = "more" if z > 0 else "fewer"
-    words = (
-        f"{more} samples than expected {place_words(low, high)} (DN {dn[0]} to {dn[1]}: "
-        f"{seen:.3g} seen, {expected:.3g} expected)"
-    )
-    return Place.of(
-        "code.smooth", z=z, sentence=words, p=p, dn=dn, seen=seen, expected=expected, share_of_gap=share
-    )
-
-
-def _contribution(seen: FloatArray, expected: FloatArray) -> FloatArray:
-    """Return what codes contribute to the gap, nats: ``o log(o / e) - o + e``."""
-    return np.asarray(special.kl_div(seen, np.maximum(expected, 1e-9)))
-
-
-def _signed_root(seen: FloatArray, expected: FloatArray) -> FloatArray:
-    """Return the signed root of the Poisson deviance, about N(0, 1) by chance."""
-    return np.asarray(np.sign(seen - expected) * np.sqrt(2.0 * special.kl_div(seen, expected)))

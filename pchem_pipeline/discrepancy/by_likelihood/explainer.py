@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_likelihood.additions import AddedSets
-from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
+from pchem_pipeline.discrepancy.by_likelihood.gap import on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_members
 from pchem_pipeline.discrepancy.by_likelihood.observed import ObservedHistograms, SampleHistograms
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
@@ -39,7 +38,6 @@ from pchem_pipeline.model.fit.shared import Samples
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_FEWEST_REPLICATES = 40
 _SPURIOUS = SpuriousCharge.model_fields["tag"].default
 
 
@@ -88,48 +86,16 @@ def find_in_histograms(
 
 
 @dataclass
-class HistogramReplicates:
-    """Draws histograms from a law, and observes them.
-
-    Attributes:
-        observed: the rows that are drawn.
-        bare: fits them without effects.
-        count: of the replicates of a law.
-        rng: all random numbers of the search.
-        effort: counts the work.
-    """
-
-    observed: ObservedHistograms
-    bare: SetComparison
-    count: int
-    rng: np.random.Generator
-    effort: Effort
-
-    def statistics(self, counts: IntArray) -> Mapping[str, float]:
-        """Return the statistics of histograms of the rows, fitted with the PCD alone."""
-        parameters = self.bare.fit((), None, counts).fit.parameters if self.observed.joint else None
-        return self.observed.statistics(counts, parameters)
-
-    def drawn(self, log_masses: FloatArray) -> list[Mapping[str, float]]:
-        """Return the statistics of histograms drawn from masses of the codes, (r, B), refit included."""
-        mass = np.exp(log_masses)
-        mass /= mass.sum(axis=1, keepdims=True)
-        total = self.observed.parts[0].sum(axis=1)
-        self.effort.replicates += self.count
-        self.effort.simulate(0, total.size, self.count)
-        return [self.statistics(self.rng.multinomial(total, mass)) for _ in range(self.count)]
-
-
-@dataclass
 class HistogramExplainer(Explainer[Explanation]):
     """Tells effects apart in histograms.
 
     Attributes:
         prepared: the histograms, split, and the model, drawn.
         observed: the rows that are looked at.
-        replicates: draws replicates of them.
-        sets: fits and scores sets of effects.
-        plain: the fit without them to train and test part.
+        sets: fits sets of effects to the train part, and scores them by the test part.
+        whole: fits them to both, and scores them by the final part.
+        bare: fits the rows without any effects.
+        rng: all random numbers of the search.
         members: the candidates.
         effects: of the model; those that were there before, and those added since.
         final: the fit of the final model to train and test part.
@@ -139,9 +105,10 @@ class HistogramExplainer(Explainer[Explanation]):
 
     prepared: Prepared
     observed: ObservedHistograms
-    replicates: HistogramReplicates
     sets: SetComparison
-    plain: FittedSet
+    whole: SetComparison
+    bare: SetComparison
+    rng: np.random.Generator
     members: Sequence[Member]
     effects: tuple[Effect, ...]
     final: FittedSet
@@ -169,29 +136,30 @@ class HistogramExplainer(Explainer[Explanation]):
             rng: all random numbers.
         """
         effort = Effort(settings.effort)
-        sets = _sets(observed, model, effort)
+        train, test, final = observed.parts
+        every = np.ones(train.shape, np.bool_)
+        own = observed.origin, every, model, observed.start, observed.layout
+        defects: dict[str, str] = {}
+        sets = SetComparison(train, test, *own, defects, effort)
         line = _on_a_line(sets, settings, times)
         if line is not None:
             sets, classes = line, {**classes, _SPURIOUS: SpuriousCharge}
-        members, untestable, defects = find_members(classes, observed.evidence, model)
-        always = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
-        found = {tag: why for tag, why in (always | untestable).items() if tag not in classes}
-        plain = sets.fit(())
-        bare = replace(sets, present=(), start=plain.fit.parameters)
-        replicates = HistogramReplicates(observed, bare, settings.replicates, rng, effort)
-        own = [replicates.statistics(part) for part in observed.parts]
-        vectors = replicates.drawn(plain.log_masses)
-        common = set(STATISTICS).intersection(*vectors, *own)
+        members, untestable = find_members(classes, observed.evidence, model, defects)
+        always = {t: c.untestable for t, c in effect_classes().items() if c.untestable and t not in classes}
+        bare = replace(sets, present=(), start=sets.plain.fit.parameters)
+        seen = [observed.statistics(part, bare) for part in observed.parts]
+        vectors = observed.drawn(sets.plain.log_masses, bare, settings.replicates, rng)
+        common = set(STATISTICS).intersection(*vectors, *seen)
         names = tuple(name for name in STATISTICS if name in common)
-        both = sets.fit((), plain.fit.parameters, observed.both)
+        whole = replace(sets, start=bare.start, train=train + test, test=final)
         effort.begin()
         first = NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model))
-        z = Measured(*(as_matrix(names, [row])[0] for row in own))
-        untestable = dict(sorted((found | untestable).items()))
+        z = Measured(*(as_matrix(names, [row])[0] for row in seen))
+        untestable = dict(sorted((always | untestable).items()))
         data = observed.evidence, observed.examined(), first, z, effort
         # what the parameters bend is no evidence against them: each candidate is fitted with them
         prepared = Prepared(settings, "histograms", *data, untestable, defects=defects)
-        return cls(prepared, observed, replicates, sets, both, members, model, both)
+        return cls(prepared, observed, sets, whole, bare, rng, members, model, whole.plain)
 
     @property
     def model(self) -> tuple[Effect, ...]:
@@ -200,17 +168,11 @@ class HistogramExplainer(Explainer[Explanation]):
 
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap of the likelihood on the final part."""
-        return self._without_effects
-
-    @cached_property
-    def _without_effects(self) -> Gap:
-        """The gap of the model before anything was added."""
-        whole = LikelihoodGap(self.observed.parts[2], self.sets.kept, 0.0, self._count, self.replicates.rng)
-        return whole.gap(self.sets.problem((), self.observed.both), self.plain.fit)
+        return self.whole.distance(self.whole.plain).gap
 
     def suspects(self, null: NullModel) -> bool:
         """Tell whether several samples fit badly together although no statistic of one deviates."""
-        return self.observed.joint and not self._without_effects.at_floor
+        return self.observed.joint and not self.gap(null).at_floor
 
     def explain(self, null: NullModel, disagreed: bool) -> Explanation | None:
         """Find the set of effects that best predicts the test part, on the codes that are understood.
@@ -218,32 +180,30 @@ class HistogramExplainer(Explainer[Explanation]):
         Raises:
             EffortSpentError: the work is at its limit; nothing was found.
         """
-        tried = self.replicates.effort.tried
+        tried = self.prepared.effort.tried
         tried.clear()
         try:
-            found = explain(self.sets, self.members, self._count, self.replicates.rng)
+            found = explain(self.sets, self.members)
         except EffortSpentError as spent:
             tags = dict.fromkeys(m.tag for m in self.members)
             raise EffortSpentError(spent.doing, (t for t in tags if t not in tried)) from spent
-        defects = self.prepared.defects
-        defects |= self.sets.failed | found.sets.failed
-        if not disagreed:
-            rise, error = found.sets.difference(found.judged, found.sets.fit(()))
-            if not found.named or rise < max(CONVINCING, CLEAR * error):
-                return None
+        rise, error = found.rise
+        if not disagreed and (not found.named or rise < max(CONVINCING, CLEAR * error)):
+            return None
         self.found = found
         return found if found.named else None
 
     def add(self, explanation: Explanation, null: NullModel) -> NullModel:
         """Put the named effects into the model, and observe histograms drawn from it."""
-        vectors = self.replicates.drawn(_with_effects(explanation))
+        masses = on_all_codes(explanation.best.log_masses, explanation.kept, self.sets.plain.log_masses)
+        vectors = self.observed.drawn(masses, self.bare, self.prepared.settings.replicates, self.rng)
         return NullModel.from_replicates(null.names, as_matrix(null.names, vectors), effects=True)
 
     def close(self, before: Gap, null: NullModel, disagreed: bool) -> Added:
         """Fit train and test part together with each effect, and measure the gap on the final part."""
         if self.found is None:
             return Added((), before)
-        closing = AddedSets(self.observed.parts, self.found, self.plain, self._count, self.replicates.rng)
+        closing = AddedSets(self.found, self.whole)
         added, self.final = closing.close(before, (self.prepared.first, null), self.prepared.z, disagreed)
         self.code = closing.codes(self.final, self.observed.evidence)
         self.effects = along_chain(self.sets.present, [each.effect for each in added.additions])
@@ -252,18 +212,6 @@ class HistogramExplainer(Explainer[Explanation]):
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the parameters of the rows looked at, NaN elsewhere, shape (1, n) or (n, J)."""
         return Fitted(self.observed.maps(self.final.fit.parameters), self.code)
-
-    @property
-    def _count(self) -> int:
-        return max(self.prepared.settings.extended_replicates, _FEWEST_REPLICATES)
-
-
-def _sets(observed: ObservedHistograms, present: tuple[Effect, ...], effort: Effort) -> SetComparison:
-    """Return what fits the rows, begun at the fit that they were observed with."""
-    train, test, _ = observed.parts
-    every = np.ones(train.shape, np.bool_)
-    found = SetComparison(train, test, observed.origin, every, present, observed.start, observed.layout)
-    return replace(found, effort=effort)
 
 
 def _on_a_line(
@@ -281,15 +229,6 @@ def _on_a_line(
     if _SPURIOUS in {effect.tag for effect in free.present}:
         return None
     line = Samples(dark, tuple(time or 0.0 for time in times))
-    straight = replace(free, samples=line, failed={}, _known={})
+    straight = replace(free, samples=line)
     best = straight.fit([Member.of(SpuriousCharge.typical()[0])])
-    return None if free.beats(free.fit(()), best) else straight
-
-
-def _with_effects(found: Explanation) -> FloatArray:
-    """Return the log masses of all codes: the plain law where codes are set aside, else with effects."""
-    judged = replace(found.sets, kept=found.kept)
-    best = judged.problem(found.best.members).log_masses(found.best.fit.theta, found.best.fit.shared)
-    plain = found.plain.log_masses
-    share = np.log(np.where(found.kept, np.exp(plain), 0.0).sum(axis=1, keepdims=True))
-    return np.where(found.kept, best + share, plain)
+    return None if free.beats(free.plain, best) else straight

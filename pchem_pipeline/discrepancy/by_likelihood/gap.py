@@ -1,131 +1,125 @@
-"""The gap of a model on histograms: Kullback-Leibler, nats per sample, with its floor and its interval.
+"""The gap of a fit on histograms that it was not fitted to: Kullback-Leibler, nats per sample.
 
-``2 G = 2 sum n log(n / (N p))`` against the saturated model is Wilks' statistic; what a right model has of it
-by chance, the refit included, comes from replicates (parametric bootstrap; each is refitted by one scoring
-step, which is all that a fit near the truth takes: Le Cam 1956). Codes that were set aside keep the
-contribution that they had under the plain model: what is not understood does not count as closed.
+``2 G = 2 sum n log(n / (N p))`` against the saturated model is Wilks' statistic. A right model has of it by
+chance what Poisson counts have in each cell, and what the errors of the fitted parameters add (Wald 1943).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import functools
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
-from pchem_pipeline.discrepancy.by_likelihood.sets import chance_of_cells, saturated
-from pchem_pipeline.discrepancy.gap import Gap, among_themselves
-from pchem_pipeline.model.fit.shared import SharedFit, SharedProblem, Tangent
+from pchem_pipeline.discrepancy.gap import Gap
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
-
-def carried_over(log_masses: FloatArray, counts: IntArray, kept: NDArray[np.bool_]) -> float:
-    """Return what codes that were set aside, and their share, contribute to the gap beyond chance, nats.
-
-    With the gap among the kept codes it adds up to that of all codes (chain rule of the divergence).
-
-    Args:
-        log_masses: of all codes under the model, shape (n, B).
-        counts: histograms, shape (n, B).
-        kept: codes that were not set aside, shape (n, B).
-    """
-    seen = counts.astype(np.float64)
-    total = seen.sum(axis=1)
-    outside = np.where(kept, 0.0, seen)
-    own = (outside * (np.log(np.maximum(outside, 1.0) / total[:, None]) - log_masses)).sum(axis=1)
-    inside = np.where(kept, seen, 0.0).sum(axis=1)
-    mass = np.where(kept, np.exp(log_masses), 0.0).sum(axis=1)
-    share = inside * np.log(np.maximum(inside, 1.0) / total / np.maximum(mass, 1e-300))
-    expected = np.where(kept, 0.0, np.exp(log_masses)) * total[:, None]
-    chance = chance_of_cells(expected) + chance_of_cells(mass * total)
-    return float((own + share).sum() - chance + 0.5 * total.size)
+_QUANTILES = special.ndtri((np.arange(400) + 0.5) / 400)  # of a sum of many cells, standard deviations
 
 
 @dataclass(frozen=True)
-class LikelihoodGap:
-    """Measures gaps by likelihood on one part of the samples.
+class Distance:
+    """The distance of histograms from a fit, nats.
 
     Attributes:
-        counts: that part, shape (n, B).
-        kept: codes that are compared, shape (n, B).
-        carried: nats that the other codes keep.
-        replicates: behind expectation and floor.
-        rng: their random numbers.
+        value: log-likelihood of their own frequencies above that of the fit.
+        expected: mean of that if the fit's law is right.
+        scatter: standard deviation of the same.
+        variance: of the value, by the samples.
+        n_samples: samples that are compared.
     """
 
-    counts: IntArray
-    kept: NDArray[np.bool_]
-    carried: float
-    replicates: int
-    rng: np.random.Generator
+    value: float
+    expected: float
+    scatter: float
+    variance: float
+    n_samples: float
 
-    @property
-    def n_samples(self) -> float:
-        """Samples of the part, those in codes set aside included."""
-        return float(self.counts.sum())
-
-    def gap(self, problem: SharedProblem, fit: SharedFit) -> Gap:
-        """Return the gap of a fit.
+    @classmethod
+    def of(
+        cls,
+        counts: NDArray[np.integer],
+        log_masses: FloatArray,
+        n_parameters: int,
+        *,
+        share: float,
+        kept: NDArray[np.bool_] | bool = True,
+    ) -> Distance:
+        """Compute it.
 
         Args:
-            problem: what was fitted, on other samples and perhaps fewer codes.
-            fit: the fit.
+            counts: histograms, shape (n, B).
+            log_masses: of the codes under the fit, given that they are kept, shape (n, B).
+            n_parameters: of the fit.
+            share: samples here for each sample that was fitted.
+            kept: codes that are compared, shape (n, B); True: all.
         """
-        judged = self._judged(problem)
-        log_masses = judged.log_masses(fit.theta, fit.shared)
-        distance = self._distance(log_masses, self.counts)
-        chance = self.by_chance(problem, fit)
-        variance = self._variance(log_masses)
-        return Gap.of(distance, chance, self.n_samples, variance=variance, carried=self.carried)
-
-    def value(self, problem: SharedProblem, fit: SharedFit, chance: float) -> float:
-        """Return a gap given what chance contributes to it, nats per sample."""
-        log_masses = self._judged(problem).log_masses(fit.theta, fit.shared)
-        return (self._distance(log_masses, self.counts) - chance + self.carried) / self.n_samples
-
-    def _judged(self, problem: SharedProblem) -> SharedProblem:
-        return replace(problem, counts=self.counts, kept=self.kept)
-
-    def _distance(self, log_masses: FloatArray, counts: IntArray) -> float:
-        return float((saturated(counts, self.kept) - (counts * log_masses).sum(axis=1)).sum())
-
-    def _variance(self, log_masses: FloatArray) -> float:
-        """Return the variance of the sum of the log-ratios of the samples, nats^2."""
-        seen = np.where(self.kept, self.counts, 0).astype(np.float64)
+        seen = np.where(kept, counts, 0).astype(np.float64)
         total = np.maximum(seen.sum(axis=1, keepdims=True), 1.0)
         ratio = np.where(seen > 0, np.log(np.maximum(seen, 1.0) / total) - log_masses, 0.0)
-        sums = (seen * ratio).sum(axis=1)
-        return float(max(((seen * ratio**2).sum(axis=1) - sums**2 / total[:, 0]).sum(), 0.0))
+        value, variance = sum_over_samples(seen, ratio)
+        mean, square = _of_cells(np.where(kept, np.exp(log_masses), 0.0) * total)
+        # the number of samples is fixed; fit and counts are both off by chance along each parameter
+        mean += 0.5 * (share * n_parameters - total.size)
+        square += share * (1.0 + 0.5 * share) * n_parameters - 0.5 * total.size
+        return cls(value, mean, float(np.sqrt(max(square, 0.0))), variance, float(total.sum()))
 
-    def by_chance(self, problem: SharedProblem, fit: SharedFit) -> FloatArray:
-        """Return distances that replicates of the fit have from their own refits, nats, (b,).
+    @property
+    def excess(self) -> float:
+        """What is beyond chance, nats."""
+        return self.value - self.expected
 
-        Those whose one step went astray, as the others show, are left out.
-        """
-        judged = self._judged(problem)
-        tangent = Tangent.at(problem, fit.theta, fit.shared)
-        fitted, compared = (
-            _frequencies(p.log_masses(fit.theta, fit.shared), p.kept) for p in (problem, judged)
-        )
-        n_fitted = np.where(problem.kept, problem.counts, 0).sum(axis=1)
-        n_compared = np.where(self.kept, self.counts, 0).sum(axis=1)
-        still, found = np.zeros(fit.theta.shape[0]), []
-        for _ in range(self.replicates):
-            drawn = self.rng.multinomial(n_fitted, fitted)
-            own, shared, _ = tangent.slopes(drawn).step(still)
-            moved = np.clip(fit.shared + shared, problem.bounds[:, 0], problem.bounds[:, 1])
-            log_masses = judged.log_masses(fit.theta + own, moved)
-            found.append(self._distance(log_masses, self.rng.multinomial(n_compared, compared)))
-        distances = np.array(found)
-        return distances[among_themselves(distances)]
-
-    def chance(self, problem: SharedProblem, fit: SharedFit) -> float:
-        """Return what chance contributes to the distance of a fit, nats."""
-        return float(self.by_chance(problem, fit).mean())
+    @property
+    def gap(self) -> Gap:
+        """What is beyond chance, per sample."""
+        chance = self.expected + self.scatter * _QUANTILES
+        return Gap.of(self.value, chance, self.n_samples, variance=self.variance)
 
 
-def _frequencies(log_masses: FloatArray, kept: NDArray[np.bool_]) -> FloatArray:
-    mass = np.where(kept, np.exp(log_masses), 0.0)
-    return np.asarray(mass / mass.sum(axis=1, keepdims=True))
+def on_all_codes(log_masses: FloatArray, kept: NDArray[np.bool_], plain: FloatArray) -> FloatArray:
+    """Return the log masses of all codes: a fit's where they are kept, with the share that the plain law has.
+
+    Args:
+        log_masses: under the fit, given that a code is kept, shape (n, B).
+        kept: codes that were not set aside, shape (n, B).
+        plain: of all codes under the plain law, shape (n, B).
+    """
+    share = np.log(np.where(kept, np.exp(plain), 0.0).sum(axis=1, keepdims=True))
+    return np.where(kept, log_masses + share, plain)
+
+
+def sum_over_samples(seen: FloatArray, values: FloatArray) -> tuple[float, float]:
+    """Return the sum of what each sample adds by its code, and its variance, by the samples of each row.
+
+    Args:
+        seen: samples, shape (n, B).
+        values: what one adds, shape (n, B).
+    """
+    sums = (seen * values).sum(axis=1)
+    variance = (seen * values**2).sum(axis=1) - sums**2 / np.maximum(seen.sum(axis=1), 1.0)
+    return float(sums.sum()), float(max(variance.sum(), 0.0))
+
+
+def _of_cells(expected: FloatArray) -> tuple[float, float]:
+    """Return mean and variance of ``sum n log(n / e) - n + e`` for Poisson counts n of expectation e, nats.
+
+    Both are 1/2 per cell where many counts are expected, and less where few are.
+    """
+    grid, *tables = _chance_table()
+    some = np.maximum(expected[expected > 0.0], np.exp(grid[0]))
+    mean, variance = (float(np.interp(np.log(some), grid, values).sum()) for values in tables)
+    return mean, variance
+
+
+@functools.cache
+def _chance_table() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return log e, from 1e-6 to 1e3, with mean and variance of ``n log(n / e) - n + e``."""
+    expected = np.geomspace(1e-6, 1e3, 600)[:, None]
+    n = np.arange(1500)
+    mass = np.exp(special.xlogy(n, expected) - expected - special.gammaln(n + 1.0))
+    values = special.kl_div(n, expected)
+    mean = (mass * values).sum(axis=1)
+    return np.log(expected[:, 0]), mean, (mass * values**2).sum(axis=1) - mean**2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,6 @@ from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.model.fit.shared import Samples
-from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FloatArray = NDArray[np.float64]
@@ -29,7 +27,7 @@ _MOST_STARTS = 6  # of one effect
 _UNLIMITED = {True: 10.0, False: 1e4}  # of a strength, of another field
 FARTHEST = 4.0  # factor by which other fields than the strength may move
 _LONGEST_LIST = 8
-_LEAST_CHANGE = 1e-12
+_LONGEST_STEP = 50.0  # times the strength of the start
 
 
 @dataclass(frozen=True)
@@ -54,12 +52,6 @@ class Coordinate:
         """Return the coordinate of a field."""
         return float(np.sign(value) * abs(value) ** self.power)
 
-    def error(self, coordinate: float, stderr: float) -> float:
-        """Return the standard error of the field of a coordinate's."""
-        return (
-            float(stderr * abs(coordinate) ** (1.0 / self.power - 1.0) / self.power) if coordinate else stderr
-        )
-
 
 @dataclass(frozen=True)
 class Member:
@@ -78,14 +70,13 @@ class Member:
         """Find the fields to fit: the strength, and other real numbers with limits."""
         names = [effect.strength] if effect.strength else []
         for name, value in effect.model_dump().items():
-            if isinstance(value, float) and name not in names and len(names) <= _MOST_EXTRA and names:
-                low, high = _limits(type(effect), name)
-                if np.isfinite([low, high]).all():
-                    names.append(name)
+            more = isinstance(value, float) and name not in names and 0 < len(names) <= _MOST_EXTRA
+            if more and np.isfinite(_limits(effect, name)).all():
+                names.append(name)
         found = []
         for name in names:
             power = effect.power if name == effect.strength else 1.0
-            limits = _limits(type(effect), name)
+            limits = _limits(effect, name)
             if name != effect.strength and limits[0] > 0:
                 value = float(getattr(effect, name))
                 limits = max(limits[0], value / FARTHEST), min(limits[1], value * FARTHEST)
@@ -119,15 +110,9 @@ class Member:
         return any(isinstance(v, tuple | list) and len(v) > _LONGEST_LIST for _, v in self.effect)
 
     @property
-    def free_satellites(self) -> bool:
-        """Whether each pixel has a weight of its own, so that no number is shared."""
-        return bool(self.effect.sample_law(SampleLaw(), _ONE_PIXEL).free_satellites)
-
-    @property
-    def bends_codes(self) -> bool:
-        """Whether it moves the edges of codes, which no comb of a pixel's own follows."""
-        law = self.effect.sample_law(SampleLaw(), _ONE_PIXEL)
-        return law.edge_shift.size > 0
+    def law(self) -> SampleLaw:
+        """The law of the samples of some pixel with the effect alone."""
+        return self.effect.sample_law(SampleLaw(), _ONE_PIXEL)
 
     @property
     def at_limit(self) -> bool:
@@ -150,13 +135,33 @@ class Member:
         """Return the member with another start."""
         return Member(self.at(coordinates), self.coordinates)
 
+    def placed(self, strength: float) -> Member:
+        """Return the member with another coordinate of its strength, as far as its limits allow."""
+        start = self.start
+        low, high = (0.5 * b for b in self.coordinates[0].bounds)
+        reach = _LONGEST_STEP * abs(start[0])
+        start[0] = float(np.clip(strength, max(low, -reach), min(high, reach)))
+        try:
+            return self.moved(start)
+        except ValueError:
+            return self
+
+    def strength_error(self, stderr: float) -> float:
+        """Return the standard error of the strength, given that of its coordinate."""
+        power, at = self.coordinates[0].power, abs(float(self.start[0]))
+        return float(stderr * at ** (1.0 / power - 1.0) / power) if at else stderr
+
     def excludes(self, other: Member) -> bool:
         """Tell whether both cannot be in one model: one effect, or two laws of the electron number."""
-        laws = [m.effect.sample_law(SampleLaw(), _ONE_PIXEL).law for m in (self, other)]
-        return self.tag == other.tag or all(law != "poisson" for law in laws)
+        return self.tag == other.tag or "poisson" not in (self.law.law, other.law.law)
 
 
 _ONE_PIXEL = pixel_maps([np.array([v]) for v in (2.0, 0.1, 100.0, 3.0)], np.ones(1, np.bool_))
+
+
+def split_coordinates(members: Sequence[Member], values: FloatArray) -> list[FloatArray]:
+    """Return the part of each member of values that all have one after the other."""
+    return np.split(values, np.cumsum([len(m.coordinates) for m in members]))[:-1]
 
 
 def law_of(
@@ -175,15 +180,12 @@ def law_of(
         own: (H, g, mu, sigma) of the rows, shape (n, 4).
         samples: which rows are of one pixel; those without electrons get none from effects either.
     """
-    effects, at = list(present), 0
-    for member in members:
-        n = len(member.coordinates)
-        effects.append(member.at(shared[at : at + n]))
-        at += n
+    parts = split_coordinates(members, shared)
+    effects = [*present, *(m.at(part) for m, part in zip(members, parts, strict=True))]
     law = sample_law(effects, pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
     if any(samples.dark) and law.added_exposure.any():
-        illuminated = ~np.tile(np.array(samples.dark), own.shape[0] // samples.n)
-        law = replace(law, added_exposure=np.where(illuminated[:, None], law.added_exposure, 0.0))
+        some = samples.illuminated(own.shape[0])[:, None]
+        law = replace(law, added_exposure=np.where(some, law.added_exposure, 0.0))
     return law
 
 
@@ -193,21 +195,24 @@ def leads_in_histograms(effect: type[Effect]) -> bool:
 
 
 def find_members(
-    classes: Mapping[str, type[Effect]], evidence: Evidence, present: Sequence[Effect]
-) -> tuple[list[Member], dict[str, str], dict[str, str]]:
+    classes: Mapping[str, type[Effect]],
+    evidence: Evidence,
+    present: Sequence[Effect],
+    failed: dict[str, str],
+) -> tuple[list[Member], dict[str, str]]:
     """Return the candidates that change a pixel's own histogram, at one or more starts each.
 
     Args:
         classes: candidates by tag.
         evidence: of the histograms, from which some estimate themselves.
         present: effects of the model; they are not candidates.
+        failed: candidates that failed, and why; more come to them.
 
     Returns:
-        Members; effects that histograms cannot show and why; effects that failed and why.
+        Members; effects that histograms cannot show and why.
     """
     members: list[Member] = []
     untestable: dict[str, str] = {}
-    failed: dict[str, str] = {}
     have = {effect.tag for effect in present}
     for tag, effect in classes.items():
         if tag in have:
@@ -220,45 +225,27 @@ def find_members(
             continue
         # an effect of a plug-in may raise anything: the others are compared all the same
         try:
-            starts = [*effect.typical(), *effect.estimate(evidence)]
-            found = [Member.of(start) for start in _distinct(starts) if _changes(start, evidence)]
+            starts = _distinct([*effect.typical(), *effect.estimate(evidence)])
+            found = [Member.of(start) for start in starts]
+            found = [m for m in found if not (m.law.neutral or m.law.free_satellites)]
         except Exception as error:
             failed[tag] = error_words(error)
             continue
         if starts and not found:
             untestable[tag] = f"{NO_ORDER}: {_SAME_LAW}"
         members += found[:_MOST_STARTS]
-    return members, untestable, failed
+    return members, untestable
 
 
 def _distinct(effects: Sequence[Effect]) -> list[Effect]:
     """Leave out starts that differ in nothing but their strength, sign included."""
-    kept: dict[str, Effect] = {}
+    kept: dict[tuple[str, float], Effect] = {}
     for effect in effects:
-        values: dict[str, Any] = effect.model_dump(mode="json")
-        value = values.pop(effect.strength, 0.0)
-        kept.setdefault(f"{values} {np.sign(value)}", effect)
+        sign = float(np.sign(getattr(effect, effect.strength, 0.0)))
+        kept.setdefault((effect.model_dump_json(exclude={effect.strength}), sign), effect)
     return list(kept.values())
 
 
-def _changes(effect: Effect, evidence: Evidence) -> bool:
-    """Tell whether an effect changes the law of the pixels in more than the width of its read noise."""
-    usable = np.flatnonzero(evidence.maps.usable.ravel())[:4]
-    columns = [np.asarray(values, np.float64).ravel()[usable] for values in evidence.maps.maps]
-    maps = pixel_maps(columns, np.ones(usable.size, np.bool_))
-    law = sample_law([effect], maps)
-    low = int((maps.bias - 8.0 * maps.read_noise_dn).min())
-    high = int((maps.bias + (maps.quanta_exposure * 3.0 + 8.0) / maps.conversion_gain).max())
-    codes = np.arange(low, high + 1)
-    change = np.abs(sample_mass(law, maps, codes) - sample_mass(SampleLaw(), maps, codes)).max()
-    return bool(change > _LEAST_CHANGE)
-
-
-def _limits(effect: type[Effect], name: str) -> tuple[float, float]:
+def _limits(effect: Effect, name: str) -> tuple[float, float]:
     """Return the limits that a field states, infinite where it states none."""
-    limits = effect.model_fields[name].metadata
-    low, high = (
-        [float(value) for limit in limits for key in keys if (value := getattr(limit, key, None)) is not None]
-        for keys in (("ge", "gt"), ("le", "lt"))
-    )
-    return max(low, default=-np.inf), min(high, default=np.inf)
+    return effect.limited(name, -np.inf), effect.limited(name, np.inf)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.discrepancy.by_likelihood.sets import split_samples
+from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import REACH
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY, observe_histograms
 from pchem_pipeline.discrepancy.verdict import Examined
@@ -77,13 +77,13 @@ class ObservedHistograms:
         _check(samples)
         layout = Samples(tuple(sample.bias for sample in samples))
         counts, origin = _rows(samples)
-        parts = split_samples(counts, 3, rng)
+        parts = _split(counts, 3, rng)
         together = None
         if layout.n > 1:
             together = _fitted_together(parts[0], origin, layout)
             parts, origin = _widened(parts, origin, together)
         evidence = _observe(parts[0], origin, layout, together)
-        start = _parameters(evidence.maps) if together is None else together
+        start = np.stack([m.ravel() for m in evidence.maps.maps], axis=1) if together is None else together
         chosen = _choose(start, counts.sum(axis=1), layout.n)
         some = tuple(part[chosen] for part in parts)
         n_pixels = samples[0].counts.shape[0]
@@ -93,11 +93,6 @@ class ObservedHistograms:
     def joint(self) -> bool:
         """Whether there are several samples of a pixel."""
         return self.layout.n > 1
-
-    @property
-    def both(self) -> IntArray:
-        """Train and test samples together, shape (r, B)."""
-        return np.asarray(self.parts[0] + self.parts[1])
 
     def examined(self) -> Examined:
         """Return what is looked at."""
@@ -112,9 +107,21 @@ class ObservedHistograms:
             final=sizes[2],
         )
 
-    def statistics(self, counts: IntArray, parameters: FloatArray | None) -> Mapping[str, float]:
-        """Return the statistics of such rows; ``parameters`` where the samples of a pixel share them."""
+    def statistics(self, counts: IntArray, bare: SetComparison) -> Mapping[str, float]:
+        """Return the statistics of histograms of the rows, fitted with the PCD alone, as ``bare`` does."""
+        parameters = replace(bare, train=counts).plain.fit.parameters if self.joint else None
         return _observe(counts, self.origin, self.layout, parameters).z
+
+    def drawn(
+        self, log_masses: FloatArray, bare: SetComparison, count: int, rng: np.random.Generator
+    ) -> list[Mapping[str, float]]:
+        """Return the statistics of histograms drawn from masses of the codes, (r, B), refit included."""
+        mass = np.exp(log_masses)
+        mass /= mass.sum(axis=1, keepdims=True)
+        total = self.parts[0].sum(axis=1)
+        bare.effort.replicates += count
+        bare.effort.simulate(0, total.size, count)
+        return [self.statistics(rng.multinomial(total, mass), bare) for _ in range(count)]
 
     def maps(self, parameters: FloatArray) -> PixelMaps:
         """Return parameters of the rows, (r, 4), as maps, NaN elsewhere, shape (1, n) or (n, J)."""
@@ -123,6 +130,22 @@ class ObservedHistograms:
         shape = (self.n_pixels, self.layout.n) if self.joint else (1, self.n_pixels)
         maps = columns.reshape(4, *shape)
         return PixelMaps.known(maps, np.isfinite(maps[0]))
+
+
+def _split(counts: NDArray[np.integer], parts: int, rng: np.random.Generator) -> tuple[IntArray, ...]:
+    """Split the samples of histograms (n, B) into equal parts at random, without replacement."""
+    left = counts.astype(np.int64)
+    found = []
+    for remaining in range(parts, 1, -1):
+        drawn = np.stack(
+            [
+                rng.multivariate_hypergeometric(row, int(row.sum()) // remaining, method="marginals")
+                for row in left
+            ]
+        )
+        found.append(drawn.astype(np.int64))
+        left = left - found[-1]
+    return (*found, left)
 
 
 def _check(samples: Sequence[SampleHistograms]) -> None:
@@ -152,7 +175,7 @@ def _fitted_together(counts: IntArray, origin: IntArray, layout: Samples) -> Flo
 
 def _observe(counts: IntArray, origin: IntArray, layout: Samples, parameters: FloatArray | None) -> Evidence:
     """Observe the rows with electrons; the others say nothing about how electrons come and are read."""
-    illuminated = np.tile(~np.array(layout.dark), origin.size // layout.n)
+    illuminated = layout.illuminated(origin.size)
     known = None if parameters is None else parameters[illuminated]
     return observe_histograms(counts[illuminated].astype(np.uint32), origin[illuminated], parameters=known)
 
@@ -181,12 +204,6 @@ def _widened(
     high = np.nanmax(mu + (h + REACH * (np.sqrt(h) + 1.0)) / g + REACH * sigma - last)
     left, right = (max(int(np.ceil(more)), 0) for more in (low, high))
     return tuple(np.pad(part, ((0, 0), (left, right))) for part in parts), origin - left
-
-
-def _parameters(maps: PixelMaps) -> FloatArray:
-    """Return (H, g, mu, sigma), (n, 4), NaN where not usable."""
-    columns = maps.maps
-    return np.stack([values.ravel() for values in columns], axis=1)
 
 
 def _choose(parameters: FloatArray, total: NDArray[np.integer], n_samples: int) -> NDArray[np.intp]:

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST
-from pchem_pipeline.discrepancy.by_likelihood.comb import (
-    Interval,
-    doubtful_peaks,
-    electrons_of,
-    inside,
-    valleys,
-)
-from pchem_pipeline.discrepancy.by_likelihood.gap import LikelihoodGap
+from pchem_pipeline.discrepancy.by_likelihood.comb import doubtful_peaks, valleys
 from pchem_pipeline.discrepancy.by_likelihood.members import FARTHEST, Member
-from pchem_pipeline.discrepancy.by_likelihood.sets import (
-    SWAPPED,
-    Choice,
-    FittedSet,
-    SetComparison,
-    compare_sets,
-    find_rivals,
-    of_best_kind,
-)
+from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison, select
 from pchem_pipeline.model.arithmetic.significance import CLEAR
+from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
 
 FloatArray = NDArray[np.float64]
 
@@ -42,18 +28,21 @@ class Named:
 
     Attributes:
         member: as fitted.
-        apart: by how much its strength differs when fewer codes are compared.
+        weight: what it adds to the score, nats.
         rivals: effects that could stand in its place, the best first, with how far the set with each is
             behind the judged one, nats, and the standard error.
-        equals: rivals (tags) that do as well within three standard errors.
-        weight: what it adds to the score, nats.
+        apart: by how much its strength differs when fewer codes are compared.
     """
 
     member: Member
-    apart: float
-    rivals: tuple[tuple[Member, float, float], ...]
-    equals: tuple[str, ...]
     weight: float
+    rivals: tuple[tuple[Member, float, float], ...]
+    apart: float = 0.0
+
+    @property
+    def equals(self) -> tuple[str, ...]:
+        """The rivals (tags) that do as well within three standard errors."""
+        return tuple(other.tag for other, behind, error in self.rivals if -behind < CLEAR * error)
 
 
 @dataclass(frozen=True)
@@ -61,72 +50,47 @@ class Explanation:
     """What the search came to.
 
     Attributes:
-        sets: fitted and scored on the codes on which effects were compared.
         kept: codes that the gap compares, shape (n, B): all but a peak set aside.
         set_aside: codes that the fit leaves out.
-        plain: the fit without effects to all codes.
         best: the named effects, fitted to the codes that the gap compares.
-        judged: the set in which they were compared, perhaps with unsteady members.
-        named: its effects, the weightiest first.
-        unsteady: effects that fit in one view and not in another: stand-ins of something unknown.
+        named: its effects, the weightiest first, compared on perhaps fewer codes, perhaps beside others.
+        stand_ins: tags of effects that fit in one view and not in another, for something unknown.
         nearest: tags of the best single effects on all codes.
-        rest: share of the gap that the judged set leaves among the codes of the sets.
+        rest: share of the gap that is left among the codes on which effects were compared.
+        rise: by how much the set of them predicts these better than none, nats, and the standard error.
     """
 
-    sets: SetComparison
     kept: NDArray[np.bool_]
     set_aside: tuple[Interval, ...]
-    plain: FittedSet
     best: FittedSet
-    judged: FittedSet
     named: tuple[Named, ...]
-    unsteady: tuple[Member, ...]
+    stand_ins: tuple[str, ...]
     nearest: tuple[str, ...]
     rest: float
-
-    @property
-    def peak(self) -> Interval | None:
-        """The peak that was set aside."""
-        return self.set_aside[0] if self.set_aside else None
+    rise: tuple[float, float]
 
 
-def explain(
-    sets: SetComparison, candidates: Sequence[Member], replicates: int, rng: np.random.Generator
-) -> Explanation:
+def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
     """Find the effects that explain histograms.
 
     Args:
         sets: with all codes.
         candidates: effects at their starts.
-        replicates: behind what chance leaves.
-        rng: their random numbers.
     """
-    choice = compare_sets(sets, candidates)
-    nearest = tuple(m.tag for s in choice.fitted[:3] for m in s.members)
-    left, floor = _left(sets, choice.best, replicates, rng)
-    if left > floor and any(m.tabulated for m in choice.best.members):
-        candidates = [c for c in candidates if not c.tabulated]
-        choice = compare_sets(sets, candidates)
-        left, floor = _left(sets, choice.best, replicates, rng)
-    at_first = max(sets.gap(choice.plain), 1e-12)
-    if choice.best.members and left <= max(floor, LARGEST_REST * at_first):
-        named = [_named(sets, choice.best, m, candidates) for m in choice.best.members]
-        return Explanation(
-            sets, sets.kept, (), choice.plain, choice.best, choice.best, _sorted(named), (), nearest,
-            left / at_first,
-        )  # fmt: skip
-    fixed_in_dn = combs_coincide(choice.plain.fit.parameters)
-    pool = [c for c in candidates if not (c.tabulated or (fixed_in_dn and c.bends_codes))]
-    return _narrowed(sets, pool, choice, nearest)
+    nearest = tuple(one.members[0].tag for one in sets.extended(sets.plain, candidates))
+    best = select(sets, candidates)
+    rest, rise = _rest(sets, best), sets.difference(best, sets.plain)
+    if best.members and (rest <= LARGEST_REST or sets.distance(best).gap.at_floor):
+        named = tuple(_named(sets, best, candidates))
+        return Explanation(sets.kept, (), best, named, (), nearest, rest, rise)
+    fixed_in_dn = combs_coincide(sets.plain.fit.parameters)
+    pool = [c for c in candidates if not (c.tabulated or (fixed_in_dn and c.law.edge_shift.size))]
+    return _narrowed(sets, pool, nearest)
 
 
-def _left(
-    sets: SetComparison, best: FittedSet, replicates: int, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Return the gap that a set leaves on the scored part, and its floor, nats per sample."""
-    gaps = LikelihoodGap(sets.test, sets.kept, 0.0, replicates, rng)
-    gap = gaps.gap(sets.problem(best.members), best.fit)
-    return gap.value, gap.floor
+def _rest(sets: SetComparison, best: FittedSet) -> float:
+    """Return the share of the gap of the plain law that a set leaves."""
+    return sets.distance(best).excess / max(sets.distance(sets.plain).excess, 1e-12)
 
 
 def combs_coincide(parameters: FloatArray) -> bool:
@@ -139,49 +103,48 @@ def combs_coincide(parameters: FloatArray) -> bool:
     return bool(np.ptp(np.quantile(bias, [0.1, 0.9])) * gain < _COINCIDE)
 
 
-def _narrowed(
-    sets: SetComparison, candidates: Sequence[Member], whole: Choice, nearest: tuple[str, ...]
-) -> Explanation:
-    """Compare on the codes that are understood, and keep what holds on more of them."""
-    plain = whole.plain
-    parameters = plain.fit.parameters
-    electrons = electrons_of(sets.origin, sets.train.shape[1], parameters)
-    peak = _cut_peak(sets, electrons, candidates, whole)
-    between = valleys(sets, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
-    wide = sets.on(~inside(peak, electrons), parameters)
-    view = sets.on(~inside(peak + between, electrons), parameters)
-    choice = compare_sets(view, candidates, coarse=True)
-    steady, unsteady = _steady(wide, choice.best, candidates)
-    rest = view.gap(choice.best) / max(view.gap(choice.plain), 1e-12)
-    named: list[Named] = []
-    best = wide.fit((), parameters)
-    if steady:
-        start = choice.best.fit.parameters
-        fitted = wide.attempt(steady, start)
-        best = best if fitted is None else of_best_kind(wide, fitted, candidates)
-        there = view.attempt(best.members, start)
-        for member in best.members:
-            told, apart = choice.best.member(member.tag), 0.0
-            assert told is not None  # another kind of it at most
-            if there is not None and (other := there.member(member.tag)) is not None:
-                apart = _apart(member, other)
-            named.append(replace(_named(view, choice.best, told, candidates), member=member, apart=apart))
-    return Explanation(
-        view, wide.kept, peak, plain, best, choice.best, _sorted(named), tuple(unsteady), nearest, rest
+def _narrowed(sets: SetComparison, candidates: Sequence[Member], nearest: tuple[str, ...]) -> Explanation:
+    """Select on the codes that are understood, and keep what is selected on more of them, too."""
+    parameters = sets.plain.fit.parameters
+    electrons = electrons_of(sets.origin, sets.train.shape[1], parameters[:, 1], parameters[:, 2])
+
+    def excluding(*intervals: Interval) -> SetComparison:
+        return replace(sets, kept=~inside(intervals, electrons), start=parameters)
+
+    excess = sets.distance(select(sets, candidates)).excess
+    peak = _cut_peak({p: excluding(p) for p in doubtful_peaks(sets.train, electrons)}, candidates, excess)
+    between = valleys(sets.train, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
+    wide, view = excluding(*peak), excluding(*peak, *between)
+    judged = select(view, candidates)
+    there = wide.attempt(judged.members, judged.fit.parameters)
+    there = select(wide, candidates, there, largest=len(judged.members), least=0.0)
+    steady = [other for m in judged.members if (other := there.member(m.tag)) and _alike(m, other)]
+    best = wide.attempt(steady, judged.fit.parameters) or wide.plain
+    again = view.attempt(best.members, judged.fit.parameters) or judged
+    named = tuple(
+        replace(one, member=fitted, apart=_apart(fitted, other))
+        for one in _named(view, judged, candidates)
+        if (fitted := best.member(one.member.tag)) and (other := again.member(one.member.tag))
     )
+    stand_ins = tuple(m.tag for m in judged.members if best.member(m.tag) is None)
+    rest, rise = _rest(view, judged), view.difference(judged, view.plain)
+    return Explanation(wide.kept, peak, best, named, stand_ins, nearest, rest, rise)
 
 
 def _cut_peak(
-    sets: SetComparison, electrons: FloatArray, candidates: Sequence[Member], whole: Choice
+    views: Mapping[Interval, SetComparison], candidates: Sequence[Member], excess: float
 ) -> tuple[Interval, ...]:
-    """Return the peak without which known effects explain far more, if there is one."""
-    best, found = _PAYS * sets.gap(whole.best) * sets.n_test, None
-    for interval in doubtful_peaks(sets, electrons)[:_PEAKS_TRIED]:
-        view = sets.on(~interval.holds(electrons), whole.plain.fit.parameters)
-        left = view.gap(compare_sets(view, candidates, largest=2, coarse=True).best) * view.n_test
-        if left < best:
-            best, found = left, interval
-    return () if found is None else (found,)
+    """Return the peak without which a known effect explains far more, if there is one.
+
+    Args:
+        views: by the peak that each leaves out.
+        candidates: effects at their starts.
+        excess: gap that is left with all peaks, nats.
+    """
+    likely = sorted(views, key=lambda peak: views[peak].distance(views[peak].plain).excess)[:_PEAKS_TRIED]
+    left = {p: views[p].distance(select(views[p], candidates, largest=1)).excess for p in likely}
+    best = min(left, key=lambda peak: left[peak], default=None)
+    return () if best is None or left[best] >= _PAYS * excess else (best,)
 
 
 def _apart(member: Member, there: Member) -> float:
@@ -190,65 +153,24 @@ def _apart(member: Member, there: Member) -> float:
     return abs(float(getattr(member.effect, name)) - float(getattr(there.effect, name))) if name else 0.0
 
 
-def _steady(
-    wide: SetComparison, best: FittedSet, candidates: Sequence[Member]
-) -> tuple[list[Member], list[Member]]:
-    """Split a set into members that hold on more codes, as fitted there, and those that do not.
-
-    On more codes each member may be exchanged for another effect; those for which one does better, and those
-    that change their sign or their strength, stand in for something else.
-    """
-    fitted = wide.attempt(best.members, best.fit.parameters) if best.members else None
-    if fitted is None:
-        return [], list(best.members)
-    fitted = _exchanged(wide, fitted, candidates)
-    steady: list[Member] = []
-    unsteady: list[Member] = []
-    for member in best.members:
-        other = fitted.member(member.tag)
-        if other is None or other.at_limit or member.at_limit or not _alike(member, other):
-            unsteady.append(member)
-            continue
-        without = wide.attempt_without(fitted, member)
-        better = without is not None and wide.beats(fitted, without, 0.0)
-        (steady if better else unsteady).append(other)
-    return steady, unsteady
-
-
-def _exchanged(wide: SetComparison, fitted: FittedSet, candidates: Sequence[Member]) -> FittedSet:
-    """Exchange one member of a set for another effect while that is better."""
-    plain = wide.fit((), fitted.fit.parameters)
-    for _ in fitted.members:
-        offers = []
-        whole = wide.rise(fitted, plain)
-        for member in fitted.members:
-            base = wide.attempt_without(fitted, member)
-            if base is not None and wide.rise(fitted, base) < SWAPPED * whole:
-                offers += find_rivals(wide, fitted, member, candidates)[1][:1]
-        best = max(offers, key=lambda s: s.score, default=fitted)
-        if not wide.beats(best, fitted, 0.0):
-            break
-        fitted = best
-    return fitted
-
-
 def _alike(one: Member, other: Member) -> bool:
-    """Tell whether two fits of an effect agree in sign and roughly in strength."""
+    """Tell whether two fits of an effect agree in sign and roughly in strength, neither at a limit."""
+    if one.at_limit or other.at_limit:
+        return False
     if not one.effect.strength or one.kind != other.kind:
         return True
     a, b = (float(getattr(m.effect, m.effect.strength)) for m in (one, other))
     return a * b > 0 and max(abs(a), abs(b)) < FARTHEST * min(abs(a), abs(b))
 
 
-def _named(sets: SetComparison, best: FittedSet, member: Member, candidates: Sequence[Member]) -> Named:
-    """Compare a member of a set with what could stand in its place."""
-    without, found = find_rivals(sets, best, member, candidates)
-    rivals = tuple(
-        (other, *sets.difference(rival, best)) for rival in found if (other := rival.new(best)) is not None
-    )
-    equals = tuple(other.tag for other, behind, error in rivals if -behind < CLEAR * error)
-    return Named(member, 0.0, rivals, equals, sets.rise(best, without) if without else 0.0)
-
-
-def _sorted(named: Sequence[Named]) -> tuple[Named, ...]:
-    return tuple(sorted(named, key=lambda n: -n.weight))
+def _named(sets: SetComparison, best: FittedSet, candidates: Sequence[Member]) -> list[Named]:
+    """Return the members of a set with what could stand in their places, the weightiest first."""
+    found = []
+    for member in best.members:
+        others = [c for c in candidates if c.tag != member.tag]
+        without = sets.without(best, member.tag)
+        instead = [] if without is None else sets.extended(without, others)
+        weight = 0.0 if without is None else best.score - without.score
+        rivals = tuple((one.members[-1], *sets.difference(one, best)) for one in instead)
+        found.append(Named(member, weight, rivals))
+    return sorted(found, key=lambda n: -n.weight)

@@ -56,6 +56,10 @@ class Samples:
         """Number of samples of a pixel, J."""
         return len(self.dark)
 
+    def illuminated(self, n_rows: int) -> NDArray[np.bool_]:
+        """Tell which rows are of samples with electrons, shape (n_rows,)."""
+        return np.asarray(np.tile(~np.array(self.dark), n_rows // self.n))
+
     @property
     def n_exposures(self) -> int:
         """Own parameters that are exposures."""
@@ -200,11 +204,13 @@ class SharedFit:
         return to_parameters(self.row_theta)
 
     @property
-    def row_variance(self) -> FloatArray:
-        """Variances of (log H, log 1/g, mu, log sigma_R^2) of the rows, shape (n J, 4)."""
+    def stderr(self) -> FloatArray:
+        """Standard errors of the parameters of the rows, shape (n J, 4)."""
         slopes = self.samples.slopes
         found = np.einsum("jap,npq,jaq->nja", slopes, self.own_covariance, slopes, optimize=True)
-        return np.asarray(found.reshape(-1, 4))
+        h, g, _, sigma = self.parameters.T
+        per = np.stack([h, g, np.ones_like(h), 0.5 * np.exp(self.row_theta[:, 3]) / sigma], axis=1)
+        return np.asarray(np.sqrt(np.maximum(found.reshape(-1, 4), 0.0)) * per)
 
 
 def to_parameters(theta: FloatArray) -> FloatArray:

@@ -150,7 +150,7 @@ def refit_maps(
     stderr = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)).T
     inside = good & acted_on
     moved = {
-        name: _change(after[inside] - before[inside], error[inside], unit)
+        name: change_of(after[inside] - before[inside], error[inside], unit)
         for (name, unit), before, after, error in zip(UNITS.items(), flat, new, stderr, strict=True)
     }
     new_maps = PixelMaps.known(new, good.reshape(shape))
@@ -269,7 +269,8 @@ def _places(maps: PixelMaps, numbers: NDArray[np.int64]) -> PixelPlaces:
     return PixelPlaces.of_block(None, (ny, nx), numbers)
 
 
-def _change(difference: NDArray[np.float64], stderr: NDArray[np.float64], unit: str) -> dict[str, Any]:
+def change_of(difference: NDArray[np.float64], stderr: NDArray[np.float64], unit: str) -> dict[str, Any]:
+    """Return the median of a change of a parameter over the pixels, and the same in standard errors."""
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = difference / stderr
     finite = ratio[np.isfinite(ratio)]

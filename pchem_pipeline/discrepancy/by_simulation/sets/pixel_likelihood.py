@@ -386,7 +386,7 @@ def identifiable_from_histograms(effect: Effect) -> bool:
         return False
     member = Member.of(effect)
     try:
-        return not member.free_satellites and not member.tabulated and bool(member.coordinates)
+        return not member.law.free_satellites and not member.tabulated and bool(member.coordinates)
     except ConfigError as error:
         if not _refuses(error):
             raise
