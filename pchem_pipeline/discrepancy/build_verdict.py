@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
@@ -44,8 +44,6 @@ from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.arithmetic.significance import CLEAR, FALSE_ALARM, NO_CHANCE
-
-FloatArray = NDArray[np.float64]
 
 #: Largest share of a gap above its floor that may remain with effects that explain it.
 LARGEST_REST = 0.2

@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class Covariance:
         """Return it with further modes, each of which scatters with a deviation of 1, shape (k, m)."""
         return replace(self, common=np.concatenate([self.common, modes]))
 
-    def among(self, kept: NDArray[np.bool_] | list[int]) -> Covariance:
+    def among(self, kept: BoolArray | list[int]) -> Covariance:
         """Return that of some of the statistics."""
         return Covariance(self.own[kept], self.common[:, kept])
 

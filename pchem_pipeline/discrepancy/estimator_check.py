@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.framework.effect import Effect
@@ -32,7 +33,7 @@ class RecoveredStrength:
     """
 
     true: float
-    found: NDArray[np.float64]
+    found: FloatArray
 
     @property
     def n_guesses(self) -> int:

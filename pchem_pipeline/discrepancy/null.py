@@ -15,17 +15,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import without_skew
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR, PRICE
-
-FloatArray = NDArray[np.float64]
 
 _OF_ORDER = ("time", "frame", "space")
 # statistics of neighbouring codes, and their period, DN
@@ -103,7 +101,7 @@ class NullModel:
             std, skewness, tests = pooled, before.skewness, before.effective_tests
         return cls(names, mean, std, covariance, vectors, skewness, tests)
 
-    def moved_by(self, vectors: FloatArray) -> NDArray[np.bool_]:
+    def moved_by(self, vectors: FloatArray) -> BoolArray:
         """Test which statistics effects shift (t-test) or widen (F-test), shape (m,).
 
         A common mode widens trends and correlations in time without shifting them.
@@ -131,7 +129,7 @@ class NullModel:
         return np.array([EXACT.get(name.partition("@")[0], 0.0) for name in self.names])
 
     @property
-    def counts(self) -> NDArray[np.bool_]:
+    def counts(self) -> BoolArray:
         """Which statistics are normal quantiles of a count, shape (m,)."""
         return _are_counts(self.names)
 
@@ -237,7 +235,7 @@ def _kind(name: str) -> str:
     return name.partition("@")[0].rpartition(".")[2]
 
 
-def _are_counts(names: Sequence[str]) -> NDArray[np.bool_]:
+def _are_counts(names: Sequence[str]) -> BoolArray:
     return np.isin([_kind(name) for name in names], _COUNTS)
 
 
@@ -304,7 +302,7 @@ class Measured:
         return (self.train + self.test) / 2.0
 
 
-def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> NDArray[np.bool_]:
+def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> BoolArray:
     """Return which statistics do not depend on the pixels' fitted parameters (are ancillary), shape (m,).
 
     Given the histograms, frames without an effect are in random order, which fixes all statistics of time,

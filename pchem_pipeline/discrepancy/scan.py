@@ -19,9 +19,9 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy import families
 from pchem_pipeline.discrepancy.families import (
     FEWEST,
@@ -37,10 +37,6 @@ from pchem_pipeline.discrepancy.observe.rare import SEED
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 _FRAME_PERIODS = range(2, 33)
 _SWEEPS = 3  # of the ends of a range over the frames

@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray
 from pchem_pipeline.discrepancy.families import BOXES, Edges, Place, box, box_sums, every_nth, with_sharp_ends
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.observe.pairs import (
@@ -37,8 +37,6 @@ from pchem_pipeline.discrepancy.observe.sums import CHANNELS
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.region import Region, Taps
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-
-BoolArray = NDArray[np.bool_]
 
 _CONTRAST = 0.4  # mean outside of a place over that inside, at most
 #: Guesses that are held against the scatter of the frames, the most significant first.

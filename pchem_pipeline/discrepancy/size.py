@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
 from pchem_pipeline.discrepancy.observe.rare import SEED
@@ -90,7 +91,7 @@ def _is_measured_noise(effect: Effect) -> bool:
     return parameters_of(effect, math.nan)[effect.strength].unit == "DN"
 
 
-def _of_scatter(electrons: NDArray[np.float64], maps: PixelMaps) -> Size:
+def _of_scatter(electrons: FloatArray, maps: PixelMaps) -> Size:
     """Return the size of a scatter of so many e- of each usable pixel."""
     in_dn = electrons / maps.conversion_gain[maps.usable]
     dn, noise = float(np.sqrt(np.mean(in_dn**2))), float(np.median(maps.read_noise_dn[maps.usable]))
@@ -104,11 +105,9 @@ def _of_noise(dn: float, maps: PixelMaps) -> Size:
     return Size(electrons=dn * gain, dn=dn, of_read_noise=dn / noise)
 
 
-def _change(
-    effect: Effect, maps: PixelMaps, n_frames: int, blocks: int, seed: int
-) -> NDArray[np.float64] | None:
+def _change(effect: Effect, maps: PixelMaps, n_frames: int, blocks: int, seed: int) -> FloatArray | None:
     """Return what an effect does to the samples of one stack, (frame, y, x); None where it does nothing."""
-    seen: list[NDArray[np.float64]] = []
+    seen: list[FloatArray] = []
     shape = maps.usable.shape
     settings = SimulateSettings(
         shape=(shape[0], shape[1]), n_frames=n_frames, seed=seed, bit_depth=_BITS, effects=()
@@ -120,13 +119,13 @@ def _change(
     return np.concatenate(seen) if seen else None
 
 
-def _spread(changes: Sequence[NDArray[np.float64]], share: float) -> float:
+def _spread(changes: Sequence[FloatArray], share: float) -> float:
     """Return by how much samples change from frame to frame, where they change if that is rare."""
     mean_square = np.mean([np.mean((change - change.mean(axis=0)) ** 2) for change in changes])
     return float(np.sqrt(mean_square / (share if 0.0 < share < RARE else 1.0)))
 
 
-def _watched(effect: Effect, seen: list[NDArray[np.float64]]) -> Effect:
+def _watched(effect: Effect, seen: list[FloatArray]) -> Effect:
     """Return an effect as it is, everywhere and always, that notes what it changes."""
     kind = type(effect)
 

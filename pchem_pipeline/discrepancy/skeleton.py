@@ -15,9 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.build_verdict import Added, Findings, Fitted, build_verdict
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap
@@ -100,7 +98,7 @@ class Explainer(ABC, Generic[Explanation]):
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the parameters of the pixels under the model that the verdict leaves."""
 
-    def tolerance(self) -> NDArray[np.float64] | float:
+    def tolerance(self) -> FloatArray | float:
         """Return the deviations that are not held against the added effects, shape (m,)."""
         return 0.0
 

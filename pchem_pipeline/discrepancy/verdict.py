@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -682,6 +682,6 @@ class Discrepancy:
     model: tuple[Effect, ...]
     maps: PixelMaps
     evidence: Evidence
-    statistics: tuple[tuple[str, ...], NDArray[np.float64], NDArray[np.float64]]
-    code_extended: NDArray[np.float64] | None = None
+    statistics: tuple[tuple[str, ...], FloatArray, FloatArray]
+    code_extended: FloatArray | None = None
     added: AddedExposure | None = None

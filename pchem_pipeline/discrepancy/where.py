@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
@@ -18,8 +19,6 @@ from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-
-FloatArray = NDArray[np.float64]
 
 #: Maps of neighbours, along x and along y: charge with charge, readout with readout, one with the other.
 PAIRS = ("x.kk", "x.rr", "x.rk", "y.kk", "y.rr", "y.rk")
@@ -76,7 +75,7 @@ def suspected_frames(
     return {name: frames for name, frames in found.items() if frames}
 
 
-def unfitted_place(usable: NDArray[np.bool_], significance: float = SIGNIFICANCE) -> Suspect | None:
+def unfitted_place(usable: BoolArray, significance: float = SIGNIFICANCE) -> Suspect | None:
     """Return where pixels without a fit to be relied upon come together; None where chance explains it.
 
     An effect of single pixels in a part of the sensor may leave only that to be seen.

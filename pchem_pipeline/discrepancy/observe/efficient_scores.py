@@ -13,11 +13,9 @@ All arrays are of n pixels at once, each over x codes: what is beyond the codes 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.law.cell_scores_numba import N_COLUMNS, N_NUISANCE
-
-FloatArray = NDArray[np.float64]
 
 N_TESTS = N_COLUMNS - N_NUISANCE
 _SINGULAR = 1e-9

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.digital.groups import GROUP, MOST_SAMPLES, groups_of
 from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
@@ -25,10 +26,6 @@ from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.operators.couple import Source
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 Spectra = NDArray[np.complexfloating]
 Axes = tuple[int, ...]  # of (frame, y, x)
 

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.arithmetic.robust import chi_square as chi_square
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-
-FloatArray = NDArray[np.float64]
 
 _SMALL = 1e-12
 # an event that is next to impossible counts as much as this many standard deviations

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe.digital.groups import (
     bit_statistics,
@@ -51,9 +52,6 @@ from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 #: Pixels with one of these flags are left out. A poor fit is no reason: it is what is looked for. Nor is a
 #: bias that may be off by one electron: all that is looked at stays nearly the same, but to choose the pixels
 #: with an unambiguous sample would bias the statistics of the rest.
@@ -71,7 +69,7 @@ def observe(
     n_run: int,
     block_frames: int,
     fit: FitSettings | None = None,
-    exclude: NDArray[np.bool_] | None = None,
+    exclude: BoolArray | None = None,
     start: PixelMaps | None = None,
     fitted: bool = True,
 ) -> Evidence:
@@ -189,7 +187,7 @@ def _check(frames: NDArray[Any], numbers: IntArray, block_frames: int) -> None:
 
 
 def _compared(
-    seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np.bool_], shape: tuple[int, int]
+    seen: PixelHistograms, parameters: FloatArray, usable: BoolArray, shape: tuple[int, int]
 ) -> tuple[Evidence, PixelLaws]:
     """Compare histograms with the PCD at the parameters of a fit."""
     laws = pixel_laws(seen, parameters, usable)
@@ -204,7 +202,7 @@ def _compared(
     def known(values: FloatArray) -> FloatArray:
         return np.where(good, values, np.nan).reshape(shape)
 
-    def mapped(values: FloatArray) -> NDArray[np.float32]:
+    def mapped(values: FloatArray) -> Float32Array:
         return known(values).astype(np.float32)
 
     low, high = (np.where(good[:, None], moments[side], 0.0) for side in ("low", "high"))
@@ -239,10 +237,10 @@ def _with_fit(evidence: Evidence, result: FitResult) -> Evidence:
 
 def _fitted(
     seen: PixelHistograms,
-    wanted: NDArray[np.bool_],
+    wanted: BoolArray,
     fit: FitSettings | None,
     near: PixelMaps | None,
-) -> tuple[FitResult, FloatArray, NDArray[np.bool_]]:
+) -> tuple[FitResult, FloatArray, BoolArray]:
     """Return the fit, its parameters (n, 4), and which pixels can be used."""
     start = None if near is None else near.columns
     # every sample counts here: what the tail guard would leave out is what is looked for
@@ -255,7 +253,7 @@ def _fitted(
     return result, parameters, usable & _inside(seen)
 
 
-def _without_steps(gain: FloatArray, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _without_steps(gain: FloatArray, usable: BoolArray) -> BoolArray:
     """Tell which pixels have a comb that whole DN hardly show, where most pixels have a coarser one, (n,).
 
     Of noise that hides the electrons, as in the dark, in reference columns or in noisy pixels, a few of many
@@ -275,12 +273,12 @@ def _without_steps(gain: FloatArray, usable: NDArray[np.bool_]) -> NDArray[np.bo
     return np.asarray(few & (step < min(_FINEST_STEP, _FAR_FINER * most)) & (most > _FINEST_STEP))
 
 
-def _inside(seen: PixelHistograms) -> NDArray[np.bool_]:
+def _inside(seen: PixelHistograms) -> BoolArray:
     """Return which histograms hold nearly all samples of their pixel, (n,)."""
     return np.asarray(seen.outside.sum(axis=1) <= MOST_OUTSIDE * seen.counts.sum(axis=1))
 
 
-def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: NDArray[np.bool_]) -> PixelMaps:
+def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: BoolArray) -> PixelMaps:
     """Return the plain fit of some frames, from nothing, as :func:`observe` makes it.
 
     Args:
@@ -312,10 +310,10 @@ def _time_series(view: FrameView, n_run: int, **others: Any) -> TimeSeries:
     def over(values: FloatArray, count: FloatArray) -> FloatArray:
         return np.asarray(values / np.maximum(count, 1e-300) * (count > 0))
 
-    def mapped(values: FloatArray) -> NDArray[np.float32]:
+    def mapped(values: FloatArray) -> Float32Array:
         return np.where(view.pixels.usable, values, np.nan).astype(np.float32)
 
-    def lags(name: str) -> NDArray[np.float32]:
+    def lags(name: str) -> Float32Array:
         of = (view.correlations[f"time.lag{lag}.{name}"].of_pixels for lag in (1, 2, 3))
         return np.stack(list(of)).astype(np.float32)
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.families import (
     Contrast,
     Edges,
@@ -31,11 +32,6 @@ from pchem_pipeline.discrepancy.observe.sums import CHANNELS, code_ranges, pixel
 from pchem_pipeline.discrepancy.observe.sums_numba import look_up
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 #: What pixels share: their row, their column, or only the frame (neither row nor column); and how many axes
 #: of a table of their pairs are rows, and columns.

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
@@ -48,7 +49,7 @@ class SensorWindow:
         rows, columns = shape[-2:]
         return cls((0, rows), (0, columns), (rows, columns))
 
-    def mask(self, region: Region | None) -> NDArray[np.bool_]:
+    def mask(self, region: Region | None) -> BoolArray:
         """Return which pixels of the window lie in a region, (y, x)."""
         every = np.ones(self.shape, np.bool_) if region is None else region.mask(self.shape)
         return every[slice(*self.rows), slice(*self.columns)]
@@ -141,14 +142,14 @@ class Part:
         """It in one line, for the names of its statistics."""
         return ",".join(place.text() for place in (self.region, self.when) if place is not None)
 
-    def frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def frames(self, numbers: IntArray) -> BoolArray:
         """Return which frames are its."""
         return np.ones(numbers.size, np.bool_) if self.when is None else self.when.frames(numbers)
 
 
 def part_evidence(
     frames: NDArray[np.unsignedinteger[Any]],
-    numbers: NDArray[np.int64],
+    numbers: IntArray,
     maps: PixelMaps,
     part: Part,
     *,
@@ -190,7 +191,7 @@ def part_evidence(
 
 def part_statistics(
     frames: NDArray[np.unsignedinteger[Any]],
-    numbers: NDArray[np.int64],
+    numbers: IntArray,
     maps: PixelMaps,
     parts: Sequence[Part],
     *,

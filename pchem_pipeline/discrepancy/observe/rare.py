@@ -11,14 +11,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.tables import analog_width
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, Evidence, PixelMaps
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Sets of samples that :func:`rare_samples` gives at most.
 N_SETS = 4
@@ -41,7 +38,7 @@ class RareSamples:
     expected: FloatArray
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self) -> BoolArray:
         """Which pixels have one, (y, x)."""
         found = np.zeros(self.expected.shape, np.bool_)
         found[self.hits[:, 1], self.hits[:, 2]] = True

@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, PixelMaps
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: What a sample is split into: k and r.
 CHANNELS = ("charge", "readout")
@@ -40,7 +38,7 @@ class PixelStatistics:
         square: weights of r^2 by which a common relative change of the noise is told best.
     """
 
-    usable: NDArray[np.bool_]
+    usable: BoolArray
     mode: FloatArray
     variance: FloatArray
     cross: FloatArray
@@ -94,15 +92,13 @@ def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     )
 
 
-def code_ranges(laws: PixelLaws, usable: NDArray[np.bool_]) -> NDArray[np.int32]:
+def code_ranges(laws: PixelLaws, usable: BoolArray) -> NDArray[np.int32]:
     """Return first code, last code and first row of the tables, (3, y, x); row 0 (zeros) where not usable."""
     first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T
     return np.stack([first, first + length - 1, start]).reshape(3, *usable.shape).astype(np.int32)
 
 
-def samples_beyond(
-    frames: NDArray[Any], laws: PixelLaws, usable: NDArray[np.bool_], *, above: bool
-) -> IntArray:
+def samples_beyond(frames: NDArray[Any], laws: PixelLaws, usable: BoolArray, *, above: bool) -> IntArray:
     """Return the samples above or below the support of their pixel, by frame: position, y, x, DN."""
     seen = (laws.moments["high" if above else "low"][:, 0] > 0).reshape(usable.shape) & usable
     samples, (first, length) = frames[:, seen].T, laws.support[seen.ravel(), :2].T[:, :, None]

@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import Float32Array, FloatArray
 from pchem_pipeline.base.kernel import kernel
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
 
 
 @kernel

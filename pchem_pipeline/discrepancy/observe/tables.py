@@ -16,16 +16,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe import tables_numba as kernel
 from pchem_pipeline.discrepancy.observe.efficient_scores import N_TESTS, efficient_scores, whiten
 from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.cell_scores_numba import N_COLUMNS, N_NUISANCE
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 _SMALLEST_WIDTH = 0.1  # DN: below it peaks are single codes
 _ALLOWED = 1e-2  # samples expected beyond the codes of a pixel, on either side, at most
@@ -83,7 +80,7 @@ class PixelHistograms:
         """Take ready-made histograms (n, B) that hold all samples of their pixels."""
         return cls(counts, origin.astype(np.int64), np.zeros((len(counts), 2)))
 
-    def extremes(self, some: NDArray[np.bool_]) -> tuple[int, int]:
+    def extremes(self, some: BoolArray) -> tuple[int, int]:
         """Return the smallest and the largest code of some pixels, (n,), DN."""
         if self.ends is not None:
             return int(self.ends[0, some].min()), int(self.ends[1, some].max())
@@ -135,11 +132,11 @@ class PixelLaws(NamedTuple):
     moments: NDArray[np.void]
     scores: FloatArray
     support: IntArray
-    tables: NDArray[np.float32]
+    tables: Float32Array
     codes: CodeSums
 
 
-def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np.bool_]) -> PixelLaws:
+def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: BoolArray) -> PixelLaws:
     """Compare the histogram of every usable pixel with its fitted law.
 
     Args:
@@ -333,7 +330,7 @@ def _add_codes(
             covariance -= total.T @ (n[:, None] * total)
 
 
-def _natural(parameters: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
+def _natural(parameters: FloatArray, usable: BoolArray) -> FloatArray:
     """Return H, 1/g (DN), mu and the analog read noise (DN); harmless numbers for unusable pixels."""
     exposure, gain, bias, sigma = np.where(usable[:, None], parameters, [1.0, 1.0, 0.0, 1.0]).T
     return np.ascontiguousarray(np.stack([exposure, 1.0 / gain, bias, analog_width(sigma)], axis=1))

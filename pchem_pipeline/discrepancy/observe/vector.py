@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
@@ -22,8 +22,6 @@ from pchem_pipeline.discrepancy.observe.view import OF_LINES, FrameView
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
 from pchem_pipeline.model.arithmetic.significance import OUTLYING
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
-
-FloatArray = NDArray[np.float64]
 
 _TAIL = float(special.ndtr(-OUTLYING))
 _ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself

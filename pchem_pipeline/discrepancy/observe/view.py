@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.laws import SLOWEST, best, chi_square
 from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, PixelStatistics, blocks_of, pixel_statistics
@@ -24,8 +25,6 @@ from pchem_pipeline.discrepancy.observe.sums_numba import add_frames, sum_rows
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 _Slices = tuple[slice, slice]
 
 _LAGS = 3
@@ -271,7 +270,7 @@ def _count(edges: IntArray, lag: int) -> int:
     return int(np.maximum(np.diff(edges) - lag, 0).sum())
 
 
-def _add_products(u: NDArray[np.float32], known: int, products: dict[str, FloatArray]) -> None:
+def _add_products(u: Float32Array, known: int, products: dict[str, FloatArray]) -> None:
     """Add the products of frames (2, t, y, x) with those before; the first ``known`` are that only.
 
     A product with the pixel behind the end of a row is none of neighbours, and is not used.

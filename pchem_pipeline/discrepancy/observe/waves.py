@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, IntArray
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
@@ -24,10 +25,6 @@ from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, FALSE_ALARM
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
-
-Float32Array = NDArray[np.float32]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 _MOST_SAMPLES, _FRAMES_AT_ONCE = 1 << 22, 32
 _ALL_OF_IT = 0.7  # of the amplitude of a wave at any phase, for one whose phase runs on

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.observe.laws import extreme, poisson
 from pchem_pipeline.discrepancy.observe.tables import CodeSums, PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
@@ -22,8 +23,6 @@ from pchem_pipeline.discrepancy.quick.series import normal_p
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
-
-FloatArray = NDArray[np.float64]
 
 #: Statistics of the codes in words.
 _WORDS = {
@@ -104,7 +103,7 @@ def _sums(sample: CodeSample) -> CodeSums | None:
         exact = FitSettings(likelihood="exact")
         fit = fit_histograms(counts, origin, settings=exact, adc_limits=sample.limits, start=found)
         found = np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
-    usable: NDArray[np.bool_] = np.asarray(np.isfinite(found).all(axis=1))
+    usable: BoolArray = np.asarray(np.isfinite(found).all(axis=1))
     for _ in range(2):  # of all pixels, then without those that may be at a wrong maximum
         laws = pixel_laws(PixelHistograms.alone(counts, origin), found, usable)
         if not laws.good.any():

@@ -7,14 +7,12 @@ jump of the offset separates the means only.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 from pchem_pipeline.model.arithmetic.significance import CERTAIN
 from pchem_pipeline.model.histogram.odd_frames import FEWEST_FRAMES, frame_words
-
-FloatArray = NDArray[np.float64]
 
 #: Frames of a level, at least, and as a share of all.
 _FEWEST_OF_LEVEL, _LEAST_SHARE = 4, 0.01
@@ -25,7 +23,7 @@ _SHOWN = 3
 
 
 def levels_check(
-    mean: FloatArray, variance: FloatArray, gain: float, empty: NDArray[np.int64] | tuple[()] = ()
+    mean: FloatArray, variance: FloatArray, gain: float, empty: IntArray | tuple[()] = ()
 ) -> Check:
     """Test whether the frames are of several exposures.
 
@@ -46,8 +44,8 @@ def levels_check(
 
 
 def _parted(
-    mean: FloatArray, variance: FloatArray, gain: float, frames: NDArray[np.int64]
-) -> tuple[list[NDArray[np.int64]], float]:
+    mean: FloatArray, variance: FloatArray, gain: float, frames: IntArray
+) -> tuple[list[IntArray], float]:
     """Return the frames of each level, and how probable the growth of the variance between any two is."""
     levels, p = [frames], 1.0
     if frames.size < FEWEST_FRAMES:  # of 16, chance leaves such a gap in one of 400 runs
@@ -73,7 +71,7 @@ def _chance(low: FloatArray, high: FloatArray) -> float:
     return float(special.stdtr(n - 2.0, -(high.mean() - low.mean()) / error))
 
 
-def _halves(frames: NDArray[np.int64], mean: FloatArray, fewest: int) -> list[NDArray[np.int64]] | None:
+def _halves(frames: IntArray, mean: FloatArray, fewest: int) -> list[IntArray] | None:
     """Return frames in two parts between which the means leave a clean gap; None where there is no such gap.
 
     Of all cuts through the sorted means the one with the least variance within both parts (Otsu 1979).
@@ -94,9 +92,7 @@ def _halves(frames: NDArray[np.int64], mean: FloatArray, fewest: int) -> list[ND
     return [np.sort(ordered[:cut]), np.sort(ordered[cut:])]
 
 
-def _shot_noise_grows(
-    halves: list[NDArray[np.int64]], mean: FloatArray, variance: FloatArray, gain: float
-) -> bool:
+def _shot_noise_grows(halves: list[IntArray], mean: FloatArray, variance: FloatArray, gain: float) -> bool:
     """Tell whether the variance grows between two levels as the shot noise of their electrons would."""
     low, high = halves
     grown = float(np.median(variance[high]) - np.median(variance[low]))

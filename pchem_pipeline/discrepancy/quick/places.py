@@ -7,18 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.families import cell_edges
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.discrepancy.scan import Suspect, scan_map
 from pchem_pipeline.effects.framework.region import Region
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 #: Cells along an edge of the maps that are scanned; of a larger sensor pixels are taken together.
 _CELLS = 128

@@ -20,9 +20,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.checks import KINDS, Check, QuickLook, check_of, graded
@@ -42,7 +42,6 @@ from pchem_pipeline.model.maps.ordered import median_of
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
-FloatArray = NDArray[np.float64]
 
 #: Lines with a variance above this multiple of the median hold hot pixels, and are left out of frame means.
 _LOUD = 4.0
@@ -121,7 +120,7 @@ def _odd_frames(sums: StackSums) -> list[Check]:
     return checks
 
 
-def _without(frames: NDArray[np.int64], n: int) -> str:
+def _without(frames: IntArray, n: int) -> str:
     """Return how a run of n frames does without some of them: a range leaves out its ends."""
     if frames.size and int(frames.max()) == frames.size - 1:
         return f"with --frames {frames.size}: (input.frame_range)"
@@ -271,7 +270,7 @@ def _of_lines(lines: Lines) -> _Estimate:
     return _Estimate(float(weight @ value) / total, total**-0.5, effective * lines.freedom)
 
 
-def _deviations(lines: Lines) -> tuple[NDArray[np.int64], FloatArray, float, float]:
+def _deviations(lines: Lines) -> tuple[IntArray, FloatArray, float, float]:
     """Return the lines with a covariance, it in standard errors, and the middle and spread of these."""
     value, error = lines.covariance
     some = np.flatnonzero(np.isfinite(error) & (lines.n_pairs > 0))
@@ -280,7 +279,7 @@ def _deviations(lines: Lines) -> tuple[NDArray[np.int64], FloatArray, float, flo
     return some, z, centre, max(1.0, robust_sd(z, centre)) if some.size else 1.0
 
 
-def _quiet(sums: StackSums) -> NDArray[np.bool_]:
+def _quiet(sums: StackSums) -> BoolArray:
     """Return the rows that count in the means of frames, (y,)."""
     variance = sums.rows.variance
     some = variance > 0

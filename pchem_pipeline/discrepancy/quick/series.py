@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.observe.laws import FAR, SLOWEST, best, chi_square
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
-
-FloatArray = NDArray[np.float64]
 
 #: Frequencies on either side from which the noise around one is taken.
 _AROUND = 64

@@ -9,11 +9,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.model.maps.ordered import Ordered
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Lines whose sums are looked at together.
 _LINES_AT_ONCE = 1 << 12
@@ -40,7 +38,7 @@ class Lines:
     variance: FloatArray
     pairs: FloatArray
     neighbours: FloatArray
-    length: NDArray[np.int64]
+    length: IntArray
 
     @property
     def n_pairs(self) -> FloatArray:
@@ -103,9 +101,9 @@ class StackSums:
     numbers: IntArray
     n_blocks: int
     lengths: IntArray
-    block_sum: NDArray[np.int64]
-    block_sum_square: NDArray[np.int64]
-    row_sum: NDArray[np.int64]
+    block_sum: IntArray
+    block_sum_square: IntArray
+    row_sum: IntArray
     column_blocks: IntArray
     column_sum: NDArray[np.signedinteger]
     all_means: FloatArray

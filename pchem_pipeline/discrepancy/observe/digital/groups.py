@@ -15,13 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.effects.framework.evidence import PixelMaps, PredictedSamples, PreviousBits
 from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted
 from pchem_pipeline.model.arithmetic.significance import CLEAR
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 GROUP = 4  # frames whose predictions are exchanged
 #: Samples of all groups together, unless there is but one, where all frames of a group are compared with all,
@@ -52,7 +50,7 @@ def groups_of(edges: IntArray, samples_of_a_frame: int, most_samples: int = MOST
 
 
 def predicted_samples(
-    frames: NDArray[np.unsignedinteger[Any]], edges: IntArray, usable: NDArray[np.bool_]
+    frames: NDArray[np.unsignedinteger[Any]], edges: IntArray, usable: BoolArray
 ) -> dict[str, PredictedSamples]:
     """Return how samples compare with their predictions, by kind; none where frames or pixels are too few.
 
@@ -128,7 +126,7 @@ def predicted_statistics(found: Mapping[str, PredictedSamples]) -> dict[str, flo
 
 
 def nearer_statistics(
-    frames: NDArray[np.unsignedinteger[Any]], edges: NDArray[np.int64], maps: PixelMaps
+    frames: NDArray[np.unsignedinteger[Any]], edges: IntArray, maps: PixelMaps
 ) -> dict[str, float]:
     """Return the statistic of samples that are nearer to the one before than chance makes them.
 
@@ -165,8 +163,8 @@ def nearer_statistics(
 
 def previous_bits(
     frames: NDArray[np.unsignedinteger[Any]],
-    edges: NDArray[np.int64],
-    usable: NDArray[np.bool_],
+    edges: IntArray,
+    usable: BoolArray,
     noise: FloatArray,
 ) -> PreviousBits | None:
     """Return the regression of samples on the bits of those before; None where there are too few.

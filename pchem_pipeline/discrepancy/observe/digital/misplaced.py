@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.digital.groups import MOST_PAIRED
 from pchem_pipeline.discrepancy.observe.digital.misplaced_numba import (
     N_PLACES,
@@ -27,8 +28,6 @@ from pchem_pipeline.effects.framework.neighbours import neighbours
 from pchem_pipeline.model.arithmetic.significance import CERTAIN
 from pchem_pipeline.model.histogram.count import histogram_frames
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Lines = Literal["rows", "columns"]
 
 _LINES: tuple[Lines, Lines] = ("rows", "columns")
@@ -42,8 +41,8 @@ _FARTHEST = 60.0  # logarithm of a ratio: beyond it nothing changes
 def misplaced_lines(
     frames: NDArray[np.unsignedinteger[Any]],
     counts: NDArray[Any],
-    origin: NDArray[np.int64],
-    usable: NDArray[np.bool_],
+    origin: IntArray,
+    usable: BoolArray,
 ) -> tuple[dict[str, float], dict[str, FloatArray]]:
     """Return the statistics of misplaced rows and columns, and their shares by place.
 
@@ -77,7 +76,7 @@ def misplaced_lines(
 
 
 def own_lines(
-    frames: NDArray[np.unsignedinteger[Any]], usable: NDArray[np.bool_], effects: Iterable[Effect]
+    frames: NDArray[np.unsignedinteger[Any]], usable: BoolArray, effects: Iterable[Effect]
 ) -> NDArray[np.unsignedinteger[Any]]:
     """Return frames in which lines that effects likely misplaced are those of other frames, drawn at random.
 
@@ -101,8 +100,8 @@ def own_lines(
 
 
 def _moved(
-    frames: NDArray[Any], own: NDArray[Any], usable: NDArray[np.bool_], lines: Lines, share: FloatArray
-) -> NDArray[np.bool_]:
+    frames: NDArray[Any], own: NDArray[Any], usable: BoolArray, lines: Lines, share: FloatArray
+) -> BoolArray:
     """Return which lines are likelier misplaced than not, (frame, line), by the histograms of ``own``."""
     histograms = histogram_frames(own)
     counts = histograms.counts.reshape(usable.size, -1)
@@ -112,7 +111,7 @@ def _moved(
     return np.asarray(likelier > 1.0 - share.sum())
 
 
-def with_others(frames: NDArray[Any], moved: NDArray[np.bool_]) -> NDArray[Any]:
+def with_others(frames: NDArray[Any], moved: BoolArray) -> NDArray[Any]:
     """Return frames (frame, line, sample) with some lines replaced by those of others, drawn at random."""
     found, rng = frames.copy(), np.random.default_rng(0)
     for y in np.flatnonzero(moved.any(axis=0) & ~moved.all(axis=0)):
@@ -136,10 +135,10 @@ class _Table:
     """
 
     first: IntArray
-    ratios: NDArray[np.float32]
+    ratios: Float32Array
 
     @classmethod
-    def of(cls, counts: NDArray[Any], origin: IntArray, usable: NDArray[np.bool_], lines: Lines) -> _Table:
+    def of(cls, counts: NDArray[Any], origin: IntArray, usable: BoolArray, lines: Lines) -> _Table:
         """Return it for histograms (y * x, B) whose bins begin at ``origin``, DN."""
         some = np.flatnonzero((counts > 0).any(axis=0))
         # one more on either side stands for all codes beyond
@@ -162,9 +161,7 @@ class _Table:
             ratios[..., j] = known * (np.take_along_axis(other, at, axis=2) - own)
         return cls(begin, ratios)
 
-    def compared(
-        self, lines: NDArray[Any], stride: int, *, whole: bool
-    ) -> tuple[FloatArray, NDArray[np.float32]]:
+    def compared(self, lines: NDArray[Any], stride: int, *, whole: bool) -> tuple[FloatArray, Float32Array]:
         """Return what a share of misplaced rows gains each, and likelihood ratios (frame, y, N_PLACES)."""
         ratios = np.empty((*lines.shape[:2], N_PLACES), np.float32)
         gains = np.empty(lines.shape[:2])
@@ -172,7 +169,7 @@ class _Table:
         return gains, ratios
 
 
-def _shares(ratios: NDArray[np.float32]) -> FloatArray:
+def _shares(ratios: Float32Array) -> FloatArray:
     """Return the likeliest shares of lines that come from each place, by expectation and maximisation."""
     likelihood = np.exp(np.minimum(ratios.reshape(-1, N_PLACES).astype(np.float64), _FARTHEST))
     share = np.full(N_PLACES, _SHARE)

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: Rows and columns from a pixel to that whose samples it may hold: the next line, that before, early, late.
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
@@ -31,12 +30,12 @@ def _log_mean(values: FloatArray) -> float:
 @kernel
 def compare_rows(
     frames: NDArray[Any],
-    first: NDArray[np.int64],
-    table: NDArray[np.float32],
+    first: IntArray,
+    table: Float32Array,
     stride: int,
     share: float,
     whole: bool,
-    ratios: NDArray[np.float32],
+    ratios: Float32Array,
     gains: FloatArray,
 ) -> None:
     """Compare rows at other places with them at their own.

@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Frames = NDArray[np.unsignedinteger[Any]]
 
 _FIRST = 2  # samples of a line that are compared before all of them are
@@ -79,7 +78,7 @@ class Repeats:
         return z
 
 
-def _equal_lines(one: Frames, other: Frames) -> NDArray[np.bool_]:
+def _equal_lines(one: Frames, other: Frames) -> BoolArray:
     """Return which lines of two stacks (frame, line, sample) are equal, (frame, line)."""
     equal = np.asarray((one[:, :, :_FIRST] == other[:, :, :_FIRST]).all(axis=2))
     at = np.nonzero(equal)
@@ -111,7 +110,7 @@ def equal_squares(frames: Frames) -> IntArray:
 
 
 def square_statistics(
-    found: IntArray, seen: PixelHistograms, usable: NDArray[np.bool_], top: int
+    found: IntArray, seen: PixelHistograms, usable: BoolArray, top: int
 ) -> dict[str, float]:
     """Return the statistic of squares of equal samples; none without squares of usable pixels.
 
