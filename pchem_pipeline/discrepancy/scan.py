@@ -33,7 +33,6 @@ from pchem_pipeline.discrepancy.families import (
     log_binomial_tails,
     successive,
 )
-from pchem_pipeline.discrepancy.observe.rare import SEED
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
@@ -368,7 +367,7 @@ def scan_event_frames(
     """
     if positions.size > _MOST_EVENTS:
         expected *= _MOST_EVENTS / positions.size
-        positions = np.sort(np.random.default_rng(SEED).choice(positions, _MOST_EVENTS, replace=False))
+        positions = np.sort(np.random.default_rng(1).choice(positions, _MOST_EVENTS, replace=False))
     m, n = positions.size, numbers.size
     if m < FEWEST or n < 2 * shortest:
         return None

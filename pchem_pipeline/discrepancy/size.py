@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
-from pchem_pipeline.discrepancy.observe.rare import SEED
 from pchem_pipeline.discrepancy.verdict import RARE, Size, parameters_of
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane
@@ -59,7 +58,7 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     blocks = min(blocks, -(-n_frames // _BLOCK_FRAMES))
     stacks = 1 if effect.far_reaching else -(-_FEWEST_FRAMES // (blocks * _BLOCK_FRAMES))
     try:
-        drawn = [_change(effect, maps, n_frames, blocks, SEED + i) for i in range(stacks)]
+        drawn = [_change(effect, maps, n_frames, blocks, seed) for seed in range(1, stacks + 1)]
     except PchEmError:
         return None
     inside = np.ones_like(maps.usable)

@@ -20,8 +20,7 @@ from scipy import fft
 from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.digital.groups import GROUP, MOST_SAMPLES, groups_of
-from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
-from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
+from pchem_pipeline.discrepancy.observe.sums import FrameBlocks, Samples, pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.operators.couple import Source

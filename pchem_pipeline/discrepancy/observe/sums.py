@@ -1,16 +1,19 @@
-"""The two channels of the samples of pixels: their moments, the codes that have them, and those beyond."""
+"""The two channels of the samples of pixels: their moments, the codes that have them, and frames of both."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
-from pchem_pipeline.discrepancy.observe.tables import PixelLaws
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from pchem_pipeline.discrepancy.observe.laws import FAR
+from pchem_pipeline.discrepancy.observe.sums_numba import look_up
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, PixelMaps
 
 #: What a sample is split into: k and r.
@@ -107,3 +110,140 @@ def samples_beyond(frames: NDArray[Any], laws: PixelLaws, usable: BoolArray, *, 
     y, x = np.nonzero(seen)
     hits = np.stack([frame, y[pixel], x[pixel], samples[pixel, frame]], axis=1).astype(np.int64)
     return hits[np.lexsort((hits[:, 2], hits[:, 1], hits[:, 0]))]
+
+
+# -- frames as deviations of their pixels ------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FrameBlocks:
+    """Frames of some rows that come by blocks.
+
+    Attributes:
+        n_frames: number of them.
+        blocks: yields about so many successive frames at a time, (frame, y, x), DN.
+    """
+
+    n_frames: int
+    blocks: Callable[[int], Iterable[NDArray[np.unsignedinteger[Any]]]]
+
+    @classmethod
+    def of(
+        cls, frames: NDArray[np.unsignedinteger[Any]], chosen: IntArray | None = None, together: int = 1
+    ) -> FrameBlocks:
+        """Take frames in memory.
+
+        Args:
+            frames: codes (n, y, x), DN.
+            chosen: positions of those that are meant; None: all.
+            together: successive ones of these that come in the same block.
+        """
+        n_frames = frames.shape[0] if chosen is None else chosen.size
+
+        def blocks(size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
+            size = together * max(size // together, 1)
+            for some in (slice(begin, begin + size) for begin in range(0, n_frames, size)):
+                yield frames[some if chosen is None else chosen[some]]
+
+        return cls(n_frames, blocks)
+
+
+def laws_of_frames(frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> PixelLaws:
+    """Compare the histograms of frames (n, y, x) with the fit of their pixels."""
+    return pixel_laws(PixelHistograms.of(frames), maps.columns, maps.usable.ravel())
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Frames as standardised deviations of their pixels, of both channels.
+
+    Attributes:
+        frames: codes (n, y, x), DN.
+        first, last: smallest and largest code of each pixel's table, (y, x).
+        start: row of the first one in ``tables``, (y, x).
+        tables: k and r of each code over their standard deviation, (rows, 2).
+        usable: pixels that count, (y, x).
+        most: samples that are looked at at a time, whole frames.
+    """
+
+    frames: FrameBlocks
+    first: NDArray[np.int32]
+    last: NDArray[np.int32]
+    start: NDArray[np.int32]
+    tables: Float32Array
+    usable: BoolArray
+    most: int = 1 << 20
+
+    @classmethod
+    def of(cls, frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> Samples:
+        """Prepare frames by the fit of their pixels."""
+        return cls.by_laws(FrameBlocks.of(frames), laws_of_frames(frames, maps), maps)
+
+    @classmethod
+    def by_laws(
+        cls, frames: FrameBlocks, laws: PixelLaws, maps: PixelMaps, *, standardised: bool = True
+    ) -> Samples:
+        """Prepare frames by the laws of their pixels, made of all samples of the frames or of more.
+
+        Args:
+            frames: codes.
+            laws: of the pixels' samples.
+            maps: parameters of the pixels.
+            standardised: False: k (e-) and r (DN) as they are.
+        """
+        pixels = pixel_statistics(laws, maps)
+        usable = pixels.usable
+        tables = laws.tables
+        if standardised:
+            codes = np.where(laws.good, laws.support[:, 1], 0)
+            deviation = np.sqrt(np.where(usable, pixels.variance, 1.0)).reshape(2, -1).astype(np.float32)
+            tables = tables[: 1 + codes.sum()].copy()
+            tables[1:] /= np.repeat(deviation.T, codes, axis=0)
+            # a track of a particle is no common mode
+            np.clip(tables, -FAR, FAR, out=tables)
+        first, last, start = code_ranges(laws, usable)
+        return cls(frames, first, last, start, tables, usable)
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return self.frames.n_frames
+
+    def without(self, pixels: BoolArray) -> Samples:
+        """Return it without some pixels, (y, x)."""
+        return replace(self, usable=self.usable & ~pixels)
+
+    def chunks(
+        self, channels: tuple[int, ...] = (0, 1), rows: slice = slice(None), columns: slice = slice(None)
+    ) -> Iterator[Float32Array]:
+        """Yield some frames at a time as deviations (channel, frame, y, x), 0 where not usable."""
+        box = rows, columns
+        first, last, start, weight = (
+            np.ascontiguousarray(each[box])
+            for each in (self.first, self.last, self.start, self.usable.astype(np.float32))
+        )
+        for block in self.frames.blocks(max(1, self.most // self.usable.size)):
+            codes = np.ascontiguousarray(block[:, rows, columns])
+            values = np.empty((2, *codes.shape), np.float32)
+            look_up(codes, first, last, start, self.tables, weight, values)
+            yield values[channels[0] : channels[-1] + 1]
+
+    def energies(self, channel: int, mode: str, pixels: BoolArray) -> FloatArray:
+        """Return the sum of the products of pairs of some pixels that share a mode, in each frame, (n,)."""
+        rows, columns = (np.flatnonzero((self.usable & pixels).any(axis=axis)) for axis in (1, 0))
+        if rows.size == 0:
+            return np.zeros(self.n_frames)
+        box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        inside = pixels[box].astype(np.float32)
+        found = [energies(u * inside, mode) for (u,) in self.chunks((channel,), *box)]
+        return np.concatenate(found)
+
+
+def energies(u: Float32Array, mode: str) -> FloatArray:
+    """Return the sum of the products of all pairs that share a mode, of frames (t, y, x)."""
+    own = np.einsum("tyx,tyx->t", u, u, dtype=np.float64)
+    rows, columns = (u.sum(axis=axis, dtype=np.float64) for axis in (2, 1))
+    of_rows, of_columns = ((sums**2).sum(axis=1) for sums in (rows, columns))
+    if mode == "frame":
+        return np.asarray(rows.sum(axis=1) ** 2 - of_rows - of_columns + own) / 2.0
+    return np.asarray((of_rows if mode == "row" else of_columns) - own) / 2.0

@@ -19,8 +19,7 @@ from scipy import fft, ndimage
 
 from pchem_pipeline.base.arrays import BoolArray, Float32Array, IntArray
 from pchem_pipeline.discrepancy.observe import laws as laws_of
-from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
-from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
+from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES, FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, FALSE_ALARM

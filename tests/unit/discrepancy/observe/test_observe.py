@@ -13,10 +13,10 @@ from scipy import special, stats
 
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe.efficient_scores import efficient_scores, whiten
 from pchem_pipeline.discrepancy.observe.observe import _without_steps, observe, observe_histograms
-from pchem_pipeline.discrepancy.observe.rare import expected_beyond, rare_samples, single_samples
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
+from pchem_pipeline.discrepancy.observe.tables import efficient_scores, whiten
+from pchem_pipeline.discrepancy.where import expected_beyond, rare_samples, single_samples
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, SCORES, Evidence, PixelMaps
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.histogram.count import histogram_frames
