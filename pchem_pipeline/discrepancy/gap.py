@@ -17,8 +17,7 @@ import numpy as np
 from scipy import special
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
-from pchem_pipeline.discrepancy.covariance import Covariance
-from pchem_pipeline.discrepancy.null import STRAY, NullModel, moments
+from pchem_pipeline.discrepancy.null import STRAY, Covariance, NullModel, moments
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE

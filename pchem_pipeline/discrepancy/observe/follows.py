@@ -19,7 +19,7 @@ from scipy import fft
 
 from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe import laws as laws_of
-from pchem_pipeline.discrepancy.observe.digital.groups import GROUP, MOST_SAMPLES, groups_of
+from pchem_pipeline.discrepancy.observe.digital import GROUP, MOST_SAMPLES, groups_of
 from pchem_pipeline.discrepancy.observe.sums import FrameBlocks, Samples, pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps

@@ -15,22 +15,18 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.errors import InputError, PchEmError
-from pchem_pipeline.discrepancy.observe.digital.groups import (
+from pchem_pipeline.discrepancy.observe.digital import (
+    Repeats,
     bit_statistics,
     nearer_statistics,
     predicted_samples,
     predicted_statistics,
     previous_bits,
-)
-from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines
-from pchem_pipeline.discrepancy.observe.digital.repeats import (
-    Repeats,
-    equal_squares,
-    log_alike,
     square_statistics,
 )
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
+from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS, samples_beyond
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import (
@@ -68,7 +64,6 @@ def observe(
     *,
     n_run: int,
     block_frames: int,
-    fit: FitSettings | None = None,
     exclude: BoolArray | None = None,
     start: PixelMaps | None = None,
     fitted: bool = True,
@@ -80,7 +75,6 @@ def observe(
         numbers: their frame numbers in the run, increasing, (n,).
         n_run: frames of the whole run.
         block_frames: frames in a block; blocks begin anew where numbers are missing.
-        fit: settings of the fit; the defaults if None.
         exclude: pixels not to look at, (y, x).
         start: parameters near those of these frames, where they are known: saves time.
         fitted: take the parameters from a fit of these frames; False: take ``start`` as it is, for frames too
@@ -95,12 +89,11 @@ def observe(
     seen = PixelHistograms.of(frames)
     wanted = np.ones(shape, np.bool_) if exclude is None else ~exclude
     if fitted or start is None:
-        result, parameters, usable = _fitted(seen, wanted.ravel(), fit, start)
+        result, parameters, usable = _fitted(seen, wanted.ravel(), start)
     else:
         result, parameters = None, start.columns
         usable = (wanted & start.usable).ravel() & _inside(seen)
-    evidence, laws = _compared(seen, parameters, usable, (shape[0], shape[1]))
-    evidence = evidence if result is None else _with_fit(evidence, result)
+    evidence, laws = _compared(seen, parameters, usable, (shape[0], shape[1]), result)
     maps = evidence.maps
     view = FrameView.of(frames, numbers, block_frames, laws, maps)
     edges = view.edges
@@ -109,7 +102,6 @@ def observe(
     predicted = predicted_samples(frames, edges, maps.usable)
     spread = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
     bits = previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
-    squares = equal_squares(frames)
     waves = waves_across(frames, numbers, laws, maps)
     misplaced_z, misplaced = misplaced_lines(frames, seen.counts, seen.origin, maps.usable)
     z = {
@@ -123,8 +115,8 @@ def observe(
         **bit_statistics(bits),
         **nearer_statistics(frames, edges, maps),
         **follow_statistics(frames, edges, laws, maps),
-        **repeats.statistics(log_alike(seen, maps.usable.shape), len(frames)),
-        **square_statistics(squares, seen, maps.usable, int(frames.max())),
+        **repeats.statistics(seen, frames.shape),
+        **square_statistics(frames, seen, maps.usable),
         **misplaced_z,
         **waves.z,
     }
@@ -148,7 +140,6 @@ def observe_histograms(
     counts: NDArray[np.unsignedinteger[Any]],
     origin: IntArray,
     *,
-    fit: FitSettings | None = None,
     parameters: FloatArray | None = None,
 ) -> Evidence:
     """Return the evidence of ready-made histograms: no time, no neighbours.
@@ -156,7 +147,6 @@ def observe_histograms(
     Args:
         counts: one histogram per pixel (and sample), (n, B).
         origin: DN of bin 0, (n,).
-        fit: settings of the fit; the defaults if None.
         parameters: (H, g, mu, sigma) of a fit of more than one histogram each, (n, 4), NaN where not usable;
             None: each histogram is fitted by itself.
 
@@ -166,11 +156,12 @@ def observe_histograms(
     Raises:
         PchEmError: no pixel is usable.
     """
-    n, seen = len(counts), PixelHistograms.alone(counts, origin)
-    if parameters is not None:
-        return _compared(seen, parameters, np.asarray(np.isfinite(parameters).all(axis=1)), (1, n))[0]
-    result, parameters, usable = _fitted(seen, np.ones(n, np.bool_), fit, None)
-    return _with_fit(_compared(seen, parameters, usable, (1, n))[0], result)
+    n, seen, result = len(counts), PixelHistograms.alone(counts, origin), None
+    if parameters is None:
+        result, parameters, usable = _fitted(seen, np.ones(n, np.bool_))
+    else:
+        usable = np.asarray(np.isfinite(parameters).all(axis=1))
+    return _compared(seen, parameters, usable, (1, n), result)[0]
 
 
 def _check(frames: NDArray[Any], numbers: IntArray, block_frames: int) -> None:
@@ -187,9 +178,13 @@ def _check(frames: NDArray[Any], numbers: IntArray, block_frames: int) -> None:
 
 
 def _compared(
-    seen: PixelHistograms, parameters: FloatArray, usable: BoolArray, shape: tuple[int, int]
+    seen: PixelHistograms,
+    parameters: FloatArray,
+    usable: BoolArray,
+    shape: tuple[int, int],
+    fit: FitResult | None,
 ) -> tuple[Evidence, PixelLaws]:
-    """Compare histograms with the PCD at the parameters of a fit."""
+    """Compare histograms with the PCD at the parameters of a fit; None: its errors are not known."""
     laws = pixel_laws(seen, parameters, usable)
     good = laws.good
     if not good.any():
@@ -206,7 +201,7 @@ def _compared(
         return known(values).astype(np.float32)
 
     low, high = (np.where(good[:, None], moments[side], 0.0) for side in ("low", "high"))
-
+    ambiguous = 0.0 if fit is None else np.mean((fit.fit_status[good] & int(FitStatus.BIAS_AMBIGUOUS)) != 0)
     evidence = Evidence(
         maps=PixelMaps.known(parameters.T, good.reshape(shape)),
         n_frames=int(seen.samples.max()),
@@ -221,30 +216,19 @@ def _compared(
         time=None,
         z=in_order(sample_statistics(laws, parameters[:, 0], residuals)),
         tail_expected=np.stack([mapped(low[:, 1]), mapped(high[:, 1])]),
+        covariance=None if fit is None else fit.covariance.reshape(*shape, 4, 4),
+        ambiguous=float(ambiguous),
     )
     return evidence, laws
 
 
-def _with_fit(evidence: Evidence, result: FitResult) -> Evidence:
-    """Return the evidence with covariances and doubts of the fit that it was compared with."""
-    good = evidence.maps.usable
-    return replace(
-        evidence,
-        covariance=result.covariance.reshape(*good.shape, 4, 4),
-        ambiguous=float(np.mean((result.fit_status[good.ravel()] & int(FitStatus.BIAS_AMBIGUOUS)) != 0)),
-    )
-
-
 def _fitted(
-    seen: PixelHistograms,
-    wanted: BoolArray,
-    fit: FitSettings | None,
-    near: PixelMaps | None,
+    seen: PixelHistograms, wanted: BoolArray, near: PixelMaps | None = None
 ) -> tuple[FitResult, FloatArray, BoolArray]:
     """Return the fit, its parameters (n, 4), and which pixels can be used."""
     start = None if near is None else near.columns
     # every sample counts here: what the tail guard would leave out is what is looked for
-    settings = (fit or FitSettings()).model_copy(update={"tail_guard": 0.0, "errors": "information"})
+    settings = FitSettings(tail_guard=0.0, errors="information")
     outside = seen.outside.T.astype(np.int64)
     result = fit_histograms(seen.counts, seen.origin, *outside, settings=settings, start=start)
     parameters = result.columns
@@ -285,7 +269,7 @@ def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: BoolArray) ->
         frames: codes (n, y, x), DN.
         exclude: pixels not to look at, (y, x).
     """
-    _, parameters, usable = _fitted(PixelHistograms.of(frames), ~exclude.ravel(), None, None)
+    _, parameters, usable = _fitted(PixelHistograms.of(frames), ~exclude.ravel())
     return PixelMaps.known(parameters.T, usable.reshape(exclude.shape))
 
 

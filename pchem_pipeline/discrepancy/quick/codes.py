@@ -19,7 +19,7 @@ from pchem_pipeline.discrepancy.observe.laws import extreme, poisson
 from pchem_pipeline.discrepancy.observe.tables import CodeSums, PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
-from pchem_pipeline.discrepancy.quick.series import normal_p
+from pchem_pipeline.discrepancy.quick.frames import normal_p
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings

@@ -27,15 +27,13 @@ from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.checks import KINDS, Check, QuickLook, check_of, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
-from pchem_pipeline.discrepancy.quick.levels import levels_check
+from pchem_pipeline.discrepancy.quick.frames import levels_check, normal_p, odd_frame_checks, series_checks
 from pchem_pipeline.discrepancy.quick.places import block_deviations, sensor_cells, sensor_places
-from pchem_pipeline.discrepancy.quick.series import normal_p, series_checks
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, SIGNIFICANCE
-from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_words, odd_words
 from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY
 from pchem_pipeline.model.maps.ordered import median_of
 
@@ -75,7 +73,7 @@ def quick_look(
     if sums is not None and sums.freedom > 0:
         checks.append(levels_check(sums.all_means, sums.all_variances, gain, sums.odd.get("empty", ())))
         stack = _stack_checks(sums, maps)
-        checks += [*_odd_frames(sums), *stack, *_wave(sums, stack)]
+        checks += [*odd_frame_checks(sums), *stack, *_wave(sums, stack)]
     if codes is not None:
         checks += code_checks(codes)
     samples = 0 if sums is None else sums.n_frames * int(np.prod(sums.shape))
@@ -94,39 +92,6 @@ _NEEDS = {
     "wave": ("pickup in readout order", "fewer than 8 rows or columns"),
     "frame_noise": ("noise common to a frame", "fewer than 4 rows or columns"),
 }
-
-
-def _odd_frames(sums: StackSums) -> list[Check]:
-    """Return whether frames are far, moved, empty or copies: all other checks are of the rest."""
-    n, odd = sums.all_means.size, sums.odd
-    if not odd:
-        return []
-    equal = chance_of_copies(sums.rows.variance, n)
-    checks = []
-    for name, kinds, p in (
-        ("odd_frames", ("far",), n * FAR_CHANCE),
-        ("empty_frames", ("empty",), n * FAR_CHANCE),
-        ("repeated_frames", ("copied",), equal),
-        ("moved_frames", ("moved_x", "moved_y"), n * FAR_CHANCE),
-    ):
-        some = {kind: odd[kind] for kind in kinds if kind in odd}
-        number = sum(frames.size for frames in some.values())
-        where = odd_words(some, sums.all_means, sums.all_variances)
-        if name in ("empty_frames", "repeated_frames"):  # the title says how they are odd
-            where = frame_words(odd[kinds[0]])
-        p = min(p, 1.0) if number else 1.0
-        how = _without(np.concatenate([*some.values(), np.empty(0, np.int64)]), n)
-        checks.append(check_of(name, p, number / n, limit=1.0 / n, where=where, how=how))
-    return checks
-
-
-def _without(frames: IntArray, n: int) -> str:
-    """Return how a run of n frames does without some of them: a range leaves out its ends."""
-    if frames.size and int(frames.max()) == frames.size - 1:
-        return f"with --frames {frames.size}: (input.frame_range)"
-    if frames.size and int(frames.min()) == n - frames.size:
-        return f"with --frames :{n - frames.size} (input.frame_range)"
-    return "of the files"
 
 
 def _wave(sums: StackSums, others: Sequence[Check]) -> list[Check]:

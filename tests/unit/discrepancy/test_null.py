@@ -5,8 +5,7 @@ import pytest
 from scipy import special, stats
 
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import Population, Posterior
-from pchem_pipeline.discrepancy.covariance import Covariance
-from pchem_pipeline.discrepancy.null import NullModel, moments, without_strays
+from pchem_pipeline.discrepancy.null import Covariance, NullModel, moments, without_strays
 from pchem_pipeline.discrepancy.observe import laws
 
 REPLICATES, SETS, DATA = 40, 300, 50

@@ -15,7 +15,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.quick import places
 from pchem_pipeline.discrepancy.quick.checks import KINDS, Check, QuickLook
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
-from pchem_pipeline.discrepancy.quick.levels import levels_check
+from pchem_pipeline.discrepancy.quick.frames import levels_check
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect

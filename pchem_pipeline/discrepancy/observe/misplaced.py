@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from pchem_pipeline.discrepancy.observe.digital.groups import MOST_PAIRED
-from pchem_pipeline.discrepancy.observe.digital.misplaced_numba import (
+from pchem_pipeline.discrepancy.observe.digital import MOST_PAIRED
+from pchem_pipeline.discrepancy.observe.misplaced_numba import (
     N_PLACES,
     STEPS,
     compare_rows,
