@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from pchem_pipeline.discrepancy.verdict import (
     Candidate,
     Change,
     Discrepancy,
-    Examined,
     Families,
     GapChange,
     Moved,
@@ -40,10 +39,13 @@ from pchem_pipeline.discrepancy.verdict import (
 )
 from pchem_pipeline.effects.framework.compose import AddedExposure, place_words, title_words
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.arithmetic.significance import CLEAR, FALSE_ALARM, NO_CHANCE
+
+if TYPE_CHECKING:
+    from pchem_pipeline.discrepancy.skeleton import Prepared
 
 #: Largest share of a gap above its floor that may remain with effects that explain it.
 LARGEST_REST = 0.2
@@ -263,35 +265,22 @@ class Findings:
         return tuple(effect for effect in extended if effect.key in keys)
 
 
-def build_verdict(
-    found: Findings,
-    model: tuple[Effect, ...],
-    fitted: Fitted,
-    looked_at: tuple[Evidence, Examined],
-    *,
-    untestable: Mapping[str, str],
-    defects: Mapping[str, str],
-    n_replicates: int,
-    work: float,
-) -> Discrepancy:
+def build_verdict(found: Findings, data: Prepared, model: tuple[Effect, ...], fitted: Fitted) -> Discrepancy:
     """Build the verdict.
 
     Args:
         found: results of the search.
+        data: that were searched.
         model: effects of the final model.
         fitted: the pixels under it.
-        looked_at: evidence of the train samples, and the samples examined.
-        untestable: effects that such data cannot show, and why.
-        defects: candidates that failed, and why.
-        n_replicates: number of simulated stacks or histograms.
-        work: counted work, CPU seconds.
     """
+    additions, before, after = found.added.additions, found.before, found.added.after
     # unidentified gain and read noise give no size in e-
     sizes = {
         each.effect: None
         if found.doubt
-        else size_of(fitted.seen(each.effect), fitted.maps, looked_at[1].frames)
-        for each in found.added.additions
+        else size_of(fitted.seen(each.effect), fitted.maps, data.examined.frames)
+        for each in additions
     }
     both = found.z.both
     pulls = found.first.pulls(both, splits=2), found.last.pulls(both, splits=2)
@@ -305,23 +294,31 @@ def build_verdict(
             effects=tuple(dict.fromkeys(effect.tag for effect in found.named)),
             model_effects=tuple(effect.model_dump(mode="json") for effect in model),
             proposed=tuple(effect.model_dump(mode="json") for effect in found.proposed),
-            steps=tuple(each.step(sizes[each.effect]) for each in found.added.additions),
-            gap=_gap_change(found.before, found.added),
+            steps=tuple(each.step(sizes[each.effect]) for each in additions),
+            gap=GapChange(
+                before=before.value,
+                after=after.value,
+                floor=after.floor,
+                closed_fraction=closed_share(before.value, after.value) if additions else 0.0,
+                interval_before=before.interval,
+                interval_after=after.interval,
+                standing_out=after.standing_out,
+            ),
             where=tuple(found.places),
             unexplained=(*found.added.residuals, *_still(found, pulls[1])),
             set_aside=found.added.set_aside if found.named else (),
-            untestable=dict(untestable),
-            defects=dict(defects),
-            examined=looked_at[1],
+            untestable=dict(data.untestable),
+            defects=dict(data.defects),
+            examined=data.examined,
             p_global=Change(before=found.first.global_p(both, 2), after=found.last.global_p(both, 2)),
-            replicates=n_replicates,
-            work=round(work, 1),
+            replicates=data.effort.replicates,
+            work=round(data.effort.spent, 1),
             versions={"statistics": VERSION},
         ),
         model=model,
         maps=fitted.maps,
-        evidence=looked_at[0],
-        statistics=(found.first.names, pulls[0], pulls[1]),
+        evidence=data.evidence,
+        statistics=(found.first.names, *pulls),
         code_extended=fitted.code_extended,
         added=fitted.added,
     )
@@ -353,19 +350,6 @@ def largest_pulls(
     )
 
 
-def _gap_change(before: Gap, added: Added) -> GapChange:
-    after = added.after
-    return GapChange(
-        before=before.value,
-        after=after.value,
-        floor=after.floor,
-        closed_fraction=closed_share(before.value, after.value) if added.additions else 0.0,
-        interval_before=before.interval,
-        interval_after=after.interval,
-        standing_out=after.standing_out,
-    )
-
-
 def _more_samples(other: Candidate) -> str:
     """Return the data that decide between a candidate and the best.
 
@@ -391,15 +375,13 @@ def _nearly(found: Findings) -> str:
     return f"; borderline: {'; '.join(words)}; take more frames to decide" if words else ""
 
 
-_OF_PIXELS = " (histograms of single pixels only; frames, rows, columns and neighbours were not tested)"
-
-
 def _sentence(found: Findings, sizes: Mapping[Effect, Size | None]) -> str:
     """Return the verdict in one sentence: the effect, its size, and the remaining discrepancy."""
     state, data, added = found.state, found.samples, found.added
     titles = [_sized(effect, sizes) for effect in found.named]
     if state == "consistent":
-        seen = _OF_PIXELS if data == "histograms" else ""
+        seen = " (histograms of single pixels only; frames, rows, columns and neighbours were not tested)"
+        seen = seen if data == "histograms" else ""
         return f"Data and model agree in every statistic tested{seen}{_nearly(found)}."
     if state == "cannot_tell":
         return (
@@ -420,11 +402,10 @@ def _sentence(found: Findings, sizes: Mapping[Effect, Size | None]) -> str:
     if state == "named_in_part":
         words = f"{_rest(found)}{_shown(found)}{_nearest(found)}{_left(added)}{_doubts(added)}"
         return f"The model was missing {_and(titles)}{words}{_broken(found)}."
-    words = f"with {'them' if len(titles) > 1 else 'it'}, {_AGREE}{_left(added)}{_doubts(added)}"
-    return f"The model was missing {_and(titles)}; {words}."
-
-
-_AGREE = "data and model agree within sampling noise"
+    return (
+        f"The model was missing {_and(titles)}; with {'them' if len(titles) > 1 else 'it'}, data and model "
+        f"agree within sampling noise{_left(added)}{_doubts(added)}."
+    )
 
 
 def _none(found: Findings) -> str:
@@ -464,17 +445,16 @@ def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Si
     lead = f"The model was missing {_and(titles)}; {_none(found)} explains the rest"
     if not titles:
         lead = f"{_none(found).capitalize()} explains the discrepancy"
-    return (
-        f"{lead}; empirically, {words}; this {_closed(found)}, and is a description, not a cause"
-        f"{_remains(found)}{_broken(found)}."
-    )
-
-
-def _remains(found: Findings) -> str:
-    """State whether an empirical description is complete, and in the model."""
+    before, after = found.before, found.added.after
+    closed = f"does not reduce the discrepancy in unseen {found.samples}"
+    if not before.at_floor and after.value < before.value:
+        share = share_text(closed_share(before.value, after.value))
+        closed = f"explains {share} of the discrepancy in unseen {found.samples}"
+    rest = "; single statistics still disagree" if found.still else ""
     if found.proposed:
-        return "; more than sampling noise remains, so it is proposed, not added to the model"
-    return "; single statistics still disagree" if found.still else ""
+        rest = "; more than sampling noise remains, so it is proposed, not added to the model"
+    lead = f"{lead}; empirically, {words}; this {closed}, and is a description, not a cause"
+    return f"{lead}{rest}{_broken(found)}."
 
 
 def _nearest(found: Findings) -> str:
@@ -494,15 +474,6 @@ def _title(tag: str) -> str:
     """Return the title of an effect."""
     effect = effect_classes().get(tag)
     return tag if effect is None else effect.title or tag
-
-
-def _closed(found: Findings) -> str:
-    """State the share of the gap that an empirical description explains."""
-    before, after = found.before, found.added.after
-    if before.at_floor or after.value >= before.value:
-        return f"does not reduce the discrepancy in unseen {found.samples}"
-    share = share_text(closed_share(before.value, after.value))
-    return f"explains {share} of the discrepancy in unseen {found.samples}"
 
 
 def _rest(found: Findings) -> str:

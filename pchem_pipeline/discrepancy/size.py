@@ -6,7 +6,6 @@ rounding and around the mean of each pixel.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
-from pchem_pipeline.discrepancy.verdict import RARE, Size, parameters_of
+from pchem_pipeline.discrepancy.verdict import RARE, Size
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -30,7 +29,6 @@ _FEWEST_FRAMES = 20_000
 _FEWEST_BLOCKS = 4  # of the whole sensor
 _BITS = 24
 _CHANGED = 1e-9
-_IN_DN = (Plane.ADC, Plane.READOUT)
 
 
 def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
@@ -43,12 +41,17 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     """
     if not maps.usable.any():
         return None
+    gain, noise = maps.conversion_gain[maps.usable], float(np.median(maps.read_noise_dn[maps.usable]))
     scatter = effect.added_scatter_e(maps.quanta_exposure[maps.usable])
     if scatter is not None:
-        return _of_scatter(scatter, maps)
-    if _is_measured_noise(effect):
-        return _of_noise(float(getattr(effect, effect.strength)), maps)
-    blocks, noise = _BLOCKS, float(np.median(maps.read_noise_dn[maps.usable]))
+        electrons, dn = (float(np.sqrt(np.mean(each**2))) for each in (scatter, scatter / gain))
+        return Size(electrons=electrons, dn=dn, of_read_noise=dn / noise)
+    if effect.empirical and effect.power == 2.0 and effect.unit(effect.strength) == "DN":
+        # what samples share as it was measured: of light that varies they change by whole electrons, most of
+        # them by their own chance
+        dn = float(getattr(effect, effect.strength))
+        return Size(electrons=dn * float(np.median(gain)), dn=dn, of_read_noise=dn / noise)
+    blocks = _BLOCKS
     if effect.far_reaching:
         blocks = max(_BLOCKS * _MOST_ROWS**2 // maps.usable.size, _FEWEST_BLOCKS)
     else:
@@ -69,8 +72,8 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     if not changes:
         return None
     share = float(np.mean([np.mean(np.abs(change) > _CHANGED) for change in changes]))
-    gain = np.where(maps.usable, maps.conversion_gain, np.median(maps.conversion_gain[maps.usable]))
-    gain, in_dn = gain[inside], effect.plane in _IN_DN
+    gain = np.where(maps.usable, maps.conversion_gain, np.median(maps.conversion_gain[maps.usable]))[inside]
+    in_dn = effect.plane in (Plane.ADC, Plane.READOUT)
     dn = _spread([change if in_dn else change / gain for change in changes], share)
     return Size(
         electrons=_spread([change * gain if in_dn else change for change in changes], share),
@@ -78,30 +81,6 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         of_read_noise=dn / noise,
         samples=share,
     )
-
-
-def _is_measured_noise(effect: Effect) -> bool:
-    """Tell whether the strength of an effect is the measured standard deviation of what samples share, DN.
-
-    Where it is light that varies, samples change by whole electrons, most of them by their own chance.
-    """
-    if not effect.empirical or effect.power != 2.0:
-        return False
-    return parameters_of(effect, math.nan)[effect.strength].unit == "DN"
-
-
-def _of_scatter(electrons: FloatArray, maps: PixelMaps) -> Size:
-    """Return the size of a scatter of so many e- of each usable pixel."""
-    in_dn = electrons / maps.conversion_gain[maps.usable]
-    dn, noise = float(np.sqrt(np.mean(in_dn**2))), float(np.median(maps.read_noise_dn[maps.usable]))
-    return Size(electrons=float(np.sqrt(np.mean(electrons**2))), dn=dn, of_read_noise=dn / noise)
-
-
-def _of_noise(dn: float, maps: PixelMaps) -> Size:
-    """Return the size of a noise of so many DN, at the gain and read noise of the median pixel."""
-    gain = float(np.median(maps.conversion_gain[maps.usable]))
-    noise = float(np.median(maps.read_noise_dn[maps.usable]))
-    return Size(electrons=dn * gain, dn=dn, of_read_noise=dn / noise)
 
 
 def _change(effect: Effect, maps: PixelMaps, n_frames: int, blocks: int, seed: int) -> FloatArray | None:

@@ -136,16 +136,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         data.samples, z, first, null, before, places, still, added, data.doubt, limit or by.limit
     )
     model = found.model(present, by.model)
-    return build_verdict(
-        found,
-        model,
-        by.fitted(model),
-        (data.evidence, data.examined),
-        untestable=data.untestable,
-        defects=data.defects,
-        n_replicates=data.effort.replicates,
-        work=data.effort.spent,
-    )
+    return build_verdict(found, data, model, by.fitted(model))
 
 
 def _extended(
