@@ -170,7 +170,8 @@ class NullModel:
         tests = _effective_tests(names, vectors, skewness)
         if before is not None:
             moved = before.moved_by(vectors)
-            pooled = np.where(moved, std, _pooled(std, len(vectors), before.std, before.n_replicates))
+            n, m = len(vectors), before.n_replicates
+            pooled = np.where(moved, std, np.sqrt((n * std**2 + m * before.std**2) / (n + m)))
             covariance = covariance.scaled(pooled / std)
             std, skewness, tests = pooled, before.skewness, before.effective_tests
         return cls(names, mean, std, covariance, vectors, skewness, tests)
@@ -287,10 +288,6 @@ def as_matrix(
             raise KeyError(names[int(j)])
         found[lacking[:, j], j] = there.mean() if there.size else np.asarray(usual)[j]
     return found
-
-
-def _pooled(first: FloatArray, n_first: int, second: FloatArray, n_second: int) -> FloatArray:
-    return np.asarray(np.sqrt((n_first * first**2 + n_second * second**2) / (n_first + n_second)))
 
 
 def _std(deviations: FloatArray) -> FloatArray:

@@ -231,25 +231,24 @@ def _significant(
     return place if place.log_p <= math.log(significance) else None
 
 
-def affected_share(z: FloatArray, inside: BoolArray, level: float = SURE) -> float:
+def affected_share(z: FloatArray, inside: BoolArray) -> float:
     """Return a lower bound of the share of the values inside a place that are larger than by chance.
 
     All-resolutions inference (Rosenblatt et al. 2018; Goeman and Solari 2011): closed testing with Simes'
     test bounds the number of true deviations of all sets at once, so that the place may have been chosen
-    after looking: ``max_u (1 - u + #{i inside: m p_i <= u level})`` with all m values (Hommel's smaller
-    number would do, and give a little more).
+    after looking: ``max_u (1 - u + #{i inside: m p_i <= u a})`` with all m values (Hommel's smaller
+    number would do, and give a little more). Any of these bounds is too large with the probability a = SURE.
 
     Args:
         z: one-sided deviations of all values, N(0, 1) by chance, (m,).
         inside: the place, (m,).
-        level: probability that any of these bounds is too large.
     """
     n = int(inside.sum())
     if n == 0:
         return 0.0
     p = np.sort(special.ndtr(-z[inside]))
     # the smallest u for which the i-th value counts
-    u = np.maximum(np.ceil(z.size * p / level), 1.0)
+    u = np.maximum(np.ceil(z.size * p / SURE), 1.0)
     bound = 1.0 - u + np.arange(1, n + 1)
     return float(max(bound.max(), 0.0) / n)
 

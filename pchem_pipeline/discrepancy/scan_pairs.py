@@ -106,20 +106,19 @@ def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: in
     return found
 
 
-def shared_elsewhere(samples: Samples, place: Shared, *, significance: float = SIGNIFICANCE) -> Region | None:
+def shared_elsewhere(samples: Samples, place: Shared) -> Region | None:
     """Return all pixels outside a place if they share noise among themselves as those inside do; else None.
 
     Args:
         samples: standardised frames.
         place: found among them.
-        significance: largest probability of a chance.
     """
     rest = samples.without(place.region.mask(samples.usable.shape))
     if rest.usable.sum() <= 2 * FEWEST_PIXELS:
         return None
     pairs = pairs_of(rest)[place.channel][place.mode]
     z = float(pairs.sums.flat[-1]) / math.sqrt(max(2.0 * float(pairs.counts.flat[-1]), 1.0))
-    return Region.of_mask(rest.usable) if special.log_ndtr(-z) <= math.log(significance) else None
+    return Region.of_mask(rest.usable) if special.log_ndtr(-z) <= math.log(SIGNIFICANCE) else None
 
 
 def _most_significant(samples: Samples, log_limit: float) -> Shared | None:

@@ -123,7 +123,11 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     still = disagreed = disagrees(null, z, significance)
     if still or (not data.doubt and by.suspects(null)):
         try:
-            null = _extended(by, null, still, tell) or null
+            tell("comparing candidates")
+            explanation = by.explain(null, still)
+            if explanation is not None:
+                tell("refitting the pixels with the likeliest effects")
+                null = by.add(explanation, null) or null
         except EffortSpentError as spent:
             limit = spent.words()
         still = disagrees(null, z, significance, by.tolerance())
@@ -137,19 +141,3 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     )
     model = found.model(present, by.model)
     return build_verdict(found, data, model, by.fitted(model))
-
-
-def _extended(
-    by: Explainer[Explanation], null: NullModel, still: bool, tell: Callable[[str], None]
-) -> NullModel | None:
-    """Compare candidates and add the best; return the null of the new model, None where none is established.
-
-    Raises:
-        EffortSpentError: the work is at its limit; nothing was added.
-    """
-    tell("comparing candidates")
-    explanation = by.explain(null, still)
-    if explanation is None:
-        return None
-    tell("refitting the pixels with the likeliest effects")
-    return by.add(explanation, null)

@@ -45,20 +45,16 @@ State = Literal[
 _NAN = float("nan")
 
 
-def _number(value: Any) -> Any:
-    return _NAN if value is None else value
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def _two_digits(value: float) -> str:
     """Format a number to two significant digits without an exponent: 0.035, 21, 2,000."""
     return f"{value:.2g}" if abs(value) < 99.5 else f"{float(f'{value:.2g}'):,.0f}"
 
 
-Number = Annotated[float, BeforeValidator(_number), PlainSerializer(_finite, when_used="json")]
+Number = Annotated[
+    float,
+    BeforeValidator(lambda value: _NAN if value is None else value),
+    PlainSerializer(lambda value: value if math.isfinite(value) else None, when_used="json"),
+]
 Interval = tuple[Number, Number]
 
 

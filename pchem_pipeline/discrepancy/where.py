@@ -88,17 +88,16 @@ def suspected_frames(
     return {name: frames for name, frames in found.items() if frames}
 
 
-def unfitted_place(usable: BoolArray, significance: float = SIGNIFICANCE) -> Suspect | None:
+def unfitted_place(usable: BoolArray) -> Suspect | None:
     """Return where pixels without a fit to be relied upon come together; None where chance explains it.
 
     An effect of single pixels in a part of the sensor may leave only that to be seen.
 
     Args:
         usable: pixels with a fit, (y, x).
-        significance: largest probability of a chance, in any place.
     """
     alike, every = np.ones(usable.shape), np.ones(usable.shape, np.bool_)
-    return next(iter(scan_event_map(~usable, alike, every, significance=significance, most=1)), None)
+    return next(iter(scan_event_map(~usable, alike, every, most=1)), None)
 
 
 def pixel_maps(evidence: Evidence) -> dict[str, FloatArray]:
@@ -281,16 +280,12 @@ def _frames(name: str, evidence: Evidence) -> tuple[int, ...]:
     if name.startswith("tail.high") and time.hits.size:
         return tuple(int(f) for f in np.unique(time.hits[:, 0])[:_MOST_LISTED])
     if name.endswith(".largest"):
-        series = _series(name, time)
+        series = time.frame_charge if ".charge." in name else time.frame_readout
         spread = robust_sd(series)
         order = np.argsort(-np.abs(series - np.median(series)))
         outlying = [i for i in order if abs(series[i] - np.median(series)) > 5.0 * spread]
         return tuple(sorted(int(time.frames[i]) for i in (outlying or order[:1])[:_MOST_LISTED]))
     return ()
-
-
-def _series(name: str, time: TimeSeries) -> FloatArray:
-    return time.frame_charge if ".charge." in name else time.frame_readout
 
 
 # -- samples that chance hardly makes ---------------------------------------------------------------

@@ -203,7 +203,9 @@ def part_statistics(
     Arguments as in :func:`part_evidence`.
     """
     found: dict[str, float] = {}
-    leading = _leading() if parts else ()
+    # of all effects, in the order of the catalogue
+    wanted = {name for effect in effect_classes().values() for name in effect.signature[:_LEADING]}
+    leading = [name for name in STATISTICS if name in wanted]
     window = window or SensorWindow.whole(frames.shape)
     for part in parts:
         mask = window.mask(part.region)
@@ -220,9 +222,3 @@ def part_statistics(
             continue
         found |= {f"{name}@{part.text}": evidence.z[name] for name in leading if name in evidence.z}
     return found
-
-
-def _leading() -> tuple[str, ...]:
-    """Return the leading statistics of all effects, in the order of the catalogue."""
-    wanted = {name for effect in effect_classes().values() for name in effect.signature[:_LEADING]}
-    return tuple(name for name in STATISTICS if name in wanted)

@@ -95,12 +95,6 @@ def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     )
 
 
-def code_ranges(laws: PixelLaws, usable: BoolArray) -> NDArray[np.int32]:
-    """Return first code, last code and first row of the tables, (3, y, x); row 0 (zeros) where not usable."""
-    first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T
-    return np.stack([first, first + length - 1, start]).reshape(3, *usable.shape).astype(np.int32)
-
-
 def samples_beyond(frames: NDArray[Any], laws: PixelLaws, usable: BoolArray, *, above: bool) -> IntArray:
     """Return the samples above or below the support of their pixel, by frame: position, y, x, DN."""
     seen = (laws.moments["high" if above else "low"][:, 0] > 0).reshape(usable.shape) & usable
@@ -195,14 +189,16 @@ class Samples:
         usable = pixels.usable
         tables = laws.tables
         if standardised:
-            codes = np.where(laws.good, laws.support[:, 1], 0)
+            length = np.where(laws.good, laws.support[:, 1], 0)
             deviation = np.sqrt(np.where(usable, pixels.variance, 1.0)).reshape(2, -1).astype(np.float32)
-            tables = tables[: 1 + codes.sum()].copy()
-            tables[1:] /= np.repeat(deviation.T, codes, axis=0)
+            tables = tables[: 1 + length.sum()].copy()
+            tables[1:] /= np.repeat(deviation.T, length, axis=0)
             # a track of a particle is no common mode
             np.clip(tables, -FAR, FAR, out=tables)
-        first, last, start = code_ranges(laws, usable)
-        return cls(frames, first, last, start, tables, usable)
+        # of pixels that do not count the row 0, of zeros
+        first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T
+        ranges = np.stack([first, first + length - 1, start]).reshape(3, *usable.shape).astype(np.int32)
+        return cls(frames, ranges[0], ranges[1], ranges[2], tables, usable)
 
     @property
     def n_frames(self) -> int:

@@ -131,18 +131,10 @@ def _levels(power: Float32Array) -> list[Float32Array]:
     series = power.reshape(len(power), -1)
     found = []
     for values, shape in ((series.T, (1, *power.shape[1:])), (series, (-1, 1, 1))):
-        level = _median(values) / np.log(2.0)
+        level = np.median(values, axis=1) / np.log(2.0)
         noise = np.where(level > 1.0 + BEYOND_DOUBT / np.sqrt(values.shape[1]), level, 1.0)
         found.append(noise.astype(np.float32).reshape(shape))
     return found
-
-
-def _median(values: Float32Array) -> Float32Array:
-    """Return the median of each row, faster than numpy, which looks for both middle ones at once."""
-    middle = values.shape[1] // 2
-    ordered = np.partition(values, middle, axis=1)
-    upper = ordered[:, middle]
-    return upper if values.shape[1] % 2 else np.mean([ordered[:, :middle].max(axis=1), upper], axis=0)
 
 
 def _steady(u: Float32Array, numbers: IntArray, ratio: Float32Array) -> Wave | None:

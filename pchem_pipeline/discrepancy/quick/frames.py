@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy import special
+from scipy import ndimage, special
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.laws import FAR, SLOWEST, best, chi_square
@@ -26,7 +26,7 @@ _FEWEST_OF_LEVEL, _LEAST_SHARE = 4, 0.01
 _SHOT_SHARE = 0.25
 _MOST_LEVELS = 8
 _SHOWN = 3
-#: Frequencies on either side from which the noise around one is taken.
+#: Frequencies on either side, but for the next ones, from which the noise around one is taken.
 _AROUND = 64
 
 
@@ -82,7 +82,12 @@ def _period(series: FloatArray) -> Check:
     power = np.abs(np.fft.rfft(series)[1:]) ** 2
     freedom = np.full(power.size, 2.0)
     freedom[n // 2 - 1 :] = 1.0 if n % 2 == 0 else 2.0
-    around, width = _around(power)
+    beside = np.ones(2 * _AROUND + 1)
+    beside[_AROUND - 1 : _AROUND + 2] = 0.0
+    total, width = (
+        ndimage.convolve1d(each, beside, mode="constant") for each in (power, np.ones(power.size))
+    )
+    around = total / width
     p = special.fdtrc(freedom, 2.0 * width, power / np.maximum(around, 1e-300))
     at = int(np.argmin(p))
     # a line between two frequencies spreads over those around it
@@ -91,18 +96,6 @@ def _period(series: FloatArray) -> Check:
     words = f"period {n / (at + 1):.4g} frames" if freedom[at] == 2.0 else "even and odd frames differ"
     size = math.sqrt(freedom[at] * height) / n
     return check_of("period", look_elsewhere(float(p[at]), power.size), size, where=words)
-
-
-def _around(power: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the mean power around each frequency, itself left out, and of how many it is."""
-    size = power.size
-    total = np.concatenate([[0.0], np.cumsum(power)])
-    index = np.arange(size)
-    low, high = np.maximum(index - _AROUND, 0), np.minimum(index + _AROUND + 1, size)
-    inner_low, inner_high = np.maximum(index - 1, 0), np.minimum(index + 2, size)
-    count = (high - low) - (inner_high - inner_low)
-    sums = total[high] - total[low] - total[inner_high] + total[inner_low]
-    return np.maximum(sums, 0.0) / np.maximum(count, 1), np.maximum(count, 1).astype(np.float64)
 
 
 def _memory(series: FloatArray) -> Check:
