@@ -26,8 +26,7 @@ _NEXT_ALONG = {"next_x": 1, "next_y": 0}
 
 def block_deviations(sums: StackSums) -> FloatArray:
     """Return the mean of each pixel over each block, less that over the run and that of all pixels, DN."""
-    means = sums.block_sum / sums.lengths[:, None, None]
-    means -= np.average(means, axis=0, weights=sums.lengths)
+    means = sums.block_means()
     # the median over the pixels, for what all of them do: hot pixels move more
     return np.asarray(means - np.median(means, axis=(1, 2))[:, None, None])
 

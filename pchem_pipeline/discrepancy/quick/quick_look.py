@@ -215,8 +215,7 @@ def _local_drift(sums: StackSums, place: Suspect | None) -> Check:
     common = block_deviations(sums)[:, inside].mean(axis=1)
     chance = float(sums.variance[inside].mean()) / (float(sums.lengths.mean()) * inside.sum())
     size = math.sqrt(max(float(np.average(common**2, weights=sums.lengths)) - chance, 0.0))
-    words, numbers = place.region.describe(), place.region.numbers()
-    return check_of("local_drift", place.p, size, where=words, region=numbers)
+    return _placed(check_of("local_drift", place.p, size), place, sums)
 
 
 # -- what is common to lines and frames ----------------------------------------------------------
@@ -413,15 +412,13 @@ def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
     lengths = sums.lengths
     if lengths.size < MINIMUM_BLOCKS:
         return []
-    means = sums.block_sum / lengths[:, None, None]
-    means -= np.average(means, axis=0, weights=lengths)
     some = sums.variance > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         charge = np.where(maps.usable, maps.quanta_exposure / maps.conversion_gain, 0.0)[some]
         # the third central moment of the samples, H / g^3
         third = np.where(maps.usable, maps.quanta_exposure / maps.conversion_gain**3, 0.0)[some]
     weight = 1.0 / sums.variance[some]
-    values = means[:, some]
+    values = sums.block_means()[:, some]
     basis = np.stack([np.ones(charge.size), charge])
     inner = (basis * weight) @ basis.T
     shared = np.linalg.lstsq(inner, (basis * weight) @ values.T, rcond=None)[0]

@@ -162,6 +162,12 @@ class StackSums:
         within /= float(lengths.sum() - lengths.size)
         return within
 
+    def block_means(self) -> FloatArray:
+        """Return the mean of each pixel over each block at hand, less that over all, (b, y, x), DN."""
+        means = self.block_sum / self.lengths[:, None, None]
+        means -= np.average(means, axis=0, weights=self.lengths)
+        return means
+
     @cached_property
     def mean_signal(self) -> FloatArray:
         """Mean of each pixel over the frames of the blocks at hand, (y, x), DN."""
@@ -181,43 +187,39 @@ class StackSums:
     @cached_property
     def rows(self) -> Lines:
         """Sums over the rows of all frames."""
-        ny, nx = self.shape
-        v = self.variance
-        pairs = v.sum(axis=1) ** 2 - (v**2).sum(axis=1) - 2.0 * (v[:, :-1] * v[:, 1:]).sum(axis=1)
-        return Lines(
-            self.row_sum,
-            self.starts,
-            self.freedom,
-            v.sum(axis=1),
-            pairs,
-            np.nansum(self.next_x, axis=1),
-            np.full(ny, nx),
-        )
+        whole = np.zeros(1, np.int64)
+        return _lines(self.row_sum, self.lengths, self.variance.T, self.next_x.T, whole)
 
     @cached_property
     def columns(self) -> Lines:
         """Sums over the columns of each group of rows, (group, x) in one axis, of some blocks."""
-        ny, nx = self.shape
-        lengths = self.lengths[self.column_blocks]
-        starts = np.cumsum(lengths) - lengths
-        freedom = float(lengths.sum() - lengths.size)
-        everywhere = self.column_blocks.size == self.lengths.size
-        v = self.variance if everywhere else self._variance(self.column_blocks)
-        tops = np.arange(0, ny, ROW_GROUP)
-        total, square = np.add.reduceat(v, tops, axis=0), np.add.reduceat(v**2, tops, axis=0)
-        product = np.zeros_like(v)
-        np.multiply(v[:-1], v[1:], out=product[:-1])
-        product[ROW_GROUP - 1 :: ROW_GROUP] = 0.0  # no product crosses the border of a group
-        along = np.add.reduceat(product, tops, axis=0)
-        del product  # as large as a map
-        covariance = np.add.reduceat(np.nan_to_num(self.next_y), tops, axis=0)
-        heights = np.diff(np.append(tops, ny))
-        return Lines(
-            self.column_sum.reshape(self.column_sum.shape[0], -1),
-            starts,
-            freedom,
-            total.ravel(),
-            (total**2 - square - 2.0 * along).ravel(),
-            covariance.ravel(),
-            np.repeat(heights, nx),
-        )
+        some, groups = self.column_blocks, np.arange(0, self.shape[0], ROW_GROUP)
+        variance = self.variance if some.size == self.lengths.size else self._variance(some)
+        sums = self.column_sum.reshape(self.column_sum.shape[0], -1)
+        return _lines(sums, self.lengths[some], variance, self.next_y, groups)
+
+
+def _lines(
+    sums: NDArray[np.signedinteger],
+    lengths: IntArray,
+    variance: FloatArray,
+    covariance: FloatArray,
+    groups: IntArray,
+) -> Lines:
+    """Return lines along the first axis of maps (along, across), cut into groups of pixels by their first."""
+    total, square = (np.add.reduceat(each, groups, axis=0) for each in (variance, variance**2))
+    product = np.zeros_like(variance)
+    np.multiply(variance[:-1], variance[1:], out=product[:-1])
+    product[groups[1:] - 1] = 0.0  # no product crosses the border of a group
+    along = np.add.reduceat(product, groups, axis=0)
+    del product  # as large as a map
+    heights = np.diff(np.append(groups, len(variance)))
+    return Lines(
+        sums,
+        np.asarray(np.cumsum(lengths) - lengths),
+        float(lengths.sum() - lengths.size),
+        total.ravel(),
+        (total**2 - square - 2.0 * along).ravel(),
+        np.add.reduceat(np.nan_to_num(covariance), groups, axis=0).ravel(),
+        np.repeat(heights, variance.shape[1]),
+    )
