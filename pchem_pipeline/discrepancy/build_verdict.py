@@ -10,33 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.discrepancy import verdict as schema
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
 from pchem_pipeline.discrepancy.size import size_of
-from pchem_pipeline.discrepancy.verdict import (
-    CONVINCING_PLACEBO,
-    MOST_PULLS,
-    Candidate,
-    Change,
-    Discrepancy,
-    Families,
-    GapChange,
-    Moved,
-    Place,
-    Pull,
-    Rival,
-    Size,
-    State,
-    Step,
-    Verdict,
-    closed_share,
-    families_words,
-    form_of,
-    parameters_of,
-    share_text,
-    sigma_text,
-)
 from pchem_pipeline.effects.framework.compose import AddedExposure, place_words, title_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -83,13 +61,13 @@ class Addition:
     effect: Effect
     alone: bool
     against: str
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[schema.Candidate, ...]
     strength_stderr: float
     before: Gap
     after: Gap
-    rivals: tuple[Rival, ...]
-    placebo: Rival | None
-    pulls: tuple[Pull, ...]
+    rivals: tuple[schema.Rival, ...]
+    placebo: schema.Rival | None
+    pulls: tuple[schema.Pull, ...]
     moved: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     described: bool = False
     certain: bool = True
@@ -110,7 +88,7 @@ class Addition:
         return self.verdict == "named"
 
     @property
-    def verdict(self) -> State:
+    def verdict(self) -> schema.State:
         """The verdict on this effect alone."""
         if self.described:
             return "described"
@@ -118,25 +96,25 @@ class Addition:
             return "unexplained"
         return "named" if self.alone and self.confirmed else "ambiguous"
 
-    def step(self, size: Size | None) -> Step:
+    def step(self, size: schema.Size | None) -> schema.Step:
         """Make its entry in ``discrepancy.json``."""
-        return Step(
+        return schema.Step(
             effect=self.effect.tag if self.named else None,
             verdict=self.verdict,
             # an unconfirmed effect without a competitor is listed alone
             candidates=self.candidates[:1] if self.alone and not self.confirmed else self.candidates,
-            parameters=parameters_of(self.effect, self.strength_stderr),
-            form=form_of(self.effect),
+            parameters=schema.parameters_of(self.effect, self.strength_stderr),
+            form=schema.form_of(self.effect),
             place=place_words(self.effect),
             gap_before=self.before.value,
             gap_after=self.after.value,
             gap_floor=self.after.floor,
             gap_interval_after=self.after.interval,
-            families=Families(before=dict(self.before.families), after=dict(self.after.families)),
+            families=schema.Families(before=dict(self.before.families), after=dict(self.after.families)),
             size=size,
             rivals=self.rivals,
             placebo=self.placebo,
-            moved={name: Moved(**change) for name, change in self.moved.items()},
+            moved={name: schema.Moved(**change) for name, change in self.moved.items()},
             separate=self._separate(),
             pulls=self.pulls,
         )
@@ -175,7 +153,7 @@ class Added:
     unfinished: bool = False
     nearest: tuple[str, ...] = ()
     stand_ins: tuple[str, ...] = ()
-    residuals: tuple[Place, ...] = ()
+    residuals: tuple[schema.Place, ...] = ()
     set_aside: tuple[tuple[float | None, float | None], ...] = ()
 
 
@@ -213,14 +191,14 @@ class Findings:
     first: NullModel
     last: NullModel
     before: Gap
-    places: Sequence[Place]
+    places: Sequence[schema.Place]
     still: bool
     added: Added
     doubt: str = ""
     limit: str = ""
 
     @property
-    def state(self) -> State:
+    def state(self) -> schema.State:
         """The kind of verdict."""
         additions = self.added.additions
         if not additions:
@@ -265,7 +243,9 @@ class Findings:
         return tuple(effect for effect in extended if effect.key in keys)
 
 
-def build_verdict(found: Findings, data: Prepared, model: tuple[Effect, ...], fitted: Fitted) -> Discrepancy:
+def build_verdict(
+    found: Findings, data: Prepared, model: tuple[Effect, ...], fitted: Fitted
+) -> schema.Discrepancy:
     """Build the verdict.
 
     Args:
@@ -284,8 +264,8 @@ def build_verdict(found: Findings, data: Prepared, model: tuple[Effect, ...], fi
     }
     both = found.z.both
     pulls = found.first.pulls(both, splits=2), found.last.pulls(both, splits=2)
-    return Discrepancy(
-        verdict=Verdict(
+    return schema.Discrepancy(
+        verdict=schema.Verdict(
             verdict=found.state,
             sentence=_sentence(found, sizes).removesuffix(".")
             + (f"; {found.limit}." if found.limit else "."),
@@ -295,11 +275,11 @@ def build_verdict(found: Findings, data: Prepared, model: tuple[Effect, ...], fi
             model_effects=tuple(effect.model_dump(mode="json") for effect in model),
             proposed=tuple(effect.model_dump(mode="json") for effect in found.proposed),
             steps=tuple(each.step(sizes[each.effect]) for each in additions),
-            gap=GapChange(
+            gap=schema.GapChange(
                 before=before.value,
                 after=after.value,
                 floor=after.floor,
-                closed_fraction=closed_share(before.value, after.value) if additions else 0.0,
+                closed_fraction=schema.closed_share(before.value, after.value) if additions else 0.0,
                 interval_before=before.interval,
                 interval_after=after.interval,
                 standing_out=after.standing_out,
@@ -310,7 +290,7 @@ def build_verdict(found: Findings, data: Prepared, model: tuple[Effect, ...], fi
             untestable=dict(data.untestable),
             defects=dict(data.defects),
             examined=data.examined,
-            p_global=Change(before=found.first.global_p(both, 2), after=found.last.global_p(both, 2)),
+            p_global=schema.Change(before=found.first.global_p(both, 2), after=found.last.global_p(both, 2)),
             replicates=data.effort.replicates,
             work=round(data.effort.spent, 1),
             versions={"statistics": VERSION},
@@ -324,7 +304,7 @@ def build_verdict(found: Findings, data: Prepared, model: tuple[Effect, ...], fi
     )
 
 
-def _still(found: Findings, pulls: FloatArray) -> list[Place]:
+def _still(found: Findings, pulls: FloatArray) -> list[schema.Place]:
     """Return the largest disagreement with the final model, and other significant ones."""
     if not found.still:
         return []
@@ -332,25 +312,25 @@ def _still(found: Findings, pulls: FloatArray) -> list[Place]:
     chance = [look_elsewhere(p, tests) for p in found.last.p_of(pulls, 2).tolist()]
     order = np.argsort(-np.abs(pulls))[:_MOST_UNEXPLAINED].tolist()
     kept = [i for n, i in enumerate(order) if n == 0 or chance[i] < NO_CHANCE]
-    return [Place.of(found.last.names[i], z=float(pulls[i])) for i in kept]
+    return [schema.Place.of(found.last.names[i], z=float(pulls[i])) for i in kept]
 
 
 def largest_pulls(
     names: Sequence[str], weight: FloatArray, before: FloatArray, after: FloatArray
-) -> tuple[Pull, ...]:
+) -> tuple[schema.Pull, ...]:
     """Return the statistics of largest weight with their pulls; all arguments have shape (m,)."""
     return tuple(
-        Pull(
+        schema.Pull(
             statistic=names[i],
             sentence=STATISTICS[names[i]].says(float(before[i])),
             before=float(before[i]),
             after=float(after[i]),
         )
-        for i in np.argsort(-np.abs(weight))[:MOST_PULLS]
+        for i in np.argsort(-np.abs(weight))[: schema.MOST_PULLS]
     )
 
 
-def _more_samples(other: Candidate) -> str:
+def _more_samples(other: schema.Candidate) -> str:
     """Return the data that decide between a candidate and the best.
 
     A difference of log-likelihoods grows with the number of samples, its standard error with the root.
@@ -375,7 +355,7 @@ def _nearly(found: Findings) -> str:
     return f"; borderline: {'; '.join(words)}; take more frames to decide" if words else ""
 
 
-def _sentence(found: Findings, sizes: Mapping[Effect, Size | None]) -> str:
+def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Return the verdict in one sentence: the effect, its size, and the remaining discrepancy."""
     state, data, added = found.state, found.samples, found.added
     titles = [_sized(effect, sizes) for effect in found.named]
@@ -413,7 +393,7 @@ def _none(found: Findings) -> str:
     return "no effect tried" if found.limit else "no known effect"
 
 
-def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
+def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Describe effects between which the data do not decide, and unconfirmed ones."""
     data, additions = found.samples, found.added.additions
     unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in additions if not each.alone]
@@ -429,7 +409,7 @@ def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Si
     return f"{also} lacks {_and(unknown)}: these {data} do not decide which{weak}{rest}."
 
 
-def _sized(effect: Effect, sizes: Mapping[Effect, Size | None]) -> str:
+def _sized(effect: Effect, sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Describe an effect by name, size and region."""
     size = sizes.get(effect)
     if size is None:
@@ -438,7 +418,7 @@ def _sized(effect: Effect, sizes: Mapping[Effect, Size | None]) -> str:
     return f"{_title(effect.tag)} of {size.words()}{place}"
 
 
-def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
+def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Describe the data empirically where no known effect explains them."""
     known = [(effect.describe(), sizes.get(effect)) for effect in found.described]
     words = "; and ".join(text if size is None else f"{text}, size {size.words()}" for text, size in known)
@@ -448,7 +428,7 @@ def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Si
     before, after = found.before, found.added.after
     closed = f"does not reduce the discrepancy in unseen {found.samples}"
     if not before.at_floor and after.value < before.value:
-        share = share_text(closed_share(before.value, after.value))
+        share = schema.share_text(schema.closed_share(before.value, after.value))
         closed = f"explains {share} of the discrepancy in unseen {found.samples}"
     rest = "; single statistics still disagree" if found.still else ""
     if found.proposed:
@@ -482,8 +462,9 @@ def _rest(found: Findings) -> str:
     if after.at_floor or found.before.value <= 0.0:
         return ""
     if after.value <= after.floor:
-        return f"; a significant discrepancy remains in {families_words(after.standing_out)}"
-    return f"; {share_text(1.0 - closed_share(found.before.value, after.value))} of the discrepancy remains"
+        return f"; a significant discrepancy remains in {schema.families_words(after.standing_out)}"
+    left = 1.0 - schema.closed_share(found.before.value, after.value)
+    return f"; {schema.share_text(left)} of the discrepancy remains"
 
 
 def _broken(found: Findings) -> str:
@@ -505,7 +486,7 @@ def _shown(found: Findings) -> str:
     worst = int(np.argmax(np.abs(pulls)))
     name = found.last.names[worst]
     says = STATISTICS[name].says(float(pulls[worst]))
-    return f"; one statistic still disagrees: {says} ({sigma_text(pulls[worst])})"
+    return f"; one statistic still disagrees: {says} ({schema.sigma_text(pulls[worst])})"
 
 
 def _doubts(added: Added) -> str:
@@ -515,11 +496,10 @@ def _doubts(added: Added) -> str:
         closed = each.before.value - each.after.value
         if each.named and each.placebo is not None and closed > 0.0:
             share = (each.before.value - max(each.placebo.gap_after, 0.0)) / closed
-            if share > CONVINCING_PLACEBO:
-                words += (
-                    f"; an unrelated control, {_title(each.placebo.effect)}, explains "
-                    f"{share_text(min(share, 1.0))} of that, too: {_title(each.effect.tag)} is doubtful"
-                )
+            if share > schema.CONVINCING_PLACEBO:
+                control, part = _title(each.placebo.effect), schema.share_text(min(share, 1.0))
+                words += f"; an unrelated control, {control}, explains {part} of that, too: "
+                words += f"{_title(each.effect.tag)} is doubtful"
     return words
 
 

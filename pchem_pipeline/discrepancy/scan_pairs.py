@@ -27,20 +27,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from pchem_pipeline.discrepancy.families import (
-    BOXES,
-    Contrast,
-    Edges,
-    Place,
-    Ranges,
-    box,
-    box_sums,
-    cell_edges,
-    cumulative,
-    every_nth,
-    normal,
-    with_sharp_ends,
-)
+from pchem_pipeline.discrepancy import families
 from pchem_pipeline.discrepancy.observe.laws import chi_square
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, Samples, energies
 from pchem_pipeline.discrepancy.scan import Suspect
@@ -63,7 +50,7 @@ _CONTRAST = 0.4  # mean outside of a place over that inside, at most
 _MEASURED = 8
 #: Families of places (boxes, and two of lines at a period and scattered lines), modes and channels; half of
 #: them, since places count to one side only.
-_LOG_LOOKS = math.log((len(BOXES) + 2) * len(MODES) * len(CHANNELS) / 2.0)
+_LOG_LOOKS = math.log((len(families.BOXES) + 2) * len(MODES) * len(CHANNELS) / 2.0)
 _LINE_BY_CHANCE = 1e-4  # probability of a line that stands out by itself, among all
 
 
@@ -83,7 +70,7 @@ class Shared(Suspect):
 class _Guess(NamedTuple):
     """The best place of a family, of one channel and mode."""
 
-    place: Place
+    place: families.Place
     channel: int
     mode: str
 
@@ -176,7 +163,7 @@ def _measured(samples: Samples, guess: _Guess) -> Shared:
     )
 
 
-def _region(place: Place) -> Region:
+def _region(place: families.Place) -> Region:
     """Return a place as a region, lines at a period as such."""
     if place.family != "period":
         return Region.of_mask(place.mask)
@@ -188,10 +175,10 @@ def _region(place: Place) -> Region:
 def _with_ends(samples: Samples, guess: _Guess) -> _Guess:
     """Return a box with its ends among finer cells, each scanned with another pass over the frames."""
 
-    def at(edges: Edges) -> PairContrast:
+    def at(edges: families.Edges) -> PairContrast:
         return pairs_of(samples, edges)[guess.channel][guess.mode]
 
-    place = with_sharp_ends(guess.place, at)
+    place = families.with_sharp_ends(guess.place, at)
     if place is guess.place:
         return guess
     # of lines without samples nothing is known
@@ -205,23 +192,23 @@ def _with_ends(samples: Samples, guess: _Guess) -> _Guess:
 # -- families -----------------------------------------------------------------------------------
 
 
-def _places(contrast: PairContrast, mode: str, usable: BoolArray) -> Iterator[Place | None]:
+def _places(contrast: PairContrast, mode: str, usable: BoolArray) -> Iterator[families.Place | None]:
     """Yield the best place of each family."""
     if contrast.counts.flat[-1] > 0:
-        yield from (box(contrast, family) for family in BOXES)
-        yield from (every_nth(contrast, axis) for axis in (1, 0))
+        yield from (families.box(contrast, family) for family in families.BOXES)
+        yield from (families.every_nth(contrast, axis) for axis in (1, 0))
         if mode != "frame":
             yield _scattered(contrast, 0 if mode == "row" else 1, usable)
 
 
-def _scattered(contrast: PairContrast, axis: int, usable: BoolArray) -> Place | None:
+def _scattered(contrast: PairContrast, axis: int, usable: BoolArray) -> families.Place | None:
     """Return the rows (axis 0) or columns (1) that stand out each by itself, where they are not one band."""
     cells = contrast.edges
     ranges = [(np.array([0]), np.array([each.size - 1])) for each in cells]
     ends = np.arange(cells[axis].size)
     ranges[axis] = ends[:-1], ends[1:]
     sums, counts = (
-        box_sums(table, contrast.axes, *ranges).ravel() for table in (contrast.sums, contrast.counts)
+        families.box_sums(table, contrast.axes, *ranges).ravel() for table in (contrast.sums, contrast.counts)
     )
     some, n = counts > 0, sums.size
     if some.sum() < 3:
@@ -237,14 +224,14 @@ def _scattered(contrast: PairContrast, axis: int, usable: BoolArray) -> Place | 
         return None
     together = float(z[chosen] @ np.sqrt(counts[chosen]) / np.sqrt(counts[chosen].sum()))
     # of all sets of as many lines
-    return Place("scattered", mask, together, math.log(2.0 * special.binom(n, int(chosen.sum()))))
+    return families.Place("scattered", mask, together, math.log(2.0 * special.binom(n, int(chosen.sum()))))
 
 
 # -- sums of products of pairs -------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairContrast(Contrast):
+class PairContrast(families.Contrast):
     """Sums of products of pairs of pixels that share a row (column, frame), over boxes of the sensor.
 
     Pairs are counted twice, as (a, b) and (b, a). Only sums that are too large count.
@@ -258,9 +245,9 @@ class PairContrast(Contrast):
     area: FloatArray
     by_number: tuple[FloatArray, FloatArray]
 
-    def boxes(self, rows: Ranges, columns: Ranges) -> FloatArray:
+    def boxes(self, rows: families.Ranges, columns: families.Ranges) -> FloatArray:
         """Return the deviations of all boxes of some ranges of cells, 0 where one is too small or large."""
-        size = box_sums(self.area, (1, 1), rows, columns)
+        size = families.box_sums(self.area, (1, 1), rows, columns)
         some = (size >= FEWEST_PIXELS) & (size <= LARGEST * self.area[-1, -1])
         return np.where(some, super().boxes(rows, columns), 0.0)
 
@@ -270,7 +257,7 @@ class PairContrast(Contrast):
         return self.null(*(part.sum(axis=(0, 2)).diagonal() for part in parts))
 
 
-def pairs_of(samples: Samples, edges: Edges | None = None) -> list[dict[str, PairContrast]]:
+def pairs_of(samples: Samples, edges: families.Edges | None = None) -> list[dict[str, PairContrast]]:
     """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share.
 
     Args:
@@ -278,7 +265,7 @@ def pairs_of(samples: Samples, edges: Edges | None = None) -> list[dict[str, Pai
         edges: of the cells of rows and of columns, pixels; None: cells of equal size.
     """
     if edges is None:
-        rows, columns = (cell_edges(n, _CELLS) for n in samples.usable.shape)
+        rows, columns = (families.cell_edges(n, _CELLS) for n in samples.usable.shape)
         edges = rows, columns
     counted, gathered = _Gathered(edges), [_Gathered(edges) for _ in CHANNELS]
     counted.add(samples.usable[None].astype(np.float32))
@@ -286,8 +273,10 @@ def pairs_of(samples: Samples, edges: Edges | None = None) -> list[dict[str, Pai
         for each, u in zip(gathered, chunk, strict=True):
             each.add(u)
     n = samples.n_frames
-    counts = {mode: (cumulative(n * table), n * rest) for mode, (table, rest) in counted.tables().items()}
-    area = cumulative(samples.usable.astype(np.float64))
+    counts = {
+        mode: (families.cumulative(n * table), n * rest) for mode, (table, rest) in counted.tables().items()
+    }
+    area = families.cumulative(samples.usable.astype(np.float64))
     found: list[dict[str, PairContrast]] = []
     for each in gathered:
         found.append({})
@@ -295,10 +284,10 @@ def pairs_of(samples: Samples, edges: Edges | None = None) -> list[dict[str, Pai
             cells, (number, number_by) = each.edges(mode), counts[mode]
             found[-1][mode] = PairContrast(
                 edges=cells,
-                sums=cumulative(table),
+                sums=families.cumulative(table),
                 counts=number,
                 # that pairs are counted twice doubles the variance of a sum
-                null=normal(float(table.sum()), float(number.flat[-1]), 2.0, 1.0, one_sided=True),
+                null=families.normal(float(table.sum()), float(number.flat[-1]), 2.0, 1.0, one_sided=True),
                 axes=MODES[mode],
                 area=area[np.ix_(*cells)],
                 by_number=(by_number, number_by),
@@ -324,7 +313,7 @@ class _Gathered:
         squares: of all pixels, (y', x').
     """
 
-    def __init__(self, cells: Edges) -> None:
+    def __init__(self, cells: families.Edges) -> None:
         """Begin with nothing, for cells of rows and columns with these edges."""
         self.cells = cells
         y, x = (each.size - 1 for each in cells)
@@ -334,7 +323,7 @@ class _Gathered:
         self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])
         self.frames = np.zeros((self.squares.size, self.squares.size))
 
-    def edges(self, mode: str) -> Edges:
+    def edges(self, mode: str) -> families.Edges:
         """Return the edges of the cells of rows and of columns, pixels."""
         strides = self.stride if mode == "frame" else (1, 1)
         rows, columns = (

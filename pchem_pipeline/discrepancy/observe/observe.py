@@ -15,31 +15,12 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.errors import InputError, PchEmError
-from pchem_pipeline.discrepancy.observe.digital import (
-    Repeats,
-    bit_statistics,
-    nearer_statistics,
-    predicted_samples,
-    predicted_statistics,
-    previous_bits,
-    square_statistics,
-)
+from pchem_pipeline.discrepancy.observe import digital, vector
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
 from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS, samples_beyond
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
-from pchem_pipeline.discrepancy.observe.vector import (
-    block_statistics,
-    frame_statistics,
-    goodness_of,
-    in_order,
-    line_statistics,
-    product_statistics,
-    quadrant_series,
-    quadrant_sums,
-    sample_statistics,
-)
 from pchem_pipeline.discrepancy.observe.view import FrameView
 from pchem_pipeline.discrepancy.observe.waves import waves_across
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
@@ -98,25 +79,25 @@ def observe(
     view = FrameView.of(frames, numbers, block_frames, laws, maps)
     edges = view.edges
     hits = [samples_beyond(frames, laws, maps.usable, above=above) for above in (True, False)]
-    repeats = Repeats.of(frames, numbers)
-    predicted = predicted_samples(frames, edges, maps.usable)
+    repeats = digital.Repeats.of(frames, numbers)
+    predicted = digital.predicted_samples(frames, edges, maps.usable)
     spread = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
-    bits = previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
+    bits = digital.previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
     waves = waves_across(frames, numbers, laws, maps)
     misplaced_z, misplaced = misplaced_lines(frames, seen.counts, seen.origin, maps.usable)
     z = {
         **evidence.z,
         "tail.high.clusters": _clusters(hits[0], laws, frames.shape),
-        **product_statistics(view),
-        **block_statistics(view),
-        **frame_statistics(view),
-        **line_statistics(view),
-        **predicted_statistics(predicted),
-        **bit_statistics(bits),
-        **nearer_statistics(frames, edges, maps),
+        **vector.product_statistics(view),
+        **vector.block_statistics(view),
+        **vector.frame_statistics(view),
+        **vector.line_statistics(view),
+        **digital.predicted_statistics(predicted),
+        **digital.bit_statistics(bits),
+        **digital.nearer_statistics(frames, edges, maps),
         **follow_statistics(frames, edges, laws, maps),
         **repeats.statistics(seen, frames.shape),
-        **square_statistics(frames, seen, maps.usable),
+        **digital.square_statistics(frames, seen, maps.usable),
         **misplaced_z,
         **waves.z,
     }
@@ -133,7 +114,7 @@ def observe(
         hits=_numbered(hits[0], numbers),
         low_hits=_numbered(hits[1], numbers),
     )
-    return replace(evidence, time=time, z=in_order(z))
+    return replace(evidence, time=time, z=vector.in_order(z))
 
 
 def observe_histograms(
@@ -208,13 +189,13 @@ def _compared(
         charge_std=known(moments["charge_std"]),
         readout_std=known(moments["readout_std"]),
         scores={name: mapped(laws.scores[:, 0, j]) for j, name in enumerate(SCORES)},
-        goodness=mapped(goodness_of(moments["goodness"])),
-        peaks=mapped(goodness_of(moments["peaks"])),
+        goodness=mapped(vector.goodness_of(moments["goodness"])),
+        peaks=mapped(vector.goodness_of(moments["peaks"])),
         tail_low=low[:, 0].reshape(shape).astype(np.uint32),
         tail_high=high[:, 0].reshape(shape).astype(np.uint32),
         code=residuals,
         time=None,
-        z=in_order(sample_statistics(laws, parameters[:, 0], residuals)),
+        z=vector.in_order(vector.sample_statistics(laws, parameters[:, 0], residuals)),
         tail_expected=np.stack([mapped(low[:, 1]), mapped(high[:, 1])]),
         covariance=None if fit is None else fit.covariance.reshape(*shape, 4, 4),
         ambiguous=float(ambiguous),
@@ -319,7 +300,7 @@ def _time_series(view: FrameView, n_run: int, **others: Any) -> TimeSeries:
         frame_charge=view.halves[0].sum(axis=(0, 2)) / exposure.sum(),
         frame_readout=view.halves[1].sum(axis=(0, 2)) / number.sum(),
         frame_gain=view.gain,
-        quadrant_readout=over(quadrant_series(view.halves[1]), quadrant_sums(number)),
+        quadrant_readout=over(vector.quadrant_series(view.halves[1]), vector.quadrant_sums(number)),
         row_charge=rows[0],
         row_readout=rows[1],
         column_charge=columns[0],
