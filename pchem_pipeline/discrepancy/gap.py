@@ -113,11 +113,7 @@ class StatisticsGap:
     )
 
     def gap(
-        self,
-        z: FloatArray,
-        mean: FloatArray,
-        replicates: FloatArray,
-        strengths: FloatArray | None = None,
+        self, z: FloatArray, mean: FloatArray, replicates: FloatArray, strengths: FloatArray | None = None
     ) -> Gap:
         """Compute the gap of a model.
 

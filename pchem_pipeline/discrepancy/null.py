@@ -389,12 +389,7 @@ def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> BoolArray:
     return np.array([f in _OF_ORDER or name in free for f, name in kinds], np.bool_)
 
 
-def disagrees(
-    null: NullModel,
-    z: Measured,
-    significance: float,
-    tolerance: FloatArray | float = 0.0,
-) -> bool:
+def disagrees(null: NullModel, z: Measured, significance: float, tolerance: FloatArray | float = 0.0) -> bool:
     """Test whether any statistic deviates significantly, with the same sign in both splits.
 
     Args:

@@ -369,16 +369,13 @@ def scan_event_frames(
     value = min(0.0, float(log_p[at]) + math.log(m * (m - 1) / 2))
     if value > math.log(significance):
         return None
-    begin, end = _ends(int(positions[first[at]]), int(positions[last[at]]), int(last[at] - first[at]), n)
+    # as wide as a constant rate asks for
+    begin, end = int(positions[first[at]]), int(positions[last[at]])
+    beyond = round((end - begin) / max(int(last[at] - first[at]), 1) / 2)
+    begin, end = max(begin - beyond, 0), min(end + beyond + 1, n)
     inside = (positions >= begin) & (positions < end)
     seen = (float(inside.sum()), end - begin), (float((~inside).sum()), max(n - end + begin, 1))
     rates = [events / frames - expected / n for events, frames in seen]
     when = When(range=((int(numbers[begin]), int(numbers[end - 1]) + 1),))
     z = float(-special.ndtri_exp(float(log_p[at])))
     return Stretch(family="range", z=z, log_p=value, inside=rates[0], outside=rates[1], when=when)
-
-
-def _ends(first: int, last: int, gaps: int, n: int) -> tuple[int, int]:
-    """Return a range of frames about its first and last event, as wide as a constant rate asks for."""
-    beyond = round((last - first) / max(gaps, 1) / 2)
-    return max(first - beyond, 0), min(last + beyond + 1, n)

@@ -14,19 +14,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms
 from pchem_pipeline.effects.framework.evidence import PixelMaps, PredictedSamples, PreviousBits
 from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted
 from pchem_pipeline.model.arithmetic.significance import CLEAR, SIGNIFICANCE
-
-Frames = NDArray[np.unsignedinteger[Any]]
 
 GROUP = 4  # frames whose predictions are exchanged
 #: Samples of all groups together, unless there is but one, where all frames of a group are compared with all,
@@ -59,7 +56,7 @@ def groups_of(edges: IntArray, samples_of_a_frame: int, most_samples: int = MOST
     return np.asarray(chosen, np.int64)
 
 
-def predicted_samples(frames: Frames, edges: IntArray, usable: BoolArray) -> dict[str, PredictedSamples]:
+def predicted_samples(frames: CodeArray, edges: IntArray, usable: BoolArray) -> dict[str, PredictedSamples]:
     """Return how samples compare with their predictions, by kind; none where frames or pixels are too few.
 
     Args:
@@ -133,7 +130,7 @@ def predicted_statistics(found: Mapping[str, PredictedSamples]) -> dict[str, flo
     }
 
 
-def nearer_statistics(frames: Frames, edges: IntArray, maps: PixelMaps) -> dict[str, float]:
+def nearer_statistics(frames: CodeArray, edges: IntArray, maps: PixelMaps) -> dict[str, float]:
     """Return the statistic of samples that are nearer to the one before than chance makes them.
 
     Whatever ties successive samples together, in proportion or not, changes how often they nearly agree. Of
@@ -167,12 +164,7 @@ def nearer_statistics(frames: Frames, edges: IntArray, maps: PixelMaps) -> dict[
     return {"time.nearer": laws.best(*found, independent=min(float(len(found)), _INDEPENDENT))}
 
 
-def previous_bits(
-    frames: Frames,
-    edges: IntArray,
-    usable: BoolArray,
-    noise: FloatArray,
-) -> PreviousBits | None:
+def previous_bits(frames: CodeArray, edges: IntArray, maps: PixelMaps) -> PreviousBits | None:
     """Return the regression of samples on the bits of those before; None where there are too few.
 
     What a sample has in common with the value of the one before is crosstalk of many kinds; what it has in
@@ -182,9 +174,10 @@ def previous_bits(
     Args:
         frames: codes (frame, y, x), DN.
         edges: positions of the blocks, (b + 1,).
-        usable: pixels that count, (y, x).
-        noise: standard deviation of the samples of each pixel, DN, (y, x).
+        maps: parameters of the pixels.
     """
+    usable = maps.usable
+    noise = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
     pairs = usable[:, 1:] & usable[:, :-1]
     first = groups_of(edges, usable.size, MOST_PAIRED)
     if not first.size or not pairs.any():
@@ -192,7 +185,7 @@ def previous_bits(
     # of each group two pairs of frames
     later = (first[:, None] + np.array([1, 3])).ravel()
     one, two = frames[later], frames[later - 1]
-    weight = np.where(pairs, 1.0 / noise[:, 1:], 0.0).astype(np.float32)
+    weight = np.where(pairs, 1.0 / np.where(usable, noise, 1.0)[:, 1:], 0.0).astype(np.float32)
     value = np.subtract(one, two, dtype=np.float32) if one.itemsize < 4 else one - two.astype(np.float64)
     own = (value[:, :, 1:] * weight).ravel()
     design = np.empty((1 + BITS, own.size), np.float32)
@@ -247,7 +240,7 @@ class Repeats:
     consecutive: int
 
     @classmethod
-    def of(cls, frames: Frames, numbers: IntArray) -> Repeats:
+    def of(cls, frames: CodeArray, numbers: IntArray) -> Repeats:
         """Count those of frames (frame, y, x) with their numbers in the run."""
         consecutive = np.diff(numbers) == 1
         in_time = _equal_lines(frames[1:], frames[:-1]) & consecutive[:, None]
@@ -283,7 +276,7 @@ class Repeats:
         return z
 
 
-def _equal_lines(one: Frames, other: Frames) -> BoolArray:
+def _equal_lines(one: CodeArray, other: CodeArray) -> BoolArray:
     """Return which lines of two stacks (frame, line, sample) are equal, (frame, line)."""
     equal = np.asarray((one[:, :, :_FIRST] == other[:, :, :_FIRST]).all(axis=2))
     at = np.nonzero(equal)
@@ -299,7 +292,7 @@ def _log_alike(seen: PixelHistograms) -> FloatArray:
     return np.asarray(np.log(np.maximum(alike, 1e-12)), np.float64)
 
 
-def equal_squares(frames: Frames) -> IntArray:
+def equal_squares(frames: CodeArray) -> IntArray:
     """Return how often all samples of 2 x 2 pixels of frames (frame, y, x) are equal, (y-1, x-1).
 
     Those at the highest DN of all do not count: a particle's cloud leaves all of its pixels at the limit.
@@ -314,7 +307,7 @@ def equal_squares(frames: Frames) -> IntArray:
     return found
 
 
-def square_statistics(frames: Frames, seen: PixelHistograms, usable: BoolArray) -> dict[str, float]:
+def square_statistics(frames: CodeArray, seen: PixelHistograms, usable: BoolArray) -> dict[str, float]:
     """Return the statistic of squares of equal samples; none without squares of usable pixels.
 
     Given the histograms, frames without an effect are in random order.

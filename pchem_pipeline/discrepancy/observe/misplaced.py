@@ -16,13 +16,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.digital import MOST_PAIRED
-from pchem_pipeline.discrepancy.observe.misplaced_numba import (
-    N_PLACES,
-    STEPS,
-    compare_rows,
-)
+from pchem_pipeline.discrepancy.observe.misplaced_numba import N_PLACES, STEPS, compare_rows
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.neighbours import neighbours
 from pchem_pipeline.model.arithmetic.significance import CERTAIN
@@ -39,10 +35,7 @@ _FARTHEST = 60.0  # logarithm of a ratio: beyond it nothing changes
 
 
 def misplaced_lines(
-    frames: NDArray[np.unsignedinteger[Any]],
-    counts: NDArray[Any],
-    origin: IntArray,
-    usable: BoolArray,
+    frames: CodeArray, counts: NDArray[Any], origin: IntArray, usable: BoolArray
 ) -> tuple[dict[str, float], dict[str, FloatArray]]:
     """Return the statistics of misplaced rows and columns, and their shares by place.
 
@@ -75,9 +68,7 @@ def misplaced_lines(
     return z, shares
 
 
-def own_lines(
-    frames: NDArray[np.unsignedinteger[Any]], usable: BoolArray, effects: Iterable[Effect]
-) -> NDArray[np.unsignedinteger[Any]]:
+def own_lines(frames: CodeArray, usable: BoolArray, effects: Iterable[Effect]) -> CodeArray:
     """Return frames in which lines that effects likely misplaced are those of other frames, drawn at random.
 
     Each sample in a pixel's histogram is then its own, as many as there were.

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe import digital, vector
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
@@ -40,7 +40,7 @@ _ALIKE, _FEW = 1.25, 0.1  # ratio of like steps, and share of the pixels that ma
 
 
 def observe(
-    frames: NDArray[np.unsignedinteger[Any]],
+    frames: CodeArray,
     numbers: IntArray,
     *,
     n_run: int,
@@ -78,11 +78,10 @@ def observe(
     maps = evidence.maps
     view = FrameView.of(frames, numbers, block_frames, laws, maps)
     edges = view.edges
-    hits = [samples_beyond(frames, laws, maps.usable, above=above) for above in (True, False)]
+    hits = [samples_beyond(frames, numbers, laws, maps.usable, above=above) for above in (True, False)]
     repeats = digital.Repeats.of(frames, numbers)
     predicted = digital.predicted_samples(frames, edges, maps.usable)
-    spread = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
-    bits = digital.previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
+    bits = digital.previous_bits(frames, edges, maps)
     waves = waves_across(frames, numbers, laws, maps)
     misplaced_z, misplaced = misplaced_lines(frames, seen.counts, seen.origin, maps.usable)
     z = {
@@ -111,17 +110,14 @@ def observe(
         previous_bits=bits,
         misplaced_lines=misplaced,
         waves=waves.found,
-        hits=_numbered(hits[0], numbers),
-        low_hits=_numbered(hits[1], numbers),
+        hits=hits[0],
+        low_hits=hits[1],
     )
     return replace(evidence, time=time, z=vector.in_order(z))
 
 
 def observe_histograms(
-    counts: NDArray[np.unsignedinteger[Any]],
-    origin: IntArray,
-    *,
-    parameters: FloatArray | None = None,
+    counts: CodeArray, origin: IntArray, *, parameters: FloatArray | None = None
 ) -> Evidence:
     """Return the evidence of ready-made histograms: no time, no neighbours.
 
@@ -243,7 +239,7 @@ def _inside(seen: PixelHistograms) -> BoolArray:
     return np.asarray(seen.outside.sum(axis=1) <= MOST_OUTSIDE * seen.counts.sum(axis=1))
 
 
-def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: BoolArray) -> PixelMaps:
+def fitted_maps(frames: CodeArray, exclude: BoolArray) -> PixelMaps:
     """Return the plain fit of some frames, from nothing, as :func:`observe` makes it.
 
     Args:
@@ -316,8 +312,3 @@ def _time_series(view: FrameView, n_run: int, **others: Any) -> TimeSeries:
         **others,
         frame_noise=view.series["noise"],
     )
-
-
-def _numbered(hits: IntArray, numbers: IntArray) -> IntArray:
-    """Return samples (position, y, x, DN) with the number of their frame in the run."""
-    return np.column_stack([numbers[hits[:, 0]], hits[:, 1:]]).astype(np.int64)

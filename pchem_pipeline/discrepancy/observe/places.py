@@ -9,12 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
@@ -148,7 +146,7 @@ class Part:
 
 
 def part_evidence(
-    frames: NDArray[np.unsignedinteger[Any]],
+    frames: CodeArray,
     numbers: IntArray,
     maps: PixelMaps,
     part: Part,
@@ -179,18 +177,12 @@ def part_evidence(
     window = window or SensorWindow.whole(frames.shape)
     exclude = ~(window.mask(part.region) & maps.usable)
     return observe(
-        stack,
-        numbers[chosen],
-        n_run=n_run,
-        block_frames=length,
-        exclude=exclude,
-        start=maps,
-        fitted=fitted,
+        stack, numbers[chosen], n_run=n_run, block_frames=length, exclude=exclude, start=maps, fitted=fitted
     )
 
 
 def part_statistics(
-    frames: NDArray[np.unsignedinteger[Any]],
+    frames: CodeArray,
     numbers: IntArray,
     maps: PixelMaps,
     parts: Sequence[Part],

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.observe.sums_numba import look_up
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
@@ -95,14 +95,16 @@ def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     )
 
 
-def samples_beyond(frames: NDArray[Any], laws: PixelLaws, usable: BoolArray, *, above: bool) -> IntArray:
-    """Return the samples above or below the support of their pixel, by frame: position, y, x, DN."""
+def samples_beyond(
+    frames: NDArray[Any], numbers: IntArray, laws: PixelLaws, usable: BoolArray, *, above: bool
+) -> IntArray:
+    """Return the samples above or below the support of their pixel: number of the frame, y, x, DN."""
     seen = (laws.moments["high" if above else "low"][:, 0] > 0).reshape(usable.shape) & usable
     samples, (first, length) = frames[:, seen].T, laws.support[seen.ravel(), :2].T[:, :, None]
     pixel, frame = np.nonzero(samples > first + length - 1 if above else samples < first)
     pixel, frame = pixel[:MOST_HITS], frame[:MOST_HITS]
     y, x = np.nonzero(seen)
-    hits = np.stack([frame, y[pixel], x[pixel], samples[pixel, frame]], axis=1).astype(np.int64)
+    hits = np.stack([numbers[frame], y[pixel], x[pixel], samples[pixel, frame]], axis=1).astype(np.int64)
     return hits[np.lexsort((hits[:, 2], hits[:, 1], hits[:, 0]))]
 
 
@@ -119,12 +121,10 @@ class FrameBlocks:
     """
 
     n_frames: int
-    blocks: Callable[[int], Iterable[NDArray[np.unsignedinteger[Any]]]]
+    blocks: Callable[[int], Iterable[CodeArray]]
 
     @classmethod
-    def of(
-        cls, frames: NDArray[np.unsignedinteger[Any]], chosen: IntArray | None = None, together: int = 1
-    ) -> FrameBlocks:
+    def of(cls, frames: CodeArray, chosen: IntArray | None = None, together: int = 1) -> FrameBlocks:
         """Take frames in memory.
 
         Args:
@@ -134,7 +134,7 @@ class FrameBlocks:
         """
         n_frames = frames.shape[0] if chosen is None else chosen.size
 
-        def blocks(size: int) -> Iterator[NDArray[np.unsignedinteger[Any]]]:
+        def blocks(size: int) -> Iterator[CodeArray]:
             size = together * max(size // together, 1)
             for some in (slice(begin, begin + size) for begin in range(0, n_frames, size)):
                 yield frames[some if chosen is None else chosen[some]]
@@ -142,7 +142,7 @@ class FrameBlocks:
         return cls(n_frames, blocks)
 
 
-def laws_of_frames(frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> PixelLaws:
+def laws_of_frames(frames: CodeArray, maps: PixelMaps) -> PixelLaws:
     """Compare the histograms of frames (n, y, x) with the fit of their pixels."""
     return pixel_laws(PixelHistograms.of(frames), maps.columns, maps.usable.ravel())
 
@@ -169,7 +169,7 @@ class Samples:
     most: int = 1 << 20
 
     @classmethod
-    def of(cls, frames: NDArray[np.unsignedinteger[Any]], maps: PixelMaps) -> Samples:
+    def of(cls, frames: CodeArray, maps: PixelMaps) -> Samples:
         """Prepare frames by the fit of their pixels."""
         return cls.by_laws(FrameBlocks.of(frames), laws_of_frames(frames, maps), maps)
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe import tables_numba as kernel
 from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
@@ -62,13 +62,13 @@ class PixelHistograms:
         ends: smallest and largest code of each, DN, (2, n); None: those of the histograms.
     """
 
-    counts: NDArray[np.unsignedinteger[Any]]
+    counts: CodeArray
     origin: IntArray
     outside: FloatArray
     ends: NDArray[np.integer[Any]] | None = None
 
     @classmethod
-    def of(cls, frames: NDArray[np.unsignedinteger[Any]]) -> PixelHistograms:
+    def of(cls, frames: CodeArray) -> PixelHistograms:
         """Count the samples of each pixel of frames (frame, y, x), DN."""
         found = histogram_frames(frames)
         outside = np.stack([found.under.ravel(), found.over.ravel()], axis=1).astype(np.float64)
@@ -77,9 +77,7 @@ class PixelHistograms:
         return cls(counts, found.origin.ravel().astype(np.int64), outside, ends)
 
     @classmethod
-    def alone(
-        cls, counts: NDArray[np.unsignedinteger[Any]], origin: NDArray[np.integer[Any]]
-    ) -> PixelHistograms:
+    def alone(cls, counts: CodeArray, origin: NDArray[np.integer[Any]]) -> PixelHistograms:
         """Take ready-made histograms (n, B) that hold all samples of their pixels."""
         return cls(counts, origin.astype(np.int64), np.zeros((len(counts), 2)))
 
@@ -148,7 +146,9 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: BoolArray)
         usable: pixels to look at, (n,).
     """
     n = usable.size
-    natural = _natural(parameters, usable)
+    # harmless numbers for unusable pixels
+    exposure, gain, bias, sigma = np.where(usable[:, None], parameters, [1.0, 1.0, 0.0, 1.0]).T
+    natural = np.ascontiguousarray(np.stack([exposure, 1.0 / gain, bias, analog_width(sigma)], axis=1))
     window, electrons = np.zeros((n, 2), np.int64), np.zeros((n, 2), np.int64)
     samples = float(seen.counts.sum(axis=1).max(initial=1)) + float(seen.outside.sum(axis=1).max(initial=0.0))
     kernel.supports(natural, np.log(_NEGLIGIBLE / (samples * n)), electrons, window)
@@ -331,12 +331,6 @@ def _add_codes(
         for column in weighted:
             total = np.bincount(pixel * size + place, column, n.size * size).reshape(n.size, size)
             covariance -= total.T @ (n[:, None] * total)
-
-
-def _natural(parameters: FloatArray, usable: BoolArray) -> FloatArray:
-    """Return H, 1/g (DN), mu and the analog read noise (DN); harmless numbers for unusable pixels."""
-    exposure, gain, bias, sigma = np.where(usable[:, None], parameters, [1.0, 1.0, 0.0, 1.0]).T
-    return np.ascontiguousarray(np.stack([exposure, 1.0 / gain, bias, analog_width(sigma)], axis=1))
 
 
 def analog_width(sigma: FloatArray) -> FloatArray:

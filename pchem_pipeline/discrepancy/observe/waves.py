@@ -11,13 +11,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from pchem_pipeline.base.arrays import BoolArray, Float32Array, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, IntArray
 from pchem_pipeline.discrepancy.observe import laws as laws_of
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES, FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
@@ -51,11 +50,7 @@ class Waves:
 
 
 def waves_across(
-    frames: NDArray[np.unsignedinteger[Any]],
-    numbers: IntArray,
-    laws: PixelLaws,
-    maps: PixelMaps,
-    inside: BoolArray | None = None,
+    frames: CodeArray, numbers: IntArray, laws: PixelLaws, maps: PixelMaps, inside: BoolArray | None = None
 ) -> Waves:
     """Look for waves in the residuals of frames.
 
@@ -176,10 +171,7 @@ def _waves_of_sine(cycles: Mapping[str, float]) -> float:
 
 
 def _climbed(
-    u: Float32Array,
-    places: Mapping[str, IntArray],
-    start: Sequence[float],
-    sizes: Sequence[int],
+    u: Float32Array, places: Mapping[str, IntArray], start: Sequence[float], sizes: Sequence[int]
 ) -> tuple[dict[str, float], NDArray[np.complexfloating]]:
     """Return the frequencies near a peak, each in turn by ever finer steps, and the sums of samples there.
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray
 from pchem_pipeline.discrepancy.observe.laws import extreme, poisson
 from pchem_pipeline.discrepancy.observe.tables import CodeSums, PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
@@ -58,7 +58,7 @@ class CodeSample:
         limits: first and last code of the ADC that the fit knows, DN; None: none.
     """
 
-    counts: NDArray[np.unsignedinteger[Any]]
+    counts: CodeArray
     origin: NDArray[np.integer[Any]]
     parameters: FloatArray
     joint: bool = False

@@ -346,11 +346,7 @@ def _first_known(*estimates: _Estimate) -> float:
 
 
 def _resemblance(
-    name: str,
-    covariance: FloatArray,
-    size: FloatArray,
-    common: _Common,
-    shared: tuple[float, float],
+    name: str, covariance: FloatArray, size: FloatArray, common: _Common, shared: tuple[float, float]
 ) -> list[Check]:
     """Return whether pairs of samples resemble each other, beyond what they share with others.
 
