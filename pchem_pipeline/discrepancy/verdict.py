@@ -20,7 +20,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, Va
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.base.units import per_cent
-from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
@@ -239,17 +239,6 @@ class Families(_Part):
     after: dict[str, Number] = {}
 
 
-#: Families of statistics in words.
-_FAMILIES = {
-    "shape": "the shape of the histograms",
-    "code": "the codes",
-    "tail": "the tails",
-    "time": "the order in time",
-    "frame": "the frames",
-    "space": "neighbours and lines",
-}
-
-
 def closed_share(before: float, after: float) -> float:
     """Compute ``1 - after / before``, limited to 0 ... 1; 0 without a gap before."""
     return min(max(1.0 - max(after, 0.0) / before, 0.0), 1.0) if before > 0.0 else 0.0
@@ -257,7 +246,7 @@ def closed_share(before: float, after: float) -> float:
 
 def families_words(families: Sequence[str]) -> str:
     """Describe families of statistics."""
-    return " and ".join(_FAMILIES.get(family, family) for family in families)
+    return " and ".join(FAMILIES.get(family, family) for family in families)
 
 
 class GapChange(_Part):

@@ -8,7 +8,7 @@ used, so that the answer stays finite and keeps growing with the effect.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.base.arrays import FloatArray
@@ -23,12 +23,6 @@ FAR = 6.0
 #: Slowest waves along a series whose squares are summed (the adaptive test of Neyman, Fan 1996).
 SLOWEST = (2, 4, 8, 16, 32)
 _SHORT_END = 0.25  # of the cubic root of a gamma law
-
-
-def counted(count: ArrayLike, expected: ArrayLike) -> FloatArray:
-    """Return ``2 sqrt(c + 3/8) - 2 sqrt(e + 3/8)``: variance 1 for a Poisson count (Anscombe 1948)."""
-    seen, mean = np.asarray(count, np.float64), np.maximum(np.asarray(expected, np.float64), 0.0)
-    return np.asarray(2.0 * (np.sqrt(seen + 0.375) - np.sqrt(mean + 0.375)))
 
 
 def without_skew(z: FloatArray, skewness: FloatArray) -> FloatArray:
@@ -50,8 +44,13 @@ def poisson(count: int, expected: float) -> float:
 
 
 def repeats(count: int, expected: float) -> float:
-    """Return 10 for each coincidence that cannot happen; where they do happen, what :func:`counted` says."""
-    return float(_CERTAIN * count) if expected < SIGNIFICANCE else float(counted(count, expected))
+    """Return 10 for each coincidence that cannot happen; where they do happen, a normal quantile.
+
+    That is ``2 sqrt(c + 3/8) - 2 sqrt(e + 3/8)``, of variance 1 for a Poisson count (Anscombe 1948).
+    """
+    if expected < SIGNIFICANCE:
+        return float(_CERTAIN * count)
+    return float(2.0 * (np.sqrt(count + 0.375) - np.sqrt(expected + 0.375)))
 
 
 def largest_normal(values: FloatArray) -> float:

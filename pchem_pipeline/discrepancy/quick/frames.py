@@ -144,8 +144,7 @@ def _parted(
     fewest = max(_FEWEST_OF_LEVEL, int(np.ceil(_LEAST_SHARE * frames.size)))
     while len(levels) < _MOST_LEVELS:
         for number, frames in enumerate(levels):
-            halves = _halves(frames, mean, fewest)
-            if halves is not None and _shot_noise_grows(halves, mean, variance, gain):
+            if halves := _halves(frames, mean, variance, gain, fewest):
                 p = min(p, _chance(variance[halves[0]], variance[halves[1]]))
                 levels[number : number + 1] = halves
                 break
@@ -162,14 +161,16 @@ def _chance(low: FloatArray, high: FloatArray) -> float:
     return float(special.stdtr(n - 2.0, -(high.mean() - low.mean()) / error))
 
 
-def _halves(frames: IntArray, mean: FloatArray, fewest: int) -> list[IntArray] | None:
-    """Return frames in two parts between which the means leave a clean gap; None where there is no such gap.
+def _halves(
+    frames: IntArray, mean: FloatArray, variance: FloatArray, gain: float, fewest: int
+) -> list[IntArray]:
+    """Return frames in two parts between which the means leave a clean gap, and the shot noise grows, or [].
 
     Of all cuts through the sorted means the one with the least variance within both parts (Otsu 1979).
     """
     n = frames.size
     if n < 2 * fewest:
-        return None
+        return []
     ordered = frames[np.argsort(mean[frames], kind="stable")]
     values = mean[ordered] - mean[ordered].mean()
     count = np.arange(fewest, n - fewest + 1)
@@ -179,15 +180,11 @@ def _halves(frames: IntArray, mean: FloatArray, fewest: int) -> list[IntArray] |
     within = float(np.sqrt((cut * low.var() + (n - cut) * high.var()) / n))
     # the halves of a normal or a uniform distribution of n frames are some 4/n standard deviations apart
     if high[0] - low[-1] <= CERTAIN * within:
-        return None
-    return [np.sort(ordered[:cut]), np.sort(ordered[cut:])]
-
-
-def _shot_noise_grows(halves: list[IntArray], mean: FloatArray, variance: FloatArray, gain: float) -> bool:
-    """Tell whether the variance grows between two levels as the shot noise of their electrons would."""
+        return []
+    halves = [np.sort(ordered[:cut]), np.sort(ordered[cut:])]
     low, high = halves
     grown = float(np.median(variance[high]) - np.median(variance[low]))
-    return grown * gain > _SHOT_SHARE * float(mean[high].mean() - mean[low].mean())
+    return halves if grown * gain > _SHOT_SHARE * float(mean[high].mean() - mean[low].mean()) else []
 
 
 # -- odd frames --------------------------------------------------------------------------------------

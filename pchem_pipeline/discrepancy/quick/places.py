@@ -20,8 +20,6 @@ from pchem_pipeline.effects.framework.region import Region
 _CELLS = 128
 #: Pixels that are looked at together.
 _AT_ONCE = 1 << 17
-#: Axis along which the values of a map are of a pixel and the next one.
-_NEXT_ALONG = {"next_x": 1, "next_y": 0}
 
 
 def block_deviations(sums: StackSums) -> FloatArray:
@@ -111,9 +109,8 @@ def _place(name: str, cells: CellMap, significance: float) -> Suspect | None:
     usable = cells.counts > 0
     # standard normal as the pixels are
     scaled = cells.sums / np.sqrt(np.maximum(cells.counts, 1.0))
-    places = scan_map(
-        scaled, usable, significance=significance, most=1, single=False, next_along=_NEXT_ALONG.get(name)
-    )
+    along = {"next_x": 1, "next_y": 0}.get(name)
+    places = scan_map(scaled, usable, significance=significance, most=1, single=False, next_along=along)
     if not places:
         return None
     inside = places[0].region.mask(usable.shape)

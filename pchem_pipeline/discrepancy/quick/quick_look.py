@@ -105,7 +105,7 @@ def _wave(sums: StackSums, others: Sequence[Check]) -> list[Check]:
     p = look_elsewhere(float(special.gammaincc(frames, frames * line["ratio"])), cells)
     limit = line["unit"] * math.sqrt(sure / SEEN_MIDWAY)
     # what pixels share more in a part of the sensor has all frequencies; runs of earlier versions lack p
-    shared = any(check.p < SIGNIFICANCE for check in others if check.name in _SHARED)
+    shared = any(check.p < SIGNIFICANCE for check in others if check.name.endswith("_noise"))
     in_lines = 1.0 if shared else look_elsewhere(line.get("line_p", 1.0), line.get("line_looks", 1.0))
     of, how = "", "; pchem discrepancy finds its frequency"
     if in_lines < p and p > SIGNIFICANCE:  # lines show a wave across the frame, too
@@ -160,11 +160,6 @@ def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
     return _located(checks, sums)
 
 
-_SHARED = ("frame_noise", "row_noise", "column_noise")
-#: Checks of which a part of the sensor alone may fail.
-_LOCAL = ("neighbours_x", "neighbours_y", "lag")
-
-
 def _located(checks: list[Check], sums: StackSums) -> list[Check]:
     """Return checks with the part of the sensor that they are about, and one of parts that drift apart."""
     cells = sensor_cells(sums)
@@ -196,7 +191,7 @@ def _told_once(checks: list[Check], noise: str, neighbours: str) -> list[Check]:
 def _placed(check: Check, place: Suspect, sums: StackSums) -> Check:
     """Return a check with its place; noise of lines has the size that it has there."""
     p, size = check.p, check.size
-    if check.name in _LOCAL:
+    if check.name in ("neighbours_x", "neighbours_y", "lag"):  # a part of the sensor alone may fail
         p = look_elsewhere(min(check.p, place.p), 2.0)
     if check.name in ("row_noise", "column_noise") and place.only_there:
         shared = sums.next_x if check.name == "row_noise" else sums.next_y
