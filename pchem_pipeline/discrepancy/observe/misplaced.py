@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.digital import MOST_PAIRED
-from pchem_pipeline.discrepancy.observe.misplaced_numba import N_PLACES, STEPS, compare_rows
+from pchem_pipeline.discrepancy.observe.observe_numba import N_PLACES, STEPS, compare_rows
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.neighbours import neighbours
 from pchem_pipeline.model.arithmetic.significance import CERTAIN
@@ -122,7 +122,7 @@ class _Table:
 
     Attributes:
         first: DN of the first code, shape (y, x).
-        ratios: see :func:`~.misplaced_numba.compare_rows`, shape (y, x, B, 4).
+        ratios: see :func:`~.observe_numba.compare_rows`, shape (y, x, B, 4).
     """
 
     first: IntArray

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.laws import FAR
-from pchem_pipeline.discrepancy.observe.sums_numba import look_up
+from pchem_pipeline.discrepancy.observe.observe_numba import look_up
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, PixelMaps
 

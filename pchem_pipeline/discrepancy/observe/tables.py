@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.discrepancy.observe import tables_numba as kernel
+from pchem_pipeline.discrepancy.observe import observe_numba as kernel
 from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.cell_scores_numba import N_COLUMNS, N_NUISANCE

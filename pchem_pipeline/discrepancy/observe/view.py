@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.laws import SLOWEST, best, chi_square
+from pchem_pipeline.discrepancy.observe.observe_numba import add_frames, sum_rows
 from pchem_pipeline.discrepancy.observe.sums import (
     CHANNELS,
     FrameBlocks,
@@ -27,7 +28,6 @@ from pchem_pipeline.discrepancy.observe.sums import (
     blocks_of,
     pixel_statistics,
 )
-from pchem_pipeline.discrepancy.observe.sums_numba import add_frames, sum_rows
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 

@@ -319,7 +319,7 @@ class _Common:
         down = sums.next_y[quiet]
         neighbours = along * float(np.mean(down[np.isfinite(down)])) if np.isfinite(down).any() else 0.0
         others = pairs * nx - pairs
-        estimate = (value - neighbours - (pairs - along) * _first_known(self.columns)) / others
+        estimate = (value - neighbours - (pairs - along) * self.columns.value) / others
         error = chance / others
         if math.isfinite(self.columns.error):
             error = math.hypot(error, pairs / others * self.columns.error)
@@ -330,14 +330,9 @@ class _Common:
         """By how much correlated pixels raise the variance of a mean over them."""
         (ny, nx), variance = self.sums.shape, self.sums.variance
         typical = median_of(variance, ~(variance > 0))
-        frame = _first_known(self.frame)
-        row, column = (_first_known(each, self.frame) - frame for each in (self.rows, self.columns))
+        frame, lines = self.frame.value, (self.rows, self.columns)
+        row, column = (each.value - frame if math.isfinite(each.error) else 0.0 for each in lines)
         return 1.0 + (ny * nx * frame**2 + nx * row**2 + ny * column**2) / typical**2
-
-
-def _first_known(*estimates: _Estimate) -> float:
-    """Return the value of the first estimate that there is, else 0."""
-    return next((each.value for each in estimates if math.isfinite(each.error)), 0.0)
 
 
 def _resemblance(
