@@ -47,15 +47,11 @@ class Addition:
         effect: with its fitted parameters.
         alone: whether all others are excluded.
         against: reason of its rejection, starting with "it"; empty if it is accepted.
-        candidates: effects compared, the likeliest first.
         strength_stderr: standard error of its strength.
         before, after: gap on the final samples without and with it.
-        rivals: the next best effects, fitted the same way, the best first.
-        placebo: best unrelated control, or None.
-        pulls: the statistics that changed most.
-        moved: change of each parameter map by the refit with the effect.
         described: whether it is an empirical description without a cause.
         certain: whether its strength is significant.
+        candidates, rivals, placebo, pulls, moved: see :class:`~pchem_pipeline.discrepancy.verdict.Step`.
     """
 
     effect: Effect

@@ -211,9 +211,7 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
             spots["region_share"] = suspect.share
         for stretch in frames.get(STATISTICS[name].series, ())[:1]:
             spots |= {"when": stretch.when.numbers(), "when_p": stretch.p}
-        if (
-            "@" in name
-        ):  # of a part, which is told on the sensor: that is the place, not what stands out of it
+        if "@" in name:  # of a part on the sensor: that is the place, not what stands out of it
             part = zip(("region", "when"), parse_place(name.partition("@")[2]), strict=True)
             spots |= {key: place.numbers() for key, place in part if place is not None}
         places.append(

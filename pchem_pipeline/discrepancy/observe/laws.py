@@ -99,16 +99,22 @@ def _log_gamma_tail(shape: float, value: float) -> float:
     return float((shape - 1.0) * np.log(value) - value - special.gammaln(shape))
 
 
-def extreme(count: int, on: float, beyond: float) -> float:
-    """Return the normal quantile of ``count`` samples at the extreme value and none beyond it.
+def pile_up(observed: FloatArray, expected: FloatArray, at: int, *, top: bool) -> float:
+    """Return the normal quantile of the samples at the highest or lowest code, with none beyond it.
+
+    The chance of none beyond the extreme code is uniform over repetitions, and given some, the counts on it
+    follow a Poisson law: both as normal quantiles, averaged.
 
     Args:
-        count: samples at the extreme, at least 1.
-        on: samples expected there.
-        beyond: samples expected beyond.
+        observed: samples of each code, (n,).
+        expected: those expected, (n,).
+        at: the extreme code; anywhere else than among these nothing is expected.
+        top: it is the highest one.
     """
-    on = max(on, _SMALL)
-    # P(no sample beyond) is uniform; half of the chance of the extreme itself splits the ties
+    known = 0 <= at < expected.size
+    count, on = (max(int(observed[at]), 1), max(float(expected[at]), _SMALL)) if known else (1, _SMALL)
+    beyond = float((expected[max(at + 1, 0) :] if top else expected[: max(at, 0)]).sum())
+    # half of the chance of the extreme itself splits the ties
     nothing = _quantile(-beyond + np.log(0.5 + 0.5 * np.exp(-on)))
     piled = _quantile(_log_poisson_tail(count, on) - np.log(-np.expm1(-on)))
     return float((nothing + piled) / np.sqrt(2.0))

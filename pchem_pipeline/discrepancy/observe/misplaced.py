@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,6 @@ from pchem_pipeline.model.arithmetic.significance import CERTAIN
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 Lines = Literal["rows", "columns"]
-
-_LINES: tuple[Lines, Lines] = ("rows", "columns")
 
 _SHARE = 1e-3  # of the lines, for which the statistic is the best one
 _CHANCE = 4.0  # variance of the sum where hardly a line is likely anywhere else: one or two of them
@@ -55,7 +53,7 @@ def misplaced_lines(
     if min(usable.shape) < 2:
         return z, shares
     chosen = frames[:: max(1, -(-frames.size // MOST_PAIRED))]
-    for lines in _LINES:
+    for lines in get_args(Lines):
         table = _Table.of(counts, origin, usable, lines)
         turned = _turned(chosen, lines)
         strides = 0, max(1, len(turned) // turned.shape[2])
@@ -139,7 +137,7 @@ class _Table:
         logs = np.log(real, out=real).astype(np.float32).reshape(*usable.shape, -1)
         del real
         first = (origin + some[0] - 1).reshape(usable.shape)
-        axis = _LINES.index(lines)
+        axis = int(lines == "columns")
         own, begin, count = (np.ascontiguousarray(a.swapaxes(0, axis)) for a in (logs, first, usable))
         ratios, codes = np.empty((*own.shape, len(STEPS)), np.float32), np.arange(own.shape[2])
         for j, (dy, dx) in enumerate(STEPS):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray
-from pchem_pipeline.discrepancy.observe.laws import extreme, poisson
+from pchem_pipeline.discrepancy.observe.laws import pile_up, poisson
 from pchem_pipeline.discrepancy.observe.tables import CodeSums, PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
@@ -151,10 +151,8 @@ def _pile_up(codes: CodeSums, sample: CodeSample, code: int, top: bool) -> Check
     at = code - codes.first
     z = -math.inf
     if 0 <= at < seen.size and seen[at]:
-        beyond = expected[at + 1 :] if top else expected[:at]
-        on = float(expected[at])
         # a fit that expects too many beyond is poor; what is cut off is on the code
-        z = min(extreme(int(seen[at]), on, float(beyond.sum())), poisson(int(seen[at]), on))
+        z = min(pile_up(seen, expected, at, top=top), poisson(int(seen[at]), float(expected[at])))
     bins = sample.origin[:, None] + np.arange(sample.counts.shape[1])
     share = float(sample.counts[bins == code].sum() / sample.counts.sum())
     known = sample.limits is not None and code == sample.limits[top]
