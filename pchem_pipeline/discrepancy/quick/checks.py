@@ -71,9 +71,7 @@ class _Kind(NamedTuple):
     """What is said of a check, and what explains it.
 
     Attributes:
-        unit: of the size.
-        title: the disturbance, a noun.
-        advice: consequence and cure.
+        unit, title, advice: as of :class:`Check`.
         signs: statistics of the catalogue that show the same: an effect with one of them in its signature
             explains the check.
         limits: sizes (of those in DN shares of the read noise) from which it deserves caution, and from which

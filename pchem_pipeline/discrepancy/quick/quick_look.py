@@ -28,8 +28,7 @@ from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.checks import KINDS, Check, QuickLook, check_of, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
 from pchem_pipeline.discrepancy.quick.frames import levels_check, normal_p, odd_frame_checks, series_checks
-from pchem_pipeline.discrepancy.quick.places import block_deviations, sensor_cells, sensor_places
-from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
+from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums, sensor_cells, sensor_places
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
@@ -207,7 +206,7 @@ def _local_drift(sums: StackSums, place: Suspect | None) -> Check:
     if place is None:
         return check_of("local_drift", 1.0, 0.0)
     inside = place.region.mask(sums.shape) & (sums.variance > 0)
-    common = block_deviations(sums)[:, inside].mean(axis=1)
+    common = sums.block_means(apart=True)[:, inside].mean(axis=1)
     chance = float(sums.variance[inside].mean()) / (float(sums.lengths.mean()) * inside.sum())
     size = math.sqrt(max(float(np.average(common**2, weights=sums.lengths)) - chance, 0.0))
     return _placed(check_of("local_drift", place.p, size), place, sums)
@@ -340,12 +339,8 @@ def _resemblance(
 ) -> list[Check]:
     """Return whether pairs of samples resemble each other, beyond what they share with others.
 
-    Args:
-        name: of the check.
-        covariance: of each pair, DN^2; NaN where there is none.
-        size: what it would be if both were equal, DN^2.
-        common: what pixels share.
-        shared: the part of the covariance that is not of the pair alone, and its error, DN^2.
+    The covariance of each pair, NaN where there is none, is compared with its ``size`` if both were equal,
+    DN^2; ``shared`` is the part of it that is not of the pair alone, and its error.
     """
     some = (size > 0) & np.isfinite(covariance)
     if not some.any():
@@ -404,7 +399,7 @@ def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
         # the third central moment of the samples, H / g^3
         third = np.where(maps.usable, maps.quanta_exposure / maps.conversion_gain**3, 0.0)[some]
     weight = 1.0 / sums.variance[some]
-    values = sums.block_means()[:, some]
+    values = sums.block_means(apart=False)[:, some]
     basis = np.stack([np.ones(charge.size), charge])
     inner = (basis * weight) @ basis.T
     shared = np.linalg.lstsq(inner, (basis * weight) @ values.T, rcond=None)[0]

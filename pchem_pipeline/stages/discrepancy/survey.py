@@ -25,7 +25,7 @@ from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
-from pchem_pipeline.discrepancy.quick.places import CellMap, sensor_cells, sensor_places
+from pchem_pipeline.discrepancy.quick.sums import CellMap, sensor_cells, sensor_places
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.scan_pairs import pairs_bytes, scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
