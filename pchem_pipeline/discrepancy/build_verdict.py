@@ -178,8 +178,7 @@ class Findings:
         places: disagreements of the data with the model before.
         still: whether the data disagree with the final model.
         added: added effects, and the remaining discrepancy.
-        doubt: why the pixels' parameters are not identified, and the cure; empty if they are.
-        limit: what was not tried when the search had used its budget; empty if it finished.
+        doubt, limit: see :class:`~pchem_pipeline.discrepancy.verdict.Verdict`.
     """
 
     samples: str

@@ -25,7 +25,6 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR, PRICE
 
-_OF_ORDER = ("time", "frame", "space")
 # statistics of neighbouring codes, and their period, DN
 _OF_CODES = {"code.alternating": 2, "code.period2": 2, "code.largest": 2, "code.rough": 3, "code.period4": 4}
 _SHORTER = 1.5  # smallest peak distance over such a period at which the fit cannot absorb it
@@ -67,10 +66,6 @@ class Covariance:
     def variances(self) -> FloatArray:
         """Variance of each statistic, shape (m,)."""
         return np.asarray(self.own + np.einsum("rm,rm->m", self.common, self.common))
-
-    def dense(self) -> FloatArray:
-        """Return the matrix, shape (m, m)."""
-        return np.asarray(np.diag(self.own) + self.common.T @ self.common)
 
     def times(self, factor: float) -> Covariance:
         """Return so many times the covariance; the factor is not negative."""
@@ -386,7 +381,7 @@ def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> BoolArray:
     step = float(np.nanmedian(1.0 / maps.conversion_gain[maps.usable])) if maps.usable.any() else 0.0
     free = {name for name, period in _OF_CODES.items() if _SHORTER * period <= step}
     kinds = ((STATISTICS[name].family, name) for name in names)
-    return np.array([f in _OF_ORDER or name in free for f, name in kinds], np.bool_)
+    return np.array([f in ("time", "frame", "space") or name in free for f, name in kinds], np.bool_)
 
 
 def disagrees(null: NullModel, z: Measured, significance: float, tolerance: FloatArray | float = 0.0) -> bool:

@@ -86,10 +86,19 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
 def _change(effect: Effect, maps: PixelMaps, n_frames: int, blocks: int, seed: int) -> FloatArray | None:
     """Return what an effect does to the samples of one stack, (frame, y, x); None where it does nothing."""
     seen: list[FloatArray] = []
+    kind = type(effect)
+
+    class Watched(kind):  # type: ignore[misc, valid-type]
+        def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+            changed: NDArray[Any] = super().apply(values, context)
+            seen.append(changed.astype(np.float64) - values.astype(np.float64))
+            return changed
+
+    everywhere = Watched.model_validate(effect.at_place(None).model_dump())
     shape = maps.usable.shape
     settings = SimulateSettings(
         shape=(shape[0], shape[1]), n_frames=n_frames, seed=seed, bit_depth=_BITS, effects=()
-    ).model_copy(update={"effects": (_watched(effect, seen),)})
+    ).model_copy(update={"effects": (everywhere,)})
     truth = truth_of(maps)
     last = max(n_frames - _BLOCK_FRAMES, 0)
     for first in np.unique(np.linspace(0, last, blocks).astype(int)).tolist():
@@ -101,17 +110,3 @@ def _spread(changes: Sequence[FloatArray], share: float) -> float:
     """Return by how much samples change from frame to frame, where they change if that is rare."""
     mean_square = np.mean([np.mean((change - change.mean(axis=0)) ** 2) for change in changes])
     return float(np.sqrt(mean_square / (share if 0.0 < share < RARE else 1.0)))
-
-
-def _watched(effect: Effect, seen: list[FloatArray]) -> Effect:
-    """Return an effect as it is, everywhere and always, that notes what it changes."""
-    kind = type(effect)
-
-    class Watched(kind):  # type: ignore[misc, valid-type]
-        def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-            changed: NDArray[Any] = super().apply(values, context)
-            seen.append(changed.astype(np.float64) - values.astype(np.float64))
-            return changed
-
-    found: Effect = Watched.model_validate(effect.at_place(None).model_dump())
-    return found

@@ -261,7 +261,11 @@ class Repeats:
             seen: histograms of the pixels.
             shape: of the frames (frame, y, x).
         """
-        alike = _log_alike(seen).reshape(shape[1:])
+        real = seen.counts.astype(np.float32)
+        total = np.maximum(real.sum(axis=1) + seen.outside.sum(axis=1), 1.0)
+        # the log of the chance that two samples of a pixel are equal
+        equal = np.maximum(np.einsum("ib,ib->i", real, real) / total**2, 1e-12)
+        alike = np.asarray(np.log(equal).reshape(shape[1:]), np.float64)
         by_axis = {"rows": alike.sum(axis=1), "columns": alike.sum(axis=0)}
         chance = {name: float(np.exp(np.minimum(same, 0.0)).sum()) for name, same in by_axis.items()}
         frames = float(np.exp(min(alike.sum(), 0.0)))
@@ -282,14 +286,6 @@ def _equal_lines(one: CodeArray, other: CodeArray) -> BoolArray:
     at = np.nonzero(equal)
     equal[at] = (one[at] == other[at]).all(axis=1)
     return equal
-
-
-def _log_alike(seen: PixelHistograms) -> FloatArray:
-    """Return the log of the chance that two samples of a pixel are equal, (n,)."""
-    real = seen.counts.astype(np.float32)
-    total = np.maximum(real.sum(axis=1) + seen.outside.sum(axis=1), 1.0)
-    alike = np.einsum("ib,ib->i", real, real) / total**2
-    return np.asarray(np.log(np.maximum(alike, 1e-12)), np.float64)
 
 
 def equal_squares(frames: CodeArray) -> IntArray:

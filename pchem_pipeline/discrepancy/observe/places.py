@@ -73,16 +73,6 @@ class SensorWindow:
         effect = effect.to_sensor(rows, columns, self.shape)
         return effect if part is None else effect.at_place(part.region, part.when)
 
-    def _known_as(self, region: Region) -> Region | None:
-        """Return the known region of the sensor of which the window shows nearly the same, if any."""
-        height, width = self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
-        found = region.mask((height, width))
-        for place in self.known:
-            seen = self.mask(place)
-            if (found & seen).sum() >= _SAME * (found | seen).sum():
-                return place
-        return None
-
     def on_sensor(self, region: Region | None) -> Region | None:
         """Return a region of the window as one of the sensor.
 
@@ -97,9 +87,12 @@ class SensorWindow:
             if taps.every is not None and taps.width == 1:
                 which = tuple(sorted((w + taps.first) % taps.every for w in taps.which))
                 taps = taps.model_copy(update={"first": 0, "which": which})
+        # the known region of which the window shows nearly the same
+        found = region.mask((self.rows[1] - y, self.columns[1] - x))
         rows = tuple((a + y, b + y) for a, b in region.rows)
         columns = tuple((a + x, b + x) for a, b in region.columns)
-        same = self._known_as(region)
+        seen = ((place, self.mask(place)) for place in self.known)
+        same = next((p for p, mask in seen if (found & mask).sum() >= _SAME * (found | mask).sum()), None)
         return region.model_copy(
             update={
                 "rows": rows if same is None else _beyond(rows, self.rows, same.rows),
