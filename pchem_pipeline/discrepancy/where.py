@@ -36,7 +36,6 @@ _MOST_PLACES = 20
 _WIDEST_CODE_WINDOW = 24
 #: Sets of samples that :func:`rare_samples` gives at most.
 N_SETS = 4
-_BY_CHANCE = 1.0  # of the rarer samples, in the whole stack
 _REACH, _FURTHER = 12.0, 15  # electron numbers about H, in its root and beside that
 _CHUNK = 256  # samples
 
@@ -252,10 +251,9 @@ def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:
     if not name.startswith("code."):
         return None
     code = evidence.code
-    if name == "code.top":
-        return (code.maximum, code.maximum)
-    if name == "code.bottom":
-        return (code.minimum, code.minimum)
+    ends = {"code.top": (code.maximum, code.maximum), "code.bottom": (code.minimum, code.minimum)}
+    if name in ends:
+        return ends[name]
     expected = np.maximum(code.expected, 1.0)
     deviation = (code.observed - code.expected) / np.sqrt(expected)
     total = np.concatenate([[0.0], np.cumsum(deviation)])
@@ -317,7 +315,8 @@ def rare_samples(evidence: Evidence) -> Iterator[RareSamples]:
     time = evidence.time
     if time is None or evidence.tail_expected is None:
         return
-    limit = _BY_CHANCE / max(int(evidence.maps.usable.sum()), 1)
+    # by chance there is one in the whole stack
+    limit = 1.0 / max(int(evidence.maps.usable.sum()), 1)
     for hits, beyond, above in zip(
         (time.low_hits, time.hits), evidence.tail_expected, (False, True), strict=True
     ):

@@ -64,13 +64,10 @@ def predicted_samples(frames: CodeArray, edges: IntArray, usable: BoolArray) -> 
         edges: positions of the blocks, (b + 1,).
         usable: pixels that count, (y, x).
     """
-    if min(usable.shape) < 3 or not usable[1:-1, 1:-1].any():
-        return {}
-    first = groups_of(edges, usable.size)
-    if not first.size:
+    first, inside = groups_of(edges, usable.size), usable[1:-1, 1:-1]
+    if min(usable.shape) < 3 or not inside.any() or not first.size:
         return {}
     chosen = frames[first[:, None] + np.arange(GROUP)].reshape(-1, *usable.shape)
-    inside = usable[1:-1, 1:-1]
     samples = chosen[:, 1:-1, 1:-1][:, inside].astype(np.int32).reshape(first.size, GROUP, -1)
     reach = _FARTHEST * float(samples.std(axis=(0, 1)).mean())
     step = max(1, int(np.ceil(reach / _MOST_THRESHOLDS)))

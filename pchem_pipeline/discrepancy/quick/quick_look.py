@@ -197,8 +197,8 @@ def _placed(check: Check, place: Suspect, sums: StackSums) -> Check:
         inside = place.region.mask(sums.shape)
         excess = float(np.nanmean(shared[inside]) - np.nanmean(shared[~inside]))
         size = max(size, math.sqrt(max(excess, 0.0)))
-    words, numbers = place.region.describe(), place.region.numbers()
-    return replace(check, p=p, size=size, where=check.where or words, region=numbers)
+    where = check.where or place.region.describe()
+    return replace(check, p=p, size=size, where=where, region=place.region.numbers())
 
 
 def _local_drift(sums: StackSums, place: Suspect | None) -> Check:
