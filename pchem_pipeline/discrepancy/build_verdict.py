@@ -5,47 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.discrepancy import verdict as schema
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
 from pchem_pipeline.discrepancy.size import size_of
-from pchem_pipeline.discrepancy.verdict import (
-    CONVINCING_PLACEBO,
-    MOST_PULLS,
-    Candidate,
-    Change,
-    Discrepancy,
-    Examined,
-    Families,
-    GapChange,
-    Moved,
-    Place,
-    Pull,
-    Rival,
-    Size,
-    State,
-    Step,
-    Verdict,
-    closed_share,
-    families_words,
-    form_of,
-    parameters_of,
-    share_text,
-    sigma_text,
-)
 from pchem_pipeline.effects.framework.compose import AddedExposure, place_words, title_words
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
+from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.arithmetic.significance import CLEAR, FALSE_ALARM, NO_CHANCE
 
-FloatArray = NDArray[np.float64]
+if TYPE_CHECKING:
+    from pchem_pipeline.discrepancy.skeleton import Prepared
 
 #: Largest share of a gap above its floor that may remain with effects that explain it.
 LARGEST_REST = 0.2
@@ -69,27 +47,23 @@ class Addition:
         effect: with its fitted parameters.
         alone: whether all others are excluded.
         against: reason of its rejection, starting with "it"; empty if it is accepted.
-        candidates: effects compared, the likeliest first.
         strength_stderr: standard error of its strength.
         before, after: gap on the final samples without and with it.
-        rivals: the next best effects, fitted the same way, the best first.
-        placebo: best unrelated control, or None.
-        pulls: the statistics that changed most.
-        moved: change of each parameter map by the refit with the effect.
         described: whether it is an empirical description without a cause.
         certain: whether its strength is significant.
+        candidates, rivals, placebo, pulls, moved: see :class:`~pchem_pipeline.discrepancy.verdict.Step`.
     """
 
     effect: Effect
     alone: bool
     against: str
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[schema.Candidate, ...]
     strength_stderr: float
     before: Gap
     after: Gap
-    rivals: tuple[Rival, ...]
-    placebo: Rival | None
-    pulls: tuple[Pull, ...]
+    rivals: tuple[schema.Rival, ...]
+    placebo: schema.Rival | None
+    pulls: tuple[schema.Pull, ...]
     moved: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     described: bool = False
     certain: bool = True
@@ -110,7 +84,7 @@ class Addition:
         return self.verdict == "named"
 
     @property
-    def verdict(self) -> State:
+    def verdict(self) -> schema.State:
         """The verdict on this effect alone."""
         if self.described:
             return "described"
@@ -118,25 +92,25 @@ class Addition:
             return "unexplained"
         return "named" if self.alone and self.confirmed else "ambiguous"
 
-    def step(self, size: Size | None) -> Step:
+    def step(self, size: schema.Size | None) -> schema.Step:
         """Make its entry in ``discrepancy.json``."""
-        return Step(
+        return schema.Step(
             effect=self.effect.tag if self.named else None,
             verdict=self.verdict,
             # an unconfirmed effect without a competitor is listed alone
             candidates=self.candidates[:1] if self.alone and not self.confirmed else self.candidates,
-            parameters=parameters_of(self.effect, self.strength_stderr),
-            form=form_of(self.effect),
+            parameters=schema.parameters_of(self.effect, self.strength_stderr),
+            form=schema.form_of(self.effect),
             place=place_words(self.effect),
             gap_before=self.before.value,
             gap_after=self.after.value,
             gap_floor=self.after.floor,
             gap_interval_after=self.after.interval,
-            families=Families(before=dict(self.before.families), after=dict(self.after.families)),
+            families=schema.Families(before=dict(self.before.families), after=dict(self.after.families)),
             size=size,
             rivals=self.rivals,
             placebo=self.placebo,
-            moved={name: Moved(**change) for name, change in self.moved.items()},
+            moved={name: schema.Moved(**change) for name, change in self.moved.items()},
             separate=self._separate(),
             pulls=self.pulls,
         )
@@ -175,7 +149,7 @@ class Added:
     unfinished: bool = False
     nearest: tuple[str, ...] = ()
     stand_ins: tuple[str, ...] = ()
-    residuals: tuple[Place, ...] = ()
+    residuals: tuple[schema.Place, ...] = ()
     set_aside: tuple[tuple[float | None, float | None], ...] = ()
 
 
@@ -204,8 +178,7 @@ class Findings:
         places: disagreements of the data with the model before.
         still: whether the data disagree with the final model.
         added: added effects, and the remaining discrepancy.
-        doubt: why the pixels' parameters are not identified, and the cure; empty if they are.
-        limit: what was not tried when the search had used its budget; empty if it finished.
+        doubt, limit: see :class:`~pchem_pipeline.discrepancy.verdict.Verdict`.
     """
 
     samples: str
@@ -213,14 +186,14 @@ class Findings:
     first: NullModel
     last: NullModel
     before: Gap
-    places: Sequence[Place]
+    places: Sequence[schema.Place]
     still: bool
     added: Added
     doubt: str = ""
     limit: str = ""
 
     @property
-    def state(self) -> State:
+    def state(self) -> schema.State:
         """The kind of verdict."""
         additions = self.added.additions
         if not additions:
@@ -266,39 +239,28 @@ class Findings:
 
 
 def build_verdict(
-    found: Findings,
-    model: tuple[Effect, ...],
-    fitted: Fitted,
-    looked_at: tuple[Evidence, Examined],
-    *,
-    untestable: Mapping[str, str],
-    defects: Mapping[str, str],
-    n_replicates: int,
-    work: float,
-) -> Discrepancy:
+    found: Findings, data: Prepared, model: tuple[Effect, ...], fitted: Fitted
+) -> schema.Discrepancy:
     """Build the verdict.
 
     Args:
         found: results of the search.
+        data: that were searched.
         model: effects of the final model.
         fitted: the pixels under it.
-        looked_at: evidence of the train samples, and the samples examined.
-        untestable: effects that such data cannot show, and why.
-        defects: candidates that failed, and why.
-        n_replicates: number of simulated stacks or histograms.
-        work: counted work, CPU seconds.
     """
+    additions, before, after = found.added.additions, found.before, found.added.after
     # unidentified gain and read noise give no size in e-
     sizes = {
         each.effect: None
         if found.doubt
-        else size_of(fitted.seen(each.effect), fitted.maps, looked_at[1].frames)
-        for each in found.added.additions
+        else size_of(fitted.seen(each.effect), fitted.maps, data.examined.frames)
+        for each in additions
     }
     both = found.z.both
     pulls = found.first.pulls(both, splits=2), found.last.pulls(both, splits=2)
-    return Discrepancy(
-        verdict=Verdict(
+    return schema.Discrepancy(
+        verdict=schema.Verdict(
             verdict=found.state,
             sentence=_sentence(found, sizes).removesuffix(".")
             + (f"; {found.limit}." if found.limit else "."),
@@ -307,29 +269,37 @@ def build_verdict(
             effects=tuple(dict.fromkeys(effect.tag for effect in found.named)),
             model_effects=tuple(effect.model_dump(mode="json") for effect in model),
             proposed=tuple(effect.model_dump(mode="json") for effect in found.proposed),
-            steps=tuple(each.step(sizes[each.effect]) for each in found.added.additions),
-            gap=_gap_change(found.before, found.added),
+            steps=tuple(each.step(sizes[each.effect]) for each in additions),
+            gap=schema.GapChange(
+                before=before.value,
+                after=after.value,
+                floor=after.floor,
+                closed_fraction=schema.closed_share(before.value, after.value) if additions else 0.0,
+                interval_before=before.interval,
+                interval_after=after.interval,
+                standing_out=after.standing_out,
+            ),
             where=tuple(found.places),
             unexplained=(*found.added.residuals, *_still(found, pulls[1])),
             set_aside=found.added.set_aside if found.named else (),
-            untestable=dict(untestable),
-            defects=dict(defects),
-            examined=looked_at[1],
-            p_global=Change(before=found.first.global_p(both, 2), after=found.last.global_p(both, 2)),
-            replicates=n_replicates,
-            work=round(work, 1),
+            untestable=dict(data.untestable),
+            defects=dict(data.defects),
+            examined=data.examined,
+            p_global=schema.Change(before=found.first.global_p(both, 2), after=found.last.global_p(both, 2)),
+            replicates=data.effort.replicates,
+            work=round(data.effort.spent, 1),
             versions={"statistics": VERSION},
         ),
         model=model,
         maps=fitted.maps,
-        evidence=looked_at[0],
-        statistics=(found.first.names, pulls[0], pulls[1]),
+        evidence=data.evidence,
+        statistics=(found.first.names, *pulls),
         code_extended=fitted.code_extended,
         added=fitted.added,
     )
 
 
-def _still(found: Findings, pulls: FloatArray) -> list[Place]:
+def _still(found: Findings, pulls: FloatArray) -> list[schema.Place]:
     """Return the largest disagreement with the final model, and other significant ones."""
     if not found.still:
         return []
@@ -337,38 +307,25 @@ def _still(found: Findings, pulls: FloatArray) -> list[Place]:
     chance = [look_elsewhere(p, tests) for p in found.last.p_of(pulls, 2).tolist()]
     order = np.argsort(-np.abs(pulls))[:_MOST_UNEXPLAINED].tolist()
     kept = [i for n, i in enumerate(order) if n == 0 or chance[i] < NO_CHANCE]
-    return [Place.of(found.last.names[i], z=float(pulls[i])) for i in kept]
+    return [schema.Place.of(found.last.names[i], z=float(pulls[i])) for i in kept]
 
 
 def largest_pulls(
     names: Sequence[str], weight: FloatArray, before: FloatArray, after: FloatArray
-) -> tuple[Pull, ...]:
+) -> tuple[schema.Pull, ...]:
     """Return the statistics of largest weight with their pulls; all arguments have shape (m,)."""
     return tuple(
-        Pull(
+        schema.Pull(
             statistic=names[i],
             sentence=STATISTICS[names[i]].says(float(before[i])),
             before=float(before[i]),
             after=float(after[i]),
         )
-        for i in np.argsort(-np.abs(weight))[:MOST_PULLS]
+        for i in np.argsort(-np.abs(weight))[: schema.MOST_PULLS]
     )
 
 
-def _gap_change(before: Gap, added: Added) -> GapChange:
-    after = added.after
-    return GapChange(
-        before=before.value,
-        after=after.value,
-        floor=after.floor,
-        closed_fraction=closed_share(before.value, after.value) if added.additions else 0.0,
-        interval_before=before.interval,
-        interval_after=after.interval,
-        standing_out=after.standing_out,
-    )
-
-
-def _more_samples(other: Candidate) -> str:
+def _more_samples(other: schema.Candidate) -> str:
     """Return the data that decide between a candidate and the best.
 
     A difference of log-likelihoods grows with the number of samples, its standard error with the root.
@@ -393,15 +350,13 @@ def _nearly(found: Findings) -> str:
     return f"; borderline: {'; '.join(words)}; take more frames to decide" if words else ""
 
 
-_OF_PIXELS = " (histograms of single pixels only; frames, rows, columns and neighbours were not tested)"
-
-
-def _sentence(found: Findings, sizes: Mapping[Effect, Size | None]) -> str:
+def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Return the verdict in one sentence: the effect, its size, and the remaining discrepancy."""
     state, data, added = found.state, found.samples, found.added
     titles = [_sized(effect, sizes) for effect in found.named]
     if state == "consistent":
-        seen = _OF_PIXELS if data == "histograms" else ""
+        seen = " (histograms of single pixels only; frames, rows, columns and neighbours were not tested)"
+        seen = seen if data == "histograms" else ""
         return f"Data and model agree in every statistic tested{seen}{_nearly(found)}."
     if state == "cannot_tell":
         return (
@@ -422,11 +377,10 @@ def _sentence(found: Findings, sizes: Mapping[Effect, Size | None]) -> str:
     if state == "named_in_part":
         words = f"{_rest(found)}{_shown(found)}{_nearest(found)}{_left(added)}{_doubts(added)}"
         return f"The model was missing {_and(titles)}{words}{_broken(found)}."
-    words = f"with {'them' if len(titles) > 1 else 'it'}, {_AGREE}{_left(added)}{_doubts(added)}"
-    return f"The model was missing {_and(titles)}; {words}."
-
-
-_AGREE = "data and model agree within sampling noise"
+    return (
+        f"The model was missing {_and(titles)}; with {'them' if len(titles) > 1 else 'it'}, data and model "
+        f"agree within sampling noise{_left(added)}{_doubts(added)}."
+    )
 
 
 def _none(found: Findings) -> str:
@@ -434,7 +388,7 @@ def _none(found: Findings) -> str:
     return "no effect tried" if found.limit else "no known effect"
 
 
-def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
+def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Describe effects between which the data do not decide, and unconfirmed ones."""
     data, additions = found.samples, found.added.additions
     unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in additions if not each.alone]
@@ -450,7 +404,7 @@ def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Si
     return f"{also} lacks {_and(unknown)}: these {data} do not decide which{weak}{rest}."
 
 
-def _sized(effect: Effect, sizes: Mapping[Effect, Size | None]) -> str:
+def _sized(effect: Effect, sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Describe an effect by name, size and region."""
     size = sizes.get(effect)
     if size is None:
@@ -459,24 +413,23 @@ def _sized(effect: Effect, sizes: Mapping[Effect, Size | None]) -> str:
     return f"{_title(effect.tag)} of {size.words()}{place}"
 
 
-def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, Size | None]) -> str:
+def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Describe the data empirically where no known effect explains them."""
     known = [(effect.describe(), sizes.get(effect)) for effect in found.described]
     words = "; and ".join(text if size is None else f"{text}, size {size.words()}" for text, size in known)
     lead = f"The model was missing {_and(titles)}; {_none(found)} explains the rest"
     if not titles:
         lead = f"{_none(found).capitalize()} explains the discrepancy"
-    return (
-        f"{lead}; empirically, {words}; this {_closed(found)}, and is a description, not a cause"
-        f"{_remains(found)}{_broken(found)}."
-    )
-
-
-def _remains(found: Findings) -> str:
-    """State whether an empirical description is complete, and in the model."""
+    before, after = found.before, found.added.after
+    closed = f"does not reduce the discrepancy in unseen {found.samples}"
+    if not before.at_floor and after.value < before.value:
+        share = schema.share_text(schema.closed_share(before.value, after.value))
+        closed = f"explains {share} of the discrepancy in unseen {found.samples}"
+    rest = "; single statistics still disagree" if found.still else ""
     if found.proposed:
-        return "; more than sampling noise remains, so it is proposed, not added to the model"
-    return "; single statistics still disagree" if found.still else ""
+        rest = "; more than sampling noise remains, so it is proposed, not added to the model"
+    lead = f"{lead}; empirically, {words}; this {closed}, and is a description, not a cause"
+    return f"{lead}{rest}{_broken(found)}."
 
 
 def _nearest(found: Findings) -> str:
@@ -498,23 +451,15 @@ def _title(tag: str) -> str:
     return tag if effect is None else effect.title or tag
 
 
-def _closed(found: Findings) -> str:
-    """State the share of the gap that an empirical description explains."""
-    before, after = found.before, found.added.after
-    if before.at_floor or after.value >= before.value:
-        return f"does not reduce the discrepancy in unseen {found.samples}"
-    share = share_text(closed_share(before.value, after.value))
-    return f"explains {share} of the discrepancy in unseen {found.samples}"
-
-
 def _rest(found: Findings) -> str:
     """State the remaining share of the gap; empty if it is within sampling noise."""
     after = found.added.after
     if after.at_floor or found.before.value <= 0.0:
         return ""
     if after.value <= after.floor:
-        return f"; a significant discrepancy remains in {families_words(after.standing_out)}"
-    return f"; {share_text(1.0 - closed_share(found.before.value, after.value))} of the discrepancy remains"
+        return f"; a significant discrepancy remains in {schema.families_words(after.standing_out)}"
+    left = 1.0 - schema.closed_share(found.before.value, after.value)
+    return f"; {schema.share_text(left)} of the discrepancy remains"
 
 
 def _broken(found: Findings) -> str:
@@ -536,7 +481,7 @@ def _shown(found: Findings) -> str:
     worst = int(np.argmax(np.abs(pulls)))
     name = found.last.names[worst]
     says = STATISTICS[name].says(float(pulls[worst]))
-    return f"; one statistic still disagrees: {says} ({sigma_text(pulls[worst])})"
+    return f"; one statistic still disagrees: {says} ({schema.sigma_text(pulls[worst])})"
 
 
 def _doubts(added: Added) -> str:
@@ -546,11 +491,10 @@ def _doubts(added: Added) -> str:
         closed = each.before.value - each.after.value
         if each.named and each.placebo is not None and closed > 0.0:
             share = (each.before.value - max(each.placebo.gap_after, 0.0)) / closed
-            if share > CONVINCING_PLACEBO:
-                words += (
-                    f"; an unrelated control, {_title(each.placebo.effect)}, explains "
-                    f"{share_text(min(share, 1.0))} of that, too: {_title(each.effect.tag)} is doubtful"
-                )
+            if share > schema.CONVINCING_PLACEBO:
+                control, part = _title(each.placebo.effect), schema.share_text(min(share, 1.0))
+                words += f"; an unrelated control, {control}, explains {part} of that, too: "
+                words += f"{_title(each.effect.tag)} is doubtful"
     return words
 
 

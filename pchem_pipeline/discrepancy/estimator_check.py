@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.framework.effect import Effect
@@ -32,7 +33,7 @@ class RecoveredStrength:
     """
 
     true: float
-    found: NDArray[np.float64]
+    found: FloatArray
 
     @property
     def n_guesses(self) -> int:
@@ -98,11 +99,10 @@ def recovered_strength(
 
 def _check_reach(effect: Effect, shape: tuple[int, int], seed: int) -> None:
     """Raise an error where single rows or later frames are not what they are in the whole: bands differ."""
-    settings = SimulateSettings(shape=shape, n_frames=_BLOCK, seed=seed, effects=(effect,))
-    truth, middle, later = draw_truth(settings), shape[0] // 2, _BLOCK // 2
-    whole = simulate_block(truth, settings, (0, _BLOCK), electron_frames=0)[0]
-    band = simulate_block(truth, settings, (0, _BLOCK), (middle, shape[0]), electron_frames=0)[0]
-    block = simulate_block(truth, settings, (later, _BLOCK), electron_frames=0)[0]
+    middle, later = shape[0] // 2, _BLOCK // 2
+    whole = _simulated(effect, _BLOCK, shape, seed)
+    band = _simulated(effect, _BLOCK, shape, seed, top=middle)
+    block = _simulated(effect, _BLOCK, shape, seed, first=later)
     for same, what, declared in (
         (np.array_equal(whole[:, middle:], band), "rows", "reach_rows"),
         (np.array_equal(whole[later:], block), "frames", "reach_frames"),
@@ -115,7 +115,9 @@ def _check_reach(effect: Effect, shape: tuple[int, int], seed: int) -> None:
 
 
 def _simulated(
-    effect: Effect, n_frames: int, shape: tuple[int, int], seed: int
+    effect: Effect, n_frames: int, shape: tuple[int, int], seed: int, first: int = 0, top: int = 0
 ) -> NDArray[np.unsignedinteger]:
+    """Return simulated frames from the number ``first`` on, of the rows from ``top`` on."""
     settings = SimulateSettings(shape=shape, n_frames=n_frames, seed=seed, effects=(effect,))
-    return simulate_block(draw_truth(settings), settings, (0, n_frames), electron_frames=0)[0]
+    part = (first, n_frames), (top, shape[0])
+    return simulate_block(draw_truth(settings), settings, *part, electron_frames=0)[0]

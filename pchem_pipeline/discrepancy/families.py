@@ -15,15 +15,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.model.arithmetic.significance import PRICE
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 #: First indices of ranges, and their ends.
 Ranges = tuple[IntArray, IntArray] | IntArray
 #: Of the cells of rows, and of columns.

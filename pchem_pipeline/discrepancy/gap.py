@@ -14,16 +14,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.covariance import Covariance
-from pchem_pipeline.discrepancy.null import STRAY, NullModel, moments
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.discrepancy.null import STRAY, Covariance, NullModel, moments
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-
-FloatArray = NDArray[np.float64]
 
 _REST_OF_NAMED = 0.1  # largest remaining gap beside a named effect, over the gap that the effect closes
 _FLOOR_QUANTILE = 0.95
@@ -114,11 +111,7 @@ class StatisticsGap:
     )
 
     def gap(
-        self,
-        z: FloatArray,
-        mean: FloatArray,
-        replicates: FloatArray,
-        strengths: FloatArray | None = None,
+        self, z: FloatArray, mean: FloatArray, replicates: FloatArray, strengths: FloatArray | None = None
     ) -> Gap:
         """Compute the gap of a model.
 
@@ -189,7 +182,7 @@ class StatisticsGap:
         return found
 
 
-def among_themselves(distances: FloatArray, apart: float = _APART) -> NDArray[np.bool_]:
+def among_themselves(distances: FloatArray, apart: float = _APART) -> BoolArray:
     """Return which replicates are no outliers, (b,).
 
     Args:

@@ -13,21 +13,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.covariance import Covariance
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import without_skew
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR, PRICE
 
-FloatArray = NDArray[np.float64]
-
-_OF_ORDER = ("time", "frame", "space")
 # statistics of neighbouring codes, and their period, DN
 _OF_CODES = {"code.alternating": 2, "code.period2": 2, "code.largest": 2, "code.rough": 3, "code.period4": 4}
 _SHORTER = 1.5  # smallest peak distance over such a period at which the fit cannot absorb it
@@ -48,6 +45,76 @@ _SUSPICION = 0.1  # global p-value below which candidates are compared
 #: Robust standard deviations beyond which a replicate is an outlier: with effects, which may change a few
 #: replicates only; and at which a statistic is winsorised without any.
 STRAY, _STRAY_ALONE = 30.0, 10.0
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """A covariance ``diag(own) + common.T @ common`` of many statistics from few replicates.
+
+    The sample covariance shrunk towards its diagonal has this form, and so have all sums with it; whitening
+    is linear in the number of statistics, not cubic.
+
+    Attributes:
+        own: variance of each statistic by itself, above 0, shape (m,).
+        common: modes that they share, shape (r, m).
+    """
+
+    own: FloatArray
+    common: FloatArray
+
+    @property
+    def variances(self) -> FloatArray:
+        """Variance of each statistic, shape (m,)."""
+        return np.asarray(self.own + np.einsum("rm,rm->m", self.common, self.common))
+
+    def times(self, factor: float) -> Covariance:
+        """Return so many times the covariance; the factor is not negative."""
+        return Covariance(self.own * factor, self.common * np.sqrt(factor))
+
+    def scaled(self, ratio: FloatArray) -> Covariance:
+        """Return that of statistics so many times as large each, shape (m,)."""
+        return Covariance(self.own * ratio**2, self.common * ratio)
+
+    def plus(self, variances: FloatArray) -> Covariance:
+        """Return it with independent scatter besides, shape (m,)."""
+        return replace(self, own=self.own + variances)
+
+    def with_modes(self, modes: FloatArray) -> Covariance:
+        """Return it with further modes, each of which scatters with a deviation of 1, shape (k, m)."""
+        return replace(self, common=np.concatenate([self.common, modes]))
+
+    def among(self, kept: BoolArray | list[int]) -> Covariance:
+        """Return that of some of the statistics."""
+        return Covariance(self.own[kept], self.common[:, kept])
+
+    def white(self, rows: FloatArray) -> FloatArray:
+        """Return vectors, (..., m), in a basis in which they scatter independently with a deviation of 1."""
+        scale, modes, change, _ = self._whitening
+        scaled = rows / scale
+        return np.asarray(scaled + ((scaled @ modes.T) * change) @ modes)
+
+    @property
+    def log_root_determinant(self) -> float:
+        """Half the logarithm of the determinant."""
+        return self._whitening[3]
+
+    @cached_property
+    def _whitening(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Own deviations, common modes as orthonormal rows, by how much each shrinks, the determinant.
+
+        Of ``I + V.T V`` the symmetric root, from the eigenvectors of the smaller of ``V V.T`` and ``V.T V``.
+        """
+        scale = np.sqrt(self.own)
+        common = self.common / scale
+        few = len(common) < scale.size
+        sizes, axes = np.linalg.eigh(common @ common.T if few else common.T @ common)
+        real = sizes > 1e-12 * max(float(sizes.max(initial=0.0)), 1.0)
+        sizes = sizes[real]
+        modes = axes[:, real].T
+        if few:
+            modes = modes @ common / np.sqrt(sizes)[:, None]
+        half = float(np.sum(np.log(scale)) + 0.5 * np.sum(np.log1p(sizes)))
+        return scale, modes, 1.0 / np.sqrt(1.0 + sizes) - 1.0, half
 
 
 @dataclass(frozen=True)
@@ -98,12 +165,13 @@ class NullModel:
         tests = _effective_tests(names, vectors, skewness)
         if before is not None:
             moved = before.moved_by(vectors)
-            pooled = np.where(moved, std, _pooled(std, len(vectors), before.std, before.n_replicates))
+            n, m = len(vectors), before.n_replicates
+            pooled = np.where(moved, std, np.sqrt((n * std**2 + m * before.std**2) / (n + m)))
             covariance = covariance.scaled(pooled / std)
             std, skewness, tests = pooled, before.skewness, before.effective_tests
         return cls(names, mean, std, covariance, vectors, skewness, tests)
 
-    def moved_by(self, vectors: FloatArray) -> NDArray[np.bool_]:
+    def moved_by(self, vectors: FloatArray) -> BoolArray:
         """Test which statistics effects shift (t-test) or widen (F-test), shape (m,).
 
         A common mode widens trends and correlations in time without shifting them.
@@ -131,7 +199,7 @@ class NullModel:
         return np.array([EXACT.get(name.partition("@")[0], 0.0) for name in self.names])
 
     @property
-    def counts(self) -> NDArray[np.bool_]:
+    def counts(self) -> BoolArray:
         """Which statistics are normal quantiles of a count, shape (m,)."""
         return _are_counts(self.names)
 
@@ -217,10 +285,6 @@ def as_matrix(
     return found
 
 
-def _pooled(first: FloatArray, n_first: int, second: FloatArray, n_second: int) -> FloatArray:
-    return np.asarray(np.sqrt((n_first * first**2 + n_second * second**2) / (n_first + n_second)))
-
-
 def _std(deviations: FloatArray) -> FloatArray:
     return _std_of(np.sum(deviations**2, axis=0), deviations.shape[0] - 1)
 
@@ -237,7 +301,7 @@ def _kind(name: str) -> str:
     return name.partition("@")[0].rpartition(".")[2]
 
 
-def _are_counts(names: Sequence[str]) -> NDArray[np.bool_]:
+def _are_counts(names: Sequence[str]) -> BoolArray:
     return np.isin([_kind(name) for name in names], _COUNTS)
 
 
@@ -304,7 +368,7 @@ class Measured:
         return (self.train + self.test) / 2.0
 
 
-def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> NDArray[np.bool_]:
+def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> BoolArray:
     """Return which statistics do not depend on the pixels' fitted parameters (are ancillary), shape (m,).
 
     Given the histograms, frames without an effect are in random order, which fixes all statistics of time,
@@ -317,15 +381,10 @@ def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> NDArray[np.bool
     step = float(np.nanmedian(1.0 / maps.conversion_gain[maps.usable])) if maps.usable.any() else 0.0
     free = {name for name, period in _OF_CODES.items() if _SHORTER * period <= step}
     kinds = ((STATISTICS[name].family, name) for name in names)
-    return np.array([f in _OF_ORDER or name in free for f, name in kinds], np.bool_)
+    return np.array([f in ("time", "frame", "space") or name in free for f, name in kinds], np.bool_)
 
 
-def disagrees(
-    null: NullModel,
-    z: Measured,
-    significance: float,
-    tolerance: FloatArray | float = 0.0,
-) -> bool:
+def disagrees(null: NullModel, z: Measured, significance: float, tolerance: FloatArray | float = 0.0) -> bool:
     """Test whether any statistic deviates significantly, with the same sign in both splits.
 
     Args:

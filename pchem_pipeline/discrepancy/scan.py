@@ -19,28 +19,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy import families
-from pchem_pipeline.discrepancy.families import (
-    FEWEST,
-    SURE,
-    Contrast,
-    Place,
-    best_place,
-    contrast_of_map,
-    log_binomial_tails,
-    successive,
-)
-from pchem_pipeline.discrepancy.observe.rare import SEED
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 _FRAME_PERIODS = range(2, 33)
 _SWEEPS = 3  # of the ends of a range over the frames
@@ -121,12 +106,12 @@ def scan_map(
     """
     some = usable & np.isfinite(values)
 
-    def best(left: BoolArray) -> Place | None:
-        contrast = contrast_of_map(values, left)
-        found = best_place([*_regions(contrast), families.single(values, left) if single else None])
+    def best(left: BoolArray) -> families.Place | None:
+        contrast = families.contrast_of_map(values, left)
+        found = families.best_place([*_regions(contrast), families.single(values, left) if single else None])
         return _significant(found, values, left, significance, either_side=True)
 
-    def share(place: Place, left: BoolArray) -> float:
+    def share(place: families.Place, left: BoolArray) -> float:
         deviations = np.where(some, math.copysign(1.0, place.z) * values, -np.inf)[some]
         return affected_share(deviations, (place.mask & left)[some])
 
@@ -136,7 +121,7 @@ def scan_map(
             region=Region.of_mask(_reaching(place.mask, next_along)),
             share=share(place, left),
         )
-        for place, left in successive(best, some, most)
+        for place, left in families.successive(best, some, most)
     ]
 
 
@@ -146,7 +131,7 @@ def scan_series(
     *,
     significance: float = SIGNIFICANCE,
     most: int = 2,
-    shortest: int = FEWEST,
+    shortest: int = families.FEWEST,
 ) -> list[Stretch]:
     """Return the frames that stand out of a series, the most significant first.
 
@@ -159,24 +144,24 @@ def scan_series(
     """
     row = values[None]
 
-    def best(left: BoolArray) -> Place | None:
-        contrast = contrast_of_map(row, left, shortest, numbers)
+    def best(left: BoolArray) -> families.Place | None:
+        contrast = families.contrast_of_map(row, left, shortest, numbers)
         found = [
             families.box_of_map(contrast, "columns", shortest),
             # a multiple of a period is no better than it
             families.every_nth(contrast, 1, _FRAME_PERIODS, cycles=4, better=1.02),
             families.single(row, left),
         ]
-        return _significant(best_place(found, better=0.0), row, left, significance)
+        return _significant(families.best_place(found, better=0.0), row, left, significance)
 
     found = []
-    for place, left in successive(best, np.isfinite(row), most):
+    for place, left in families.successive(best, np.isfinite(row), most):
         family, when = _frames(place, numbers)
         found.append(Stretch(**place.means(row, left) | {"family": family}, when=when))
     return found
 
 
-def _frames(place: Place, numbers: IntArray) -> tuple[str, When]:
+def _frames(place: families.Place, numbers: IntArray) -> tuple[str, When]:
     """Return the frames of a place in a series, and what they are."""
     at = numbers[place.mask[0]]
     if place.family == "columns":
@@ -187,7 +172,7 @@ def _frames(place: Place, numbers: IntArray) -> tuple[str, When]:
     return "frames", When(single=tuple(int(number) for number in at[:_MOST_SINGLE]))
 
 
-def _regions(contrast: Contrast) -> list[Place | None]:
+def _regions(contrast: families.Contrast) -> list[families.Place | None]:
     """Return the best place of a map of every family but single pixels, the simpler ones first."""
     return [
         families.box_of_map(contrast, "rows"),
@@ -210,13 +195,13 @@ def _reaching(mask: BoolArray, axis: int | None) -> BoolArray:
 
 
 def _significant(
-    place: Place | None,
+    place: families.Place | None,
     values: FloatArray,
     some: BoolArray,
     significance: float,
     *,
     either_side: bool = False,
-) -> Place | None:
+) -> families.Place | None:
     """Return a place with its deviation in terms of the scatter inside and outside (Welch), if significant.
 
     Where values scatter more, a mean that is off says less. ``either_side``: the place, or all outside of it
@@ -236,25 +221,24 @@ def _significant(
     return place if place.log_p <= math.log(significance) else None
 
 
-def affected_share(z: FloatArray, inside: BoolArray, level: float = SURE) -> float:
+def affected_share(z: FloatArray, inside: BoolArray) -> float:
     """Return a lower bound of the share of the values inside a place that are larger than by chance.
 
     All-resolutions inference (Rosenblatt et al. 2018; Goeman and Solari 2011): closed testing with Simes'
     test bounds the number of true deviations of all sets at once, so that the place may have been chosen
-    after looking: ``max_u (1 - u + #{i inside: m p_i <= u level})`` with all m values (Hommel's smaller
-    number would do, and give a little more).
+    after looking: ``max_u (1 - u + #{i inside: m p_i <= u a})`` with all m values (Hommel's smaller
+    number would do, and give a little more). Any of these bounds is too large with the probability a = SURE.
 
     Args:
         z: one-sided deviations of all values, N(0, 1) by chance, (m,).
         inside: the place, (m,).
-        level: probability that any of these bounds is too large.
     """
     n = int(inside.sum())
     if n == 0:
         return 0.0
     p = np.sort(special.ndtr(-z[inside]))
     # the smallest u for which the i-th value counts
-    u = np.maximum(np.ceil(z.size * p / level), 1.0)
+    u = np.maximum(np.ceil(z.size * p / families.SURE), 1.0)
     bound = 1.0 - u + np.arange(1, n + 1)
     return float(max(bound.max(), 0.0) / n)
 
@@ -328,18 +312,20 @@ def scan_event_map(
         Places; ``inside`` and ``outside`` are events beyond those expected per pixel.
     """
 
-    def best(left: BoolArray) -> Place | None:
+    def best(left: BoolArray) -> families.Place | None:
         events, chance = np.where(left, seen, 0.0), np.where(left, expected, 0.0)
         total, share = float(events.sum()), chance / chance.sum()
-        place = best_place(_regions(Contrast.of_pixels(events, share, families.events(total))))
+        place = families.best_place(
+            _regions(families.Contrast.of_pixels(events, share, families.events(total)))
+        )
         if place is None:
             return None
-        tail = float(log_binomial_tails(events[place.mask].sum(), total, share[place.mask].sum()))
+        tail = float(families.log_binomial_tails(events[place.mask].sum(), total, share[place.mask].sum()))
         exact = replace(place, log_places=place.log_places + tail - float(special.log_ndtr(-place.z)))
         return exact if exact.log_p <= math.log(significance) else None
 
     found = []
-    for place, left in successive(best, usable & (expected > 0.0), most):
+    for place, left in families.successive(best, usable & (expected > 0.0), most):
         means = place.means(seen - expected, left)
         region = Region.of_mask(place.mask)
         found.append(Suspect(**means, region=region, share=max(means["inside"], 0.0)))
@@ -372,27 +358,24 @@ def scan_event_frames(
     """
     if positions.size > _MOST_EVENTS:
         expected *= _MOST_EVENTS / positions.size
-        positions = np.sort(np.random.default_rng(SEED).choice(positions, _MOST_EVENTS, replace=False))
+        positions = np.sort(np.random.default_rng(1).choice(positions, _MOST_EVENTS, replace=False))
     m, n = positions.size, numbers.size
-    if m < FEWEST or n < 2 * shortest:
+    if m < families.FEWEST or n < 2 * shortest:
         return None
-    first, last = np.triu_indices(m, FEWEST - 1)
+    first, last = np.triu_indices(m, families.FEWEST - 1)
     length = positions[last] - positions[first] + 1
-    log_p = log_binomial_tails(last - first, m - 1, np.maximum(length, shortest) / n)
+    log_p = families.log_binomial_tails(last - first, m - 1, np.maximum(length, shortest) / n)
     at = int(np.argmin(log_p))
     value = min(0.0, float(log_p[at]) + math.log(m * (m - 1) / 2))
     if value > math.log(significance):
         return None
-    begin, end = _ends(int(positions[first[at]]), int(positions[last[at]]), int(last[at] - first[at]), n)
+    # as wide as a constant rate asks for
+    begin, end = int(positions[first[at]]), int(positions[last[at]])
+    beyond = round((end - begin) / max(int(last[at] - first[at]), 1) / 2)
+    begin, end = max(begin - beyond, 0), min(end + beyond + 1, n)
     inside = (positions >= begin) & (positions < end)
     seen = (float(inside.sum()), end - begin), (float((~inside).sum()), max(n - end + begin, 1))
     rates = [events / frames - expected / n for events, frames in seen]
     when = When(range=((int(numbers[begin]), int(numbers[end - 1]) + 1),))
     z = float(-special.ndtri_exp(float(log_p[at])))
     return Stretch(family="range", z=z, log_p=value, inside=rates[0], outside=rates[1], when=when)
-
-
-def _ends(first: int, last: int, gaps: int, n: int) -> tuple[int, int]:
-    """Return a range of frames about its first and last event, as wide as a constant rate asks for."""
-    beyond = round((last - first) / max(gaps, 1) / 2)
-    return max(first - beyond, 0), min(last + beyond + 1, n)

@@ -2,10 +2,13 @@
 
 Of every band of lines, every band across them, every rectangle, every n-th line, and the lines that stand out
 each by itself the mean covariance of the pairs inside is compared with that of all other pairs, so that noise
-which all pixels share has no place. The standard error is ``1 / sqrt(N)`` of N pairs (:mod:`.observe.pairs`),
-or what the frames' scatter gives where that is more; the sum of squares behind it is skewed, which Wilson and
-Hilferty's root takes away. The probability is the union bound over the places of the family, the families,
-modes and channels.
+which all pixels share has no place. What pixels share adds to the covariance of all their pairs, not only to
+that of neighbours: a row of w pixels has w (w - 1) / 2 pairs, and w - 1 neighbours. Given the histograms,
+frames without an effect are in random order: then products of different standardised pixels have mean 0,
+variance 1, and are uncorrelated, whatever the pixels' law. So the standard error of a mean of N pairs is
+``1 / sqrt(N)``, or what the frames' scatter gives where that is more; the sum of squares behind it is skewed,
+which Wilson and Hilferty's root takes away. The probability is the union bound over the places of the family,
+the families, modes and channels.
 
 Boxes are of cells, each of several rows or columns of a large sensor; each round of finer cells
 (:func:`.families.with_sharp_ends`) is another pass over the frames.
@@ -16,36 +19,38 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from pchem_pipeline.discrepancy.families import BOXES, Edges, Place, box, box_sums, every_nth, with_sharp_ends
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from pchem_pipeline.discrepancy import families
 from pchem_pipeline.discrepancy.observe.laws import chi_square
-from pchem_pipeline.discrepancy.observe.pairs import (
-    FEWEST_PIXELS,
-    LARGEST,
-    MODES,
-    PairContrast,
-    Samples,
-    energies,
-    pairs_of,
-)
-from pchem_pipeline.discrepancy.observe.sums import CHANNELS
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS, Samples, energies
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.region import Region, Taps
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 
-BoolArray = NDArray[np.bool_]
-
+#: What pixels share: their row, their column, or only the frame (neither row nor column); and how many axes
+#: of a table of their pairs are rows, and columns.
+MODES = {"row": (1, 2), "column": (2, 1), "frame": (2, 2)}
+#: Pixels of a place, and its share of the sensor at most.
+FEWEST_PIXELS, LARGEST = 16, 0.6
+#: Lines are told apart by their number modulo this.
+PERIOD = 32
+#: Cells along an edge of the sensor, for lines; half as many for frames.
+_CELLS = 64
+#: Of each table of sums of products: two channels and the counts, as gathered and as told.
+_COPIES = 9
 _CONTRAST = 0.4  # mean outside of a place over that inside, at most
 #: Guesses that are held against the scatter of the frames, the most significant first.
 _MEASURED = 8
 #: Families of places (boxes, and two of lines at a period and scattered lines), modes and channels; half of
 #: them, since places count to one side only.
-_LOG_LOOKS = math.log((len(BOXES) + 2) * len(MODES) * len(CHANNELS) / 2.0)
+_LOG_LOOKS = math.log((len(families.BOXES) + 2) * len(MODES) * len(CHANNELS) / 2.0)
 _LINE_BY_CHANCE = 1e-4  # probability of a line that stands out by itself, among all
 
 
@@ -65,7 +70,7 @@ class Shared(Suspect):
 class _Guess(NamedTuple):
     """The best place of a family, of one channel and mode."""
 
-    place: Place
+    place: families.Place
     channel: int
     mode: str
 
@@ -88,20 +93,19 @@ def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: in
     return found
 
 
-def shared_elsewhere(samples: Samples, place: Shared, *, significance: float = SIGNIFICANCE) -> Region | None:
+def shared_elsewhere(samples: Samples, place: Shared) -> Region | None:
     """Return all pixels outside a place if they share noise among themselves as those inside do; else None.
 
     Args:
         samples: standardised frames.
         place: found among them.
-        significance: largest probability of a chance.
     """
     rest = samples.without(place.region.mask(samples.usable.shape))
     if rest.usable.sum() <= 2 * FEWEST_PIXELS:
         return None
     pairs = pairs_of(rest)[place.channel][place.mode]
     z = float(pairs.sums.flat[-1]) / math.sqrt(max(2.0 * float(pairs.counts.flat[-1]), 1.0))
-    return Region.of_mask(rest.usable) if special.log_ndtr(-z) <= math.log(significance) else None
+    return Region.of_mask(rest.usable) if special.log_ndtr(-z) <= math.log(SIGNIFICANCE) else None
 
 
 def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
@@ -159,7 +163,7 @@ def _measured(samples: Samples, guess: _Guess) -> Shared:
     )
 
 
-def _region(place: Place) -> Region:
+def _region(place: families.Place) -> Region:
     """Return a place as a region, lines at a period as such."""
     if place.family != "period":
         return Region.of_mask(place.mask)
@@ -171,10 +175,10 @@ def _region(place: Place) -> Region:
 def _with_ends(samples: Samples, guess: _Guess) -> _Guess:
     """Return a box with its ends among finer cells, each scanned with another pass over the frames."""
 
-    def at(edges: Edges) -> PairContrast:
+    def at(edges: families.Edges) -> PairContrast:
         return pairs_of(samples, edges)[guess.channel][guess.mode]
 
-    place = with_sharp_ends(guess.place, at)
+    place = families.with_sharp_ends(guess.place, at)
     if place is guess.place:
         return guess
     # of lines without samples nothing is known
@@ -188,23 +192,23 @@ def _with_ends(samples: Samples, guess: _Guess) -> _Guess:
 # -- families -----------------------------------------------------------------------------------
 
 
-def _places(contrast: PairContrast, mode: str, usable: BoolArray) -> Iterator[Place | None]:
+def _places(contrast: PairContrast, mode: str, usable: BoolArray) -> Iterator[families.Place | None]:
     """Yield the best place of each family."""
     if contrast.counts.flat[-1] > 0:
-        yield from (box(contrast, family) for family in BOXES)
-        yield from (every_nth(contrast, axis) for axis in (1, 0))
+        yield from (families.box(contrast, family) for family in families.BOXES)
+        yield from (families.every_nth(contrast, axis) for axis in (1, 0))
         if mode != "frame":
             yield _scattered(contrast, 0 if mode == "row" else 1, usable)
 
 
-def _scattered(contrast: PairContrast, axis: int, usable: BoolArray) -> Place | None:
+def _scattered(contrast: PairContrast, axis: int, usable: BoolArray) -> families.Place | None:
     """Return the rows (axis 0) or columns (1) that stand out each by itself, where they are not one band."""
     cells = contrast.edges
     ranges = [(np.array([0]), np.array([each.size - 1])) for each in cells]
     ends = np.arange(cells[axis].size)
     ranges[axis] = ends[:-1], ends[1:]
     sums, counts = (
-        box_sums(table, contrast.axes, *ranges).ravel() for table in (contrast.sums, contrast.counts)
+        families.box_sums(table, contrast.axes, *ranges).ravel() for table in (contrast.sums, contrast.counts)
     )
     some, n = counts > 0, sums.size
     if some.sum() < 3:
@@ -220,4 +224,168 @@ def _scattered(contrast: PairContrast, axis: int, usable: BoolArray) -> Place | 
         return None
     together = float(z[chosen] @ np.sqrt(counts[chosen]) / np.sqrt(counts[chosen].sum()))
     # of all sets of as many lines
-    return Place("scattered", mask, together, math.log(2.0 * special.binom(n, int(chosen.sum()))))
+    return families.Place("scattered", mask, together, math.log(2.0 * special.binom(n, int(chosen.sum()))))
+
+
+# -- sums of products of pairs -------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairContrast(families.Contrast):
+    """Sums of products of pairs of pixels that share a row (column, frame), over boxes of the sensor.
+
+    Pairs are counted twice, as (a, b) and (b, a). Only sums that are too large count.
+
+    Attributes:
+        area: pixels that count, cumulative over the cells, (y, x).
+        by_number: sums and counts of all by the numbers modulo :data:`PERIOD` of their rows and of their
+            columns, (2, PERIOD, PERIOD); 0 for lines that the pixels share.
+    """
+
+    area: FloatArray
+    by_number: tuple[FloatArray, FloatArray]
+
+    def boxes(self, rows: families.Ranges, columns: families.Ranges) -> FloatArray:
+        """Return the deviations of all boxes of some ranges of cells, 0 where one is too small or large."""
+        size = families.box_sums(self.area, (1, 1), rows, columns)
+        some = (size >= FEWEST_PIXELS) & (size <= LARGEST * self.area[-1, -1])
+        return np.where(some, super().boxes(rows, columns), 0.0)
+
+    def phases(self, axis: int, period: int) -> FloatArray:
+        """Return the deviations of every n-th row or column, by their numbers modulo the period."""
+        parts = (each[axis].reshape(PERIOD // period, period, -1, period) for each in self.by_number)
+        return self.null(*(part.sum(axis=(0, 2)).diagonal() for part in parts))
+
+
+def pairs_of(samples: Samples, edges: families.Edges | None = None) -> list[dict[str, PairContrast]]:
+    """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share.
+
+    Args:
+        samples: standardised frames.
+        edges: of the cells of rows and of columns, pixels; None: cells of equal size.
+    """
+    if edges is None:
+        rows, columns = (families.cell_edges(n, _CELLS) for n in samples.usable.shape)
+        edges = rows, columns
+    counted, gathered = _Gathered(edges), [_Gathered(edges) for _ in CHANNELS]
+    counted.add(samples.usable[None].astype(np.float32))
+    for chunk in samples.chunks():
+        for each, u in zip(gathered, chunk, strict=True):
+            each.add(u)
+    n = samples.n_frames
+    counts = {
+        mode: (families.cumulative(n * table), n * rest) for mode, (table, rest) in counted.tables().items()
+    }
+    area = families.cumulative(samples.usable.astype(np.float64))
+    found: list[dict[str, PairContrast]] = []
+    for each in gathered:
+        found.append({})
+        for mode, (table, by_number) in each.tables().items():
+            cells, (number, number_by) = each.edges(mode), counts[mode]
+            found[-1][mode] = PairContrast(
+                edges=cells,
+                sums=families.cumulative(table),
+                counts=number,
+                # that pairs are counted twice doubles the variance of a sum
+                null=families.normal(float(table.sum()), float(number.flat[-1]), 2.0, 1.0, one_sided=True),
+                axes=MODES[mode],
+                area=area[np.ix_(*cells)],
+                by_number=(by_number, number_by),
+            )
+    return found
+
+
+def pairs_bytes(shape: tuple[int, int]) -> int:
+    """Return the memory that :func:`pairs_of` takes for a sensor (rows, columns), beside its frames."""
+    y, x = (min(n, _CELLS) for n in shape)
+    v, u = (-(-n // 2) if n > _CELLS // 2 else n for n in (y, x))
+    return _COPIES * 8 * (y * x * (y + x) + (v * u) ** 2)
+
+
+class _Gathered:
+    """Sums of products of different pixels of a row, of a column, and of all of a frame.
+
+    Attributes:
+        cells: edges of the cells of rows and of columns; those of frames are every ``stride`` of these.
+        lines: products of the pixels of a row (y, x, x), and of a column (x, y, y).
+        by_number: of pixels of a row (column), and of a frame, by the numbers of their columns (rows).
+        frames: products of all pixels, (y' x', y' x').
+        squares: of all pixels, (y', x').
+    """
+
+    def __init__(self, cells: families.Edges) -> None:
+        """Begin with nothing, for cells of rows and columns with these edges."""
+        self.cells = cells
+        y, x = (each.size - 1 for each in cells)
+        self.stride = [2 if n > _CELLS // 2 else 1 for n in (y, x)]
+        self.lines = np.zeros((y, x, x)), np.zeros((x, y, y))
+        self.by_number = np.zeros((2, 2, PERIOD, PERIOD))
+        self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])
+        self.frames = np.zeros((self.squares.size, self.squares.size))
+
+    def edges(self, mode: str) -> families.Edges:
+        """Return the edges of the cells of rows and of columns, pixels."""
+        strides = self.stride if mode == "frame" else (1, 1)
+        rows, columns = (
+            np.append(each[:-1:n], each[-1]) for each, n in zip(self.cells, strides, strict=True)
+        )
+        return rows, columns
+
+    def add(self, u: Float32Array) -> None:
+        """Add frames (t, y, x)."""
+        square = np.einsum("tyx,tyx->yx", u, u, dtype=np.float64)
+        self._add_lines(0, u, square)
+        self._add_lines(1, u.transpose(0, 2, 1), square.T)
+        rows, columns = (each[:-1] for each in self.edges("frame"))
+        self.squares += _summed(square, (rows, columns))
+        flat = np.add.reduceat(np.add.reduceat(u, rows, axis=1), columns, axis=2).reshape(u.shape[0], -1)
+        self.frames += flat.T @ flat
+
+    def _add_lines(self, axis: int, u: Float32Array, square: FloatArray) -> None:
+        """Add frames (t, line, across), with the sums of their squares (line, across)."""
+        lines, across = self.cells[axis], self.cells[1 - axis]
+        cells = np.add.reduceat(u, across[:-1], axis=2)
+        own = _summed(square, (lines[:-1], across[:-1]))
+        for i, (first, last) in enumerate(pairwise(lines)):
+            part = cells[:, first:last].reshape(-1, cells.shape[2])
+            self.lines[axis][i] += part.T @ part - np.diag(own[i])
+        totals = u.sum(axis=1, dtype=np.float64)
+        squares = square.sum(axis=0), (totals**2).sum(axis=0)
+        for sums, values, each in zip(self.by_number[axis], (u, totals), squares, strict=True):
+            folded = _folded(values).reshape(-1, PERIOD)
+            sums += folded.T @ folded - np.diag(_folded(each))
+
+    def tables(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Return the sums of each mode by cells, (y, x, x), (y, y, x) or (y, y, x, x), and by numbers.
+
+        Of frames those of pixels in different rows and columns.
+        """
+        by, bx = (np.arange(0, len(each), n) for each, n in zip(self.lines, self.stride, strict=True))
+        i, j = np.arange(by.size), np.arange(bx.size)
+        frames = self.frames.reshape(*2 * self.squares.shape).transpose(0, 2, 1, 3).copy()
+        frames[i, i] -= _summed(self.lines[0], (by, bx, bx))
+        frames[:, :, j, j] -= _summed(self.lines[1], (bx, by, by)).transpose(1, 2, 0)
+        for a in i:
+            frames[a, a, j, j] -= self.squares[a]
+        # rows by the number of their columns, columns by that of their rows
+        (of_rows, by_column), (of_columns, by_row) = self.by_number
+        none = np.zeros_like(of_rows)
+        return {
+            "row": (self.lines[0], np.stack([none, of_rows])),
+            "column": (self.lines[1].transpose(1, 2, 0), np.stack([of_columns, none])),
+            "frame": (frames, np.stack([by_row - of_columns, by_column - of_rows])),
+        }
+
+
+def _summed(values: FloatArray, starts: tuple[IntArray, ...]) -> FloatArray:
+    """Return sums of groups along each axis."""
+    for axis, first in enumerate(starts):
+        values = np.add.reduceat(values, first, axis=axis)
+    return values
+
+
+def _folded(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return sums over the last axis by its number modulo the period, (..., PERIOD)."""
+    missing = -values.shape[-1] % PERIOD
+    padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)]) if missing else values
+    return np.asarray(padded.reshape(*values.shape[:-1], -1, PERIOD).sum(axis=-2))

@@ -6,17 +6,16 @@ rounding and around the mean of each pixel.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
-from pchem_pipeline.discrepancy.observe.rare import SEED
-from pchem_pipeline.discrepancy.verdict import RARE, Size, parameters_of
+from pchem_pipeline.discrepancy.verdict import RARE, Size
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -30,7 +29,6 @@ _FEWEST_FRAMES = 20_000
 _FEWEST_BLOCKS = 4  # of the whole sensor
 _BITS = 24
 _CHANGED = 1e-9
-_IN_DN = (Plane.ADC, Plane.READOUT)
 
 
 def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
@@ -43,12 +41,17 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     """
     if not maps.usable.any():
         return None
+    gain, noise = maps.conversion_gain[maps.usable], float(np.median(maps.read_noise_dn[maps.usable]))
     scatter = effect.added_scatter_e(maps.quanta_exposure[maps.usable])
     if scatter is not None:
-        return _of_scatter(scatter, maps)
-    if _is_measured_noise(effect):
-        return _of_noise(float(getattr(effect, effect.strength)), maps)
-    blocks, noise = _BLOCKS, float(np.median(maps.read_noise_dn[maps.usable]))
+        electrons, dn = (float(np.sqrt(np.mean(each**2))) for each in (scatter, scatter / gain))
+        return Size(electrons=electrons, dn=dn, of_read_noise=dn / noise)
+    if effect.empirical and effect.power == 2.0 and effect.unit(effect.strength) == "DN":
+        # what samples share as it was measured: of light that varies they change by whole electrons, most of
+        # them by their own chance
+        dn = float(getattr(effect, effect.strength))
+        return Size(electrons=dn * float(np.median(gain)), dn=dn, of_read_noise=dn / noise)
+    blocks = _BLOCKS
     if effect.far_reaching:
         blocks = max(_BLOCKS * _MOST_ROWS**2 // maps.usable.size, _FEWEST_BLOCKS)
     else:
@@ -58,7 +61,7 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     blocks = min(blocks, -(-n_frames // _BLOCK_FRAMES))
     stacks = 1 if effect.far_reaching else -(-_FEWEST_FRAMES // (blocks * _BLOCK_FRAMES))
     try:
-        drawn = [_change(effect, maps, n_frames, blocks, SEED + i) for i in range(stacks)]
+        drawn = [_change(effect, maps, n_frames, blocks, seed) for seed in range(1, stacks + 1)]
     except PchEmError:
         return None
     inside = np.ones_like(maps.usable)
@@ -69,8 +72,8 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     if not changes:
         return None
     share = float(np.mean([np.mean(np.abs(change) > _CHANGED) for change in changes]))
-    gain = np.where(maps.usable, maps.conversion_gain, np.median(maps.conversion_gain[maps.usable]))
-    gain, in_dn = gain[inside], effect.plane in _IN_DN
+    gain = np.where(maps.usable, maps.conversion_gain, np.median(maps.conversion_gain[maps.usable]))[inside]
+    in_dn = effect.plane in (Plane.ADC, Plane.READOUT)
     dn = _spread([change if in_dn else change / gain for change in changes], share)
     return Size(
         electrons=_spread([change * gain if in_dn else change for change in changes], share),
@@ -80,54 +83,9 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
     )
 
 
-def _is_measured_noise(effect: Effect) -> bool:
-    """Tell whether the strength of an effect is the measured standard deviation of what samples share, DN.
-
-    Where it is light that varies, samples change by whole electrons, most of them by their own chance.
-    """
-    if not effect.empirical or effect.power != 2.0:
-        return False
-    return parameters_of(effect, math.nan)[effect.strength].unit == "DN"
-
-
-def _of_scatter(electrons: NDArray[np.float64], maps: PixelMaps) -> Size:
-    """Return the size of a scatter of so many e- of each usable pixel."""
-    in_dn = electrons / maps.conversion_gain[maps.usable]
-    dn, noise = float(np.sqrt(np.mean(in_dn**2))), float(np.median(maps.read_noise_dn[maps.usable]))
-    return Size(electrons=float(np.sqrt(np.mean(electrons**2))), dn=dn, of_read_noise=dn / noise)
-
-
-def _of_noise(dn: float, maps: PixelMaps) -> Size:
-    """Return the size of a noise of so many DN, at the gain and read noise of the median pixel."""
-    gain = float(np.median(maps.conversion_gain[maps.usable]))
-    noise = float(np.median(maps.read_noise_dn[maps.usable]))
-    return Size(electrons=dn * gain, dn=dn, of_read_noise=dn / noise)
-
-
-def _change(
-    effect: Effect, maps: PixelMaps, n_frames: int, blocks: int, seed: int
-) -> NDArray[np.float64] | None:
+def _change(effect: Effect, maps: PixelMaps, n_frames: int, blocks: int, seed: int) -> FloatArray | None:
     """Return what an effect does to the samples of one stack, (frame, y, x); None where it does nothing."""
-    seen: list[NDArray[np.float64]] = []
-    shape = maps.usable.shape
-    settings = SimulateSettings(
-        shape=(shape[0], shape[1]), n_frames=n_frames, seed=seed, bit_depth=_BITS, effects=()
-    ).model_copy(update={"effects": (_watched(effect, seen),)})
-    truth = truth_of(maps)
-    last = max(n_frames - _BLOCK_FRAMES, 0)
-    for first in np.unique(np.linspace(0, last, blocks).astype(int)).tolist():
-        simulate_block(truth, settings, (first, min(first + _BLOCK_FRAMES, n_frames)), electron_frames=0)
-    return np.concatenate(seen) if seen else None
-
-
-def _spread(changes: Sequence[NDArray[np.float64]], share: float) -> float:
-    """Return by how much samples change from frame to frame, where they change if that is rare."""
-    mean_square = np.mean([np.mean((change - change.mean(axis=0)) ** 2) for change in changes])
-    return float(np.sqrt(mean_square / (share if 0.0 < share < RARE else 1.0)))
-
-
-def _watched(effect: Effect, seen: list[NDArray[np.float64]]) -> Effect:
-    """Return an effect as it is, everywhere and always, that notes what it changes."""
+    seen: list[FloatArray] = []
     kind = type(effect)
 
     class Watched(kind):  # type: ignore[misc, valid-type]
@@ -136,5 +94,19 @@ def _watched(effect: Effect, seen: list[NDArray[np.float64]]) -> Effect:
             seen.append(changed.astype(np.float64) - values.astype(np.float64))
             return changed
 
-    found: Effect = Watched.model_validate(effect.at_place(None).model_dump())
-    return found
+    everywhere = Watched.model_validate(effect.at_place(None).model_dump())
+    shape = maps.usable.shape
+    settings = SimulateSettings(
+        shape=(shape[0], shape[1]), n_frames=n_frames, seed=seed, bit_depth=_BITS, effects=()
+    ).model_copy(update={"effects": (everywhere,)})
+    truth = truth_of(maps)
+    last = max(n_frames - _BLOCK_FRAMES, 0)
+    for first in np.unique(np.linspace(0, last, blocks).astype(int)).tolist():
+        simulate_block(truth, settings, (first, min(first + _BLOCK_FRAMES, n_frames)), electron_frames=0)
+    return np.concatenate(seen) if seen else None
+
+
+def _spread(changes: Sequence[FloatArray], share: float) -> float:
+    """Return by how much samples change from frame to frame, where they change if that is rare."""
+    mean_square = np.mean([np.mean((change - change.mean(axis=0)) ** 2) for change in changes])
+    return float(np.sqrt(mean_square / (share if 0.0 < share < RARE else 1.0)))

@@ -15,9 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.build_verdict import Added, Findings, Fitted, build_verdict
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import Gap
@@ -100,7 +98,7 @@ class Explainer(ABC, Generic[Explanation]):
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the parameters of the pixels under the model that the verdict leaves."""
 
-    def tolerance(self) -> NDArray[np.float64] | float:
+    def tolerance(self) -> FloatArray | float:
         """Return the deviations that are not held against the added effects, shape (m,)."""
         return 0.0
 
@@ -125,7 +123,11 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
     still = disagreed = disagrees(null, z, significance)
     if still or (not data.doubt and by.suspects(null)):
         try:
-            null = _extended(by, null, still, tell) or null
+            tell("comparing candidates")
+            explanation = by.explain(null, still)
+            if explanation is not None:
+                tell("refitting the pixels with the likeliest effects")
+                null = by.add(explanation, null) or null
         except EffortSpentError as spent:
             limit = spent.words()
         still = disagrees(null, z, significance, by.tolerance())
@@ -138,29 +140,4 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
         data.samples, z, first, null, before, places, still, added, data.doubt, limit or by.limit
     )
     model = found.model(present, by.model)
-    return build_verdict(
-        found,
-        model,
-        by.fitted(model),
-        (data.evidence, data.examined),
-        untestable=data.untestable,
-        defects=data.defects,
-        n_replicates=data.effort.replicates,
-        work=data.effort.spent,
-    )
-
-
-def _extended(
-    by: Explainer[Explanation], null: NullModel, still: bool, tell: Callable[[str], None]
-) -> NullModel | None:
-    """Compare candidates and add the best; return the null of the new model, None where none is established.
-
-    Raises:
-        EffortSpentError: the work is at its limit; nothing was added.
-    """
-    tell("comparing candidates")
-    explanation = by.explain(null, still)
-    if explanation is None:
-        return None
-    tell("refitting the pixels with the likeliest effects")
-    return by.add(explanation, null)
+    return build_verdict(found, data, model, by.fitted(model))

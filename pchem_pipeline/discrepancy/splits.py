@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.verdict import Examined
 
@@ -28,9 +28,9 @@ class Splits:
         block_frames: frames in a block of consecutive ones.
     """
 
-    train: NDArray[np.int64]
-    test: NDArray[np.int64]
-    final: NDArray[np.int64]
+    train: IntArray
+    test: IntArray
+    final: IntArray
     block_frames: int
 
     def examined(self, shape: tuple[int, ...]) -> Examined:
@@ -63,7 +63,7 @@ def block_length(n_frames: int, wanted: int | None = None) -> int:
     return length
 
 
-def split_frames(numbers: NDArray[np.int64], block_frames: int) -> Splits:
+def split_frames(numbers: IntArray, block_frames: int) -> Splits:
     """Deal whole blocks of consecutive frames to train, test and final in turn.
 
     Args:

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.base.units import per_cent
-from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
@@ -45,20 +45,16 @@ State = Literal[
 _NAN = float("nan")
 
 
-def _number(value: Any) -> Any:
-    return _NAN if value is None else value
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def _two_digits(value: float) -> str:
     """Format a number to two significant digits without an exponent: 0.035, 21, 2,000."""
     return f"{value:.2g}" if abs(value) < 99.5 else f"{float(f'{value:.2g}'):,.0f}"
 
 
-Number = Annotated[float, BeforeValidator(_number), PlainSerializer(_finite, when_used="json")]
+Number = Annotated[
+    float,
+    BeforeValidator(lambda value: _NAN if value is None else value),
+    PlainSerializer(lambda value: value if math.isfinite(value) else None, when_used="json"),
+]
 Interval = tuple[Number, Number]
 
 
@@ -243,17 +239,6 @@ class Families(_Part):
     after: dict[str, Number] = {}
 
 
-#: Families of statistics in words.
-_FAMILIES = {
-    "shape": "the shape of the histograms",
-    "code": "the codes",
-    "tail": "the tails",
-    "time": "the order in time",
-    "frame": "the frames",
-    "space": "neighbours and lines",
-}
-
-
 def closed_share(before: float, after: float) -> float:
     """Compute ``1 - after / before``, limited to 0 ... 1; 0 without a gap before."""
     return min(max(1.0 - max(after, 0.0) / before, 0.0), 1.0) if before > 0.0 else 0.0
@@ -261,7 +246,7 @@ def closed_share(before: float, after: float) -> float:
 
 def families_words(families: Sequence[str]) -> str:
     """Describe families of statistics."""
-    return " and ".join(_FAMILIES.get(family, family) for family in families)
+    return " and ".join(FAMILIES.get(family, family) for family in families)
 
 
 class GapChange(_Part):
@@ -682,6 +667,6 @@ class Discrepancy:
     model: tuple[Effect, ...]
     maps: PixelMaps
     evidence: Evidence
-    statistics: tuple[tuple[str, ...], NDArray[np.float64], NDArray[np.float64]]
-    code_extended: NDArray[np.float64] | None = None
+    statistics: tuple[tuple[str, ...], FloatArray, FloatArray]
+    code_extended: FloatArray | None = None
     added: AddedExposure | None = None

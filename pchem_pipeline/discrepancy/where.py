@@ -1,25 +1,32 @@
-"""Locations of a disagreement: deviating statistics with their pixels, DN and frames."""
+"""Locations of a disagreement: deviating statistics with their pixels, DN and frames.
+
+Samples that chance hardly makes are listed of either tail: those beyond the support of their pixel, and rarer
+ones. Of a thousand pixels up to ten have one beyond their support by chance. Those hide a dozen of a few
+pixels or frames with heavy tails, which lie farther out: so the samples are also looked at by themselves of
+which chance makes one in the whole stack.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
+from pchem_pipeline.discrepancy.observe.tables import analog_width
 from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_event_map, scan_map, scan_series
 from pchem_pipeline.discrepancy.verdict import Place
-from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
+from pchem_pipeline.effects.framework.evidence import MOST_HITS, Evidence, PixelMaps, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-
-FloatArray = NDArray[np.float64]
 
 #: Maps of neighbours, along x and along y: charge with charge, readout with readout, one with the other.
 PAIRS = ("x.kk", "x.rr", "x.rk", "y.kk", "y.rr", "y.rk")
@@ -27,6 +34,10 @@ _FALSE_DISCOVERY_RATE = 0.05
 _MOST_LISTED = 50
 _MOST_PLACES = 20
 _WIDEST_CODE_WINDOW = 24
+#: Sets of samples that :func:`rare_samples` gives at most.
+N_SETS = 4
+_REACH, _FURTHER = 12.0, 15  # electron numbers about H, in its root and beside that
+_CHUNK = 256  # samples
 
 
 def suspected_regions(
@@ -76,17 +87,16 @@ def suspected_frames(
     return {name: frames for name, frames in found.items() if frames}
 
 
-def unfitted_place(usable: NDArray[np.bool_], significance: float = SIGNIFICANCE) -> Suspect | None:
+def unfitted_place(usable: BoolArray) -> Suspect | None:
     """Return where pixels without a fit to be relied upon come together; None where chance explains it.
 
     An effect of single pixels in a part of the sensor may leave only that to be seen.
 
     Args:
         usable: pixels with a fit, (y, x).
-        significance: largest probability of a chance, in any place.
     """
     alike, every = np.ones(usable.shape), np.ones(usable.shape, np.bool_)
-    return next(iter(scan_event_map(~usable, alike, every, significance=significance, most=1)), None)
+    return next(iter(scan_event_map(~usable, alike, every, most=1)), None)
 
 
 def pixel_maps(evidence: Evidence) -> dict[str, FloatArray]:
@@ -200,9 +210,7 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
             spots["region_share"] = suspect.share
         for stretch in frames.get(STATISTICS[name].series, ())[:1]:
             spots |= {"when": stretch.when.numbers(), "when_p": stretch.p}
-        if (
-            "@" in name
-        ):  # of a part, which is told on the sensor: that is the place, not what stands out of it
+        if "@" in name:  # of a part on the sensor: that is the place, not what stands out of it
             part = zip(("region", "when"), parse_place(name.partition("@")[2]), strict=True)
             spots |= {key: place.numbers() for key, place in part if place is not None}
         places.append(
@@ -243,10 +251,9 @@ def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:
     if not name.startswith("code."):
         return None
     code = evidence.code
-    if name == "code.top":
-        return (code.maximum, code.maximum)
-    if name == "code.bottom":
-        return (code.minimum, code.minimum)
+    ends = {"code.top": (code.maximum, code.maximum), "code.bottom": (code.minimum, code.minimum)}
+    if name in ends:
+        return ends[name]
     expected = np.maximum(code.expected, 1.0)
     deviation = (code.observed - code.expected) / np.sqrt(expected)
     total = np.concatenate([[0.0], np.cumsum(deviation)])
@@ -269,7 +276,7 @@ def _frames(name: str, evidence: Evidence) -> tuple[int, ...]:
     if name.startswith("tail.high") and time.hits.size:
         return tuple(int(f) for f in np.unique(time.hits[:, 0])[:_MOST_LISTED])
     if name.endswith(".largest"):
-        series = _series(name, time)
+        series = time.frame_charge if ".charge." in name else time.frame_readout
         spread = robust_sd(series)
         order = np.argsort(-np.abs(series - np.median(series)))
         outlying = [i for i in order if abs(series[i] - np.median(series)) > 5.0 * spread]
@@ -277,5 +284,86 @@ def _frames(name: str, evidence: Evidence) -> tuple[int, ...]:
     return ()
 
 
-def _series(name: str, time: TimeSeries) -> FloatArray:
-    return time.frame_charge if ".charge." in name else time.frame_readout
+# -- samples that chance hardly makes ---------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RareSamples:
+    """Samples that are as rare in all pixels, no two of them in one frame or in one pixel.
+
+    Attributes:
+        hits: frame, y, x, DN, (n, 4), by frame.
+        expected: how many of them chance makes in each pixel, but for a factor, (y, x).
+    """
+
+    hits: IntArray
+    expected: FloatArray
+
+    @property
+    def seen(self) -> BoolArray:
+        """Which pixels have one, (y, x)."""
+        found = np.zeros(self.expected.shape, np.bool_)
+        found[self.hits[:, 1], self.hits[:, 2]] = True
+        return found
+
+
+def rare_samples(evidence: Evidence) -> Iterator[RareSamples]:
+    """Yield the samples beyond the support of their pixels, and the rarer ones, of the low and the high tail.
+
+    None of a tail of which not all samples are listed: those that are lie where they were looked for first.
+    """
+    time = evidence.time
+    if time is None or evidence.tail_expected is None:
+        return
+    # by chance there is one in the whole stack
+    limit = 1.0 / max(int(evidence.maps.usable.sum()), 1)
+    for hits, beyond, above in zip(
+        (time.low_hits, time.hits), evidence.tail_expected, (False, True), strict=True
+    ):
+        if len(hits) >= MOST_HITS:
+            continue
+        expected = np.nan_to_num(np.asarray(beyond, np.float64))
+        yield RareSamples(single_samples(hits), expected)
+        rarer = hits[expected_beyond(hits, evidence.maps, evidence.n_frames, above=above) < limit]
+        # codes are whole: a pixel reaches some part of the limit, or none of them
+        yield RareSamples(single_samples(rarer), np.minimum(expected, limit))
+
+
+def single_samples(hits: IntArray) -> IntArray:
+    """Return samples (frame, y, x, DN) of which no two are in one frame or in one pixel, in their order.
+
+    One disturbed frame or row, or one odd pixel, holds many, and is no place. Which of them stays is drawn,
+    so that none is favoured by its order.
+    """
+    frames, pixels = set[int](), set[tuple[int, int]]()
+    kept = []
+    for i in np.random.default_rng(1).permutation(len(hits)):
+        frame, y, x = (int(number) for number in hits[i, :3])
+        if frame not in frames and (y, x) not in pixels:
+            frames.add(frame)
+            pixels.add((y, x))
+            kept.append(int(i))
+    return hits[np.sort(np.array(kept, np.int64))]
+
+
+def expected_beyond(hits: IntArray, maps: PixelMaps, n_frames: int, *, above: bool) -> FloatArray:
+    """Return how many samples as far out, or farther, the PCD of each pixel makes in all frames, (n,).
+
+    Args:
+        hits: frame, y, x, DN, (n, 4).
+        maps: fitted parameters.
+        n_frames: samples of a pixel.
+        above: of the high tail; False: of the low one.
+    """
+    found = np.empty(len(hits))
+    for begin in range(0, len(hits), _CHUNK):
+        part = hits[begin : begin + _CHUNK]
+        exposure, gain, bias, sigma = (m[part[:, 1], part[:, 2]][:, None] for m in maps.maps)
+        width = analog_width(sigma)
+        reach = np.ceil(_REACH * np.sqrt(exposure)) + _FURTHER
+        electrons = np.maximum(np.floor(exposure) - reach, 0.0) + np.arange(2 * int(reach.max()) + 1)
+        probability = special.xlogy(electrons, exposure) - exposure - special.gammaln(electrons + 1.0)
+        far = part[:, 3:] + (-0.5 if above else 0.5) - bias - electrons / gain
+        log_tail = special.log_ndtr((-far if above else far) / width)
+        found[begin : begin + _CHUNK] = n_frames * np.exp(special.logsumexp(probability + log_tail, axis=1))
+    return found

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
+from pchem_pipeline.discrepancy.observe.sums import FrameBlocks, Samples
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pchem_pipeline.discrepancy.observe.digital.groups import nearer_statistics
+from pchem_pipeline.discrepancy.observe.digital import nearer_statistics
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
 SHAPE, FRAMES = (12, 12), 400

@@ -9,16 +9,21 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, cast
 
 from pchem_pipeline.effects.framework.evidence import SCORES
 from pchem_pipeline.effects.framework.region import parse_place
 
 VERSION = 2
 
-Family = Literal["shape", "code", "tail", "time", "frame", "space"]
-FAMILIES: tuple[Family, ...] = ("shape", "code", "tail", "time", "frame", "space")
-Channel = Literal["charge", "readout", "cross", "digital"]
+#: Families of statistics, in words.
+FAMILIES = {
+    "shape": "the shape of the histograms",
+    "code": "the codes",
+    "tail": "the tails",
+    "time": "the order in time",
+    "frame": "the frames",
+    "space": "neighbours and lines",
+}
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,7 @@ class Statistic:
     """
 
     name: str
-    channel: Channel
+    channel: str
     sentence: str
     opposite: str = ""
     map: str = ""
@@ -202,7 +207,7 @@ def _statistic(record: str) -> Statistic:
     channel, name, *words = record.split()
     shown = dict(words.pop(0).split("=") for _ in range(2) if words[0].startswith(("map=", "series=")))
     more, less = (re.sub(r"\[(.*?)\|(.*?)\]", rf"\{sign}", " ".join(words)) for sign in (1, 2))
-    return Statistic(name, cast(Channel, channel), more, "" if more == less else less, **shown)
+    return Statistic(name, channel, more, "" if more == less else less, **shown)
 
 
 class _Catalogue(dict[str, Statistic]):

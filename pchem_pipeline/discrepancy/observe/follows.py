@@ -17,18 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe import laws as laws_of
-from pchem_pipeline.discrepancy.observe.digital.groups import GROUP, MOST_SAMPLES, groups_of
-from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
-from pchem_pipeline.discrepancy.observe.sums import pixel_statistics
+from pchem_pipeline.discrepancy.observe.digital import GROUP, MOST_SAMPLES, groups_of
+from pchem_pipeline.discrepancy.observe.sums import FrameBlocks, Samples, pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.operators.couple import Source
 
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 Spectra = NDArray[np.complexfloating]
 Axes = tuple[int, ...]  # of (frame, y, x)
 
@@ -92,7 +88,7 @@ class FollowingSamples:
     @classmethod
     def of(
         cls,
-        frames: NDArray[np.unsignedinteger[Any]],
+        frames: CodeArray,
         edges: IntArray,
         laws: PixelLaws,
         maps: PixelMaps,
@@ -115,7 +111,16 @@ class FollowingSamples:
         stack = FrameBlocks.of(frames, (first[:, None] + np.arange(GROUP)).ravel(), GROUP)
         samples = replace(Samples.by_laws(stack, laws, maps), most=MOST_SAMPLES)
         inside = samples.usable if inside is None else samples.usable & inside
-        return cls(samples, inside, *_charge_of(laws, maps))
+        pixels = pixel_statistics(laws, maps)
+        usable = pixels.usable
+        correlation = pixels.cross / np.sqrt(np.where(usable, pixels.variance.prod(axis=0), 1.0))
+        left = 1.0 - correlation**2
+        resolved = usable & (left > _RESOLVED)
+        scale = np.where(resolved, 1.0 / np.sqrt(np.where(resolved, left, 1.0)), 0.0)
+        mean = np.where(usable, maps.quanta_exposure, 0.0)
+        spread = np.sqrt(np.where(usable, pixels.variance[0], 0.0))
+        single = [each.astype(np.float32) for each in (correlation, scale, mean, spread)]
+        return cls(samples, inside, single[0], single[1], single[2], single[3])
 
     @property
     def groups(self) -> int:
@@ -224,22 +229,6 @@ class FollowingSamples:
         return products, pairs
 
 
-def _charge_of(
-    laws: PixelLaws, maps: PixelMaps
-) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array]:
-    """Return the correlation of charge and residual, the scale of what it leaves, mean and spread, (y, x)."""
-    pixels = pixel_statistics(laws, maps)
-    usable = pixels.usable
-    correlation = pixels.cross / np.sqrt(np.where(usable, pixels.variance.prod(axis=0), 1.0))
-    left = 1.0 - correlation**2
-    resolved = usable & (left > _RESOLVED)
-    scale = np.where(resolved, 1.0 / np.sqrt(np.where(resolved, left, 1.0)), 0.0)
-    mean = np.where(usable, maps.quanta_exposure, 0.0)
-    spread = np.sqrt(np.where(usable, pixels.variance[0], 0.0))
-    single = np.float32
-    return correlation.astype(single), scale.astype(single), mean.astype(single), spread.astype(single)
-
-
 def _scatter(u: Float32Array) -> FloatArray:
     """Return the sums of squares of frames (t, y, x): of samples, row, column and frame sums."""
     rows, columns = u.sum(axis=2, dtype=np.float64), u.sum(axis=1, dtype=np.float64)
@@ -259,7 +248,7 @@ def _centred(spectra: Spectra, size: tuple[int, int], shape: tuple[int, int]) ->
 
 
 def follow_statistics(
-    frames: NDArray[np.unsignedinteger[Any]], edges: IntArray, laws: PixelLaws, maps: PixelMaps
+    frames: CodeArray, edges: IntArray, laws: PixelLaws, maps: PixelMaps
 ) -> dict[str, float]:
     """Return the statistics of residuals that follow the charge of other samples, in space and in time.
 

@@ -8,13 +8,12 @@ used, so that the answer stays finite and keeps growing with the effect.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.arithmetic.robust import chi_square as chi_square
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-
-FloatArray = NDArray[np.float64]
 
 _SMALL = 1e-12
 # an event that is next to impossible counts as much as this many standard deviations
@@ -24,12 +23,6 @@ FAR = 6.0
 #: Slowest waves along a series whose squares are summed (the adaptive test of Neyman, Fan 1996).
 SLOWEST = (2, 4, 8, 16, 32)
 _SHORT_END = 0.25  # of the cubic root of a gamma law
-
-
-def counted(count: ArrayLike, expected: ArrayLike) -> FloatArray:
-    """Return ``2 sqrt(c + 3/8) - 2 sqrt(e + 3/8)``: variance 1 for a Poisson count (Anscombe 1948)."""
-    seen, mean = np.asarray(count, np.float64), np.maximum(np.asarray(expected, np.float64), 0.0)
-    return np.asarray(2.0 * (np.sqrt(seen + 0.375) - np.sqrt(mean + 0.375)))
 
 
 def without_skew(z: FloatArray, skewness: FloatArray) -> FloatArray:
@@ -51,8 +44,13 @@ def poisson(count: int, expected: float) -> float:
 
 
 def repeats(count: int, expected: float) -> float:
-    """Return 10 for each coincidence that cannot happen; where they do happen, what :func:`counted` says."""
-    return float(_CERTAIN * count) if expected < SIGNIFICANCE else float(counted(count, expected))
+    """Return 10 for each coincidence that cannot happen; where they do happen, a normal quantile.
+
+    That is ``2 sqrt(c + 3/8) - 2 sqrt(e + 3/8)``, of variance 1 for a Poisson count (Anscombe 1948).
+    """
+    if expected < SIGNIFICANCE:
+        return float(_CERTAIN * count)
+    return float(2.0 * (np.sqrt(count + 0.375) - np.sqrt(expected + 0.375)))
 
 
 def largest_normal(values: FloatArray) -> float:
@@ -101,16 +99,22 @@ def _log_gamma_tail(shape: float, value: float) -> float:
     return float((shape - 1.0) * np.log(value) - value - special.gammaln(shape))
 
 
-def extreme(count: int, on: float, beyond: float) -> float:
-    """Return the normal quantile of ``count`` samples at the extreme value and none beyond it.
+def pile_up(observed: FloatArray, expected: FloatArray, at: int, *, top: bool) -> float:
+    """Return the normal quantile of the samples at the highest or lowest code, with none beyond it.
+
+    The chance of none beyond the extreme code is uniform over repetitions, and given some, the counts on it
+    follow a Poisson law: both as normal quantiles, averaged.
 
     Args:
-        count: samples at the extreme, at least 1.
-        on: samples expected there.
-        beyond: samples expected beyond.
+        observed: samples of each code, (n,).
+        expected: those expected, (n,).
+        at: the extreme code; anywhere else than among these nothing is expected.
+        top: it is the highest one.
     """
-    on = max(on, _SMALL)
-    # P(no sample beyond) is uniform; half of the chance of the extreme itself splits the ties
+    known = 0 <= at < expected.size
+    count, on = (max(int(observed[at]), 1), max(float(expected[at]), _SMALL)) if known else (1, _SMALL)
+    beyond = float((expected[max(at + 1, 0) :] if top else expected[: max(at, 0)]).sum())
+    # half of the chance of the extreme itself splits the ties
     nothing = _quantile(-beyond + np.log(0.5 + 0.5 * np.exp(-on)))
     piled = _quantile(_log_poisson_tail(count, on) - np.log(-np.expm1(-on)))
     return float((nothing + piled) / np.sqrt(2.0))

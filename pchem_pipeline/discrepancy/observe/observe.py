@@ -13,36 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.errors import InputError, PchEmError
-from pchem_pipeline.discrepancy.observe.digital.groups import (
-    bit_statistics,
-    nearer_statistics,
-    predicted_samples,
-    predicted_statistics,
-    previous_bits,
-)
-from pchem_pipeline.discrepancy.observe.digital.misplaced import misplaced_lines
-from pchem_pipeline.discrepancy.observe.digital.repeats import (
-    Repeats,
-    equal_squares,
-    log_alike,
-    square_statistics,
-)
+from pchem_pipeline.discrepancy.observe import digital, vector
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
+from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS, samples_beyond
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
-from pchem_pipeline.discrepancy.observe.vector import (
-    block_statistics,
-    frame_statistics,
-    goodness_of,
-    in_order,
-    line_statistics,
-    product_statistics,
-    quadrant_series,
-    quadrant_sums,
-    sample_statistics,
-)
 from pchem_pipeline.discrepancy.observe.view import FrameView
 from pchem_pipeline.discrepancy.observe.waves import waves_across
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
@@ -50,9 +28,6 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Pixels with one of these flags are left out. A poor fit is no reason: it is what is looked for. Nor is a
 #: bias that may be off by one electron: all that is looked at stays nearly the same, but to choose the pixels
@@ -65,13 +40,12 @@ _ALIKE, _FEW = 1.25, 0.1  # ratio of like steps, and share of the pixels that ma
 
 
 def observe(
-    frames: NDArray[np.unsignedinteger[Any]],
+    frames: CodeArray,
     numbers: IntArray,
     *,
     n_run: int,
     block_frames: int,
-    fit: FitSettings | None = None,
-    exclude: NDArray[np.bool_] | None = None,
+    exclude: BoolArray | None = None,
     start: PixelMaps | None = None,
     fitted: bool = True,
 ) -> Evidence:
@@ -82,7 +56,6 @@ def observe(
         numbers: their frame numbers in the run, increasing, (n,).
         n_run: frames of the whole run.
         block_frames: frames in a block; blocks begin anew where numbers are missing.
-        fit: settings of the fit; the defaults if None.
         exclude: pixels not to look at, (y, x).
         start: parameters near those of these frames, where they are known: saves time.
         fitted: take the parameters from a fit of these frames; False: take ``start`` as it is, for frames too
@@ -97,36 +70,33 @@ def observe(
     seen = PixelHistograms.of(frames)
     wanted = np.ones(shape, np.bool_) if exclude is None else ~exclude
     if fitted or start is None:
-        result, parameters, usable = _fitted(seen, wanted.ravel(), fit, start)
+        result, parameters, usable = _fitted(seen, wanted.ravel(), start)
     else:
         result, parameters = None, start.columns
         usable = (wanted & start.usable).ravel() & _inside(seen)
-    evidence, laws = _compared(seen, parameters, usable, (shape[0], shape[1]))
-    evidence = evidence if result is None else _with_fit(evidence, result)
+    evidence, laws = _compared(seen, parameters, usable, (shape[0], shape[1]), result)
     maps = evidence.maps
     view = FrameView.of(frames, numbers, block_frames, laws, maps)
     edges = view.edges
-    hits = [samples_beyond(frames, laws, maps.usable, above=above) for above in (True, False)]
-    repeats = Repeats.of(frames, numbers)
-    predicted = predicted_samples(frames, edges, maps.usable)
-    spread = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
-    bits = previous_bits(frames, edges, maps.usable, np.where(maps.usable, spread, 1.0))
-    squares = equal_squares(frames)
+    hits = [samples_beyond(frames, numbers, laws, maps.usable, above=above) for above in (True, False)]
+    repeats = digital.Repeats.of(frames, numbers)
+    predicted = digital.predicted_samples(frames, edges, maps.usable)
+    bits = digital.previous_bits(frames, edges, maps)
     waves = waves_across(frames, numbers, laws, maps)
     misplaced_z, misplaced = misplaced_lines(frames, seen.counts, seen.origin, maps.usable)
     z = {
         **evidence.z,
         "tail.high.clusters": _clusters(hits[0], laws, frames.shape),
-        **product_statistics(view),
-        **block_statistics(view),
-        **frame_statistics(view),
-        **line_statistics(view),
-        **predicted_statistics(predicted),
-        **bit_statistics(bits),
-        **nearer_statistics(frames, edges, maps),
+        **vector.product_statistics(view),
+        **vector.block_statistics(view),
+        **vector.frame_statistics(view),
+        **vector.line_statistics(view),
+        **digital.predicted_statistics(predicted),
+        **digital.bit_statistics(bits),
+        **digital.nearer_statistics(frames, edges, maps),
         **follow_statistics(frames, edges, laws, maps),
-        **repeats.statistics(log_alike(seen, maps.usable.shape), len(frames)),
-        **square_statistics(squares, seen, maps.usable, int(frames.max())),
+        **repeats.statistics(seen, frames.shape),
+        **digital.square_statistics(frames, seen, maps.usable),
         **misplaced_z,
         **waves.z,
     }
@@ -140,25 +110,20 @@ def observe(
         previous_bits=bits,
         misplaced_lines=misplaced,
         waves=waves.found,
-        hits=_numbered(hits[0], numbers),
-        low_hits=_numbered(hits[1], numbers),
+        hits=hits[0],
+        low_hits=hits[1],
     )
-    return replace(evidence, time=time, z=in_order(z))
+    return replace(evidence, time=time, z=vector.in_order(z))
 
 
 def observe_histograms(
-    counts: NDArray[np.unsignedinteger[Any]],
-    origin: IntArray,
-    *,
-    fit: FitSettings | None = None,
-    parameters: FloatArray | None = None,
+    counts: CodeArray, origin: IntArray, *, parameters: FloatArray | None = None
 ) -> Evidence:
     """Return the evidence of ready-made histograms: no time, no neighbours.
 
     Args:
         counts: one histogram per pixel (and sample), (n, B).
         origin: DN of bin 0, (n,).
-        fit: settings of the fit; the defaults if None.
         parameters: (H, g, mu, sigma) of a fit of more than one histogram each, (n, 4), NaN where not usable;
             None: each histogram is fitted by itself.
 
@@ -168,11 +133,12 @@ def observe_histograms(
     Raises:
         PchEmError: no pixel is usable.
     """
-    n, seen = len(counts), PixelHistograms.alone(counts, origin)
-    if parameters is not None:
-        return _compared(seen, parameters, np.asarray(np.isfinite(parameters).all(axis=1)), (1, n))[0]
-    result, parameters, usable = _fitted(seen, np.ones(n, np.bool_), fit, None)
-    return _with_fit(_compared(seen, parameters, usable, (1, n))[0], result)
+    n, seen, result = len(counts), PixelHistograms.alone(counts, origin), None
+    if parameters is None:
+        result, parameters, usable = _fitted(seen, np.ones(n, np.bool_))
+    else:
+        usable = np.asarray(np.isfinite(parameters).all(axis=1))
+    return _compared(seen, parameters, usable, (1, n), result)[0]
 
 
 def _check(frames: NDArray[Any], numbers: IntArray, block_frames: int) -> None:
@@ -189,9 +155,13 @@ def _check(frames: NDArray[Any], numbers: IntArray, block_frames: int) -> None:
 
 
 def _compared(
-    seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np.bool_], shape: tuple[int, int]
+    seen: PixelHistograms,
+    parameters: FloatArray,
+    usable: BoolArray,
+    shape: tuple[int, int],
+    fit: FitResult | None,
 ) -> tuple[Evidence, PixelLaws]:
-    """Compare histograms with the PCD at the parameters of a fit."""
+    """Compare histograms with the PCD at the parameters of a fit; None: its errors are not known."""
     laws = pixel_laws(seen, parameters, usable)
     good = laws.good
     if not good.any():
@@ -204,49 +174,38 @@ def _compared(
     def known(values: FloatArray) -> FloatArray:
         return np.where(good, values, np.nan).reshape(shape)
 
-    def mapped(values: FloatArray) -> NDArray[np.float32]:
+    def mapped(values: FloatArray) -> Float32Array:
         return known(values).astype(np.float32)
 
     low, high = (np.where(good[:, None], moments[side], 0.0) for side in ("low", "high"))
-
+    ambiguous = 0.0 if fit is None else np.mean((fit.fit_status[good] & int(FitStatus.BIAS_AMBIGUOUS)) != 0)
     evidence = Evidence(
         maps=PixelMaps.known(parameters.T, good.reshape(shape)),
         n_frames=int(seen.samples.max()),
         charge_std=known(moments["charge_std"]),
         readout_std=known(moments["readout_std"]),
         scores={name: mapped(laws.scores[:, 0, j]) for j, name in enumerate(SCORES)},
-        goodness=mapped(goodness_of(moments["goodness"])),
-        peaks=mapped(goodness_of(moments["peaks"])),
+        goodness=mapped(vector.goodness_of(moments["goodness"])),
+        peaks=mapped(vector.goodness_of(moments["peaks"])),
         tail_low=low[:, 0].reshape(shape).astype(np.uint32),
         tail_high=high[:, 0].reshape(shape).astype(np.uint32),
         code=residuals,
         time=None,
-        z=in_order(sample_statistics(laws, parameters[:, 0], residuals)),
+        z=vector.in_order(vector.sample_statistics(laws, parameters[:, 0], residuals)),
         tail_expected=np.stack([mapped(low[:, 1]), mapped(high[:, 1])]),
+        covariance=None if fit is None else fit.covariance.reshape(*shape, 4, 4),
+        ambiguous=float(ambiguous),
     )
     return evidence, laws
 
 
-def _with_fit(evidence: Evidence, result: FitResult) -> Evidence:
-    """Return the evidence with covariances and doubts of the fit that it was compared with."""
-    good = evidence.maps.usable
-    return replace(
-        evidence,
-        covariance=result.covariance.reshape(*good.shape, 4, 4),
-        ambiguous=float(np.mean((result.fit_status[good.ravel()] & int(FitStatus.BIAS_AMBIGUOUS)) != 0)),
-    )
-
-
 def _fitted(
-    seen: PixelHistograms,
-    wanted: NDArray[np.bool_],
-    fit: FitSettings | None,
-    near: PixelMaps | None,
-) -> tuple[FitResult, FloatArray, NDArray[np.bool_]]:
+    seen: PixelHistograms, wanted: BoolArray, near: PixelMaps | None = None
+) -> tuple[FitResult, FloatArray, BoolArray]:
     """Return the fit, its parameters (n, 4), and which pixels can be used."""
     start = None if near is None else near.columns
     # every sample counts here: what the tail guard would leave out is what is looked for
-    settings = (fit or FitSettings()).model_copy(update={"tail_guard": 0.0, "errors": "information"})
+    settings = FitSettings(tail_guard=0.0, errors="information")
     outside = seen.outside.T.astype(np.int64)
     result = fit_histograms(seen.counts, seen.origin, *outside, settings=settings, start=start)
     parameters = result.columns
@@ -255,7 +214,7 @@ def _fitted(
     return result, parameters, usable & _inside(seen)
 
 
-def _without_steps(gain: FloatArray, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _without_steps(gain: FloatArray, usable: BoolArray) -> BoolArray:
     """Tell which pixels have a comb that whole DN hardly show, where most pixels have a coarser one, (n,).
 
     Of noise that hides the electrons, as in the dark, in reference columns or in noisy pixels, a few of many
@@ -275,19 +234,19 @@ def _without_steps(gain: FloatArray, usable: NDArray[np.bool_]) -> NDArray[np.bo
     return np.asarray(few & (step < min(_FINEST_STEP, _FAR_FINER * most)) & (most > _FINEST_STEP))
 
 
-def _inside(seen: PixelHistograms) -> NDArray[np.bool_]:
+def _inside(seen: PixelHistograms) -> BoolArray:
     """Return which histograms hold nearly all samples of their pixel, (n,)."""
     return np.asarray(seen.outside.sum(axis=1) <= MOST_OUTSIDE * seen.counts.sum(axis=1))
 
 
-def fitted_maps(frames: NDArray[np.unsignedinteger[Any]], exclude: NDArray[np.bool_]) -> PixelMaps:
+def fitted_maps(frames: CodeArray, exclude: BoolArray) -> PixelMaps:
     """Return the plain fit of some frames, from nothing, as :func:`observe` makes it.
 
     Args:
         frames: codes (n, y, x), DN.
         exclude: pixels not to look at, (y, x).
     """
-    _, parameters, usable = _fitted(PixelHistograms.of(frames), ~exclude.ravel(), None, None)
+    _, parameters, usable = _fitted(PixelHistograms.of(frames), ~exclude.ravel())
     return PixelMaps.known(parameters.T, usable.reshape(exclude.shape))
 
 
@@ -312,10 +271,10 @@ def _time_series(view: FrameView, n_run: int, **others: Any) -> TimeSeries:
     def over(values: FloatArray, count: FloatArray) -> FloatArray:
         return np.asarray(values / np.maximum(count, 1e-300) * (count > 0))
 
-    def mapped(values: FloatArray) -> NDArray[np.float32]:
+    def mapped(values: FloatArray) -> Float32Array:
         return np.where(view.pixels.usable, values, np.nan).astype(np.float32)
 
-    def lags(name: str) -> NDArray[np.float32]:
+    def lags(name: str) -> Float32Array:
         of = (view.correlations[f"time.lag{lag}.{name}"].of_pixels for lag in (1, 2, 3))
         return np.stack(list(of)).astype(np.float32)
 
@@ -337,7 +296,7 @@ def _time_series(view: FrameView, n_run: int, **others: Any) -> TimeSeries:
         frame_charge=view.halves[0].sum(axis=(0, 2)) / exposure.sum(),
         frame_readout=view.halves[1].sum(axis=(0, 2)) / number.sum(),
         frame_gain=view.gain,
-        quadrant_readout=over(quadrant_series(view.halves[1]), quadrant_sums(number)),
+        quadrant_readout=over(vector.quadrant_series(view.halves[1]), vector.quadrant_sums(number)),
         row_charge=rows[0],
         row_readout=rows[1],
         column_charge=columns[0],
@@ -353,8 +312,3 @@ def _time_series(view: FrameView, n_run: int, **others: Any) -> TimeSeries:
         **others,
         frame_noise=view.series["noise"],
     )
-
-
-def _numbered(hits: IntArray, numbers: IntArray) -> IntArray:
-    """Return samples (position, y, x, DN) with the number of their frame in the run."""
-    return np.column_stack([numbers[hits[:, 0]], hits[:, 1:]]).astype(np.int64)

@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
@@ -48,7 +47,7 @@ class SensorWindow:
         rows, columns = shape[-2:]
         return cls((0, rows), (0, columns), (rows, columns))
 
-    def mask(self, region: Region | None) -> NDArray[np.bool_]:
+    def mask(self, region: Region | None) -> BoolArray:
         """Return which pixels of the window lie in a region, (y, x)."""
         every = np.ones(self.shape, np.bool_) if region is None else region.mask(self.shape)
         return every[slice(*self.rows), slice(*self.columns)]
@@ -74,16 +73,6 @@ class SensorWindow:
         effect = effect.to_sensor(rows, columns, self.shape)
         return effect if part is None else effect.at_place(part.region, part.when)
 
-    def _known_as(self, region: Region) -> Region | None:
-        """Return the known region of the sensor of which the window shows nearly the same, if any."""
-        height, width = self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
-        found = region.mask((height, width))
-        for place in self.known:
-            seen = self.mask(place)
-            if (found & seen).sum() >= _SAME * (found | seen).sum():
-                return place
-        return None
-
     def on_sensor(self, region: Region | None) -> Region | None:
         """Return a region of the window as one of the sensor.
 
@@ -98,9 +87,12 @@ class SensorWindow:
             if taps.every is not None and taps.width == 1:
                 which = tuple(sorted((w + taps.first) % taps.every for w in taps.which))
                 taps = taps.model_copy(update={"first": 0, "which": which})
+        # the known region of which the window shows nearly the same
+        found = region.mask((self.rows[1] - y, self.columns[1] - x))
         rows = tuple((a + y, b + y) for a, b in region.rows)
         columns = tuple((a + x, b + x) for a, b in region.columns)
-        same = self._known_as(region)
+        seen = ((place, self.mask(place)) for place in self.known)
+        same = next((p for p, mask in seen if (found & mask).sum() >= _SAME * (found | mask).sum()), None)
         return region.model_copy(
             update={
                 "rows": rows if same is None else _beyond(rows, self.rows, same.rows),
@@ -141,14 +133,14 @@ class Part:
         """It in one line, for the names of its statistics."""
         return ",".join(place.text() for place in (self.region, self.when) if place is not None)
 
-    def frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def frames(self, numbers: IntArray) -> BoolArray:
         """Return which frames are its."""
         return np.ones(numbers.size, np.bool_) if self.when is None else self.when.frames(numbers)
 
 
 def part_evidence(
-    frames: NDArray[np.unsignedinteger[Any]],
-    numbers: NDArray[np.int64],
+    frames: CodeArray,
+    numbers: IntArray,
     maps: PixelMaps,
     part: Part,
     *,
@@ -178,19 +170,13 @@ def part_evidence(
     window = window or SensorWindow.whole(frames.shape)
     exclude = ~(window.mask(part.region) & maps.usable)
     return observe(
-        stack,
-        numbers[chosen],
-        n_run=n_run,
-        block_frames=length,
-        exclude=exclude,
-        start=maps,
-        fitted=fitted,
+        stack, numbers[chosen], n_run=n_run, block_frames=length, exclude=exclude, start=maps, fitted=fitted
     )
 
 
 def part_statistics(
-    frames: NDArray[np.unsignedinteger[Any]],
-    numbers: NDArray[np.int64],
+    frames: CodeArray,
+    numbers: IntArray,
     maps: PixelMaps,
     parts: Sequence[Part],
     *,
@@ -202,7 +188,9 @@ def part_statistics(
     Arguments as in :func:`part_evidence`.
     """
     found: dict[str, float] = {}
-    leading = _leading() if parts else ()
+    # of all effects, in the order of the catalogue
+    wanted = {name for effect in effect_classes().values() for name in effect.signature[:_LEADING]}
+    leading = [name for name in STATISTICS if name in wanted]
     window = window or SensorWindow.whole(frames.shape)
     for part in parts:
         mask = window.mask(part.region)
@@ -219,9 +207,3 @@ def part_statistics(
             continue
         found |= {f"{name}@{part.text}": evidence.z[name] for name in leading if name in evidence.z}
     return found
-
-
-def _leading() -> tuple[str, ...]:
-    """Return the leading statistics of all effects, in the order of the catalogue."""
-    wanted = {name for effect in effect_classes().values() for name in effect.signature[:_LEADING]}
-    return tuple(name for name in STATISTICS if name in wanted)

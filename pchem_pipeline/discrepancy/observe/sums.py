@@ -1,19 +1,20 @@
-"""The two channels of the samples of pixels: their moments, the codes that have them, and those beyond."""
+"""The two channels of the samples of pixels: their moments, the codes that have them, and frames of both."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe.tables import PixelLaws
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
+from pchem_pipeline.discrepancy.observe.laws import FAR
+from pchem_pipeline.discrepancy.observe.observe_numba import look_up
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, PixelMaps
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: What a sample is split into: k and r.
 CHANNELS = ("charge", "readout")
@@ -40,7 +41,7 @@ class PixelStatistics:
         square: weights of r^2 by which a common relative change of the noise is told best.
     """
 
-    usable: NDArray[np.bool_]
+    usable: BoolArray
     mode: FloatArray
     variance: FloatArray
     cross: FloatArray
@@ -94,20 +95,151 @@ def pixel_statistics(laws: PixelLaws, maps: PixelMaps) -> PixelStatistics:
     )
 
 
-def code_ranges(laws: PixelLaws, usable: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Return first code, last code and first row of the tables, (3, y, x); row 0 (zeros) where not usable."""
-    first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T
-    return np.stack([first, first + length - 1, start]).reshape(3, *usable.shape).astype(np.int32)
-
-
 def samples_beyond(
-    frames: NDArray[Any], laws: PixelLaws, usable: NDArray[np.bool_], *, above: bool
+    frames: NDArray[Any], numbers: IntArray, laws: PixelLaws, usable: BoolArray, *, above: bool
 ) -> IntArray:
-    """Return the samples above or below the support of their pixel, by frame: position, y, x, DN."""
+    """Return the samples above or below the support of their pixel: number of the frame, y, x, DN."""
     seen = (laws.moments["high" if above else "low"][:, 0] > 0).reshape(usable.shape) & usable
     samples, (first, length) = frames[:, seen].T, laws.support[seen.ravel(), :2].T[:, :, None]
     pixel, frame = np.nonzero(samples > first + length - 1 if above else samples < first)
     pixel, frame = pixel[:MOST_HITS], frame[:MOST_HITS]
     y, x = np.nonzero(seen)
-    hits = np.stack([frame, y[pixel], x[pixel], samples[pixel, frame]], axis=1).astype(np.int64)
+    hits = np.stack([numbers[frame], y[pixel], x[pixel], samples[pixel, frame]], axis=1).astype(np.int64)
     return hits[np.lexsort((hits[:, 2], hits[:, 1], hits[:, 0]))]
+
+
+# -- frames as deviations of their pixels ------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FrameBlocks:
+    """Frames of some rows that come by blocks.
+
+    Attributes:
+        n_frames: number of them.
+        blocks: yields about so many successive frames at a time, (frame, y, x), DN.
+    """
+
+    n_frames: int
+    blocks: Callable[[int], Iterable[CodeArray]]
+
+    @classmethod
+    def of(cls, frames: CodeArray, chosen: IntArray | None = None, together: int = 1) -> FrameBlocks:
+        """Take frames in memory.
+
+        Args:
+            frames: codes (n, y, x), DN.
+            chosen: positions of those that are meant; None: all.
+            together: successive ones of these that come in the same block.
+        """
+        n_frames = frames.shape[0] if chosen is None else chosen.size
+
+        def blocks(size: int) -> Iterator[CodeArray]:
+            size = together * max(size // together, 1)
+            for some in (slice(begin, begin + size) for begin in range(0, n_frames, size)):
+                yield frames[some if chosen is None else chosen[some]]
+
+        return cls(n_frames, blocks)
+
+
+def laws_of_frames(frames: CodeArray, maps: PixelMaps) -> PixelLaws:
+    """Compare the histograms of frames (n, y, x) with the fit of their pixels."""
+    return pixel_laws(PixelHistograms.of(frames), maps.columns, maps.usable.ravel())
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Frames as standardised deviations of their pixels, of both channels.
+
+    Attributes:
+        frames: codes (n, y, x), DN.
+        first, last: smallest and largest code of each pixel's table, (y, x).
+        start: row of the first one in ``tables``, (y, x).
+        tables: k and r of each code over their standard deviation, (rows, 2).
+        usable: pixels that count, (y, x).
+        most: samples that are looked at at a time, whole frames.
+    """
+
+    frames: FrameBlocks
+    first: NDArray[np.int32]
+    last: NDArray[np.int32]
+    start: NDArray[np.int32]
+    tables: Float32Array
+    usable: BoolArray
+    most: int = 1 << 20
+
+    @classmethod
+    def of(cls, frames: CodeArray, maps: PixelMaps) -> Samples:
+        """Prepare frames by the fit of their pixels."""
+        return cls.by_laws(FrameBlocks.of(frames), laws_of_frames(frames, maps), maps)
+
+    @classmethod
+    def by_laws(
+        cls, frames: FrameBlocks, laws: PixelLaws, maps: PixelMaps, *, standardised: bool = True
+    ) -> Samples:
+        """Prepare frames by the laws of their pixels, made of all samples of the frames or of more.
+
+        Args:
+            frames: codes.
+            laws: of the pixels' samples.
+            maps: parameters of the pixels.
+            standardised: False: k (e-) and r (DN) as they are.
+        """
+        pixels = pixel_statistics(laws, maps)
+        usable = pixels.usable
+        tables = laws.tables
+        if standardised:
+            length = np.where(laws.good, laws.support[:, 1], 0)
+            deviation = np.sqrt(np.where(usable, pixels.variance, 1.0)).reshape(2, -1).astype(np.float32)
+            tables = tables[: 1 + length.sum()].copy()
+            tables[1:] /= np.repeat(deviation.T, length, axis=0)
+            # a track of a particle is no common mode
+            np.clip(tables, -FAR, FAR, out=tables)
+        # of pixels that do not count the row 0, of zeros
+        first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T
+        ranges = np.stack([first, first + length - 1, start]).reshape(3, *usable.shape).astype(np.int32)
+        return cls(frames, ranges[0], ranges[1], ranges[2], tables, usable)
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return self.frames.n_frames
+
+    def without(self, pixels: BoolArray) -> Samples:
+        """Return it without some pixels, (y, x)."""
+        return replace(self, usable=self.usable & ~pixels)
+
+    def chunks(
+        self, channels: tuple[int, ...] = (0, 1), rows: slice = slice(None), columns: slice = slice(None)
+    ) -> Iterator[Float32Array]:
+        """Yield some frames at a time as deviations (channel, frame, y, x), 0 where not usable."""
+        box = rows, columns
+        first, last, start, weight = (
+            np.ascontiguousarray(each[box])
+            for each in (self.first, self.last, self.start, self.usable.astype(np.float32))
+        )
+        for block in self.frames.blocks(max(1, self.most // self.usable.size)):
+            codes = np.ascontiguousarray(block[:, rows, columns])
+            values = np.empty((2, *codes.shape), np.float32)
+            look_up(codes, first, last, start, self.tables, weight, values)
+            yield values[channels[0] : channels[-1] + 1]
+
+    def energies(self, channel: int, mode: str, pixels: BoolArray) -> FloatArray:
+        """Return the sum of the products of pairs of some pixels that share a mode, in each frame, (n,)."""
+        rows, columns = (np.flatnonzero((self.usable & pixels).any(axis=axis)) for axis in (1, 0))
+        if rows.size == 0:
+            return np.zeros(self.n_frames)
+        box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        inside = pixels[box].astype(np.float32)
+        found = [energies(u * inside, mode) for (u,) in self.chunks((channel,), *box)]
+        return np.concatenate(found)
+
+
+def energies(u: Float32Array, mode: str) -> FloatArray:
+    """Return the sum of the products of all pairs that share a mode, of frames (t, y, x)."""
+    own = np.einsum("tyx,tyx->t", u, u, dtype=np.float64)
+    rows, columns = (u.sum(axis=axis, dtype=np.float64) for axis in (2, 1))
+    of_rows, of_columns = ((sums**2).sum(axis=1) for sums in (rows, columns))
+    if mode == "frame":
+        return np.asarray(rows.sum(axis=1) ** 2 - of_rows - of_columns + own) / 2.0
+    return np.asarray((of_rows if mode == "row" else of_columns) - own) / 2.0

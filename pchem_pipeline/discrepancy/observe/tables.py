@@ -3,7 +3,9 @@
 The mass of a code is that of the rounded PCD (differences of normal cdfs, Hendrickson et al. 2023, eq.
 PCD_RV_definition), so that coarse quantisation is no discrepancy. The scores are Rao's efficient scores: the
 part of a Hermite x Charlier polynomial that is orthogonal, in the Fisher metric of the mass, to the four
-directions in which the parameters move it; to first order the fit does not matter for them.
+directions in which the parameters move it; to first order the fit does not matter for them. To second order
+it does: with the parameters fitted by maximum likelihood their sum has the expectation ``-1/2 sum_ab cov(a,
+b) sum_x psi(x) D_a D_b p(x)``, and second derivatives of p along these directions are polynomials again.
 """
 
 from __future__ import annotations
@@ -16,17 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.discrepancy.observe import tables_numba as kernel
-from pchem_pipeline.discrepancy.observe.efficient_scores import N_TESTS, efficient_scores, whiten
+from pchem_pipeline.discrepancy.observe import observe_numba as kernel
 from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.cell_scores_numba import N_COLUMNS, N_NUISANCE
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
-
+N_TESTS = N_COLUMNS - N_NUISANCE
+_SINGULAR = 1e-9  # squared length of a column, over that before
 _SMALLEST_WIDTH = 0.1  # DN: below it peaks are single codes
 _ALLOWED = 1e-2  # samples expected beyond the codes of a pixel, on either side, at most
 #: Pixels whose law covers more codes than this are not looked at.
@@ -62,13 +62,13 @@ class PixelHistograms:
         ends: smallest and largest code of each, DN, (2, n); None: those of the histograms.
     """
 
-    counts: NDArray[np.unsignedinteger[Any]]
+    counts: CodeArray
     origin: IntArray
     outside: FloatArray
     ends: NDArray[np.integer[Any]] | None = None
 
     @classmethod
-    def of(cls, frames: NDArray[np.unsignedinteger[Any]]) -> PixelHistograms:
+    def of(cls, frames: CodeArray) -> PixelHistograms:
         """Count the samples of each pixel of frames (frame, y, x), DN."""
         found = histogram_frames(frames)
         outside = np.stack([found.under.ravel(), found.over.ravel()], axis=1).astype(np.float64)
@@ -77,13 +77,11 @@ class PixelHistograms:
         return cls(counts, found.origin.ravel().astype(np.int64), outside, ends)
 
     @classmethod
-    def alone(
-        cls, counts: NDArray[np.unsignedinteger[Any]], origin: NDArray[np.integer[Any]]
-    ) -> PixelHistograms:
+    def alone(cls, counts: CodeArray, origin: NDArray[np.integer[Any]]) -> PixelHistograms:
         """Take ready-made histograms (n, B) that hold all samples of their pixels."""
         return cls(counts, origin.astype(np.int64), np.zeros((len(counts), 2)))
 
-    def extremes(self, some: NDArray[np.bool_]) -> tuple[int, int]:
+    def extremes(self, some: BoolArray) -> tuple[int, int]:
         """Return the smallest and the largest code of some pixels, (n,), DN."""
         if self.ends is not None:
             return int(self.ends[0, some].min()), int(self.ends[1, some].max())
@@ -135,11 +133,11 @@ class PixelLaws(NamedTuple):
     moments: NDArray[np.void]
     scores: FloatArray
     support: IntArray
-    tables: NDArray[np.float32]
+    tables: Float32Array
     codes: CodeSums
 
 
-def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np.bool_]) -> PixelLaws:
+def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: BoolArray) -> PixelLaws:
     """Compare the histogram of every usable pixel with its fitted law.
 
     Args:
@@ -148,7 +146,9 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: NDArray[np
         usable: pixels to look at, (n,).
     """
     n = usable.size
-    natural = _natural(parameters, usable)
+    # harmless numbers for unusable pixels
+    exposure, gain, bias, sigma = np.where(usable[:, None], parameters, [1.0, 1.0, 0.0, 1.0]).T
+    natural = np.ascontiguousarray(np.stack([exposure, 1.0 / gain, bias, analog_width(sigma)], axis=1))
     window, electrons = np.zeros((n, 2), np.int64), np.zeros((n, 2), np.int64)
     samples = float(seen.counts.sum(axis=1).max(initial=1)) + float(seen.outside.sum(axis=1).max(initial=0.0))
     kernel.supports(natural, np.log(_NEGLIGIBLE / (samples * n)), electrons, window)
@@ -333,12 +333,6 @@ def _add_codes(
             covariance -= total.T @ (n[:, None] * total)
 
 
-def _natural(parameters: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
-    """Return H, 1/g (DN), mu and the analog read noise (DN); harmless numbers for unusable pixels."""
-    exposure, gain, bias, sigma = np.where(usable[:, None], parameters, [1.0, 1.0, 0.0, 1.0]).T
-    return np.ascontiguousarray(np.stack([exposure, 1.0 / gain, bias, analog_width(sigma)], axis=1))
-
-
 def analog_width(sigma: FloatArray) -> FloatArray:
     """Return the analog read noise of a read noise with quantisation, DN; not below that of single codes."""
     return np.asarray(np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, _SMALLEST_WIDTH**2)))
@@ -353,3 +347,93 @@ def _code_axis(window: IntArray) -> tuple[int, int]:
         first = max(first, int(np.median(window[:, 0])) - _LONGEST_AXIS // 2)
         last = min(last, first + _LONGEST_AXIS - 1)
     return first, last - first + 1
+
+
+# -- efficient scores: arrays of n pixels over x codes, without mass beyond the codes of a pixel ----
+
+
+def whiten(law: FloatArray, inverse: FloatArray) -> FloatArray:
+    """Make the first columns of ``law`` orthonormal, and the tests orthogonal to them.
+
+    A parameter on which the law does not depend here, or not in a way of its own, takes nothing from the
+    tests: its column becomes 0. The read noise is one where each electron number has the same two codes.
+
+    Args:
+        law: columns times mass; changed in place, (N_COLUMNS, n, x).
+        inverse: 1/p, or 0 for codes to be left out, (n, x).
+
+    Returns:
+        The triangular factor: column j was ``sum_i factor[i, j] (new column i)``, (N_NUISANCE, N_COLUMNS, n).
+    """
+    factor: FloatArray = np.einsum("ipx,jpx->ijp", law[:N_NUISANCE] * inverse, law)
+    # Gaussian elimination of the Gram matrix is Gram-Schmidt of the columns
+    for i in range(N_NUISANCE):
+        regular = factor[i, i] > _SINGULAR
+        factor[i] *= np.where(regular, 1.0 / np.sqrt(np.where(regular, factor[i, i], 1.0)), 0.0)
+        factor[i, :i] = 0.0
+        for k in range(i + 1, N_NUISANCE):
+            factor[k] -= factor[i, k] * factor[i]
+        law[i] /= np.where(regular, factor[i, i], np.inf)[:, None]
+        law[i + 1 :] -= factor[i, i + 1 :, :, None] * law[i]
+    return factor
+
+
+def efficient_scores(
+    law: FloatArray, inverse: FloatArray, seen: FloatArray, factor: FloatArray, exposure: FloatArray
+) -> FloatArray:
+    """Compute the standardised efficient scores of the samples, their skewness and kurtosis, (n, 3, N_TESTS).
+
+    Args:
+        law: whitened, (N_COLUMNS, n, x).
+        inverse: 1/p, or 0 for codes to be left out, (n, x).
+        seen: samples of each code, (n, x).
+        factor: of the whitening.
+        exposure: H, e-, (n,).
+
+    Returns:
+        NaN where a score has no variance.
+    """
+    tests = law[N_NUISANCE:]
+    scores = tests * inverse
+    products = np.einsum("ipx,jpx->ijp", scores, tests)
+    variance, samples = np.einsum("iip->ip", products), seen.sum(axis=1)
+    total = np.einsum("ipx,px->ip", scores, seen)
+    bias = -0.5 * np.einsum("jp,ijp->ip", _curvature(_fit_covariance(factor), exposure), products)
+    cubes = scores * scores * tests
+    third, fourth = cubes.sum(axis=2), np.einsum("ipx,ipx->ip", cubes, scores)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = [
+            (total - bias) / np.sqrt(samples * variance),
+            third / (variance * np.sqrt(variance * samples)),
+            (fourth / variance**2 - 3.0) / samples,
+        ]
+    known = (variance > _SINGULAR) & (samples > 0.0)
+    return np.asarray(np.where(known, found, np.nan).transpose(2, 0, 1))
+
+
+def _fit_covariance(factor: FloatArray) -> FloatArray:
+    """Return the covariance of the fit, times the samples, along C1, He1, He1 C1, He2, (4, 4, n)."""
+    of_fit = np.moveaxis(factor[1:, 1:N_NUISANCE], 2, 0)
+    known = np.diagonal(of_fit, axis1=1, axis2=2) > 0.0
+    both = known[:, :, None] & known[:, None, :]
+    inverse = np.linalg.inv(np.where(both, of_fit, np.eye(N_NUISANCE - 1))) * both
+    return np.asarray(np.einsum("pik,pjk->ijp", inverse, inverse))
+
+
+def _curvature(covariance: FloatArray, exposure: FloatArray) -> FloatArray:
+    """Return the coefficients of the tests in ``sum_ab cov(a, b) D_a D_b p``, in their order, (N_TESTS, n).
+
+    The directions multiply the terms of the law by C1, He1, He1 C1, He2; two of them by the products, of
+    which only what is not spanned by the parameters matters.
+    """
+    c, root2 = covariance, np.sqrt(2.0)
+    return np.stack([
+        root2 * c[0, 0],  # C2
+        np.zeros_like(exposure),  # C3
+        2.0 * c[1, 3],  # He3
+        c[3, 3],  # He4
+        2.0 * (c[0, 3] + c[1, 2]) + c[2, 2] / np.sqrt(exposure),  # He2C1
+        2.0 * root2 * c[0, 2],  # He1C2
+        root2 * c[2, 2],  # He2C2
+        2.0 * c[2, 3],  # He3C1
+    ])  # fmt: skip

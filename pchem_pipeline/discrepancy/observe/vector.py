@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
@@ -22,8 +22,6 @@ from pchem_pipeline.discrepancy.observe.view import OF_LINES, FrameView
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
 from pchem_pipeline.model.arithmetic.significance import OUTLYING
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
-
-FloatArray = NDArray[np.float64]
 
 _TAIL = float(special.ndtr(-OUTLYING))
 _ENOUGH = 25.0  # samples expected of a code or bin that is judged by itself
@@ -154,11 +152,9 @@ def _code_statistics(codes: CodeSums, residuals: CodeResiduals) -> dict[str, flo
     )
     if np.isfinite(smooth):
         found["code.smooth"] = smooth
-    at = np.array([residuals.maximum, residuals.minimum]) - residuals.first
-    found["code.top"] = _pile_up(residuals.observed, residuals.expected, int(at[0]))
-    found["code.bottom"] = _pile_up(
-        residuals.observed[::-1], residuals.expected[::-1], residuals.observed.size - 1 - int(at[1])
-    )
+    for name, code in (("top", residuals.maximum), ("bottom", residuals.minimum)):
+        at = code - residuals.first
+        found[f"code.{name}"] = laws.pile_up(residuals.observed, residuals.expected, at, top=name == "top")
     return found
 
 
@@ -202,18 +198,6 @@ def _absorbed_chi_square(values: FloatArray, covariance: FloatArray, poisson: Fl
         return float("nan")
     projected = vectors.T[kept] @ values
     return float(laws.chi_square(np.sum(projected**2 / eigenvalues[kept]), int(kept.sum())))
-
-
-def _pile_up(observed: FloatArray, expected: FloatArray, at: int) -> float:
-    """Return how surprising it is that no sample lies beyond a code and so many on it.
-
-    The chance of none beyond the extreme code is uniform over repetitions, and given some, the counts on it
-    follow a Poisson law: both as normal quantiles, averaged.
-    """
-    on = float(expected[at]) if 0 <= at < expected.size else 0.0
-    beyond = float(expected[max(at + 1, 0) :].sum())
-    count = int(observed[at]) if 0 <= at < observed.size else 1
-    return laws.extreme(max(count, 1), on, beyond)
 
 
 def _lag1(view: FrameView, u: FloatArray) -> float:

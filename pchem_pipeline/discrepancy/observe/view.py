@@ -17,15 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
+from pchem_pipeline.discrepancy.observe import sums
 from pchem_pipeline.discrepancy.observe.laws import SLOWEST, best, chi_square
-from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
-from pchem_pipeline.discrepancy.observe.sums import CHANNELS, PixelStatistics, blocks_of, pixel_statistics
-from pchem_pipeline.discrepancy.observe.sums_numba import add_frames, sum_rows
+from pchem_pipeline.discrepancy.observe.observe_numba import add_frames, sum_rows
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 _Slices = tuple[slice, slice]
 
 _LAGS = 3
@@ -34,7 +32,7 @@ _LAGS = 3
 PRODUCTS: dict[str, tuple[tuple[int, int, int], tuple[tuple[int, int], ...]]] = {
     **{
         f"time.lag{lag}.{name}": ((lag, 0, 0), ((channel, channel),))
-        for channel, name in enumerate(CHANNELS)
+        for channel, name in enumerate(sums.CHANNELS)
         for lag in range(1, _LAGS + 1)
     },
     "time.cross.readout_charge": ((1, 0, 0), ((1, 0),)),
@@ -46,7 +44,7 @@ PRODUCTS: dict[str, tuple[tuple[int, int, int], tuple[tuple[int, int], ...]]] = 
     },
 }
 #: Sums of each line: of k, of r, and weighted ones of r^2, less their mean.
-OF_LINES = (*CHANNELS, "noise")
+OF_LINES = (*sums.CHANNELS, "noise")
 _CHUNK_SAMPLES = 1 << 16
 
 
@@ -88,7 +86,7 @@ class FrameView:
         products: means of :data:`PRODUCTS` after removal of the frames' common modes, (y, x) each.
     """
 
-    pixels: PixelStatistics
+    pixels: sums.PixelStatistics
     numbers: IntArray
     edges: IntArray
     block_frames: int
@@ -112,9 +110,9 @@ class FrameView:
             laws: of the pixels' samples.
             maps: parameters of the pixels.
         """
-        (n, ny, nx), edges = frames.shape, blocks_of(numbers, block_frames)
-        pixels = pixel_statistics(laws, maps)
-        samples = Samples.by_laws(FrameBlocks.of(frames), laws, maps, standardised=False)
+        (n, ny, nx), edges = frames.shape, sums.blocks_of(numbers, block_frames)
+        pixels = sums.pixel_statistics(laws, maps)
+        samples = sums.Samples.by_laws(sums.FrameBlocks.of(frames), laws, maps, standardised=False)
         halves, gain = np.zeros((2, 2, n, ny)), np.zeros(n)
         noise, columns = np.zeros((n, ny)), np.zeros((3, n, nx))
         blocks = np.zeros((edges.size - 1, 2, ny, nx))
@@ -123,7 +121,7 @@ class FrameView:
         weights = np.stack([pixels.factor, pixels.shift, pixels.square]).astype(np.float32)
         for block, (at, end) in zip(blocks, pairwise(edges.tolist()), strict=True):
             before = np.zeros((2, 0, ny, nx), np.float32)
-            in_block = replace(samples, frames=FrameBlocks.of(frames[at:end]), most=_CHUNK_SAMPLES)
+            in_block = replace(samples, frames=sums.FrameBlocks.of(frames[at:end]), most=_CHUNK_SAMPLES)
             for u in in_block.chunks():
                 some = slice(at, at + u.shape[1])
                 sum_rows(u, weights, halves[:, :, some], gain[some], noise[some])
@@ -234,14 +232,6 @@ class FrameView:
         starts = self.edges[:-1][np.diff(self.edges) == self.block_frames]
         return np.asarray(series[starts[:, None] + np.arange(self.block_frames)])
 
-    def slow_modes(self) -> FloatArray:
-        """Return orthonormal waves along the blocks, slowest first, that centring leaves, (modes, b)."""
-        root = np.sqrt(np.diff(self.edges).astype(np.float64))
-        middle = 0.5 * (self.edges[:-1] + self.edges[1:]) / self.n
-        order = np.arange(min(root.size, 1 + SLOWEST[-1]))
-        basis, _ = np.linalg.qr(np.cos(np.pi * order * middle[:, None]) * root[:, None])
-        return np.asarray(basis[:, 1:].T)
-
     def slow(self, series: FloatArray, freedom: int = 1) -> float:
         """Return the statistic of slow variation of centred series of variance 1.
 
@@ -252,7 +242,12 @@ class FrameView:
             series: sums over the blocks, divided by the root of their length, (b, m).
             freedom: independent series among the m.
         """
-        energy = np.cumsum(np.sum((self.slow_modes() @ series) ** 2, axis=1))
+        root = np.sqrt(np.diff(self.edges).astype(np.float64))
+        middle = 0.5 * (self.edges[:-1] + self.edges[1:]) / self.n
+        order = np.arange(min(root.size, 1 + SLOWEST[-1]))
+        # orthonormal waves, the slowest first; centring leaves nothing of the constant
+        waves, _ = np.linalg.qr(np.cos(np.pi * order * middle[:, None]) * root[:, None])
+        energy = np.cumsum(np.sum((waves[:, 1:].T @ series) ** 2, axis=1))
         unit = freedom * self.n / (self.n - 1.0)
         cuts = [c for c in SLOWEST if c < self.edges.size - 2]
         z = [chi_square(energy[c - 1], c * unit, 2.0 * c * freedom) for c in cuts]
@@ -271,7 +266,7 @@ def _count(edges: IntArray, lag: int) -> int:
     return int(np.maximum(np.diff(edges) - lag, 0).sum())
 
 
-def _add_products(u: NDArray[np.float32], known: int, products: dict[str, FloatArray]) -> None:
+def _add_products(u: Float32Array, known: int, products: dict[str, FloatArray]) -> None:
     """Add the products of frames (2, t, y, x) with those before; the first ``known`` are that only.
 
     A product with the pixel behind the end of a row is none of neighbours, and is not used.

@@ -11,23 +11,18 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, IntArray
 from pchem_pipeline.discrepancy.observe import laws as laws_of
-from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples
-from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
+from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES, FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, FALSE_ALARM
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
-
-Float32Array = NDArray[np.float32]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 _MOST_SAMPLES, _FRAMES_AT_ONCE = 1 << 22, 32
 _ALL_OF_IT = 0.7  # of the amplitude of a wave at any phase, for one whose phase runs on
@@ -55,11 +50,7 @@ class Waves:
 
 
 def waves_across(
-    frames: NDArray[np.unsignedinteger[Any]],
-    numbers: IntArray,
-    laws: PixelLaws,
-    maps: PixelMaps,
-    inside: BoolArray | None = None,
+    frames: CodeArray, numbers: IntArray, laws: PixelLaws, maps: PixelMaps, inside: BoolArray | None = None
 ) -> Waves:
     """Look for waves in the residuals of frames.
 
@@ -135,18 +126,10 @@ def _levels(power: Float32Array) -> list[Float32Array]:
     series = power.reshape(len(power), -1)
     found = []
     for values, shape in ((series.T, (1, *power.shape[1:])), (series, (-1, 1, 1))):
-        level = _median(values) / np.log(2.0)
+        level = np.median(values, axis=1) / np.log(2.0)
         noise = np.where(level > 1.0 + BEYOND_DOUBT / np.sqrt(values.shape[1]), level, 1.0)
         found.append(noise.astype(np.float32).reshape(shape))
     return found
-
-
-def _median(values: Float32Array) -> Float32Array:
-    """Return the median of each row, faster than numpy, which looks for both middle ones at once."""
-    middle = values.shape[1] // 2
-    ordered = np.partition(values, middle, axis=1)
-    upper = ordered[:, middle]
-    return upper if values.shape[1] % 2 else np.mean([ordered[:, :middle].max(axis=1), upper], axis=0)
 
 
 def _steady(u: Float32Array, numbers: IntArray, ratio: Float32Array) -> Wave | None:
@@ -188,10 +171,7 @@ def _waves_of_sine(cycles: Mapping[str, float]) -> float:
 
 
 def _climbed(
-    u: Float32Array,
-    places: Mapping[str, IntArray],
-    start: Sequence[float],
-    sizes: Sequence[int],
+    u: Float32Array, places: Mapping[str, IntArray], start: Sequence[float], sizes: Sequence[int]
 ) -> tuple[dict[str, float], NDArray[np.complexfloating]]:
     """Return the frequencies near a peak, each in turn by ever finer steps, and the sums of samples there.
 

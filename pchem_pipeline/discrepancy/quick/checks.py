@@ -20,10 +20,6 @@ if TYPE_CHECKING:
 
 Level = Literal["good", "note", "caution", "serious"]
 
-#: Share of the read noise from which a size deserves caution, and from which it is serious: in quadrature a
-#: tenth adds half a per cent to the read noise, a half adds an eighth.
-_SOME, _MUCH = 0.1, 0.5
-
 
 @dataclass(frozen=True)
 class Check:
@@ -71,13 +67,11 @@ class _Kind(NamedTuple):
     """What is said of a check, and what explains it.
 
     Attributes:
-        unit: of the size.
-        title: the disturbance, a noun.
-        advice: consequence and cure.
+        unit, title, advice: as of :class:`Check`.
         signs: statistics of the catalogue that show the same: an effect with one of them in its signature
             explains the check.
         limits: sizes (of those in DN shares of the read noise) from which it deserves caution, and from which
-            it is serious.
+            it is serious: in quadrature a tenth adds half a per cent to the read noise, a half an eighth.
         map: of the sensor that shows where it fails; empty: none.
     """
 
@@ -85,7 +79,7 @@ class _Kind(NamedTuple):
     title: str
     advice: str
     signs: str = ""
-    limits: tuple[float, float] = (_SOME, _MUCH)
+    limits: tuple[float, float] = (0.1, 0.5)
     map: str = ""
 
 

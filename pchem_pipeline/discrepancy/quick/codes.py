@@ -14,16 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe.laws import extreme, poisson
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray
+from pchem_pipeline.discrepancy.observe.laws import pile_up, poisson
 from pchem_pipeline.discrepancy.observe.tables import CodeSums, PixelHistograms, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
-from pchem_pipeline.discrepancy.quick.series import normal_p
+from pchem_pipeline.discrepancy.quick.frames import normal_p
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
-
-FloatArray = NDArray[np.float64]
 
 #: Statistics of the codes in words.
 _WORDS = {
@@ -59,7 +58,7 @@ class CodeSample:
         limits: first and last code of the ADC that the fit knows, DN; None: none.
     """
 
-    counts: NDArray[np.unsignedinteger[Any]]
+    counts: CodeArray
     origin: NDArray[np.integer[Any]]
     parameters: FloatArray
     joint: bool = False
@@ -104,7 +103,7 @@ def _sums(sample: CodeSample) -> CodeSums | None:
         exact = FitSettings(likelihood="exact")
         fit = fit_histograms(counts, origin, settings=exact, adc_limits=sample.limits, start=found)
         found = np.stack([fit.quanta_exposure, fit.conversion_gain, fit.bias, fit.read_noise_dn], axis=1)
-    usable: NDArray[np.bool_] = np.asarray(np.isfinite(found).all(axis=1))
+    usable: BoolArray = np.asarray(np.isfinite(found).all(axis=1))
     for _ in range(2):  # of all pixels, then without those that may be at a wrong maximum
         laws = pixel_laws(PixelHistograms.alone(counts, origin), found, usable)
         if not laws.good.any():
@@ -152,10 +151,8 @@ def _pile_up(codes: CodeSums, sample: CodeSample, code: int, top: bool) -> Check
     at = code - codes.first
     z = -math.inf
     if 0 <= at < seen.size and seen[at]:
-        beyond = expected[at + 1 :] if top else expected[:at]
-        on = float(expected[at])
         # a fit that expects too many beyond is poor; what is cut off is on the code
-        z = min(extreme(int(seen[at]), on, float(beyond.sum())), poisson(int(seen[at]), on))
+        z = min(pile_up(seen, expected, at, top=top), poisson(int(seen[at]), float(expected[at])))
     bins = sample.origin[:, None] + np.arange(sample.counts.shape[1])
     share = float(sample.counts[bins == code].sum() / sample.counts.sum())
     known = sample.limits is not None and code == sample.limits[top]

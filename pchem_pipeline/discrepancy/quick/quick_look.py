@@ -20,29 +20,25 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.laws import chi_square, without_skew
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
 from pchem_pipeline.discrepancy.quick.checks import KINDS, Check, QuickLook, check_of, graded
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
-from pchem_pipeline.discrepancy.quick.levels import levels_check
-from pchem_pipeline.discrepancy.quick.places import block_deviations, sensor_cells, sensor_places
-from pchem_pipeline.discrepancy.quick.series import normal_p, series_checks
-from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
+from pchem_pipeline.discrepancy.quick.frames import levels_check, normal_p, odd_frame_checks, series_checks
+from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums, sensor_cells, sensor_places
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, SIGNIFICANCE
-from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_words, odd_words
 from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY
 from pchem_pipeline.model.maps.ordered import median_of
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
-FloatArray = NDArray[np.float64]
 
 #: Lines with a variance above this multiple of the median hold hot pixels, and are left out of frame means.
 _LOUD = 4.0
@@ -76,7 +72,7 @@ def quick_look(
     if sums is not None and sums.freedom > 0:
         checks.append(levels_check(sums.all_means, sums.all_variances, gain, sums.odd.get("empty", ())))
         stack = _stack_checks(sums, maps)
-        checks += [*_odd_frames(sums), *stack, *_wave(sums, stack)]
+        checks += [*odd_frame_checks(sums), *stack, *_wave(sums, stack)]
     if codes is not None:
         checks += code_checks(codes)
     samples = 0 if sums is None else sums.n_frames * int(np.prod(sums.shape))
@@ -97,39 +93,6 @@ _NEEDS = {
 }
 
 
-def _odd_frames(sums: StackSums) -> list[Check]:
-    """Return whether frames are far, moved, empty or copies: all other checks are of the rest."""
-    n, odd = sums.all_means.size, sums.odd
-    if not odd:
-        return []
-    equal = chance_of_copies(sums.rows.variance, n)
-    checks = []
-    for name, kinds, p in (
-        ("odd_frames", ("far",), n * FAR_CHANCE),
-        ("empty_frames", ("empty",), n * FAR_CHANCE),
-        ("repeated_frames", ("copied",), equal),
-        ("moved_frames", ("moved_x", "moved_y"), n * FAR_CHANCE),
-    ):
-        some = {kind: odd[kind] for kind in kinds if kind in odd}
-        number = sum(frames.size for frames in some.values())
-        where = odd_words(some, sums.all_means, sums.all_variances)
-        if name in ("empty_frames", "repeated_frames"):  # the title says how they are odd
-            where = frame_words(odd[kinds[0]])
-        p = min(p, 1.0) if number else 1.0
-        how = _without(np.concatenate([*some.values(), np.empty(0, np.int64)]), n)
-        checks.append(check_of(name, p, number / n, limit=1.0 / n, where=where, how=how))
-    return checks
-
-
-def _without(frames: NDArray[np.int64], n: int) -> str:
-    """Return how a run of n frames does without some of them: a range leaves out its ends."""
-    if frames.size and int(frames.max()) == frames.size - 1:
-        return f"with --frames {frames.size}: (input.frame_range)"
-    if frames.size and int(frames.min()) == n - frames.size:
-        return f"with --frames :{n - frames.size} (input.frame_range)"
-    return "of the files"
-
-
 def _wave(sums: StackSums, others: Sequence[Check]) -> list[Check]:
     """Return whether noise has a frequency within frames: a wave across the frame, or one in each line."""
     line = sums.spectrum
@@ -141,7 +104,7 @@ def _wave(sums: StackSums, others: Sequence[Check]) -> list[Check]:
     p = look_elsewhere(float(special.gammaincc(frames, frames * line["ratio"])), cells)
     limit = line["unit"] * math.sqrt(sure / SEEN_MIDWAY)
     # what pixels share more in a part of the sensor has all frequencies; runs of earlier versions lack p
-    shared = any(check.p < SIGNIFICANCE for check in others if check.name in _SHARED)
+    shared = any(check.p < SIGNIFICANCE for check in others if check.name.endswith("_noise"))
     in_lines = 1.0 if shared else look_elsewhere(line.get("line_p", 1.0), line.get("line_looks", 1.0))
     of, how = "", "; pchem discrepancy finds its frequency"
     if in_lines < p and p > SIGNIFICANCE:  # lines show a wave across the frame, too
@@ -196,11 +159,6 @@ def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
     return _located(checks, sums)
 
 
-_SHARED = ("frame_noise", "row_noise", "column_noise")
-#: Checks of which a part of the sensor alone may fail.
-_LOCAL = ("neighbours_x", "neighbours_y", "lag")
-
-
 def _located(checks: list[Check], sums: StackSums) -> list[Check]:
     """Return checks with the part of the sensor that they are about, and one of parts that drift apart."""
     cells = sensor_cells(sums)
@@ -232,15 +190,15 @@ def _told_once(checks: list[Check], noise: str, neighbours: str) -> list[Check]:
 def _placed(check: Check, place: Suspect, sums: StackSums) -> Check:
     """Return a check with its place; noise of lines has the size that it has there."""
     p, size = check.p, check.size
-    if check.name in _LOCAL:
+    if check.name in ("neighbours_x", "neighbours_y", "lag"):  # a part of the sensor alone may fail
         p = look_elsewhere(min(check.p, place.p), 2.0)
     if check.name in ("row_noise", "column_noise") and place.only_there:
         shared = sums.next_x if check.name == "row_noise" else sums.next_y
         inside = place.region.mask(sums.shape)
         excess = float(np.nanmean(shared[inside]) - np.nanmean(shared[~inside]))
         size = max(size, math.sqrt(max(excess, 0.0)))
-    words, numbers = place.region.describe(), place.region.numbers()
-    return replace(check, p=p, size=size, where=check.where or words, region=numbers)
+    where = check.where or place.region.describe()
+    return replace(check, p=p, size=size, where=where, region=place.region.numbers())
 
 
 def _local_drift(sums: StackSums, place: Suspect | None) -> Check:
@@ -248,11 +206,10 @@ def _local_drift(sums: StackSums, place: Suspect | None) -> Check:
     if place is None:
         return check_of("local_drift", 1.0, 0.0)
     inside = place.region.mask(sums.shape) & (sums.variance > 0)
-    common = block_deviations(sums)[:, inside].mean(axis=1)
+    common = sums.block_means(apart=True)[:, inside].mean(axis=1)
     chance = float(sums.variance[inside].mean()) / (float(sums.lengths.mean()) * inside.sum())
     size = math.sqrt(max(float(np.average(common**2, weights=sums.lengths)) - chance, 0.0))
-    words, numbers = place.region.describe(), place.region.numbers()
-    return check_of("local_drift", place.p, size, where=words, region=numbers)
+    return _placed(check_of("local_drift", place.p, size), place, sums)
 
 
 # -- what is common to lines and frames ----------------------------------------------------------
@@ -271,7 +228,7 @@ def _of_lines(lines: Lines) -> _Estimate:
     return _Estimate(float(weight @ value) / total, total**-0.5, effective * lines.freedom)
 
 
-def _deviations(lines: Lines) -> tuple[NDArray[np.int64], FloatArray, float, float]:
+def _deviations(lines: Lines) -> tuple[IntArray, FloatArray, float, float]:
     """Return the lines with a covariance, it in standard errors, and the middle and spread of these."""
     value, error = lines.covariance
     some = np.flatnonzero(np.isfinite(error) & (lines.n_pairs > 0))
@@ -280,7 +237,7 @@ def _deviations(lines: Lines) -> tuple[NDArray[np.int64], FloatArray, float, flo
     return some, z, centre, max(1.0, robust_sd(z, centre)) if some.size else 1.0
 
 
-def _quiet(sums: StackSums) -> NDArray[np.bool_]:
+def _quiet(sums: StackSums) -> BoolArray:
     """Return the rows that count in the means of frames, (y,)."""
     variance = sums.rows.variance
     some = variance > 0
@@ -361,7 +318,7 @@ class _Common:
         down = sums.next_y[quiet]
         neighbours = along * float(np.mean(down[np.isfinite(down)])) if np.isfinite(down).any() else 0.0
         others = pairs * nx - pairs
-        estimate = (value - neighbours - (pairs - along) * _first_known(self.columns)) / others
+        estimate = (value - neighbours - (pairs - along) * self.columns.value) / others
         error = chance / others
         if math.isfinite(self.columns.error):
             error = math.hypot(error, pairs / others * self.columns.error)
@@ -372,31 +329,18 @@ class _Common:
         """By how much correlated pixels raise the variance of a mean over them."""
         (ny, nx), variance = self.sums.shape, self.sums.variance
         typical = median_of(variance, ~(variance > 0))
-        frame = _first_known(self.frame)
-        row, column = (_first_known(each, self.frame) - frame for each in (self.rows, self.columns))
+        frame, lines = self.frame.value, (self.rows, self.columns)
+        row, column = (each.value - frame if math.isfinite(each.error) else 0.0 for each in lines)
         return 1.0 + (ny * nx * frame**2 + nx * row**2 + ny * column**2) / typical**2
 
 
-def _first_known(*estimates: _Estimate) -> float:
-    """Return the value of the first estimate that there is, else 0."""
-    return next((each.value for each in estimates if math.isfinite(each.error)), 0.0)
-
-
 def _resemblance(
-    name: str,
-    covariance: FloatArray,
-    size: FloatArray,
-    common: _Common,
-    shared: tuple[float, float],
+    name: str, covariance: FloatArray, size: FloatArray, common: _Common, shared: tuple[float, float]
 ) -> list[Check]:
     """Return whether pairs of samples resemble each other, beyond what they share with others.
 
-    Args:
-        name: of the check.
-        covariance: of each pair, DN^2; NaN where there is none.
-        size: what it would be if both were equal, DN^2.
-        common: what pixels share.
-        shared: the part of the covariance that is not of the pair alone, and its error, DN^2.
+    The covariance of each pair, NaN where there is none, is compared with its ``size`` if both were equal,
+    DN^2; ``shared`` is the part of it that is not of the pair alone, and its error.
     """
     some = (size > 0) & np.isfinite(covariance)
     if not some.any():
@@ -449,15 +393,13 @@ def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
     lengths = sums.lengths
     if lengths.size < MINIMUM_BLOCKS:
         return []
-    means = sums.block_sum / lengths[:, None, None]
-    means -= np.average(means, axis=0, weights=lengths)
     some = sums.variance > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         charge = np.where(maps.usable, maps.quanta_exposure / maps.conversion_gain, 0.0)[some]
         # the third central moment of the samples, H / g^3
         third = np.where(maps.usable, maps.quanta_exposure / maps.conversion_gain**3, 0.0)[some]
     weight = 1.0 / sums.variance[some]
-    values = means[:, some]
+    values = sums.block_means(apart=False)[:, some]
     basis = np.stack([np.ones(charge.size), charge])
     inner = (basis * weight) @ basis.T
     shared = np.linalg.lstsq(inner, (basis * weight) @ values.T, rcond=None)[0]

@@ -1,20 +1,28 @@
-"""Summaries of a stack for a quick look, and the variances and covariances computed from them."""
+"""Summaries of a stack for a quick look: variances, covariances, and where on the sensor these differ."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.discrepancy.families import cell_edges
+from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
+from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS
+from pchem_pipeline.discrepancy.scan import Suspect, scan_map
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.model.maps.ordered import Ordered
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
+#: Cells along an edge of the maps that are scanned; of a larger sensor pixels are taken together.
+_CELLS = 128
+#: Pixels that are looked at together.
+_AT_ONCE = 1 << 17
 #: Lines whose sums are looked at together.
 _LINES_AT_ONCE = 1 << 12
 
@@ -40,7 +48,7 @@ class Lines:
     variance: FloatArray
     pairs: FloatArray
     neighbours: FloatArray
-    length: NDArray[np.int64]
+    length: IntArray
 
     @property
     def n_pairs(self) -> FloatArray:
@@ -103,9 +111,9 @@ class StackSums:
     numbers: IntArray
     n_blocks: int
     lengths: IntArray
-    block_sum: NDArray[np.int64]
-    block_sum_square: NDArray[np.int64]
-    row_sum: NDArray[np.int64]
+    block_sum: IntArray
+    block_sum_square: IntArray
+    row_sum: IntArray
     column_blocks: IntArray
     column_sum: NDArray[np.signedinteger]
     all_means: FloatArray
@@ -164,6 +172,16 @@ class StackSums:
         within /= float(lengths.sum() - lengths.size)
         return within
 
+    def block_means(self, *, apart: bool) -> FloatArray:
+        """Return the mean of each pixel over each block at hand, less that over all, (b, y, x), DN.
+
+        Args:
+            apart: less what all pixels do, too: the median, since hot pixels move more.
+        """
+        means = self.block_sum / self.lengths[:, None, None]
+        means -= np.average(means, axis=0, weights=self.lengths)
+        return np.asarray(means - np.median(means, axis=(1, 2), keepdims=True)) if apart else means
+
     @cached_property
     def mean_signal(self) -> FloatArray:
         """Mean of each pixel over the frames of the blocks at hand, (y, x), DN."""
@@ -183,43 +201,134 @@ class StackSums:
     @cached_property
     def rows(self) -> Lines:
         """Sums over the rows of all frames."""
-        ny, nx = self.shape
-        v = self.variance
-        pairs = v.sum(axis=1) ** 2 - (v**2).sum(axis=1) - 2.0 * (v[:, :-1] * v[:, 1:]).sum(axis=1)
-        return Lines(
-            self.row_sum,
-            self.starts,
-            self.freedom,
-            v.sum(axis=1),
-            pairs,
-            np.nansum(self.next_x, axis=1),
-            np.full(ny, nx),
-        )
+        whole = np.zeros(1, np.int64)
+        return _lines(self.row_sum, self.lengths, self.variance.T, self.next_x.T, whole)
 
     @cached_property
     def columns(self) -> Lines:
         """Sums over the columns of each group of rows, (group, x) in one axis, of some blocks."""
-        ny, nx = self.shape
-        lengths = self.lengths[self.column_blocks]
-        starts = np.cumsum(lengths) - lengths
-        freedom = float(lengths.sum() - lengths.size)
-        everywhere = self.column_blocks.size == self.lengths.size
-        v = self.variance if everywhere else self._variance(self.column_blocks)
-        tops = np.arange(0, ny, ROW_GROUP)
-        total, square = np.add.reduceat(v, tops, axis=0), np.add.reduceat(v**2, tops, axis=0)
-        product = np.zeros_like(v)
-        np.multiply(v[:-1], v[1:], out=product[:-1])
-        product[ROW_GROUP - 1 :: ROW_GROUP] = 0.0  # no product crosses the border of a group
-        along = np.add.reduceat(product, tops, axis=0)
-        del product  # as large as a map
-        covariance = np.add.reduceat(np.nan_to_num(self.next_y), tops, axis=0)
-        heights = np.diff(np.append(tops, ny))
-        return Lines(
-            self.column_sum.reshape(self.column_sum.shape[0], -1),
-            starts,
-            freedom,
-            total.ravel(),
-            (total**2 - square - 2.0 * along).ravel(),
-            covariance.ravel(),
-            np.repeat(heights, nx),
-        )
+        some, groups = self.column_blocks, np.arange(0, self.shape[0], ROW_GROUP)
+        variance = self.variance if some.size == self.lengths.size else self._variance(some)
+        sums = self.column_sum.reshape(self.column_sum.shape[0], -1)
+        return _lines(sums, self.lengths[some], variance, self.next_y, groups)
+
+
+def _lines(
+    sums: NDArray[np.signedinteger],
+    lengths: IntArray,
+    variance: FloatArray,
+    covariance: FloatArray,
+    groups: IntArray,
+) -> Lines:
+    """Return lines along the first axis of maps (along, across), cut into groups of pixels by their first."""
+    total, square = (np.add.reduceat(each, groups, axis=0) for each in (variance, variance**2))
+    product = np.zeros_like(variance)
+    np.multiply(variance[:-1], variance[1:], out=product[:-1])
+    product[groups[1:] - 1] = 0.0  # no product crosses the border of a group
+    along = np.add.reduceat(product, groups, axis=0)
+    del product  # as large as a map
+    heights = np.diff(np.append(groups, len(variance)))
+    return Lines(
+        sums,
+        np.asarray(np.cumsum(lengths) - lengths),
+        float(lengths.sum() - lengths.size),
+        total.ravel(),
+        (total**2 - square - 2.0 * along).ravel(),
+        np.add.reduceat(np.nan_to_num(covariance), groups, axis=0).ravel(),
+        np.repeat(heights, variance.shape[1]),
+    )
+
+
+# -- maps of the sensor, and their scan --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CellMap:
+    """Clipped sums over cells of a map of the sensor whose pixels are N(0, 1) where nothing is wrong.
+
+    Attributes:
+        rows, columns: edges of the cells, pixels.
+        sums: of the values, (cell y, cell x).
+        counts: pixels that have one.
+    """
+
+    rows: IntArray
+    columns: IntArray
+    sums: FloatArray
+    counts: FloatArray
+
+    @classmethod
+    def empty(cls, shape: tuple[int, int]) -> CellMap:
+        """Begin with no pixel of a sensor of some rows and columns."""
+        rows, columns = (cell_edges(n, _CELLS) for n in shape)
+        size = rows.size - 1, columns.size - 1
+        return cls(rows, columns, np.zeros(size), np.zeros(size))
+
+    def add(self, values: FloatArray, first: int = 0) -> None:
+        """Add rows of the map from the row ``first`` on, (y, x)."""
+        some = np.isfinite(values)
+        kept = np.where(some, np.clip(values, -FAR, FAR), 0.0)
+        at = np.searchsorted(self.rows, np.arange(first, first + values.shape[0]), side="right") - 1
+        for total, part in ((self.sums, kept), (self.counts, some.astype(np.float64))):
+            np.add.at(total, at, np.add.reduceat(part, self.columns[:-1], axis=1))
+
+    def mask(self, cells: BoolArray) -> BoolArray:
+        """Return the pixels of some cells, (y, x)."""
+        return np.repeat(np.repeat(cells, np.diff(self.rows), axis=0), np.diff(self.columns), axis=1)
+
+
+def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
+    """Return maps of all pixels, all frames, each N(0, 1) where samples are independent, summed over cells.
+
+    ``next_x`` and ``next_y`` (covariance with the next pixel), ``lag`` (with the frame before) and, of four
+    blocks of frames or more, ``spread`` (block means scatter); a pixel that never changes does not count.
+    """
+    v, root = sums.variance, math.sqrt(sums.freedom_of_all)
+    names = ("next_x", "next_y", "lag")
+    found = {name: CellMap.empty(sums.shape) for name in names}
+    rows = max(1, _AT_ONCE // v.shape[1])
+    for first in range(0, v.shape[0], rows):
+        band = slice(first, first + rows)
+        right, down = v[band, 1:], v[first + 1 : first + 1 + rows]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            next_x = sums.next_x[band, :-1] / np.sqrt(v[band, :-1] * right) * root
+            next_y = sums.next_y[band][: len(down)] / np.sqrt(v[band][: len(down)] * down) * root
+            found["lag"].add(sums.lag[band] / v[band] * root, first)
+        found["next_x"].add(np.pad(next_x, ((0, 0), (0, 1)), constant_values=np.nan), first)
+        found["next_y"].add(next_y, first)
+    if sums.lengths.size >= MINIMUM_BLOCKS:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            chi2 = (sums.lengths[:, None, None] * sums.block_means(apart=True) ** 2).sum(axis=0) / v
+        found["spread"] = CellMap.empty(sums.shape)
+        found["spread"].add(chi_square(chi2, sums.lengths.size - 1.0))
+    return found
+
+
+def sensor_places(maps: Mapping[str, CellMap], significance: float) -> dict[str, Suspect]:
+    """Return the part of the sensor where each map stands out most; none where it is everywhere alike.
+
+    Args:
+        maps: by name, as :func:`sensor_cells` makes them.
+        significance: largest probability of a chance in any of them.
+
+    Returns:
+        Places whose means are those of the map, standard deviations of a pixel.
+    """
+    found = {name: _place(name, cells, significance / len(maps)) for name, cells in maps.items()}
+    return {name: place for name, place in found.items() if place is not None}
+
+
+def _place(name: str, cells: CellMap, significance: float) -> Suspect | None:
+    usable = cells.counts > 0
+    # standard normal as the pixels are
+    scaled = cells.sums / np.sqrt(np.maximum(cells.counts, 1.0))
+    along = {"next_x": 1, "next_y": 0}.get(name)
+    places = scan_map(scaled, usable, significance=significance, most=1, single=False, next_along=along)
+    if not places:
+        return None
+    inside = places[0].region.mask(usable.shape)
+    if not (usable[inside].any() and usable[~inside].any()):
+        return None
+    means = [float(cells.sums[part].sum() / cells.counts[part].sum()) for part in (inside, ~inside)]
+    region = Region.of_mask(cells.mask(inside))
+    return replace(places[0], region=region, inside=means[0], outside=means[1])

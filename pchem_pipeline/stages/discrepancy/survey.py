@@ -22,13 +22,12 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.memory import resident_bytes
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
-from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples, pairs_bytes
-from pchem_pipeline.discrepancy.observe.sums import CHANNELS
+from pchem_pipeline.discrepancy.observe.sums import CHANNELS, FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
-from pchem_pipeline.discrepancy.quick.places import CellMap, sensor_cells, sensor_places
+from pchem_pipeline.discrepancy.quick.sums import CellMap, sensor_cells, sensor_places
 from pchem_pipeline.discrepancy.scan import Suspect
-from pchem_pipeline.discrepancy.scan_pairs import scan_pairs
+from pchem_pipeline.discrepancy.scan_pairs import pairs_bytes, scan_pairs
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
 from pchem_pipeline.effects.framework.region import Region

@@ -21,9 +21,8 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     seconds,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import expected_codes
-from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
-from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix
+from pchem_pipeline.discrepancy.null import Covariance, Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival

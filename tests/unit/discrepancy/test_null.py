@@ -5,13 +5,17 @@ import pytest
 from scipy import special, stats
 
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import Population, Posterior
-from pchem_pipeline.discrepancy.covariance import Covariance
-from pchem_pipeline.discrepancy.null import NullModel, moments, without_strays
+from pchem_pipeline.discrepancy.null import Covariance, NullModel, moments, without_strays
 from pchem_pipeline.discrepancy.observe import laws
 
 REPLICATES, SETS, DATA = 40, 300, 50
 SUMS = tuple(f"shape.{score}.chi" for score in ("C2", "C3", "He3", "He4", "He2C1", "He1C2", "He2C2", "He3C1"))
 COUNTS = ("time.lag1.charge.cnt", "time.lag1.readout.cnt", "shape.C3.cnt", "shape.He3.cnt")
+
+
+def dense(covariance: Covariance) -> np.ndarray:
+    """The covariance as a matrix, (m, m)."""
+    return np.diag(covariance.own) + covariance.common.T @ covariance.common
 
 
 def sums(rng, n):
@@ -108,10 +112,10 @@ def test_white_vectors_and_determinant_are_those_of_the_matrix(modes: int) -> No
     rng, covariance = _drawn(modes)
     rows = rng.normal(size=(5, 40))
     white = covariance.white(rows)
-    expected = rows @ np.linalg.inv(covariance.dense()) @ rows.T
+    expected = rows @ np.linalg.inv(dense(covariance)) @ rows.T
     np.testing.assert_allclose(white @ white.T, expected, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(covariance.white(rows[0]), white[0], rtol=1e-9, atol=1e-12)
-    law = stats.multivariate_normal(np.zeros(40), covariance.dense())
+    law = stats.multivariate_normal(np.zeros(40), dense(covariance))
     half = -0.5 * white[0] @ white[0] - covariance.log_root_determinant - 20.0 * np.log(2.0 * np.pi)
     assert half == pytest.approx(law.logpdf(rows[0]), rel=1e-10)
 
@@ -119,14 +123,14 @@ def test_white_vectors_and_determinant_are_those_of_the_matrix(modes: int) -> No
 @pytest.mark.parametrize("modes", MODES)
 def test_what_is_made_of_a_covariance_is_made_of_its_matrix(modes: int) -> None:
     rng, covariance = _drawn(modes)
-    dense, ratio, more = covariance.dense(), rng.uniform(0.5, 3.0, 40), rng.normal(size=(2, 40))
-    np.testing.assert_allclose(covariance.variances, np.diag(dense), rtol=1e-12)
-    np.testing.assert_allclose(covariance.times(0.3).dense(), 0.3 * dense, rtol=1e-12)
-    np.testing.assert_allclose(covariance.scaled(ratio).dense(), dense * np.outer(ratio, ratio), rtol=1e-12)
-    np.testing.assert_allclose(covariance.plus(ratio).dense(), dense + np.diag(ratio), rtol=1e-12)
-    np.testing.assert_allclose(covariance.with_modes(more).dense(), dense + more.T @ more, rtol=1e-12)
+    whole, ratio, more = dense(covariance), rng.uniform(0.5, 3.0, 40), rng.normal(size=(2, 40))
+    np.testing.assert_allclose(covariance.variances, np.diag(whole), rtol=1e-12)
+    np.testing.assert_allclose(dense(covariance.times(0.3)), 0.3 * whole, rtol=1e-12)
+    np.testing.assert_allclose(dense(covariance.scaled(ratio)), whole * np.outer(ratio, ratio), rtol=1e-12)
+    np.testing.assert_allclose(dense(covariance.plus(ratio)), whole + np.diag(ratio), rtol=1e-12)
+    np.testing.assert_allclose(dense(covariance.with_modes(more)), whole + more.T @ more, rtol=1e-12)
     some = [3, 5, 30]
-    np.testing.assert_allclose(covariance.among(some).dense(), dense[np.ix_(some, some)], rtol=1e-12)
+    np.testing.assert_allclose(dense(covariance.among(some)), whole[np.ix_(some, some)], rtol=1e-12)
 
 
 def test_a_mode_far_above_all_others_spoils_none_of_them() -> None:
@@ -152,4 +156,4 @@ def test_of_replicates_it_is_their_correlation_drawn_to_the_diagonal() -> None:
     expected = np.eye(30)
     expected[np.ix_(varied, varied)] = 0.4 * np.corrcoef(vectors[:, varied], rowvar=False)
     np.fill_diagonal(expected, 1.0)
-    np.testing.assert_allclose(covariance.dense(), expected * np.outer(std, std), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(dense(covariance), expected * np.outer(std, std), rtol=1e-10, atol=1e-12)

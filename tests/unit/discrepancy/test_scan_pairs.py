@@ -10,8 +10,7 @@ import pytest
 from helpers.standardised import samples_of
 
 from pchem_pipeline.discrepancy.families import box_sums
-from pchem_pipeline.discrepancy.observe.pairs import PERIOD, pairs_of
-from pchem_pipeline.discrepancy.scan_pairs import scan_pairs, shared_elsewhere
+from pchem_pipeline.discrepancy.scan_pairs import PERIOD, pairs_of, scan_pairs, shared_elsewhere
 from pchem_pipeline.effects.framework.region import Region
 
 SHAPE, FRAMES = (32, 32), 1000

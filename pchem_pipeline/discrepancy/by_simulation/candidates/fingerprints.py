@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from pchem_pipeline.discrepancy.covariance import Covariance
+from pchem_pipeline.discrepancy.null import Covariance
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import OUTLYING, POSSIBLE, PRICE
 

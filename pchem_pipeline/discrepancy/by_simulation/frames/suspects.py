@@ -20,10 +20,8 @@ from scipy import special
 from scipy.ndimage import binary_dilation
 
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
-from pchem_pipeline.discrepancy.observe.pairs import FEWEST_PIXELS, LARGEST, FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.places import Part
-from pchem_pipeline.discrepancy.observe.rare import N_SETS, rare_samples
-from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
+from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES, FrameBlocks, Samples
 from pchem_pipeline.discrepancy.scan import (
     Cluster,
     Stretch,
@@ -33,8 +31,8 @@ from pchem_pipeline.discrepancy.scan import (
     scan_series,
     sharpest_range,
 )
-from pchem_pipeline.discrepancy.scan_pairs import Shared, scan_pairs, shared_elsewhere
-from pchem_pipeline.discrepancy.where import frame_series, pixel_maps, suspected_regions
+from pchem_pipeline.discrepancy.scan_pairs import FEWEST_PIXELS, LARGEST, Shared, scan_pairs, shared_elsewhere
+from pchem_pipeline.discrepancy.where import N_SETS, frame_series, pixel_maps, rare_samples, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import When
 from pchem_pipeline.model.arithmetic.robust import robust_sd

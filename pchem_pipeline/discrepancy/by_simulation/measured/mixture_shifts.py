@@ -18,8 +18,8 @@ from scipy import optimize, special
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import Distance, Measurement
-from pchem_pipeline.discrepancy.observe.digital.misplaced import with_others
-from pchem_pipeline.discrepancy.observe.digital.repeats import equal_squares
+from pchem_pipeline.discrepancy.observe.digital import equal_squares
+from pchem_pipeline.discrepancy.observe.misplaced import with_others
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import Distance, Measurement, PartSamples
-from pchem_pipeline.discrepancy.observe.digital.groups import GROUP
+from pchem_pipeline.discrepancy.observe.digital import GROUP
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
 from pchem_pipeline.effects.framework.evidence import Evidence

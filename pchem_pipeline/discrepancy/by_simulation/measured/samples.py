@@ -10,8 +10,8 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe.pairs import FrameBlocks, Samples, laws_of_frames
 from pchem_pipeline.discrepancy.observe.places import Part
+from pchem_pipeline.discrepancy.observe.sums import FrameBlocks, Samples, laws_of_frames
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps

@@ -27,7 +27,7 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import MANY_MISTAKEN
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Replicate, by_part
 from pchem_pipeline.discrepancy.effort import Effort
-from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
+from pchem_pipeline.discrepancy.observe.misplaced import own_lines
 from pchem_pipeline.effects.framework.compose import added_exposures
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence

@@ -25,9 +25,8 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     log_density,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, Refit
-from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.effort import EffortSpentError
-from pchem_pipeline.discrepancy.null import NullModel
+from pchem_pipeline.discrepancy.null import Covariance, NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere

@@ -13,12 +13,11 @@ from scipy import special, stats
 
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe.efficient_scores import efficient_scores, whiten
 from pchem_pipeline.discrepancy.observe.observe import _without_steps, observe, observe_histograms
-from pchem_pipeline.discrepancy.observe.rare import expected_beyond, rare_samples, single_samples
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
+from pchem_pipeline.discrepancy.observe.tables import efficient_scores, whiten
+from pchem_pipeline.discrepancy.where import expected_beyond, rare_samples, single_samples
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, SCORES, Evidence, PixelMaps
-from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law import cell_scores_numba
 
@@ -388,14 +387,6 @@ def test_a_coarse_step_is_not_taken_for_a_comb_of_electrons_that_are_not_there()
     maps = evidence.maps
     assert maps.usable.all()
     assert np.abs(1 / maps.conversion_gain / 3.45 - 1).max() < 0.2
-    density = observe(
-        frames,
-        np.arange(len(frames)),
-        n_run=len(frames),
-        block_frames=100,
-        fit=FitSettings(likelihood="density"),
-    )
-    assert not density.maps.usable.all()  # as it would be: such combs are left out
 
 
 def test_squares_of_equal_samples_are_told_from_those_of_chance() -> None:

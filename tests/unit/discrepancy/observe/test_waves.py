@@ -7,7 +7,7 @@ import pytest
 
 from pchem_pipeline.discrepancy.by_simulation.measured.noise import measured_wave
 from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.discrepancy.observe.pairs import laws_of_frames
+from pchem_pipeline.discrepancy.observe.sums import laws_of_frames
 from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise

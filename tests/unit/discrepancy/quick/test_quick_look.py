@@ -12,10 +12,10 @@ from helpers.quick_stacks import EXPOSURE, GAIN, READ_NOISE, added, codes_of, ma
 
 from pchem_pipeline import fit_counts
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.quick import places
+from pchem_pipeline.discrepancy.quick import sums as module
 from pchem_pipeline.discrepancy.quick.checks import KINDS, Check, QuickLook
 from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
-from pchem_pipeline.discrepancy.quick.levels import levels_check
+from pchem_pipeline.discrepancy.quick.frames import levels_check
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
@@ -56,15 +56,15 @@ def by_name(look: QuickLook) -> dict[str, Check]:
 @pytest.mark.parametrize("rows", [1, 5, 32])
 def test_maps_of_the_sensor_are_the_same_in_bands(monkeypatch: pytest.MonkeyPatch, rows: int) -> None:
     sums = sums_of(stack(np.random.default_rng(6), (200, 32, 24)))
-    monkeypatch.setattr(places, "_AT_ONCE", rows * 24)
-    cells = places.sensor_cells(sums)
+    monkeypatch.setattr(module, "_AT_ONCE", rows * 24)
+    cells = module.sensor_cells(sums)
     v, root = sums.variance, np.sqrt(sums.freedom_of_all)
     right = sums.next_x[:, :-1] / np.sqrt(v[:, :-1] * v[:, 1:]) * root
     down = sums.next_y[:-1] / np.sqrt(v[:-1] * v[1:]) * root
     for name, values in (("next_x", right), ("next_y", down), ("lag", sums.lag / v * root)):
         whole = np.full(v.shape, np.nan)
         whole[: values.shape[0], : values.shape[1]] = values
-        expected = places.CellMap.empty(sums.shape)
+        expected = module.CellMap.empty(sums.shape)
         expected.add(whole)
         np.testing.assert_array_equal(cells[name].sums, expected.sums)
         np.testing.assert_array_equal(cells[name].counts, expected.counts)

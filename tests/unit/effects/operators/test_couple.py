@@ -6,7 +6,7 @@ from helpers.analog_signal import analog, within
 from helpers.small_sensors import context_of, drawn_truth, seen, taken
 from hidden.chain import hide
 
-from pchem_pipeline.discrepancy.observe.digital.groups import BITS
+from pchem_pipeline.discrepancy.observe.digital import BITS
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
-from pchem_pipeline.discrepancy.observe.digital.misplaced import own_lines
+from pchem_pipeline.discrepancy.observe.misplaced import own_lines
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted

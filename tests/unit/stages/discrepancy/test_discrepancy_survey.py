@@ -8,7 +8,7 @@ from helpers.quick_stacks import stack, sums_of
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
-from pchem_pipeline.discrepancy.observe.pairs import pairs_bytes
+from pchem_pipeline.discrepancy.scan_pairs import pairs_bytes
 from pchem_pipeline.discrepancy.verdict import Examined
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.histogram.count import histogram_frames

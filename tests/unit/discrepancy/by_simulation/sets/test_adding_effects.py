@@ -30,10 +30,9 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Histo
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, chosen
 from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, Trial, _grown, compare
-from pchem_pipeline.discrepancy.covariance import Covariance
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
-from pchem_pipeline.discrepancy.null import Measured, NullModel
+from pchem_pipeline.discrepancy.null import Covariance, Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings

@@ -1,27 +1,29 @@
-"""Samples of a few successive frames against each other: exchanging the frames says what chance does.
+"""Samples that equal others, or follow their bits: of repeated lines, squares, neighbours, frames before.
 
 Without an effect a sample is as independent of the others of its frame as of those of the next few frames,
-whatever the pixels' histograms are. So it is asked whether samples equal what their neighbours predict too
-often, or exceed it too seldom; whether they are nearer to the one before than to those of other frames; and
-whether they follow single bits of the sample read before.
+whatever the pixels' histograms are: exchanging a few successive frames says what chance does. So it is asked
+whether samples equal what their neighbours predict too often, or exceed it too seldom; whether they are
+nearer to the one before than to those of other frames; and whether they follow single bits of the sample read
+before. Lines that repeat those before them, of the same frame or of the frame before, never come by chance in
+analog data unless they are a few pixels long. Squares of equal samples are made by compression with losses,
+binning that is undone and repeated pixels; nothing analog does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe import laws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms
 from pchem_pipeline.effects.framework.evidence import PixelMaps, PredictedSamples, PreviousBits
 from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted
-from pchem_pipeline.model.arithmetic.significance import CLEAR
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from pchem_pipeline.model.arithmetic.significance import CLEAR, SIGNIFICANCE
 
 GROUP = 4  # frames whose predictions are exchanged
 #: Samples of all groups together, unless there is but one, where all frames of a group are compared with all,
@@ -34,6 +36,9 @@ _WITHIN = (0.0, 0.15, 0.5, 1.5)  # read noises
 _INDEPENDENT = 2.5  # of these
 _FEWEST = 50.0  # pairs of which one agrees and another does not
 BITS = 8  # the lowest ones
+_FIRST = 2  # samples of a line that are compared before all of them are
+_MOST_CODES = 1 << 26  # of all pixels together
+_AT_ONCE = 1 << 16  # samples
 _SMALLEST = 1e-4  # variance of a bit that the value before leaves, relative: below it is that value
 
 
@@ -51,9 +56,7 @@ def groups_of(edges: IntArray, samples_of_a_frame: int, most_samples: int = MOST
     return np.asarray(chosen, np.int64)
 
 
-def predicted_samples(
-    frames: NDArray[np.unsignedinteger[Any]], edges: IntArray, usable: NDArray[np.bool_]
-) -> dict[str, PredictedSamples]:
+def predicted_samples(frames: CodeArray, edges: IntArray, usable: BoolArray) -> dict[str, PredictedSamples]:
     """Return how samples compare with their predictions, by kind; none where frames or pixels are too few.
 
     Args:
@@ -61,13 +64,10 @@ def predicted_samples(
         edges: positions of the blocks, (b + 1,).
         usable: pixels that count, (y, x).
     """
-    if min(usable.shape) < 3 or not usable[1:-1, 1:-1].any():
-        return {}
-    first = groups_of(edges, usable.size)
-    if not first.size:
+    first, inside = groups_of(edges, usable.size), usable[1:-1, 1:-1]
+    if min(usable.shape) < 3 or not inside.any() or not first.size:
         return {}
     chosen = frames[first[:, None] + np.arange(GROUP)].reshape(-1, *usable.shape)
-    inside = usable[1:-1, 1:-1]
     samples = chosen[:, 1:-1, 1:-1][:, inside].astype(np.int32).reshape(first.size, GROUP, -1)
     reach = _FARTHEST * float(samples.std(axis=(0, 1)).mean())
     step = max(1, int(np.ceil(reach / _MOST_THRESHOLDS)))
@@ -127,9 +127,7 @@ def predicted_statistics(found: Mapping[str, PredictedSamples]) -> dict[str, flo
     }
 
 
-def nearer_statistics(
-    frames: NDArray[np.unsignedinteger[Any]], edges: NDArray[np.int64], maps: PixelMaps
-) -> dict[str, float]:
+def nearer_statistics(frames: CodeArray, edges: IntArray, maps: PixelMaps) -> dict[str, float]:
     """Return the statistic of samples that are nearer to the one before than chance makes them.
 
     Whatever ties successive samples together, in proportion or not, changes how often they nearly agree. Of
@@ -163,12 +161,7 @@ def nearer_statistics(
     return {"time.nearer": laws.best(*found, independent=min(float(len(found)), _INDEPENDENT))}
 
 
-def previous_bits(
-    frames: NDArray[np.unsignedinteger[Any]],
-    edges: NDArray[np.int64],
-    usable: NDArray[np.bool_],
-    noise: FloatArray,
-) -> PreviousBits | None:
+def previous_bits(frames: CodeArray, edges: IntArray, maps: PixelMaps) -> PreviousBits | None:
     """Return the regression of samples on the bits of those before; None where there are too few.
 
     What a sample has in common with the value of the one before is crosstalk of many kinds; what it has in
@@ -178,9 +171,10 @@ def previous_bits(
     Args:
         frames: codes (frame, y, x), DN.
         edges: positions of the blocks, (b + 1,).
-        usable: pixels that count, (y, x).
-        noise: standard deviation of the samples of each pixel, DN, (y, x).
+        maps: parameters of the pixels.
     """
+    usable = maps.usable
+    noise = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
     pairs = usable[:, 1:] & usable[:, :-1]
     first = groups_of(edges, usable.size, MOST_PAIRED)
     if not first.size or not pairs.any():
@@ -188,7 +182,7 @@ def previous_bits(
     # of each group two pairs of frames
     later = (first[:, None] + np.array([1, 3])).ravel()
     one, two = frames[later], frames[later - 1]
-    weight = np.where(pairs, 1.0 / noise[:, 1:], 0.0).astype(np.float32)
+    weight = np.where(pairs, 1.0 / np.where(usable, noise, 1.0)[:, 1:], 0.0).astype(np.float32)
     value = np.subtract(one, two, dtype=np.float32) if one.itemsize < 4 else one - two.astype(np.float64)
     own = (value[:, :, 1:] * weight).ravel()
     design = np.empty((1 + BITS, own.size), np.float32)
@@ -220,3 +214,117 @@ def bit_statistics(found: PreviousBits | None) -> dict[str, float]:
     projected = vectors.T[kept] @ (found.product / scale)
     total = float(np.sum(projected**2 / eigenvalues[kept])) / max(found.variance, 1e-300)
     return {"space.x.bits": float(laws.chi_square(total, float(kept.sum())))}
+
+
+# -- repeated lines and squares ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Repeats:
+    """Lines that are, sample by sample, the one before.
+
+    Attributes:
+        frames: positions of frames equal to the one before.
+        rows_in_time: rows of other frames that are those of the frame before.
+        rows, columns: those that are the row above, and the column on the left.
+        consecutive: frames that directly follow another.
+    """
+
+    frames: IntArray
+    rows_in_time: int
+    rows: int
+    columns: int
+    consecutive: int
+
+    @classmethod
+    def of(cls, frames: CodeArray, numbers: IntArray) -> Repeats:
+        """Count those of frames (frame, y, x) with their numbers in the run."""
+        consecutive = np.diff(numbers) == 1
+        in_time = _equal_lines(frames[1:], frames[:-1]) & consecutive[:, None]
+        whole = in_time.all(axis=1)
+        turned = frames.swapaxes(1, 2)
+        return cls(
+            np.flatnonzero(whole) + 1,
+            int(in_time[~whole].sum()),
+            int(_equal_lines(frames[:, 1:], frames[:, :-1]).sum()),
+            int(_equal_lines(turned[:, 1:], turned[:, :-1]).sum()),
+            int(consecutive.sum()),
+        )
+
+    def statistics(self, seen: PixelHistograms, shape: tuple[int, ...]) -> dict[str, float]:
+        """Return the statistics of repeats; none of lines so short that chance repeats them in a frame.
+
+        Args:
+            seen: histograms of the pixels.
+            shape: of the frames (frame, y, x).
+        """
+        real = seen.counts.astype(np.float32)
+        total = np.maximum(real.sum(axis=1) + seen.outside.sum(axis=1), 1.0)
+        # the log of the chance that two samples of a pixel are equal
+        equal = np.maximum(np.einsum("ib,ib->i", real, real) / total**2, 1e-12)
+        alike = np.asarray(np.log(equal).reshape(shape[1:]), np.float64)
+        by_axis = {"rows": alike.sum(axis=1), "columns": alike.sum(axis=0)}
+        chance = {name: float(np.exp(np.minimum(same, 0.0)).sum()) for name, same in by_axis.items()}
+        frames = float(np.exp(min(alike.sum(), 0.0)))
+        z = {
+            "frame.repeated": laws.repeats(self.frames.size, self.consecutive * frames),
+            "frame.repeated_rows": laws.repeats(self.rows_in_time, self.consecutive * chance["rows"]),
+        }
+        for name, found in (("rows", self.rows), ("columns", self.columns)):
+            expected = shape[0] * chance[name]
+            if expected < SIGNIFICANCE and by_axis[name].size > 1:
+                z[f"space.repeated.{name}"] = laws.repeats(found, expected)
+        return z
+
+
+def _equal_lines(one: CodeArray, other: CodeArray) -> BoolArray:
+    """Return which lines of two stacks (frame, line, sample) are equal, (frame, line)."""
+    equal = np.asarray((one[:, :, :_FIRST] == other[:, :, :_FIRST]).all(axis=2))
+    at = np.nonzero(equal)
+    equal[at] = (one[at] == other[at]).all(axis=1)
+    return equal
+
+
+def equal_squares(frames: CodeArray) -> IntArray:
+    """Return how often all samples of 2 x 2 pixels of frames (frame, y, x) are equal, (y-1, x-1).
+
+    Those at the highest DN of all do not count: a particle's cloud leaves all of its pixels at the limit.
+    """
+    top = frames.max(initial=0)
+    found = np.zeros((max(frames.shape[1] - 1, 0), max(frames.shape[2] - 1, 0)), np.int64)
+    step = max(1, _AT_ONCE // frames[0].size)
+    for some in (frames[first : first + step] for first in range(0, len(frames), step)):
+        rows = some[:, 1:] == some[:, :-1]
+        equal = rows[:, :, 1:] & rows[:, :, :-1] & (some[:, 1:, 1:] == some[:, 1:, :-1])
+        found += np.count_nonzero(equal & (some[:, 1:, 1:] != top), axis=0)
+    return found
+
+
+def square_statistics(frames: CodeArray, seen: PixelHistograms, usable: BoolArray) -> dict[str, float]:
+    """Return the statistic of squares of equal samples; none without squares of usable pixels.
+
+    Given the histograms, frames without an effect are in random order.
+
+    Args:
+        frames: codes (frame, y, x), DN.
+        seen: histograms of the pixels.
+        usable: pixels that count, (y, x).
+    """
+    counts, origin = seen.counts, seen.origin
+    good = usable[1:, 1:] & usable[1:, :-1] & usable[:-1, 1:] & usable[:-1, :-1]
+    first = int(origin[usable.ravel()].min(initial=origin.max(initial=0)))
+    length = int(np.where(usable.ravel(), origin, first).max(initial=first)) - first + counts.shape[1]
+    if not good.any() or length * usable.size > _MOST_CODES:
+        return {}
+    aligned = np.zeros((usable.size, length), np.float32)
+    inside = np.flatnonzero(usable)
+    columns = (origin[inside] - first)[:, None] + np.arange(counts.shape[1])
+    total = np.maximum(counts[inside].sum(axis=1, keepdims=True), 1)
+    aligned[inside[:, None], columns] = counts[inside] / total
+    top = int(frames.max()) - first
+    aligned[:, top : top + 1] = 0.0
+    chance = aligned.reshape(*usable.shape, length)
+    down = chance[1:] * chance[:-1]
+    alike = np.einsum("yxc,yxc->yx", down[:, 1:], down[:, :-1])
+    expected = float(alike[good].sum()) * float(counts[inside].sum(axis=1).max())
+    return {"space.equal.squares": laws.poisson(int(equal_squares(frames)[good].sum()), expected)}

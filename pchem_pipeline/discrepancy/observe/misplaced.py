@@ -11,27 +11,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.discrepancy.observe.digital.groups import MOST_PAIRED
-from pchem_pipeline.discrepancy.observe.digital.misplaced_numba import (
-    N_PLACES,
-    STEPS,
-    compare_rows,
-)
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
+from pchem_pipeline.discrepancy.observe.digital import MOST_PAIRED
+from pchem_pipeline.discrepancy.observe.observe_numba import N_PLACES, STEPS, compare_rows
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.neighbours import neighbours
 from pchem_pipeline.model.arithmetic.significance import CERTAIN
 from pchem_pipeline.model.histogram.count import histogram_frames
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Lines = Literal["rows", "columns"]
-
-_LINES: tuple[Lines, Lines] = ("rows", "columns")
 
 _SHARE = 1e-3  # of the lines, for which the statistic is the best one
 _CHANCE = 4.0  # variance of the sum where hardly a line is likely anywhere else: one or two of them
@@ -40,10 +33,7 @@ _FARTHEST = 60.0  # logarithm of a ratio: beyond it nothing changes
 
 
 def misplaced_lines(
-    frames: NDArray[np.unsignedinteger[Any]],
-    counts: NDArray[Any],
-    origin: NDArray[np.int64],
-    usable: NDArray[np.bool_],
+    frames: CodeArray, counts: NDArray[Any], origin: IntArray, usable: BoolArray
 ) -> tuple[dict[str, float], dict[str, FloatArray]]:
     """Return the statistics of misplaced rows and columns, and their shares by place.
 
@@ -63,7 +53,7 @@ def misplaced_lines(
     if min(usable.shape) < 2:
         return z, shares
     chosen = frames[:: max(1, -(-frames.size // MOST_PAIRED))]
-    for lines in _LINES:
+    for lines in get_args(Lines):
         table = _Table.of(counts, origin, usable, lines)
         turned = _turned(chosen, lines)
         strides = 0, max(1, len(turned) // turned.shape[2])
@@ -76,9 +66,7 @@ def misplaced_lines(
     return z, shares
 
 
-def own_lines(
-    frames: NDArray[np.unsignedinteger[Any]], usable: NDArray[np.bool_], effects: Iterable[Effect]
-) -> NDArray[np.unsignedinteger[Any]]:
+def own_lines(frames: CodeArray, usable: BoolArray, effects: Iterable[Effect]) -> CodeArray:
     """Return frames in which lines that effects likely misplaced are those of other frames, drawn at random.
 
     Each sample in a pixel's histogram is then its own, as many as there were.
@@ -101,8 +89,8 @@ def own_lines(
 
 
 def _moved(
-    frames: NDArray[Any], own: NDArray[Any], usable: NDArray[np.bool_], lines: Lines, share: FloatArray
-) -> NDArray[np.bool_]:
+    frames: NDArray[Any], own: NDArray[Any], usable: BoolArray, lines: Lines, share: FloatArray
+) -> BoolArray:
     """Return which lines are likelier misplaced than not, (frame, line), by the histograms of ``own``."""
     histograms = histogram_frames(own)
     counts = histograms.counts.reshape(usable.size, -1)
@@ -112,7 +100,7 @@ def _moved(
     return np.asarray(likelier > 1.0 - share.sum())
 
 
-def with_others(frames: NDArray[Any], moved: NDArray[np.bool_]) -> NDArray[Any]:
+def with_others(frames: NDArray[Any], moved: BoolArray) -> NDArray[Any]:
     """Return frames (frame, line, sample) with some lines replaced by those of others, drawn at random."""
     found, rng = frames.copy(), np.random.default_rng(0)
     for y in np.flatnonzero(moved.any(axis=0) & ~moved.all(axis=0)):
@@ -132,14 +120,14 @@ class _Table:
 
     Attributes:
         first: DN of the first code, shape (y, x).
-        ratios: see :func:`~.misplaced_numba.compare_rows`, shape (y, x, B, 4).
+        ratios: see :func:`~.observe_numba.compare_rows`, shape (y, x, B, 4).
     """
 
     first: IntArray
-    ratios: NDArray[np.float32]
+    ratios: Float32Array
 
     @classmethod
-    def of(cls, counts: NDArray[Any], origin: IntArray, usable: NDArray[np.bool_], lines: Lines) -> _Table:
+    def of(cls, counts: NDArray[Any], origin: IntArray, usable: BoolArray, lines: Lines) -> _Table:
         """Return it for histograms (y * x, B) whose bins begin at ``origin``, DN."""
         some = np.flatnonzero((counts > 0).any(axis=0))
         # one more on either side stands for all codes beyond
@@ -149,7 +137,7 @@ class _Table:
         logs = np.log(real, out=real).astype(np.float32).reshape(*usable.shape, -1)
         del real
         first = (origin + some[0] - 1).reshape(usable.shape)
-        axis = _LINES.index(lines)
+        axis = int(lines == "columns")
         own, begin, count = (np.ascontiguousarray(a.swapaxes(0, axis)) for a in (logs, first, usable))
         ratios, codes = np.empty((*own.shape, len(STEPS)), np.float32), np.arange(own.shape[2])
         for j, (dy, dx) in enumerate(STEPS):
@@ -162,9 +150,7 @@ class _Table:
             ratios[..., j] = known * (np.take_along_axis(other, at, axis=2) - own)
         return cls(begin, ratios)
 
-    def compared(
-        self, lines: NDArray[Any], stride: int, *, whole: bool
-    ) -> tuple[FloatArray, NDArray[np.float32]]:
+    def compared(self, lines: NDArray[Any], stride: int, *, whole: bool) -> tuple[FloatArray, Float32Array]:
         """Return what a share of misplaced rows gains each, and likelihood ratios (frame, y, N_PLACES)."""
         ratios = np.empty((*lines.shape[:2], N_PLACES), np.float32)
         gains = np.empty(lines.shape[:2])
@@ -172,7 +158,7 @@ class _Table:
         return gains, ratios
 
 
-def _shares(ratios: NDArray[np.float32]) -> FloatArray:
+def _shares(ratios: Float32Array) -> FloatArray:
     """Return the likeliest shares of lines that come from each place, by expectation and maximisation."""
     likelihood = np.exp(np.minimum(ratios.reshape(-1, N_PLACES).astype(np.float64), _FARTHEST))
     share = np.full(N_PLACES, _SHARE)

@@ -1,0 +1,15 @@
+"""Types of arrays, by the numbers that they hold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+#: Samples of frames or their counts: unsigned, of any size.
+CodeArray = NDArray[np.unsignedinteger[Any]]
