@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import InputError
 
 if TYPE_CHECKING:
@@ -148,7 +149,7 @@ def _is_time_last(values: NDArray[Any]) -> bool:
     return bool(seen and first[0] > _CLEARLY * (max(last[0], 0.0) + _ERRORS * last[1]))
 
 
-def _common_variance(values: NDArray[np.float64]) -> tuple[float, float]:
+def _common_variance(values: FloatArray) -> tuple[float, float]:
     """Return the covariance along the last axis of the means of two halves of the second, and its error.
 
     Args:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.kinds import MOST_PIECE
 from pchem_pipeline.frames.identity import content_identity
@@ -64,7 +65,7 @@ class _Channel:
 
     name: str
     origin: int
-    counts: NDArray[np.int64]
+    counts: IntArray
     notes: list[str] = field(default_factory=list)
 
 
@@ -275,7 +276,7 @@ def _channel(path: Path, name: str, dn: NDArray[Any], counts: NDArray[Any]) -> _
     return _Channel(name, low, full, notes)
 
 
-def _integers(where: str, what: str, values: NDArray[Any]) -> NDArray[np.int64]:
+def _integers(where: str, what: str, values: NDArray[Any]) -> IntArray:
     """Return values as integers; refuse NaN, fractions and other types."""
     array = np.asarray(values)
     if array.dtype.kind not in "iuf":

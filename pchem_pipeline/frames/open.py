@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.formats.map_files import read_image
@@ -49,7 +49,7 @@ def open_frames(
 _MARKER = (1 << 32) - 1
 
 
-def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> NDArray[np.bool_]:
+def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> BoolArray:
     """Return the pixels (y, x) that ``input.mask`` excludes, or that hold the marker at both ends of the run.
 
     Raises:
@@ -63,7 +63,7 @@ def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) ->
     path = mask_path(settings, base_dir)
     if path is None:
         return excluded
-    mask: NDArray[np.bool_] = read_image(path) != 0
+    mask: BoolArray = read_image(path) != 0
     if settings.roi is not None and mask.shape != excluded.shape and mask.ndim == 2:
         y0, y1, x0, x1 = settings.roi
         mask = mask[y0:y1, x0:x1]

@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
 from pchem_pipeline.frames.identity import content_identity, quick_identity
@@ -64,7 +65,7 @@ class FrameReader(ABC):
     integration_time: float | None = None
     time_words: str = ""
     camera: CameraFacts = CameraFacts()
-    timestamps: NDArray[np.float64] | None = None
+    timestamps: FloatArray | None = None
     notes: tuple[str, ...] = ()
     byte_order: str | None = None
     unwritten: bool = False

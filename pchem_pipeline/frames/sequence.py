@@ -10,6 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import shared_facts
 from pchem_pipeline.frames.identity import SCRATCH_BYTES
@@ -28,7 +29,7 @@ class FrameSequence(FrameReader):
     """
 
     format_name = "sequence"
-    excluded: NDArray[np.bool_] | None = None
+    excluded: BoolArray | None = None
 
     @property
     def order_by_habit(self) -> bool:  # type: ignore[override]
@@ -114,7 +115,7 @@ class FrameSequence(FrameReader):
         for reader, part in self._parts(buffer, t0, t1, (y0, y1)):
             self.check_bits(reader, part, y0)
 
-    def exclude(self, pixels: NDArray[np.bool_]) -> None:
+    def exclude(self, pixels: BoolArray) -> None:
         """Exclude pixels (y, x): their samples become the median of the others in the first frame.
 
         Raises:

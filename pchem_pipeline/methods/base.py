@@ -18,11 +18,11 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.model.law.pcd import log_pcd
 
-FloatArray = NDArray[np.float64]
 Needs = Literal["one sample", "a dark and a bright sample", "a series of samples"]
 
 
@@ -78,7 +78,7 @@ class Sample:
     """
 
     counts: NDArray[np.integer]
-    origin: NDArray[np.int64]
+    origin: IntArray
 
     def moments(self) -> SampleMoments:
         """Return the unbiased moments of every pixel."""
@@ -144,7 +144,7 @@ class Estimates:
     reasons: Mapping[str, int] = field(default_factory=dict)
 
     @classmethod
-    def where(cls, parameters: FloatArray, reasons: Mapping[str, NDArray[np.bool_]]) -> Estimates:
+    def where(cls, parameters: FloatArray, reasons: Mapping[str, BoolArray]) -> Estimates:
         """Return estimates with the number of pixels for which each reason holds."""
         counted = {words: int(np.count_nonzero(pixels)) for words, pixels in reasons.items()}
         return cls(parameters, {words: n for words, n in counted.items() if n})

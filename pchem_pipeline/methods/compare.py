@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample, methods
+from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Sample, methods
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import (
     expected_information,

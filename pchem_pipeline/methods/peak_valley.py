@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
-from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, no_estimates
+from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, no_estimates
 from pchem_pipeline.methods.plain_em import closed_form_start
 from pchem_pipeline.methods.settings import MethodsSettings
 

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, no_estimates
+from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, no_estimates
 from pchem_pipeline.methods.settings import MethodsSettings
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.methods.base import Estimates, FloatArray, Method, PixelSamples, Sample
+from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Sample
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import pcd_posterior
@@ -47,7 +48,7 @@ def closed_form_start(sample: Sample) -> FloatArray:
 
 def run_em(
     sample: Sample, start: FloatArray, only_light: bool, settings: MethodsSettings
-) -> tuple[FloatArray, NDArray[np.int64]]:
+) -> tuple[FloatArray, IntArray]:
     """Run EM from given points.
 
     Args:

@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

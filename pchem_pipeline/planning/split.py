@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.model.errors.expected_information import shared_information
 from pchem_pipeline.planning.frames import exposure_grid
-from pchem_pipeline.planning.point import FloatArray, Point
+from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target
 
 _STEPS = 4000

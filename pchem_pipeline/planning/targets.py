@@ -9,9 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import CHARGE_RATES
-from pchem_pipeline.planning.point import FloatArray, Point
+from pchem_pipeline.planning.point import Point
 
 #: Parameters that can be planned for, with the units in which a precision can be given.
 TARGET_NAMES: dict[str, tuple[str, ...]] = {

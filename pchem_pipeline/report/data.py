@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.report.figures.figure import Figure
     from pchem_pipeline.report.inspector import InspectorData
 
-FloatArray = NDArray[np.float64]
 
 #: A line of fewer channels than this gets a point for each, no histogram.
 FEW_CHANNELS = 32
@@ -75,7 +75,7 @@ class PixelFit:
     status: str = ""
     goodness_p: float = float("nan")
     channel: bool = False
-    mass: NDArray[np.float64] | None = None
+    mass: FloatArray | None = None
 
     @property
     def place(self) -> str:
@@ -245,7 +245,7 @@ class ReportData:
         return self.shape[0] == 1 and self.shape[1] < FEW_CHANNELS
 
     @cached_property
-    def unfitted(self) -> NDArray[np.bool_]:
+    def unfitted(self) -> BoolArray:
         """Pixels that no fit has reached yet: neither a value nor a reason; shape ``shape``."""
         status, gain = self.fit.get("fit_status"), self.maps.get("conversion_gain")
         if status is None or gain is None:
@@ -253,15 +253,15 @@ class ReportData:
         return np.asarray((status & self.failed_mask == 0) & ~np.isfinite(gain))
 
     @cached_property
-    def flagged(self) -> NDArray[np.bool_]:
+    def flagged(self) -> BoolArray:
         """Pixels with a value that the data leave open by whole electrons, or altogether; shape ``shape``."""
         return self._with_bits(int(FLAGGED))
 
-    def flagged_in(self, name: str) -> NDArray[np.bool_]:
+    def flagged_in(self, name: str) -> BoolArray:
         """Tell which pixels the data leave open in one map: a gain is known where the bias is not."""
         return self._with_bits(int(FLAGGED & flags_of(name)))
 
-    def _with_bits(self, bits: int) -> NDArray[np.bool_]:
+    def _with_bits(self, bits: int) -> BoolArray:
         status = self.fit.get("fit_status")
         if status is None:
             return np.zeros(self.shape, dtype=bool)

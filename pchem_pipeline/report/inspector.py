@@ -22,13 +22,12 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.data import MAP_NAMES, ReportData
 from pchem_pipeline.report.style.palette import shades
 from pchem_pipeline.report.style.ranges import DECADES
 from pchem_pipeline.report.style.wording import symbol, unit_text
-
-FloatArray = NDArray[np.float64]
 
 #: Codes with a meaning of their own, and the last one of the regular range.
 _NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
@@ -63,7 +62,7 @@ class Bars:
 
     first: int
     parts: int
-    counts: NDArray[np.int64]
+    counts: IntArray
 
 
 @dataclass(frozen=True)
@@ -277,12 +276,12 @@ class PixelSample:
         reasons: why pixels are here, with their indices, e.g. ``"poorest goodness of fit"``.
     """
 
-    index: NDArray[np.int64]
-    exact: Mapping[str, NDArray[np.float64]]
-    origin: NDArray[np.int64]
+    index: IntArray
+    exact: Mapping[str, FloatArray]
+    origin: IntArray
     counts: list[NDArray[np.integer[Any]]]
-    deciding: NDArray[np.float64] | None = None
-    masses: list[NDArray[np.float64]] = field(default_factory=list)
+    deciding: FloatArray | None = None
+    masses: list[FloatArray] = field(default_factory=list)
     reasons: tuple[tuple[str, tuple[int, ...]], ...] = ()
 
 

@@ -16,9 +16,9 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
@@ -331,7 +331,7 @@ def read_added_exposure(
         return None
     inside = tuple(slice(c.start - w.start, c.stop - w.start) for c, w in zip(common, window, strict=True))
     place = tuple(slice(c.start - p.start, c.stop - p.start) for c, p in zip(common, wanted, strict=True))
-    found: list[NDArray[np.float64]] = []
+    found: list[FloatArray] = []
     for name in (_EXPOSURE, _WEIGHT):
         part = store.read(f"{version.added.group}/{name}", (slice(None), *inside))
         whole = np.zeros((part.shape[0], *(p.stop - p.start for p in wanted)))

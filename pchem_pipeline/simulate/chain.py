@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Plane
@@ -116,10 +117,10 @@ class _Block:
 
     settings: SimulateSettings
     truth: TruthMaps
-    frames: NDArray[np.int64]
-    rows: NDArray[np.int64]
+    frames: IntArray
+    rows: IntArray
 
-    def run(self) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    def run(self) -> tuple[NDArray[Any], IntArray]:
         """Return digital numbers and electron numbers of the block."""
         settings, truth = self.settings, self.truth
         context = self._context()
@@ -147,9 +148,7 @@ class _Block:
         columns = np.arange(self.settings.shape[1])
         return to_words(self.frames), to_words(self.rows), to_words(columns)
 
-    def _varying_exposure(
-        self, context: EffectContext
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    def _varying_exposure(self, context: EffectContext) -> tuple[FloatArray, IntArray, FloatArray]:
         """Return exposure, electron number and read noise (frame, y, x), e-, each sample by itself."""
         truth = self.truth
         u, v = uniform_pair(make_key(self.settings.seed, _SAMPLE_PURPOSE), *self._words())
@@ -157,7 +156,7 @@ class _Block:
         exposure = self._apply(Plane.EXPOSURE, exposure, context)
         return exposure, poisson_quantile(u, exposure), truth.analog_read_noise_e * normal_quantile(v)
 
-    def _constant_exposure(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    def _constant_exposure(self) -> tuple[FloatArray, IntArray, FloatArray]:
         """Return the same where no effect touches the exposure: the numbers are equal, and come sooner."""
         truth, words = self.truth, self._words()
         shape = tuple(axis.size for axis in words)
@@ -201,7 +200,7 @@ def _of_plane(effects: Sequence[Effect], plane: Plane) -> list[tuple[int, Effect
     return [(tags[:i].count(effect.tag), effect) for i, effect in enumerate(effects) if effect.plane is plane]
 
 
-def _inside(effect: Effect, context: EffectContext) -> NDArray[np.bool_]:
+def _inside(effect: Effect, context: EffectContext) -> BoolArray:
     """Return the samples on which an effect acts, an array that broadcasts against (frame, y, x)."""
     inside = np.ones((1, 1, 1), np.bool_)
     if effect.when is not None:

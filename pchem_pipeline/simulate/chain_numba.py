@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.simulate.streams_numba import (
     normal_from_uniform,
@@ -14,8 +15,6 @@ from pchem_pipeline.simulate.streams_numba import (
     poisson_table,
     uniform_row,
 )
-
-FloatArray = NDArray[np.float64]
 
 
 class SampleKeys(NamedTuple):
@@ -36,8 +35,8 @@ class _Row(NamedTuple):
     """Room for a row of samples: tables of the electron numbers, uniform and normal numbers."""
 
     tables: FloatArray
-    first: NDArray[np.int64]
-    length: NDArray[np.int64]
+    first: IntArray
+    length: IntArray
     u: FloatArray
     v: FloatArray
     z: FloatArray

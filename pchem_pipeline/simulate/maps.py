@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import special
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.simulate.distributions import (
     ColumnPattern,
@@ -31,7 +32,7 @@ from pchem_pipeline.simulate.streams import KeyedStreams
 from pchem_pipeline.simulate.truth import Defect, TruthMaps
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
     from pchem_pipeline.simulate.settings import SimulateSettings
 
@@ -68,7 +69,7 @@ def draw_truth(settings: SimulateSettings, rows: tuple[int, int] | None = None) 
     return _with_defects(truth, settings, ys)
 
 
-def _streams(settings: SimulateSettings, purpose: str, ys: NDArray[np.int64]) -> KeyedStreams:
+def _streams(settings: SimulateSettings, purpose: str, ys: IntArray) -> KeyedStreams:
     return KeyedStreams(
         settings.seed if settings.sensor_seed is None else settings.sensor_seed,
         f"map/{purpose}",
@@ -78,21 +79,21 @@ def _streams(settings: SimulateSettings, purpose: str, ys: NDArray[np.int64]) ->
     )
 
 
-def _copula(settings: SimulateSettings, ys: NDArray[np.int64]) -> NDArray[np.float64]:
+def _copula(settings: SimulateSettings, ys: IntArray) -> FloatArray:
     """Return uniforms (parameter, y, x) with the rank correlations asked for."""
     factor = np.linalg.cholesky(np.array(settings.parameters.copula()))
     normals = [_streams(settings, f"parameter {i}", ys).normal(("y", "x"))[0] for i in range(len(factor))]
-    uniforms: NDArray[np.float64] = special.ndtr(np.tensordot(factor, np.stack(normals), axes=1))
+    uniforms: FloatArray = special.ndtr(np.tensordot(factor, np.stack(normals), axes=1))
     return uniforms
 
 
 def _with_patterns(
-    values: NDArray[np.float64],
+    values: FloatArray,
     name: str,
     distribution: Distribution,
     settings: SimulateSettings,
-    ys: NDArray[np.int64],
-) -> NDArray[np.float64]:
+    ys: IntArray,
+) -> FloatArray:
     for i, pattern in enumerate(distribution.patterns):
         streams = _streams(settings, f"{name} pattern {i}", ys)
         shift = _pattern(pattern, streams, settings.shape)
@@ -102,7 +103,7 @@ def _with_patterns(
     return np.clip(values, distribution.minimum, distribution.maximum)
 
 
-def _pattern(pattern: Pattern, streams: KeyedStreams, shape: tuple[int, int]) -> NDArray[np.float64]:
+def _pattern(pattern: Pattern, streams: KeyedStreams, shape: tuple[int, int]) -> FloatArray:
     """Return a pattern on the band, broadcastable to (y, x)."""
     # position from -1/2 to 1/2 across the sensor; a single row or column is in the middle
     y = (streams.rows[:, None] - (shape[0] - 1) / 2) / max(shape[0] - 1, 1)
@@ -119,11 +120,11 @@ def _pattern(pattern: Pattern, streams: KeyedStreams, shape: tuple[int, int]) ->
             return _floats(pattern.amplitude * 2.0 * (x**2 + y**2))
 
 
-def _floats(values: ArrayLike) -> NDArray[np.float64]:
+def _floats(values: ArrayLike) -> FloatArray:
     return np.asarray(values, dtype=np.float64)
 
 
-def _refuse_impossible(name: str, values: NDArray[np.float64]) -> None:
+def _refuse_impossible(name: str, values: FloatArray) -> None:
     if name == "bias":
         return
     must_be_positive = name in ("conversion_gain", "dn_per_electron")
@@ -135,7 +136,7 @@ def _refuse_impossible(name: str, values: NDArray[np.float64]) -> None:
         )
 
 
-def _with_defects(truth: TruthMaps, settings: SimulateSettings, ys: NDArray[np.int64]) -> TruthMaps:
+def _with_defects(truth: TruthMaps, settings: SimulateSettings, ys: IntArray) -> TruthMaps:
     """Return the maps with hot, dead and stuck pixels; a pixel has one defect at most."""
     parameters = settings.parameters
     streams = _streams(settings, "defect", ys)
@@ -158,7 +159,7 @@ def _with_defects(truth: TruthMaps, settings: SimulateSettings, ys: NDArray[np.i
     )
 
 
-def truncated_quantile(distribution: Distribution, u: NDArray[np.float64]) -> NDArray[np.float64]:
+def truncated_quantile(distribution: Distribution, u: FloatArray) -> FloatArray:
     """Return the quantiles of a distribution truncated to its bounds.
 
     Args:
@@ -181,7 +182,7 @@ def truncated_quantile(distribution: Distribution, u: NDArray[np.float64]) -> ND
     return np.clip(values, distribution.minimum, distribution.maximum)
 
 
-def _quantile(d: Distribution, u: NDArray[np.float64]) -> NDArray[np.float64]:
+def _quantile(d: Distribution, u: FloatArray) -> FloatArray:
     result: Any
     match d:
         case Normal():

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.simulate.truth import Defect, TruthMaps
@@ -25,7 +26,7 @@ class _Sequence(Effect):
 
     tag: Literal["scene"] = "scene"
     plane: ClassVar[Plane] = Plane.EXPOSURE
-    images: NDArray[np.float64]
+    images: FloatArray
 
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         """Return the exposure (frame, y, x), e-."""
@@ -34,7 +35,7 @@ class _Sequence(Effect):
 
 
 def with_scene(
-    truth: TruthMaps, settings: SimulateSettings, scene: float | NDArray[np.float64]
+    truth: TruthMaps, settings: SimulateSettings, scene: float | FloatArray
 ) -> tuple[TruthMaps, SimulateSettings]:
     """Return the sensor and its settings when it looks at a scene.
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.simulate.streams_numba import (
     fill_uniform,
     normal_from_uniform,
@@ -38,14 +39,14 @@ def make_key(seed: int, purpose: str) -> Key:
     return np.uint64(int.from_bytes(digest[:4], "little")), np.uint64(int.from_bytes(digest[4:], "little"))
 
 
-def to_words(coordinates: NDArray[np.int64]) -> NDArray[np.uint64]:
+def to_words(coordinates: IntArray) -> NDArray[np.uint64]:
     """Return coordinates as 32-bit counter words; negative ones wrap around."""
     return (coordinates & 0xFFFFFFFF).astype(np.uint64)
 
 
 def uniform_pair(
     key: Key, frames: NDArray[np.uint64], ys: NDArray[np.uint64], xs: NDArray[np.uint64], draw: int = 0
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     """Return the two independent uniforms in (0, 1) of every (frame, y, x), each of 52 bits."""
     shape = (frames.size, ys.size, xs.size)
     first, second = np.empty(shape), np.empty(shape)
@@ -53,14 +54,14 @@ def uniform_pair(
     return first, second
 
 
-def normal_quantile(p: NDArray[np.float64]) -> NDArray[np.float64]:
+def normal_quantile(p: FloatArray) -> FloatArray:
     """Return standard normal quantiles (Wichura 1988, AS 241, relative error about 1e-16)."""
     out = np.empty(p.size)
     normal_from_uniform(np.ascontiguousarray(p).reshape(-1), out)
     return out.reshape(p.shape)
 
 
-def poisson_quantile(u: NDArray[np.float64], mean: NDArray[np.float64]) -> NDArray[np.int64]:
+def poisson_quantile(u: FloatArray, mean: FloatArray) -> IntArray:
     """Return the smallest k with P(K <= k) >= u, K ~ Poisson(mean); ``mean`` broadcasts against ``u``."""
     out = np.empty(u.size, np.int64)
     means = np.ascontiguousarray(np.broadcast_to(mean, u.shape)).reshape(-1)
@@ -84,11 +85,11 @@ class KeyedStreams:
 
     seed: int
     purpose: str
-    frames: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
+    frames: IntArray
+    rows: IntArray
+    columns: IntArray
 
-    def uniform(self, dims: tuple[Dim, ...], draw: int = 0) -> NDArray[np.float64]:
+    def uniform(self, dims: tuple[Dim, ...], draw: int = 0) -> FloatArray:
         """Return uniform numbers in (0, 1), with length 1 along the dimensions not in ``dims``."""
         unknown = set(dims) - set(_DIMS)
         if unknown:
@@ -101,11 +102,11 @@ class KeyedStreams:
         )
         return uniform_pair(make_key(self.seed, f"{self.purpose}/{name}"), frames, ys, xs, draw)[0]
 
-    def normal(self, dims: tuple[Dim, ...], draw: int = 0) -> NDArray[np.float64]:
+    def normal(self, dims: tuple[Dim, ...], draw: int = 0) -> FloatArray:
         """Return standard normal numbers, with length 1 along the dimensions not in ``dims``."""
         return normal_quantile(self._other("normal").uniform(dims, draw))
 
-    def poisson(self, mean: NDArray[np.float64], draw: int = 0) -> NDArray[np.int64]:
+    def poisson(self, mean: FloatArray, draw: int = 0) -> IntArray:
         """Return Poisson numbers of the given mean (frame, y, x), one per sample."""
         return poisson_quantile(self._other("poisson").uniform(_DIMS, draw), mean)
 

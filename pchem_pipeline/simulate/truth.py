@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 
@@ -43,10 +44,10 @@ class TruthMaps:
         ConfigError: if a value is not finite, or impossible (H < 0, g <= 0, sigma_R < 0).
     """
 
-    quanta_exposure: NDArray[np.float64]
-    conversion_gain: NDArray[np.float64]
-    bias: NDArray[np.float64]
-    analog_read_noise_e: NDArray[np.float64]
+    quanta_exposure: FloatArray
+    conversion_gain: FloatArray
+    bias: FloatArray
+    analog_read_noise_e: FloatArray
     defect: NDArray[np.uint8]
 
     def __post_init__(self) -> None:
@@ -78,12 +79,12 @@ class TruthMaps:
         return rows, columns
 
     @property
-    def read_noise_dn(self) -> NDArray[np.float64]:
+    def read_noise_dn(self) -> FloatArray:
         """Read noise with quantisation, DN: sigma = (sigma_R^2 / g^2 + 1/12)^(1/2)."""
         return np.sqrt((self.analog_read_noise_e / self.conversion_gain) ** 2 + QUANTISATION_VARIANCE)
 
     @property
-    def read_noise_e(self) -> NDArray[np.float64]:
+    def read_noise_e(self) -> FloatArray:
         """Read noise with quantisation, e-: sigma_e- = g sigma."""
         return self.conversion_gain * self.read_noise_dn
 

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.methods.base import FloatArray, PixelSamples, Sample, methods
+from pchem_pipeline.methods.base import PixelSamples, Sample, methods
 from pchem_pipeline.methods.compare import compare
 from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
@@ -100,7 +100,7 @@ def _same_pixels(here: SensorInfo, there: SensorInfo, name: str) -> None:
         )
 
 
-def choose(shape: tuple[int, int], n_pixels: int, seed: int) -> NDArray[np.int64]:
+def choose(shape: tuple[int, int], n_pixels: int, seed: int) -> IntArray:
     """Choose pixels at random places, so that no pattern of rows or columns is favoured.
 
     Args:
@@ -220,14 +220,14 @@ def _do(
     }
 
 
-def _sample(store: RunStore, shape: tuple[int, int], place: NDArray[np.int64]) -> Sample:
+def _sample(store: RunStore, shape: tuple[int, int], place: IntArray) -> Sample:
     """Read the histograms of some pixels."""
     y, x = np.divmod(place, shape[1])
     counts, origin = (store.read_pixels(f"histogram/{name}", y, x) for name in ("counts", "origin"))
     return Sample(counts, origin.astype(np.int64))
 
 
-def _reference(store: RunStore, place: NDArray[np.int64]) -> tuple[FloatArray, str]:
+def _reference(store: RunStore, place: IntArray) -> tuple[FloatArray, str]:
     """Return what is held for true, and whether it is the truth or the fit of the run."""
     if store.has("truth/read_noise_e"):
         truth = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
 from pchem_pipeline.discrepancy.quick.codes import CodeSample
@@ -97,7 +97,7 @@ def read_sums(store: RunStore) -> StackSums | None:
     some = _spread(chosen.size, _MOST_LINE_SUMS // (groups * nx * int(lengths[0])))
     blocks = (np.s_[:], np.s_[:])
 
-    def lines(name: str, of: NDArray[np.int64], rest: slice | tuple[slice, ...]) -> NDArray[np.int64]:
+    def lines(name: str, of: IntArray, rest: slice | tuple[slice, ...]) -> IntArray:
         first, end = starts[of], (starts + lengths)[of]
         there = np.concatenate([np.arange(*each) for each in zip(first, end, strict=True)])
         return _read(store, name, first, end, rest)[~np.isin(there, out)]
@@ -121,7 +121,7 @@ def read_sums(store: RunStore) -> StackSums | None:
     )
 
 
-def _spread(n: int, most: int) -> NDArray[np.int64]:
+def _spread(n: int, most: int) -> IntArray:
     """Return numbers below n, all of them or at most so many, evenly spread; at least one."""
     return np.unique(np.linspace(0, n - 1, min(n, max(most, 1))).astype(np.int64))
 
@@ -129,10 +129,10 @@ def _spread(n: int, most: int) -> NDArray[np.int64]:
 def _read(
     store: RunStore,
     name: str,
-    first: NDArray[np.int64],
-    end: NDArray[np.int64],
+    first: IntArray,
+    end: IntArray,
     rest: slice | tuple[slice, ...],
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Read ranges along the first axis, those that follow each other at once."""
     cuts = np.flatnonzero(first[1:] != end[:-1]) + 1
     others = rest if isinstance(rest, tuple) else (rest,)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
 from pchem_pipeline.frames.camera import shared_facts
 from pchem_pipeline.run.input import LISTED_FILES
@@ -135,7 +135,7 @@ def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
             raise ConfigError(f"{mine.where} has the same frames as {other.where}; list each sample once")
 
 
-def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> NDArray[np.float64] | None:
+def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> FloatArray | None:
     """Return the integration time (s) or light level of each sample, NaN for a bias; None without a line.
 
     Raises:

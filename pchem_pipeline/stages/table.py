@@ -133,7 +133,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=11,
+        version=12,
         upstream=("ingest",),
         settings=("discrepancy",),
         writes=("discrepancy",),

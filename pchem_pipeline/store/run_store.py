@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
 from pchem_pipeline.base.variables import variable_at
 from pchem_pipeline.store import disk
@@ -283,7 +284,7 @@ class RunStore:
         array = self.array(name)
         return array.shards or array.chunks
 
-    def read_pixels(self, name: str, y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[Any]:
+    def read_pixels(self, name: str, y: IntArray, x: IntArray) -> NDArray[Any]:
         """Return the elements of an array (y, x, ...) at some pixels, file by file.
 
         Args:
@@ -469,7 +470,7 @@ def _one_line(path: Path, where: object) -> Iterator[None]:
         raise
 
 
-def _pixels_of(array: zarr.Array[Any], y: NDArray[np.int64], x: NDArray[np.int64]) -> NDArray[Any]:
+def _pixels_of(array: zarr.Array[Any], y: IntArray, x: IntArray) -> NDArray[Any]:
     """Return the elements of an array (y, x, ...) at some pixels, read as what they lie in, or one by one."""
     (top, left), rest = (int(y.min()), int(x.min())), array.shape[2:]
     high, wide = int(y.max()) + 1 - top, int(x.max()) + 1 - left

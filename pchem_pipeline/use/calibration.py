@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import FAILED
-from pchem_pipeline.model.law.parameters import FloatArray, PixelParameters, usable_pixels
+from pchem_pipeline.model.law.parameters import PixelParameters, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ class Calibration(PixelParameters):
         return ny, nx
 
     @cached_property
-    def usable(self) -> NDArray[np.bool_]:
+    def usable(self) -> BoolArray:
         """Pixels whose parameters define a calibration, shape (y, x)."""
         known = usable_pixels(
             np.nan_to_num(self.quanta_exposure), self.conversion_gain, self.bias, self.read_noise_dn

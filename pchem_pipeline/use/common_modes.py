@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.errors import PchEmError
-from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.use.calibration import Calibration
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class CommonModes:
     """
 
     removed: tuple[str, ...] = ()
-    parts: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0, 0), np.bool_))
+    parts: BoolArray = field(default_factory=lambda: np.zeros((0, 0, 0), np.bool_))
     variances: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     left: tuple[str, ...] = ()
     waves: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
@@ -52,7 +52,7 @@ class CommonModes:
         left = {
             effect.tag: None for effect, shared in found if shared.variance is None or effect.when is not None
         }
-        parts: dict[bytes, NDArray[np.bool_]] = {}
+        parts: dict[bytes, BoolArray] = {}
         variances: dict[bytes, FloatArray] = {}
         waves = []
         for effect, shared in found:
@@ -110,7 +110,7 @@ class Offsets:
     waves: NDArray[np.floating[Any]] = field(default_factory=lambda: np.zeros((0, 0, 2)))
     left: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
-    def of_samples(self, modes: CommonModes, rows: slice = slice(None)) -> NDArray[np.float32]:
+    def of_samples(self, modes: CommonModes, rows: slice = slice(None)) -> Float32Array:
         """Return the offset of each sample of some rows, DN, shape (frame, y, x)."""
         design, n = _Design.of(modes), len(self.rows)
         waves = self.waves if len(self.waves) else np.zeros((n, 0, 2))
@@ -151,7 +151,7 @@ class _Design:
         return cls(modes, *(np.stack([turn.real, turn.imag], axis=2) for turn in turns))
 
     @property
-    def parts_of_waves(self) -> NDArray[np.int64]:
+    def parts_of_waves(self) -> IntArray:
         """Number of the part of each wave."""
         return self.modes.waves[:, 3].astype(np.int64)
 

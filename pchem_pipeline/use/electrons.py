@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.model.law.parameters import FloatArray
+from pchem_pipeline.base.arrays import Float32Array, FloatArray
 from pchem_pipeline.use.calibration import Calibration
 
 
 def electrons(
     frames: NDArray[np.unsignedinteger[Any]],
     calibration: Calibration,
-    offsets: NDArray[np.float32] | None = None,
-    room: NDArray[np.float32] | None = None,
-) -> NDArray[np.float32]:
+    offsets: Float32Array | None = None,
+    room: Float32Array | None = None,
+) -> Float32Array:
     """Return ``g (x - mu)``, less the offsets that frames, rows and columns share.
 
     Args:
@@ -41,9 +41,7 @@ def electrons(
     return out
 
 
-def add_up(
-    frames: NDArray[np.unsignedinteger[Any]], offsets: NDArray[np.float32], sums: NDArray[np.float64]
-) -> None:
+def add_up(frames: NDArray[np.unsignedinteger[Any]], offsets: Float32Array, sums: FloatArray) -> None:
     """Add x to the sums of pixels, where there are offsets also x^2, x - b and its square; see its range.
 
     Args:
@@ -66,7 +64,7 @@ def add_up(
 
 
 def whole_parts(
-    frames: NDArray[np.unsignedinteger[Any]], offsets: NDArray[np.float32], parts: int, lift: int
+    frames: NDArray[np.unsignedinteger[Any]], offsets: Float32Array, parts: int, lift: int
 ) -> NDArray[np.uint32]:
     """Return ``x - b`` in whole parts of a DN, ``lift`` DN higher so that none is negative.
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.law.inputs import kernel_counts, pack
-from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.use import exposure_numba
 from pchem_pipeline.use.calibration import Calibration
 from pchem_pipeline.use.exposure_numba import LEAST_EXPOSURE

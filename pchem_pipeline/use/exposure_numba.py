@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.law.cells_numba import Cells, Law, cells_of
@@ -15,9 +16,6 @@ from pchem_pipeline.model.law.electron_laws_numba import electron_number
 from pchem_pipeline.model.law.levels_numba import Codes, Levels, list_levels, place_codes
 from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
 from pchem_pipeline.model.law.pixel_numba import OWN, Pixel
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LEAST_EXPOSURE = 1e-6  # e-; less is none
 _LEAST_WEIGHT = 1e-6  # of a rival: less moves no standard error

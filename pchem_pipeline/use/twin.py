@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.simulate.chain import frames_per_block, simulate_block
 from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
@@ -39,7 +39,7 @@ class Twin:
         return f"<Twin: {rows} x {columns} pixels; effects: {effects}; frames(scene, n) simulates>"
 
     def frames(
-        self, scene: float | NDArray[np.float64] | None = None, n: int = 100, *, seed: int = 1
+        self, scene: float | FloatArray | None = None, n: int = 100, *, seed: int = 1
     ) -> NDArray[np.unsignedinteger[Any]]:
         """Return n frames of a scene.
 
@@ -69,7 +69,7 @@ class Twin:
         return np.concatenate(blocks)
 
 
-def twin_maps(maps: tuple[FloatArray, ...], usable: NDArray[np.bool_], level: NDArray[Any]) -> TruthMaps:
+def twin_maps(maps: tuple[FloatArray, ...], usable: BoolArray, level: NDArray[Any]) -> TruthMaps:
     """Return the maps of a simulated sensor from those of a fit.
 
     Pixels without a fit have no parameters that could be simulated: they always give their usual DN.

@@ -8,18 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.model.fit.status import moves_gain
-from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import electron_shifts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_satellites
 from pchem_pipeline.use.calibration import Calibration, covariance_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from pchem_pipeline.model.fit.settings import FitSettings
     from pchem_pipeline.store.run_store import RunStore
 
@@ -84,7 +82,7 @@ def read_calibration(
 
 def doubtful_pixels(
     store: RunStore, calibration: Calibration, region: tuple[slice, slice] = (slice(None), slice(None))
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Tell which pixels' errors the curvature of the likelihood does not tell, shape (y, x).
 
     None of a run of several exposures, which settle the bias, or of one that keeps no histograms.

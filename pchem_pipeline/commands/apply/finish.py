@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.variables import Variable, variables_of
 from pchem_pipeline.commands.apply.settings import Job
 from pchem_pipeline.frames.formats.map_files import Cube, write_fits_cube, write_tiff_cube
@@ -64,10 +65,10 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
     )
 
 
-def _sums(output: RunStore) -> NDArray[np.float64]:
+def _sums(output: RunStore) -> FloatArray:
     """Return the sums over all frames, segment by segment in their order."""
     array = output.array("applied_parts/sums")
-    total: NDArray[np.float64] = output.read("applied_parts/sums", (slice(0, 1), *[slice(None)] * 3))[0]
+    total: FloatArray = output.read("applied_parts/sums", (slice(0, 1), *[slice(None)] * 3))[0]
     for number in range(1, array.shape[0]):
         part = output.read("applied_parts/sums", (slice(number, number + 1), *[slice(None)] * 3))[0]
         total[:4] += part[:4]
@@ -76,7 +77,7 @@ def _sums(output: RunStore) -> NDArray[np.float64]:
     return total
 
 
-def _write_errors(output: RunStore, calibration: Calibration, sums: NDArray[np.float64], n: int) -> None:
+def _write_errors(output: RunStore, calibration: Calibration, sums: FloatArray, n: int) -> None:
     """Write the two parts of the standard error of electrons, and the mean signal."""
     signal = np.where(
         calibration.usable, calibration.conversion_gain * (sums[0] / n - calibration.bias), np.nan
@@ -97,7 +98,7 @@ def _law(calibration: Calibration, job: Job) -> SampleLaw:
 def _write_noise(
     output: RunStore,
     calibration: Calibration,
-    sums: NDArray[np.float64],
+    sums: FloatArray,
     n: int,
     job: Job,
     reporter: Reporter,
@@ -116,7 +117,7 @@ def _write_noise(
     )
 
 
-def _noise_words(excess: NDArray[np.float64], expected: NDArray[np.float64]) -> str:
+def _noise_words(excess: FloatArray, expected: FloatArray) -> str:
     """Return the root of the mean excess of the pixels over shot noise, with its error, e-.
 
     Args:
@@ -133,7 +134,7 @@ def _noise_words(excess: NDArray[np.float64], expected: NDArray[np.float64]) -> 
 
 
 def _flags_of_sums(
-    calibration: Calibration, sums: NDArray[np.float64], n: int, limits: tuple[int, int] | None
+    calibration: Calibration, sums: FloatArray, n: int, limits: tuple[int, int] | None
 ) -> dict[str, Any]:
     mean = sums[0] / n
     error = np.sqrt(calibration.noise_variance_dn2 / n + calibration.covariance[..., 1, 1])
@@ -144,9 +145,7 @@ def _flags_of_sums(
     return found
 
 
-def _write_quality(
-    output: RunStore, calibration: Calibration, raised: Mapping[str, NDArray[np.bool_]]
-) -> None:
+def _write_quality(output: RunStore, calibration: Calibration, raised: Mapping[str, BoolArray]) -> None:
     """Write why pixels have no value, or deserve caution, with attributes by the CF conventions."""
     quality = calibration.fit_status.astype(np.uint32)
     for name, where in raised.items():

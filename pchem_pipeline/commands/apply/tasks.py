@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import Float32Array
 from pchem_pipeline.commands.apply.characterisation import read_calibration, with_moments, write_moments
 from pchem_pipeline.commands.apply.settings import Job, Piece
 from pchem_pipeline.frames.stream import FrameStream
@@ -30,7 +31,7 @@ N_SUMS = 6
 _WHOLE = slice(None)
 
 
-def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> NDArray[np.float32]:
+def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> Float32Array:
     """Return the offset of each sample of some rows of some frames, DN; empty where there are none."""
     if not job.removed:
         return np.zeros((0, 0, 0), np.float32)
@@ -49,7 +50,7 @@ def _calibration(
     return with_moments(found, output, rows) if job.moments else found
 
 
-def _codes(frames: NDArray[Any], job: Job, offsets: NDArray[np.float32]) -> NDArray[Any]:
+def _codes(frames: NDArray[Any], job: Job, offsets: Float32Array) -> NDArray[Any]:
     """Return the codes of samples: DN, or parts of a DN without the offsets."""
     return whole_parts(frames, offsets, job.parts, job.lift) if job.removed else frames
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ChangedError, ConfigError
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS, VARIABLES
 from pchem_pipeline.commands.compare.history import PixelStates, history_csv, history_rows
@@ -24,7 +25,6 @@ from pchem_pipeline.model.checks.run_differences import (
     compare_maps,
     reasons_of_change,
 )
-from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
 from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, RunFacts
 from pchem_pipeline.report.pages.compare import (

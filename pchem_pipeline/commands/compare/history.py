@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
 
+from pchem_pipeline.base.arrays import BoolArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
@@ -107,7 +108,7 @@ class PixelStates:
         quality: good, caution or no value.
     """
 
-    hot: NDArray[np.bool_]
+    hot: BoolArray
     exposure: NDArray[np.floating]
     stderr: NDArray[np.floating]
     status: NDArray[np.integer]

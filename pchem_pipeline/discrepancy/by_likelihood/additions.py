@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.build_verdict import (
     LARGEST_REST,
     LEAVES_TOO_MUCH,
@@ -27,9 +27,6 @@ from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
 from pchem_pipeline.effects.framework.evidence import Evidence
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
-
-FloatArray = NDArray[np.float64]
 
 _RESOLVED = 0.3  # e-: read noise above which there are no valleys
 _HALF_PEAK = 0.25  # e-: half width of what counts as a peak
@@ -76,7 +75,7 @@ def place_words(low: float, high: float) -> str:
 def find_residuals(
     seen: FloatArray,
     expected: FloatArray,
-    origin: NDArray[np.int64],
+    origin: IntArray,
     parameters: FloatArray,
     peaks: Sequence[Interval] = (),
 ) -> list[Place]:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_likelihood.additions import AddedSets
 from pchem_pipeline.discrepancy.by_likelihood.gap import on_all_codes
@@ -34,9 +34,6 @@ from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.effects.operators.fate import SpuriousCharge
 from pchem_pipeline.model.arithmetic.significance import CLEAR
 from pchem_pipeline.model.fit.shared import Samples
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _SPURIOUS = SpuriousCharge.model_fields["tag"].default
 

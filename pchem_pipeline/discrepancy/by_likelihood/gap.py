@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.gap import Gap
-
-FloatArray = NDArray[np.float64]
 
 _QUANTILES = special.ndtri((np.arange(400) + 0.5) / 400)  # of a sum of many cells, standard deviations
 
@@ -46,7 +45,7 @@ class Distance:
         n_parameters: int,
         *,
         share: float,
-        kept: NDArray[np.bool_] | bool = True,
+        kept: BoolArray | bool = True,
     ) -> Distance:
         """Compute it.
 
@@ -79,7 +78,7 @@ class Distance:
         return Gap.of(self.value, chance, self.n_samples, variance=self.variance)
 
 
-def on_all_codes(log_masses: FloatArray, kept: NDArray[np.bool_], plain: FloatArray) -> FloatArray:
+def on_all_codes(log_masses: FloatArray, kept: BoolArray, plain: FloatArray) -> FloatArray:
     """Return the log masses of all codes: a fit's where they are kept, with the share that the plain law has.
 
     Args:

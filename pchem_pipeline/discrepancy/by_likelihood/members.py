@@ -6,16 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.model.fit.shared import Samples
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-FloatArray = NDArray[np.float64]
 
 #: Why effects in time and space cannot be looked for.
 NO_ORDER = "ready-made histograms have no frame order and no neighbours"

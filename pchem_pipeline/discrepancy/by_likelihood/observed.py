@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.by_likelihood.sets import SetComparison
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import REACH
@@ -16,9 +17,6 @@ from pchem_pipeline.discrepancy.verdict import Examined
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.shared import Samples
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _FEWEST_SAMPLES = 300  # of a pixel
 _MOST_PIXELS = 256  # looked at; more add nothing about what all have in common

@@ -6,16 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.build_verdict import LARGEST_REST
 from pchem_pipeline.discrepancy.by_likelihood.comb import doubtful_peaks, valleys
 from pchem_pipeline.discrepancy.by_likelihood.members import FARTHEST, Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison, select
 from pchem_pipeline.model.arithmetic.significance import CLEAR
 from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
-
-FloatArray = NDArray[np.float64]
 
 _PAYS = 0.5  # of the gap: more must go with a peak that is set aside
 _PEAKS_TRIED = 3
@@ -60,7 +58,7 @@ class Explanation:
         rise: by how much the set of them predicts these better than none, nats, and the standard error.
     """
 
-    kept: NDArray[np.bool_]
+    kept: BoolArray
     set_aside: tuple[Interval, ...]
     best: FittedSet
     named: tuple[Named, ...]

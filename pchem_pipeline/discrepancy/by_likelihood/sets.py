@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_likelihood.gap import Distance, sum_over_samples
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, split_coordinates
@@ -22,9 +22,6 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import CLEAR, PRICE
 from pchem_pipeline.model.fit.shared import Samples, SharedFit, SharedProblem, Tangent, fit_shared
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _LARGEST_SET = 4  # effects
 _LEAST_SHARE = 0.05  # of what a set that misfits explains, that each of its effects must
@@ -90,7 +87,7 @@ class SetComparison:
     train: IntArray
     test: IntArray
     origin: IntArray
-    kept: NDArray[np.bool_]
+    kept: BoolArray
     present: tuple[Effect, ...]
     start: FloatArray
     samples: Samples = field(default_factory=Samples)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     LARGEST_DECREASE,
     Hypothesis,
@@ -20,8 +20,6 @@ from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.model.arithmetic.significance import CLEAR
-
-FloatArray = NDArray[np.float64]
 
 # standard errors of a strength in the final frames, half as many, which nothing was chosen by
 _CONFIRMED = 1.0
@@ -92,7 +90,7 @@ class Acceptance:
         there &= added.slopes.any(axis=1)  # what moves nothing has a strength without an error
         return tuple(h for h, is_there in zip(added.hypotheses, there, strict=True) if is_there)
 
-    def _counted(self, added: Refitted) -> NDArray[np.bool_]:
+    def _counted(self, added: Refitted) -> BoolArray:
         """Tell which effects account for a count beyond chance, which the final frames have, too."""
         first, z = self.first, self.z
         size = np.abs(added.parts)
@@ -107,7 +105,7 @@ class Acceptance:
         return np.asarray((seen & final & more & made & first.counts).any(axis=1))
 
 
-def _overwhelming(parts: FloatArray, shift: FloatArray, scatter: FloatArray) -> NDArray[np.bool_]:
+def _overwhelming(parts: FloatArray, shift: FloatArray, scatter: FloatArray) -> BoolArray:
     """Tell of which effects some statistic stands out far beyond what all the others make of it.
 
     Args:

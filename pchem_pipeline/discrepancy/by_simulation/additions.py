@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.build_verdict import (
     LEAVES_TOO_MUCH,
     MOST_RIVALS,
@@ -35,8 +35,6 @@ from pchem_pipeline.discrepancy.verdict import Candidate, Rival, sigma_text
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, POSSIBLE
-
-FloatArray = NDArray[np.float64]
 
 _CLEAR_MARGIN = 50.0  # nats
 _OF_SIGNATURE = 0.1  # of what an effect does to all statistics, in a family where its signature stands

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
@@ -54,9 +55,6 @@ from pchem_pipeline.discrepancy.verdict import Discrepancy
 from pchem_pipeline.effects.framework.compose import added_exposures, along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _CLEARLY_LESS = 0.5  # of the gap, the most that may stay with what is measured
 _MOST_JUDGED = 5  # sets that are asked for on the final frames

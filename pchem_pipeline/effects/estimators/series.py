@@ -26,8 +26,8 @@ from itertools import pairwise
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import Float32Array
 from pchem_pipeline.effects.types import AnyArray, FloatArray, IntArray
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, FALSE_ALARM
 
@@ -505,7 +505,7 @@ def _prepared(means: AnyArray) -> tuple[FloatArray, IntArray]:
     return field - field.mean(axis=0), lines
 
 
-def _half_plane(grid: NDArray[np.float32]) -> NDArray[np.float32]:
+def _half_plane(grid: Float32Array) -> Float32Array:
     """Return the power at all frequencies along frames and the non-negative ones along lines."""
     spectrum = np.fft.fft(np.fft.rfft(grid, axis=1).astype(np.complex64), axis=0)
     return np.asarray(np.abs(spectrum) ** 2, np.float32)
@@ -522,7 +522,7 @@ def _without_slow(field: FloatArray, frames: IntArray) -> FloatArray:
     return np.asarray(field - basis @ (basis.T @ field), np.float64)
 
 
-def _level(power: NDArray[np.float32]) -> NDArray[np.float32]:
+def _level(power: Float32Array) -> Float32Array:
     """Return the noise power around each place, so that broad humps of the spectrum are no lines.
 
     By stretches of frequencies along frames: at each of the lowest frequencies along lines, where jumps and

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, special
 
 from pchem_pipeline.effects.estimators.charge_sums import BlockCharge, against_usual_gain
@@ -19,13 +18,13 @@ Falloff = Literal["gaussian", "exponential"]
 
 
 def spot_image(
-    rows: NDArray[np.int64] | NDArray[np.float64],
-    columns: NDArray[np.int64] | NDArray[np.float64],
+    rows: IntArray | FloatArray,
+    columns: IntArray | FloatArray,
     shape: tuple[int, ...],
     centre: tuple[float, float],
     radius: float,
     falloff: Falloff = "gaussian",
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Return the brightness of a spot relative to the sensor's brightest pixel, shape (rows, columns).
 
     Args:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.framework.effect import Effect, Plane
@@ -24,10 +25,10 @@ class AddedExposure(NamedTuple):
         weight: the part of the frames spent at each; the sum over j is 1.
     """
 
-    exposure_e: NDArray[np.float64]
-    weight: NDArray[np.float64]
+    exposure_e: FloatArray
+    weight: FloatArray
 
-    def of(self, pixels: NDArray[np.bool_] | NDArray[np.intp] | tuple[slice, ...] | slice) -> AddedExposure:
+    def of(self, pixels: BoolArray | NDArray[np.intp] | tuple[slice, ...] | slice) -> AddedExposure:
         """Return that of some pixels: an index, a mask or slices of the axes after the first."""
         place = (slice(None), *(pixels if isinstance(pixels, tuple) else (pixels,)))
         return AddedExposure(self.exposure_e[place], self.weight[place])
@@ -47,7 +48,7 @@ class AddedExposure(NamedTuple):
 def added_exposures(
     effects: Sequence[Effect],
     frames: NDArray[np.unsignedinteger],
-    numbers: NDArray[np.int64],
+    numbers: IntArray,
     maps: PixelMaps,
 ) -> AddedExposure | None:
     """Return what effects add to the exposure of each pixel, all together; None where none adds any.
@@ -79,7 +80,7 @@ def added_exposures(
 def _in_its_place(
     effect: Effect,
     frames: NDArray[np.unsignedinteger],
-    numbers: NDArray[np.int64],
+    numbers: IntArray,
     maps: PixelMaps,
 ) -> AddedExposure | None:
     """Return what an effect adds inside its region, found in its frames; nothing in the others."""
@@ -97,7 +98,7 @@ def _in_its_place(
     return AddedExposure(np.concatenate([none, np.where(inside, added.exposure_e, 0.0)]), weight)
 
 
-def pixel_maps(parameters: Sequence[NDArray[np.float64]], usable: NDArray[np.bool_]) -> PixelMaps:
+def pixel_maps(parameters: Sequence[FloatArray], usable: BoolArray) -> PixelMaps:
     """Return (H, g, mu, sigma) of n pixels as effects take them, each (n,), NaN where not usable.
 
     Args:
@@ -119,14 +120,14 @@ class PixelPlaces:
         frames: numbers of the frames in the run, shape (frame,); none where they have no order.
     """
 
-    rows: NDArray[np.int64]
-    columns: NDArray[np.int64]
+    rows: IntArray
+    columns: IntArray
     shape: tuple[int, int]
-    frames: NDArray[np.int64]
+    frames: IntArray
 
     @classmethod
     def of_block(
-        cls, block: tuple[slice, slice] | None, shape: tuple[int, int], frames: NDArray[np.int64]
+        cls, block: tuple[slice, slice] | None, shape: tuple[int, int], frames: IntArray
     ) -> PixelPlaces:
         """Return those of a block of the sensor, row by row; None: all of it."""
         block = block or (slice(None), slice(None))
@@ -134,11 +135,11 @@ class PixelPlaces:
         rows, columns = np.meshgrid(y, x, indexing="ij")
         return cls(rows.ravel(), columns.ravel(), shape, frames)
 
-    def of(self, pixels: NDArray[np.bool_] | NDArray[np.intp]) -> PixelPlaces:
+    def of(self, pixels: BoolArray | NDArray[np.intp]) -> PixelPlaces:
         """Return those of some of the pixels."""
         return replace(self, rows=self.rows[pixels], columns=self.columns[pixels])
 
-    def inside(self, effect: Effect) -> NDArray[np.bool_]:
+    def inside(self, effect: Effect) -> BoolArray:
         """Return which pixels an effect acts on, shape (n,)."""
         if effect.region is None:
             return np.ones(self.rows.size, np.bool_)

@@ -9,6 +9,8 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
+
 Dim = Literal["frame", "y", "x"]
 #: What the random numbers depend on that samples, or all samples of a row, column or frame, have.
 DIMS: Mapping[str, tuple[Dim, ...]] = {
@@ -32,15 +34,15 @@ class RandomSource(Protocol):
     several independent sets apart.
     """
 
-    def uniform(self, dims: tuple[Dim, ...], draw: int = 0) -> NDArray[np.float64]:
+    def uniform(self, dims: tuple[Dim, ...], draw: int = 0) -> FloatArray:
         """Return uniform numbers in (0, 1), with length 1 along the dimensions not in ``dims``."""
         ...
 
-    def normal(self, dims: tuple[Dim, ...], draw: int = 0) -> NDArray[np.float64]:
+    def normal(self, dims: tuple[Dim, ...], draw: int = 0) -> FloatArray:
         """Return standard normal numbers, with length 1 along the dimensions not in ``dims``."""
         ...
 
-    def poisson(self, mean: NDArray[np.float64], draw: int = 0) -> NDArray[np.int64]:
+    def poisson(self, mean: FloatArray, draw: int = 0) -> IntArray:
         """Return Poisson numbers of the given mean (frame, y, x), one per sample."""
         ...
 
@@ -77,13 +79,13 @@ class EffectContext:
         read_noise: the read noise R that was added, e-; ``None`` before ANALOG.
     """
 
-    frames: NDArray[np.int64]
+    frames: IntArray
     n_frames: int
-    rows: NDArray[np.int64]
+    rows: IntArray
     shape: tuple[int, int]
     integration_time: float
     bit_depth: int
-    truth: Mapping[str, NDArray[np.float64]]
+    truth: Mapping[str, FloatArray]
     random: RandomSource
     exposure: NDArray[Any] | None = None
     charge: NDArray[Any] | None = None

@@ -40,6 +40,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.region import Region, Span, When
@@ -139,7 +140,7 @@ class Replacement(NamedTuple):
     """
 
     value: NDArray[np.integer[Any]]
-    inside: NDArray[np.bool_]
+    inside: BoolArray
     excess: int
     share: float
 
@@ -320,7 +321,7 @@ class Effect(Section):
                 found.append(one.scaled(times ** (1.0 / cls.power)) if cls.strength else one)
         return found
 
-    def representative(self, frames: NDArray[np.int64]) -> tuple[Self, float]:
+    def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return the effect as one simulation shows it best, and by what to multiply what it then shows.
 
         For effects of rare events: by chance a simulated stack holds none of them, or too many.
@@ -417,7 +418,7 @@ class Effect(Section):
         return model
 
     def added_exposure(
-        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps
+        self, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps
     ) -> AddedExposure | None:
         """Return what it adds to the exposure of each pixel: H is then the exposure without.
 
@@ -440,7 +441,7 @@ class Effect(Section):
         """
         return None
 
-    def displaced(self) -> Mapping[Literal["rows", "columns"], NDArray[np.float64]]:
+    def displaced(self) -> Mapping[Literal["rows", "columns"], FloatArray]:
         """Return the shares of lines that hold the samples of other pixels, by :data:`~.evidence.PLACES`.
 
         Of these no pixel's own histogram has a law: the search fits it without lines that are likely such.
@@ -457,7 +458,7 @@ class Effect(Section):
         """
         return None
 
-    def added_scatter_e(self, exposure: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def added_scatter_e(self, exposure: FloatArray) -> FloatArray | None:
         """Return the scatter that it adds to electron numbers, e- rms, where that is its size.
 
         Args:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.model.law.parameters import PixelParameters
 
 #: Per-pixel efficient scores: products of Hermite (readout) and Charlier (charge) polynomials beyond the four
@@ -41,10 +42,10 @@ class PixelMaps(PixelParameters):
         usable: pixels with a fit that can be relied upon.
     """
 
-    usable: NDArray[np.bool_]
+    usable: BoolArray
 
     @classmethod
-    def known(cls, parameters: Iterable[ArrayLike], usable: NDArray[np.bool_]) -> PixelMaps:
+    def known(cls, parameters: Iterable[ArrayLike], usable: BoolArray) -> PixelMaps:
         """Return maps of (H, g, mu, sigma) in the shape of ``usable``, NaN where that is False."""
         exposure, gain, bias, sigma = (
             np.where(usable, np.asarray(each, np.float64).reshape(usable.shape), np.nan)
@@ -74,8 +75,8 @@ class CodeResiduals:
     """
 
     first: int
-    observed: NDArray[np.float64]
-    expected: NDArray[np.float64]
+    observed: FloatArray
+    expected: FloatArray
     minimum: int
     maximum: int
 
@@ -93,9 +94,9 @@ class PredictedSamples:
     """
 
     equal_z: float
-    thresholds: NDArray[np.int64]
-    above: NDArray[np.float64]
-    above_chance: NDArray[np.float64]
+    thresholds: IntArray
+    above: FloatArray
+    above_chance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -110,8 +111,8 @@ class PreviousBits:
         variance: of the samples, no unit.
     """
 
-    product: NDArray[np.float64]
-    square: NDArray[np.float64]
+    product: FloatArray
+    square: FloatArray
     variance: float
 
 
@@ -192,36 +193,36 @@ class TimeSeries:
         low_hits: the same below it.
     """
 
-    frames: NDArray[np.int64]
+    frames: IntArray
     n_run: int
     block_frames: int
-    block_start: NDArray[np.int64]
-    frame_charge: NDArray[np.float64]
-    frame_readout: NDArray[np.float64]
-    frame_gain: NDArray[np.float64]
-    quadrant_readout: NDArray[np.float64]
-    row_charge: NDArray[np.float32]
-    row_readout: NDArray[np.float32]
-    column_charge: NDArray[np.float32]
-    column_readout: NDArray[np.float32]
-    block_charge: NDArray[np.float32]
-    block_readout: NDArray[np.float32]
-    lag_charge: NDArray[np.float32]
-    lag_readout: NDArray[np.float32]
-    lag_readout_charge: NDArray[np.float32]
+    block_start: IntArray
+    frame_charge: FloatArray
+    frame_readout: FloatArray
+    frame_gain: FloatArray
+    quadrant_readout: FloatArray
+    row_charge: Float32Array
+    row_readout: Float32Array
+    column_charge: Float32Array
+    column_readout: Float32Array
+    block_charge: Float32Array
+    block_readout: Float32Array
+    lag_charge: Float32Array
+    lag_readout: Float32Array
+    lag_readout_charge: Float32Array
     n_pairs: int
     neighbours: Mapping[str, float]
-    repeated: NDArray[np.int64]
+    repeated: IntArray
     repeated_rows: int
-    hits: NDArray[np.int64]
-    neighbour_maps: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    frame_noise: NDArray[np.float64] | None = None
+    hits: IntArray
+    neighbour_maps: Mapping[str, Float32Array] = field(default_factory=dict)
+    frame_noise: FloatArray | None = None
     predicted: Mapping[str, PredictedSamples] = field(default_factory=dict)
     previous_bits: PreviousBits | None = None
     repeated_lines: Mapping[str, int] = field(default_factory=dict)
-    misplaced_lines: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    misplaced_lines: Mapping[str, FloatArray] = field(default_factory=dict)
     waves: tuple[Wave, ...] = ()
-    low_hits: NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 4), np.int64))
+    low_hits: IntArray = field(default_factory=lambda: np.empty((0, 4), np.int64))
 
 
 @dataclass(frozen=True)
@@ -253,19 +254,19 @@ class Evidence:
 
     maps: PixelMaps
     n_frames: int
-    charge_std: NDArray[np.float64]
-    readout_std: NDArray[np.float64]
-    scores: Mapping[str, NDArray[np.float32]]
-    goodness: NDArray[np.float32]
-    peaks: NDArray[np.float32]
+    charge_std: FloatArray
+    readout_std: FloatArray
+    scores: Mapping[str, Float32Array]
+    goodness: Float32Array
+    peaks: Float32Array
     tail_low: NDArray[np.uint32]
     tail_high: NDArray[np.uint32]
     code: CodeResiduals
     time: TimeSeries | None
     z: Mapping[str, float] = field(default_factory=dict)
-    covariance: NDArray[np.float64] | None = None
+    covariance: FloatArray | None = None
     ambiguous: float = 0.0
-    tail_expected: NDArray[np.float32] | None = None
+    tail_expected: Float32Array | None = None
 
     def strongest(self, *names: str) -> float:
         """Return the largest |z| among the named statistics (0 where these data give none of them)."""

@@ -11,6 +11,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, IntArray
+
 
 def neighbour_words(place: tuple[int, int, int]) -> str:
     """Return the place of a neighbour in words, for example ``the sample one column to the left``."""
@@ -27,7 +29,7 @@ def neighbour_words(place: tuple[int, int, int]) -> str:
     return f"the sample {' and '.join(parts)}"
 
 
-def neighbours(values: NDArray[Any], place: tuple[int, int, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+def neighbours(values: NDArray[Any], place: tuple[int, int, int]) -> tuple[NDArray[Any], BoolArray]:
     """Return the samples at a place beside those of frames (frame, y, x), and where there are any."""
     to, source = [], []
     for shift, size in zip(place, values.shape, strict=True):
@@ -38,7 +40,7 @@ def neighbours(values: NDArray[Any], place: tuple[int, int, int]) -> tuple[NDArr
     return found, known
 
 
-def along_axis(values: NDArray[Any], step: NDArray[np.int64], axis: int) -> NDArray[Any]:
+def along_axis(values: NDArray[Any], step: IntArray, axis: int) -> NDArray[Any]:
     """Return the values so many places later along an axis, those at the ends instead of what is beyond."""
     at = np.arange(values.shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
     index = np.clip(at + step, 0, values.shape[axis] - 1)

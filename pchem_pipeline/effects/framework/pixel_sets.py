@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.effects.framework.region import Region, Span, Taps, When
 
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 # a set of pixels longer than that is no place that anybody could read; it would not fit a YAML either
 _MOST_RUNS = 20_000

@@ -33,11 +33,11 @@ from pydantic import (
     model_validator,
 )
 
+from pchem_pipeline.base.arrays import BoolArray, IntArray
 from pchem_pipeline.base.settings import Section
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    pass
 
 Quadrant = Literal["top left", "top right", "bottom left", "bottom right"]
 
@@ -169,7 +169,7 @@ class Region(_Place):
         return self
 
     @classmethod
-    def of_mask(cls, mask: NDArray[np.bool_]) -> Region:
+    def of_mask(cls, mask: BoolArray) -> Region:
         """Return the region of a map of pixels, in its simplest form: ranges, else single pixels.
 
         Raises:
@@ -179,7 +179,7 @@ class Region(_Place):
 
         return cls.model_validate(simplest_region(mask))
 
-    def mask(self, shape: tuple[int, ...], rows: NDArray[np.int64] | None = None) -> NDArray[np.bool_]:
+    def mask(self, shape: tuple[int, ...], rows: IntArray | None = None) -> BoolArray:
         """Return which pixels of a sensor, or of a band of its rows, lie in the region, (y, x).
 
         Args:
@@ -263,13 +263,13 @@ class When(_Place):
             del found["phase"], found["length"]
         return found
 
-    def frames(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def frames(self, numbers: IntArray) -> BoolArray:
         """Return which of these frames are meant, shape of ``numbers``; those before the run never are."""
         from pchem_pipeline.effects.framework.pixel_sets import frames_of
 
         return frames_of(self, numbers)
 
-    def share(self, numbers: NDArray[np.int64]) -> float:
+    def share(self, numbers: IntArray) -> float:
         """Return the share of these frames that are meant."""
         return float(self.frames(numbers).mean()) if numbers.size else 0.0
 

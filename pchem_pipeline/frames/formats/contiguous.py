@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window, sound
@@ -40,7 +41,7 @@ class Layout:
         offset: what is added to signed samples, DN; sums must not be negative. None: they are unsigned.
     """
 
-    offsets: NDArray[np.int64]
+    offsets: IntArray
     rows: int
     columns: int
     stored: np.dtype[Any]
@@ -64,7 +65,7 @@ def unsigned_type(stored: np.dtype[Any]) -> np.dtype[Any]:
 
 def even_offsets(
     path: Path, n_frames: int, frame_bytes: int, size: int, *, start: int = 0, step: int | None = None
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Return the byte offset of each of the frames that lie evenly in a file.
 
     Args:
@@ -237,7 +238,7 @@ class ContiguousReader(FrameReader):
         raise NotImplementedError
 
 
-def _runs(offsets: NDArray[np.int64], frame_bytes: int) -> list[tuple[int, int]]:
+def _runs(offsets: IntArray, frame_bytes: int) -> list[tuple[int, int]]:
     """Return (first, count) of frames that follow each other without a gap; -1 bytes: each alone."""
     breaks = np.flatnonzero(np.diff(offsets) != frame_bytes) + 1
     edges = [0, *breaks.tolist(), len(offsets)]

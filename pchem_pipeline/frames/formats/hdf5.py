@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError, quoted
 from pchem_pipeline.frames.camera import FACT_NAMES, StatedFacts, facts_from_names, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
@@ -192,9 +193,7 @@ def _check_chunks(path: Path, dataset: Any) -> None:
     check_unpacked_size(path, pieces, 4 * size, codecs)
 
 
-def _plain_offsets(
-    path: Path, file: Any, dataset: Any, shape: tuple[int, int, int]
-) -> NDArray[np.int64] | None:
+def _plain_offsets(path: Path, file: Any, dataset: Any, shape: tuple[int, int, int]) -> IntArray | None:
     """Return the byte offset of each frame that lies plainly in the file, or None where they do not all."""
     from h5py import h5t
 
@@ -216,7 +215,7 @@ def _plain_offsets(
         starts[chunk.chunk_offset[0] // dataset.chunks[0]] = chunk.byte_offset
     frame = np.arange(n_frames, dtype=np.int64)
     number, inside = np.divmod(frame, dataset.chunks[0])
-    offsets: NDArray[np.int64] = starts[number] + frame_bytes * inside
+    offsets: IntArray = starts[number] + frame_bytes * inside
     return None if (starts < 0).any() else offsets
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.fits import write_image
 from pchem_pipeline.frames.registry import require
@@ -180,7 +181,7 @@ def write_fits_cube(path: Path, cube: Cube) -> None:
     write_image(path, cube.blocks, cube.shape, cube.dtype, cards)
 
 
-def read_image(path: Path) -> NDArray[np.float64]:
+def read_image(path: Path) -> FloatArray:
     """Return an image, or a stack of images, from npy, TIFF or FITS.
 
     Args:

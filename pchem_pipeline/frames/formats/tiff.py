@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.contiguous import (
     ContiguousReader,
@@ -214,7 +215,7 @@ def _words(page: Any) -> str:
     return f"{' x '.join(str(size) for size in page.shape)} {page.dtype.name}"
 
 
-def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) -> NDArray[np.int64] | None:
+def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) -> IntArray | None:
     """Return the offset of each frame if all are stored plainly, else None."""
     first = pages[0]
     dtype = np.dtype(first.dtype)

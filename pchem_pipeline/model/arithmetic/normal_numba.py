@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pchem_pipeline.base.kernel import kernel
-
-FloatArray = NDArray[np.float64]
 
 #: Standard deviations beyond which a tail is below all that double can hold.
 FARTHEST = 38.0

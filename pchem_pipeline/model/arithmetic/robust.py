@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.base.arrays import FloatArray
 
 #: Standard deviations of a normal law in a median absolute deviation.
 OF_MEDIAN_DEVIATION = 1.4826

@@ -27,9 +27,10 @@ from numba.core import cgutils, types
 from numba.core.typeconv import Conversion
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, overload, register_model
-from numpy.typing import NDArray
 
-Simd: TypeAlias = NDArray[np.float64]
+from pchem_pipeline.base.arrays import FloatArray
+
+Simd: TypeAlias = FloatArray
 Value: TypeAlias = Simd | float
 
 _WIDTH = 8  # doubles in the widest vector register
@@ -283,12 +284,12 @@ def spliced(n: int, x: Value, y: Value) -> Simd:
     return np.where(np.arange(SIMD_WIDTH) < n, x, y)
 
 
-def simd_load(table: NDArray[np.float64], row: int, column: int) -> Simd:
+def simd_load(table: FloatArray, row: int, column: int) -> Simd:
     """Return eight successive elements of a row of a table."""
     return table[row, column : column + SIMD_WIDTH].copy()
 
 
-def simd_store(table: NDArray[np.float64], row: int, column: int, x: Value) -> None:
+def simd_store(table: FloatArray, row: int, column: int, x: Value) -> None:
     """Write eight successive elements of a row of a table."""
     table[row, column : column + SIMD_WIDTH] = x
 

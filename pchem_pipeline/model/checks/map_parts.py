@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import bdtr, stdtr
 
-from pchem_pipeline.model.law.parameters import FloatArray
+from pchem_pipeline.base.arrays import FloatArray
 
 #: Chance of a false alarm for a map, all places that are looked at together.
 _ALARM = 1e-4

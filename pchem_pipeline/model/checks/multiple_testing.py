@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.arithmetic.robust import chi_square
 
 
-def false_discovery(probability: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+def false_discovery(probability: NDArray[np.floating[Any]]) -> FloatArray:
     """Return the false-discovery rate at which each of many tests would be called significant.
 
     The step-up procedure of Benjamini and Hochberg (1995): with the p-values in ascending order,
@@ -38,7 +39,7 @@ def false_discovery(probability: NDArray[np.floating[Any]]) -> NDArray[np.float6
     return found
 
 
-def misfit(chi2: NDArray[np.float64], dof: NDArray[np.float64]) -> NDArray[np.float64]:
+def misfit(chi2: FloatArray, dof: FloatArray) -> FloatArray:
     """Return chi-square as a standard normal deviate (Wilson and Hilferty 1931), large for a poor fit.
 
     Unlike a p-value it does not run out of digits.
@@ -54,7 +55,7 @@ def misfit(chi2: NDArray[np.float64], dof: NDArray[np.float64]) -> NDArray[np.fl
         return chi_square(chi2, np.where(dof > 0, dof, np.nan))
 
 
-def poorest(chi2: NDArray[np.float64], dof: NDArray[np.float64], n: int) -> list[tuple[int, int]]:
+def poorest(chi2: FloatArray, dof: FloatArray, n: int) -> list[tuple[int, int]]:
     """Return (y, x) of the n pixels of the poorest fit, the poorest first.
 
     Args:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from pchem_pipeline.model.law.parameters import FloatArray
+from pchem_pipeline.base.arrays import FloatArray
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, erfc
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.maps import summarise
 
 #: Standard errors beyond which a single pixel, or a statistic of all pixels, counts as changed.
@@ -115,20 +115,20 @@ class MapDifference:
     spread_z: float
     n_counted: int
     largest_z: float
-    changed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), np.bool_))
+    changed: BoolArray = field(default_factory=lambda: np.zeros((0, 0), np.bool_))
     n_changed: int = 0
     p_value: float = 1.0
 
 
 ValuesAndErrors = tuple[FloatArray, FloatArray]
-Places = NDArray[np.int64]
+Places = IntArray
 #: The p-values of :func:`common_fit_p` of pixels (y, x).
 CommonFit = Callable[[Places, Places], FloatArray]
 
 
 def compare_maps(
     maps: Iterable[tuple[str, ValuesAndErrors, ValuesAndErrors]],
-    good: NDArray[np.bool_],
+    good: BoolArray,
     *,
     same_data: bool,
     rate: float = 0.01,
@@ -216,7 +216,7 @@ def common_fit_p(
 
 
 def _difference(
-    one: ValuesAndErrors, other: ValuesAndErrors, good: NDArray[np.bool_], *, same_data: bool
+    one: ValuesAndErrors, other: ValuesAndErrors, good: BoolArray, *, same_data: bool
 ) -> MapDifference:
     difference = other[0] - one[0]
     with np.errstate(invalid="ignore", divide="ignore"):

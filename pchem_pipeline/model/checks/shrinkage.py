@@ -19,12 +19,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.model.arithmetic.robust import OF_MEDIAN_DEVIATION
 from pchem_pipeline.model.fit.settings import FitSettings
-
-FloatArray = NDArray[np.float64]
 
 #: Largest change of the logarithm of a pixel's information over one standard error of its read noise. Beyond,
 #: the likelihood is no parabola, and 'estimate -+ 2 standard errors' holds the truth in 90 % instead of 95 %.
@@ -77,11 +75,11 @@ class Judged:
         return cls(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(cls)))
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> BoolArray:
         """Which pixels have all three, shape (n,)."""
         return np.isfinite(self.noise) & np.isfinite(self.gap) & (self.noise > 0) & (self.stderr > 0)
 
-    def of(self, pixels: NDArray[np.bool_] | slice) -> Judged:
+    def of(self, pixels: BoolArray | slice) -> Judged:
         """Return some of the pixels."""
         return Judged(self.noise[pixels], self.stderr[pixels], self.gap[pixels])
 
@@ -121,11 +119,11 @@ class NoisePool:
         )
         return cls(noise, _Prior.of(*some.looseness()), _slope(some.of(near), noise.centre))
 
-    def weak(self, pixels: Judged, settings: FitSettings) -> NDArray[np.bool_]:
+    def weak(self, pixels: Judged, settings: FitSettings) -> BoolArray:
         """Tell which pixels are weakly identified for either of the :meth:`reasons`, shape (n,)."""
         return np.logical_or(*self.reasons(pixels, settings))
 
-    def reasons(self, pixels: Judged, settings: FitSettings) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def reasons(self, pixels: Judged, settings: FitSettings) -> tuple[BoolArray, BoolArray]:
         """Tell which pixels have rough errors or too much noise, and which too small a gap, shape (n,) each.
 
         False for those without a value.

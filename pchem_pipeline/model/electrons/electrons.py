@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
 from pchem_pipeline.model.electrons import electrons_numba
 from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR, CodeTables, PixelLaws, SampleNumbers
 from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
 from pchem_pipeline.model.law.mass import code_ranges
-from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of, usable_pixels
+from pchem_pipeline.model.law.parameters import Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-IntArray = NDArray[np.int64]
 
 #: Stored where a pixel has no parameters and so no electron number.
 NO_NUMBER = 65535
@@ -94,8 +93,8 @@ class Numbers:
     """
 
     number: NDArray[np.unsignedinteger[Any]]
-    probability: NDArray[np.float32]
-    expected: NDArray[np.float32]
+    probability: Float32Array
+    expected: Float32Array
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,7 @@ class NumberTables:
     number: NDArray[np.unsignedinteger[Any]]
     mass: FloatArray
     right: FloatArray
-    expected: NDArray[np.float32]
+    expected: Float32Array
 
     @property
     def missing(self) -> int:

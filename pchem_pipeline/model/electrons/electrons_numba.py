@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE, SMALLEST_MASS
 from pchem_pipeline.model.law.cells_numba import Law, cells_of
@@ -20,9 +21,6 @@ from pchem_pipeline.model.law.levels_numba import (
 )
 from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
 from pchem_pipeline.model.law.pixel_numba import OWN
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Exposure that stands for a prior in which all electron numbers are alike.
 NO_PRIOR = -1.0
@@ -59,15 +57,15 @@ class CodeTables(NamedTuple):
     number: NDArray[Any]
     mass: FloatArray
     right: FloatArray
-    expected: NDArray[np.float32]
+    expected: Float32Array
 
 
 class SampleNumbers(NamedTuple):
     """What samples say of the electron number, shape (frame, n) each; the last two may be empty."""
 
     number: NDArray[Any]
-    probability: NDArray[np.float32]
-    expected: NDArray[np.float32]
+    probability: Float32Array
+    expected: Float32Array
 
 
 @kernel

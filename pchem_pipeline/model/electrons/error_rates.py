@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaln, ndtr, xlogy
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
-from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _AT_ONCE = 4096  # pixels

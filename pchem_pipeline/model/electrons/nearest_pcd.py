@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of
+from pchem_pipeline.model.law.parameters import Parameters, columns_of
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.ensemble.ensemble import poisson_sums
-from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+from pchem_pipeline.model.law.parameters import UsablePixels
 
 #: Expected number of samples of k electrons, in one frame of all pixels, below which their tails decide.
 _FEW_ELECTRONS = 1e-12

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.checks.residuals import (
     central_window,
     chi_square,
@@ -30,7 +31,7 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
 )
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleTotals
-from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+from pchem_pipeline.model.law.parameters import UsablePixels
 
 #: Components are shown up to the electron number whose mass is above this.
 _SMALLEST_COMPONENT = 1e-4

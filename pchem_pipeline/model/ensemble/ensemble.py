@@ -15,15 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
 from pchem_pipeline.model.ensemble import ensemble_numba
 from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.mass import parts_of_similar_width, sample_mass, sample_slopes
-from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE
 from pchem_pipeline.model.arithmetic.normal_numba import REACH
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, IntArray, NucedAxis, electron_pmf, weighted_mass
-from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, electron_pmf, weighted_mass
+from pchem_pipeline.model.law.parameters import UsablePixels
 
 #: Cells for each pixel up to which a table of all of them is faster than sorting.
 _MOST_CELLS = 4
@@ -76,7 +77,7 @@ def joint_cells(columns: Sequence[FloatArray], choice: HistogramChoice) -> Cells
     Returns:
         At most n cells.
     """
-    index: NDArray[np.int64] = np.zeros(columns[0].size, dtype=np.int64)
+    index: IntArray = np.zeros(columns[0].size, dtype=np.int64)
     edges = [_edges(column, choice) for column in columns]
     for column, edge in zip(columns, edges, strict=True):
         place = np.searchsorted(edge, column, side="right")

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.errors.fisher import covariance_from
-from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+from pchem_pipeline.model.law.parameters import UsablePixels
 
 #: Pixels of ordinary errors that are taken of a sensor. The variances that they add scatter by 1.4 times the
 #: mean: 16,384 give the standard error of a curve to 0.6 % of itself (4 % at its ends, where few add much).
@@ -39,16 +40,14 @@ class PixelErrors:
 
     stderr: FloatArray
     correlation: FloatArray
-    place: NDArray[np.int64]
+    place: IntArray
     share: float = 1.0
 
-    def of(self, pixels: NDArray[np.bool_]) -> PixelErrors:
+    def of(self, pixels: BoolArray) -> PixelErrors:
         """Return those of some pixels."""
         return PixelErrors(self.stderr[pixels], self.correlation[pixels], self.place[pixels], self.share)
 
-    def sampled(
-        self, pixels: UsablePixels, samples: NDArray[np.integer]
-    ) -> tuple[NDArray[np.bool_], FloatArray]:
+    def sampled(self, pixels: UsablePixels, samples: NDArray[np.integer]) -> tuple[BoolArray, FloatArray]:
         """Take some pixels.
 
         Args:

@@ -7,9 +7,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.ensemble.components import EnsembleMoments, moment_errors, predicted_moments
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
-from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+from pchem_pipeline.model.law.parameters import UsablePixels
 
 #: Name, quantity and unit of each row; effects stand in that of an extended model only.
 _MOMENTS = (

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis
-from pchem_pipeline.model.law.parameters import FloatArray
 
 #: Sizes of error of the electron numbers told apart; the last one is: and more.
 ERROR_SIZES = 8
@@ -88,7 +87,7 @@ class EnsembleTotals:
     """
 
     axes: EnsembleAxes
-    integers: NDArray[np.int64]
+    integers: IntArray
     floats: FloatArray
     samples: tuple[int, int]
 
@@ -96,7 +95,7 @@ class EnsembleTotals:
         """Return a tally that is one number."""
         return int(self.integers[self.axes.integers[name]][0])
 
-    def counts(self, name: str) -> NDArray[np.int64]:
+    def counts(self, name: str) -> IntArray:
         """Return a tally along an axis."""
         return self.integers[self.axes.integers[name]]
 

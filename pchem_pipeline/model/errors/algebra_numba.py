@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.law.pixel_numba import (
     DAMPING,
@@ -29,8 +29,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     Scratch,
 )
 
-FloatArray = NDArray[np.float64]
-
 # of the diagonal element: what must be left of it after the other parameters are taken out; a comb that
 # fits whole numbers, whose bias and gain can make up for each other, has less
 _SINGULAR = 1e-6
@@ -39,7 +37,7 @@ _SMALLEST = 1e-10  # of the damping matrix: less is lost in rounding
 
 @kernel(borrows=True)
 def cholesky(
-    matrix: FloatArray, start: int, end: int, least: float, held: NDArray[np.bool_], lower: FloatArray
+    matrix: FloatArray, start: int, end: int, least: float, held: BoolArray, lower: FloatArray
 ) -> bool:
     """Factor the rows start ... end - 1 of a matrix; False unless positive definite.
 
@@ -212,7 +210,7 @@ def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray
 
 
 @kernel(inline=True)
-def invert_arrow(at: FloatArray, theta: FloatArray, held: NDArray[np.bool_], covariance: FloatArray) -> bool:
+def invert_arrow(at: FloatArray, theta: FloatArray, held: BoolArray, covariance: FloatArray) -> bool:
     """Fill the inverse of the observed information of (H_1 ... H_J, 1/g, mu, v, q).
 
     In H itself, ``-d2 L / dH2 = (I + s) / H^2`` with information I and score s in log H: it stays finite
@@ -315,8 +313,8 @@ def enclose(at: FloatArray, theta: FloatArray, covariance: FloatArray) -> None:
 @kernel(inline=True)
 def to_natural(
     theta: FloatArray,
-    dark: NDArray[np.bool_],
-    held: NDArray[np.bool_],
+    dark: BoolArray,
+    held: BoolArray,
     rounding: float,
     full: FloatArray,
     parameters: FloatArray,

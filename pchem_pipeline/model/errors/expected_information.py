@@ -16,8 +16,9 @@ Schur complement of its H.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.mass import sample_slopes
 from pchem_pipeline.model.law.pcd import pcd_posterior
@@ -34,7 +35,7 @@ _LEAST_EXPOSURE = 1e-12  # below it a sample holds no electrons
 
 def expected_information(
     quanta_exposure: float, read_noise_e: float, conversion_gain: float = 0.0
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Return the expected Fisher information of one frame in :data:`COORDINATES`.
 
     Args:
@@ -73,7 +74,7 @@ def _range(quanta_exposure: float, noise_e: float) -> tuple[float, float]:
     return max(0.0, np.floor(quanta_exposure - width)) - reach, quanta_exposure + width + reach
 
 
-def _of_cells(quanta_exposure: float, read_noise_e: float, gain: float) -> NDArray[np.float64]:
+def _of_cells(quanta_exposure: float, read_noise_e: float, gain: float) -> FloatArray:
     """Return the information of one rounded frame for each of some places of the bias between two DN.
 
     Args:
@@ -101,7 +102,7 @@ def _of_cells(quanta_exposure: float, read_noise_e: float, gain: float) -> NDArr
 
 def shared_information(
     quanta_exposure: float, read_noise_e: float, conversion_gain: float = 0.0
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Return what one frame of a sample, its exposure unknown, tells of the other :data:`COORDINATES`.
 
     A sample without electrons (H = 0, bias frames) is one Gaussian: it tells bias and read noise, not the
@@ -126,7 +127,7 @@ def shared_information(
     return np.asarray(full[1:, 1:] - np.outer(full[0, 1:], full[0, 1:]) / full[0, 0])
 
 
-def inverse_information(information: ArrayLike) -> NDArray[np.float64]:
+def inverse_information(information: ArrayLike) -> FloatArray:
     """Return the smallest covariance, the inverse of an information matrix; NaN where it is singular.
 
     Args:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.law.mass import parts_of_similar_width, sample_mass
-from pchem_pipeline.model.law.parameters import FloatArray, Parameters, columns_of
+from pchem_pipeline.model.law.parameters import Parameters, columns_of
 from pchem_pipeline.model.law.pcd import pcd_posterior
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
@@ -49,7 +49,7 @@ def expected_scores(parameters: Parameters) -> tuple[FloatArray, FloatArray]:
     return mean, information
 
 
-def correlations(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def correlations(covariance: FloatArray) -> FloatArray:
     """Return the six correlations of (H, g, mu, sigma), see :data:`CORRELATION_PAIRS`.
 
     With the four standard errors they are the covariance, each number once.
@@ -67,7 +67,7 @@ def correlations(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(pairs, axis=-1)
 
 
-def covariance_from(stderr: NDArray[np.float64], correlation: NDArray[np.float64]) -> NDArray[np.float64]:
+def covariance_from(stderr: FloatArray, correlation: FloatArray) -> FloatArray:
     """Put the covariance of (H, g, mu, sigma) together again; the opposite of :func:`correlations`.
 
     Args:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import LEAST_EXPONENT
 from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
@@ -27,7 +27,7 @@ from pchem_pipeline.model.law.pixel_numba import (
 
 
 @kernel(inline=True)
-def fill_squared_scores(pixel: Pixel, theta: NDArray[np.float64], at: NDArray[np.float64]) -> None:
+def fill_squared_scores(pixel: Pixel, theta: FloatArray, at: FloatArray) -> None:
     """Fill the sums of outer products of the samples' scores, the middle of the sandwich, of the density.
 
     Args:
@@ -60,12 +60,12 @@ def fill_squared_scores(pixel: Pixel, theta: NDArray[np.float64], at: NDArray[np
 
 @kernel
 def grouped_trace(
-    first: NDArray[np.int64],
-    last: NDArray[np.int64],
-    frames: NDArray[np.float64],
-    parameters: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    out: NDArray[np.float64],
+    first: IntArray,
+    last: IntArray,
+    frames: FloatArray,
+    parameters: FloatArray,
+    covariance: FloatArray,
+    out: FloatArray,
 ) -> None:
     """Fill how many of the fitted parameters the groups of the chi-square test determine.
 
@@ -116,7 +116,7 @@ def grouped_trace(
 
 
 @kernel
-def _form(vector: NDArray[np.float64], matrix: NDArray[np.float64]) -> float:
+def _form(vector: FloatArray, matrix: FloatArray) -> float:
     """Return ``vector' matrix vector`` over the entries of the matrix that are known."""
     found = 0.0
     for i in range(4):

@@ -12,12 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.expected_information import inverse_information
 from pchem_pipeline.model.errors.fisher import expected_scores
 from pchem_pipeline.model.law.parameters import columns_of
-
-FloatArray = NDArray[np.float64]
 
 #: Standard errors by which rounding may bias the density's estimates before it is said (or mended).
 LARGEST_BIAS = 0.05
@@ -51,13 +50,13 @@ def rounding_bias(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic
     return out
 
 
-def rounding_may_matter(variance: FloatArray, n_frames: NDArray[np.generic]) -> NDArray[np.bool_]:
+def rounding_may_matter(variance: FloatArray, n_frames: NDArray[np.generic]) -> BoolArray:
     """Tell where peaks, or whole histograms, of these variances (DN^2) are not so wide that they are safe."""
     with np.errstate(invalid="ignore", over="ignore"):
         return np.asarray(np.sqrt(np.asarray(n_frames, np.float64)) > _SAFE * variance**2)
 
 
-def biased_by_rounding(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic]) -> NDArray[np.bool_]:
+def biased_by_rounding(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic]) -> BoolArray:
     """Tell in which pixels rounding biases the density's estimates by more than :data:`LARGEST_BIAS`.
 
     Args:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.units import FEW_STEP
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.errors import information_numba
@@ -29,7 +30,6 @@ from pchem_pipeline.model.law.inputs import kernel_counts, pack
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-FloatArray = NDArray[np.float64]
 Counts = NDArray[np.integer]
 
 WARM_UP = (
@@ -457,7 +457,7 @@ class _Batch:
             found[:, :, j] = np.where(seen.any(axis=1), self.given.origin[:, j] + ends, np.nan)
         return found[0], found[1]
 
-    def _at_limits(self, laws: Sequence[SampleLaw]) -> NDArray[np.bool_]:
+    def _at_limits(self, laws: Sequence[SampleLaw]) -> BoolArray:
         """Tell in which pixels codes pile up at a limit of the law."""
         (low, high), found = self._extremes, np.zeros(self.n, np.bool_)
         for j, each in enumerate(laws):
@@ -466,7 +466,7 @@ class _Batch:
             found |= high[:, j] >= (np.nan if each.clip_high is None else each.clip_high)
         return found
 
-    def _coarse(self, plain: FitResult) -> NDArray[np.bool_]:
+    def _coarse(self, plain: FitResult) -> BoolArray:
         """Tell in which pixels rounding biases the density's estimates, of any sample, or may deny them."""
         columns, words = plain.columns, plain.fit_status
         found = (words & int(FitStatus.COARSE_STEPS | FitStatus.NOT_CONVERGED)) != 0
@@ -483,7 +483,7 @@ class _Batch:
             found |= denied & rounding_may_matter(variance[:, j], frames)
         return np.asarray(found)
 
-    def _aliased(self, plain: FitResult) -> NDArray[np.bool_]:
+    def _aliased(self, plain: FitResult) -> BoolArray:
         """Tell in which pixels the comb of frequency ``1 - g`` may be the right one.
 
         Between 1.2 and 6 DN per electron there is such a comb. With the same variance V its skewness is at
@@ -553,7 +553,7 @@ class _Batch:
     def _freedom(
         self,
         pixels: NDArray[np.intp],
-        words: NDArray[np.int64],
+        words: IntArray,
         frames: FloatArray,
         parameters: FloatArray,
         covariance: FloatArray,
@@ -576,7 +576,7 @@ class _Batch:
             freedom[few] += 4.0 - np.clip(np.nan_to_num(known, nan=4.0), 0.0, 4.0)
         return freedom
 
-    def _reaches_adc(self, beyond: int = 0) -> NDArray[np.bool_]:
+    def _reaches_adc(self, beyond: int = 0) -> BoolArray:
         """Tell which pixels have samples at the limits of the ADC or ``beyond``, those left out included."""
         assert self.adc_limits is not None
         low, high = self._extremes

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
@@ -79,8 +79,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     Pixel,
     copy,
 )
-
-FloatArray = NDArray[np.float64]
 
 _LEAST_VARIANCE = 0.01  # DN^2, of the analog read noise at a start
 _LEAST_SHARE = (

@@ -13,8 +13,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.algebra_numba import solve_arrow
@@ -46,8 +46,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     copy,
     copy_evaluation,
 )
-
-FloatArray = NDArray[np.float64]
 
 # outcomes
 CONVERGED = 0
@@ -200,9 +198,7 @@ def same_place(left: FloatArray, right: FloatArray, cells: bool) -> bool:
 
 
 @kernel(borrows=True)
-def find_held(
-    theta: FloatArray, at: FloatArray, fixed: NDArray[np.bool_], limits: Limits, held: NDArray[np.bool_]
-) -> None:
+def find_held(theta: FloatArray, at: FloatArray, fixed: BoolArray, limits: Limits, held: BoolArray) -> None:
     """Tell which parameters stay: those fixed, and at a bound that the likelihood pushes against."""
     n = at.shape[0]
     noise = satellite = 0.0
@@ -329,9 +325,7 @@ def tie_noise(theta: FloatArray, at: FloatArray, rounding: float) -> None:
 
 
 @kernel(inline=True)
-def _tie_of(
-    theta: FloatArray, goal: Goal, flags: NDArray[np.bool_], limits: Limits, rounding: float
-) -> float:
+def _tie_of(theta: FloatArray, goal: Goal, flags: BoolArray, limits: Limits, rounding: float) -> float:
     """Return the variance of rounding with which sigma moves with 1/g; negative where it does not."""
     noise = theta.size - N_BLOCK + 1 + LOG_VARIANCE
     if flags[HELD, noise] and not flags[FIXED, noise]:  # at its floor, which moves with 1/g

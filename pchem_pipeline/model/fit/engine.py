@@ -7,8 +7,8 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import callback, types_of
 from pchem_pipeline.model.fit import (
     cells_search_numba,
@@ -76,6 +76,6 @@ def cells_search() -> Any:
 
 
 @functools.cache
-def regression_basis() -> NDArray[np.float64]:
+def regression_basis() -> FloatArray:
     """Return the basis of the regression on the characteristic function."""
     return starts_numba.regression_basis()

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
+
 #: Limits on a pixel's comb, e-; None: no limit.
 Interval = tuple[float | None, float | None]
 
@@ -18,7 +19,7 @@ def electrons_of(origin: NDArray[np.integer], width: int, gain: FloatArray, bias
     return np.asarray((codes - bias[:, None]) * gain[:, None])
 
 
-def inside(intervals: Sequence[Interval], electrons: FloatArray) -> NDArray[np.bool_]:
+def inside(intervals: Sequence[Interval], electrons: FloatArray) -> BoolArray:
     """Tell which places on the comb lie in one of the intervals."""
     found = np.zeros(electrons.shape, np.bool_)
     for low, high in intervals:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.fit import guard_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
@@ -24,8 +25,6 @@ from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Pixels = NDArray[np.intp]
 
 _MOST_PASSES = 8
@@ -33,7 +32,7 @@ _MOST_PASSES = 8
 _EXPECTED, _ENDS, _CORE, _N_ATTEMPTS = range(4)
 
 
-def far_samples(given: Histograms) -> tuple[NDArray[np.int64], BoolArray]:
+def far_samples(given: Histograms) -> tuple[IntArray, BoolArray]:
     """Return ends of the bins that no gap cuts off, (n, J, 2), and which pixels have samples beyond, (n,)."""
     n = given.counts.shape[0]
     ends, far = np.empty((n, given.dark.size, 2), np.int64), np.empty(n, np.bool_)
@@ -163,13 +162,13 @@ class _Guard:
     expect: Callable[[Pixels, FloatArray], FloatArray]
     given: Histograms
     limits: Limits
-    ends: NDArray[np.int64]
+    ends: IntArray
     answers: Answers
     whole: Answers
-    gone: NDArray[np.float64]
-    attempt: NDArray[np.int64]
-    passes: NDArray[np.int64]
-    place: NDArray[np.int64]
+    gone: FloatArray
+    attempt: IntArray
+    passes: IntArray
+    place: IntArray
 
     def keep(self, pixels: Pixels) -> None:
         """Keep the answers of pixels of which all samples were fitted."""
@@ -189,12 +188,12 @@ class _Guard:
             if some.size:
                 self.fit(some, quickly)
 
-    def _cut(self, pixels: Pixels) -> NDArray[np.bool_]:
+    def _cut(self, pixels: Pixels) -> BoolArray:
         """Tell which pixels have just had their ends, or what a gap cuts off, left out."""
         cut = (self.attempt[pixels] == _ENDS) | (self.attempt[pixels] == _CORE)
         return np.asarray(cut & (self.passes[pixels] == 0))
 
-    def suspicious(self, pixels: Pixels) -> NDArray[np.bool_]:
+    def suspicious(self, pixels: Pixels) -> BoolArray:
         """Tell which fits may have been led by outliers: by single samples or as a whole."""
         out = self.answers.out[pixels]
         fitted = np.isfinite(self.answers.parameters[pixels]).all(axis=1) & np.isfinite(out[:, OUTLYING])
@@ -202,7 +201,7 @@ class _Guard:
         misfit = (_scores(self.answers)[pixels] > BEYOND_DOUBT) & (not self.limits.cells)
         return np.asarray(fitted & ((out[:, OUTLYING] > 0) | misfit))
 
-    def begin(self, pixels: Pixels, far: NDArray[np.bool_]) -> Pixels:
+    def begin(self, pixels: Pixels, far: BoolArray) -> Pixels:
         """Leave out what the next attempt says, or the first that leaves out few enough; return pixels."""
         begun = [pixels[:0]]
         while pixels.size:
@@ -246,7 +245,7 @@ class _Guard:
         self.gone[pixels], changed = leave_out(self.given, pixels, outside)
         return changed
 
-    def check(self, pixels: Pixels, far: NDArray[np.bool_]) -> tuple[Pixels, Pixels]:
+    def check(self, pixels: Pixels, far: BoolArray) -> tuple[Pixels, Pixels]:
         """Settle the fits that stand; return those that another pass may settle, and those that none will."""
         answers, last = self.answers, self.attempt[pixels] == _N_ATTEMPTS
         lost = pixels[last & far[pixels] & self.suspicious(pixels)]
@@ -265,12 +264,12 @@ class _Guard:
         more = (self.passes[pixels] < _MOST_PASSES) & self._few(pixels)
         return pixels[more], np.concatenate([stuck, pixels[~more]])
 
-    def _few(self, pixels: Pixels) -> NDArray[np.bool_]:
+    def _few(self, pixels: Pixels) -> BoolArray:
         total = self.given.counts[pixels].sum(axis=1, dtype=np.float64)
         return np.asarray(self.gone[pixels] <= self.limits.most_outliers * total)
 
 
-def _scores(answers: Answers) -> NDArray[np.float64]:
+def _scores(answers: Answers) -> FloatArray:
     """Return the goodness of fit of all pixels as standard normal deviates; 0 without freedom."""
     freedom = np.maximum(answers.words[:, FREEDOM], 1)
     spread = 2.0 / (9.0 * freedom)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pchem_pipeline.base.arrays import BoolArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.tile_numba import Histograms
 
@@ -14,7 +12,7 @@ _FEW_DN = 4.0
 
 
 @kernel
-def find_cores(given: Histograms, ends: NDArray[np.int64], far: NDArray[np.bool_]) -> None:
+def find_cores(given: Histograms, ends: IntArray, far: BoolArray) -> None:
     """Find the bins that no gap cuts off from the core of a histogram, which holds 96 % of the frames.
 
     The model has no say here: far samples would otherwise lead the search for its parameters astray, where

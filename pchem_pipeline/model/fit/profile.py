@@ -8,14 +8,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit import engine, profile_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.tile_numba import Histograms
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.pixel_numba import BIAS, LOG_VARIANCE, SATELLITE, STEP
-
-FloatArray = NDArray[np.float64]
 
 #: Standard errors between the biases that are looked at, and how many there are at most on either side; a
 #: normal law summed in steps of 1.25 has a variance right to 1e-4.
@@ -95,7 +94,7 @@ class Profile:
         pixels: NDArray[np.intp],
         theta: FloatArray,
         place: NDArray[np.intp] | int | None = None,
-        tied: NDArray[np.bool_] | bool = False,
+        tied: BoolArray | bool = False,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Climb from theta, one parameter fixed; see :func:`.profile_numba.climb_tile`."""
         m, size = theta.shape
@@ -127,7 +126,7 @@ class Profile:
         return along
 
     def _moved(
-        self, theta: FloatArray, direction: FloatArray, distance: FloatArray, tied: NDArray[np.bool_]
+        self, theta: FloatArray, direction: FloatArray, distance: FloatArray, tied: BoolArray
     ) -> FloatArray:
         """Return theta and so many directions; tied: log (sigma g)^2 stands in the place of v."""
         place, step = self._n + LOG_VARIANCE, self._n + STEP

@@ -6,8 +6,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow
 from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, Limits, keep_inside
@@ -15,20 +15,18 @@ from pchem_pipeline.model.fit.tile_numba import Histograms, load_pixel, make_roo
 from pchem_pipeline.model.law.cells_numba import Law, resolve
 from pchem_pipeline.model.law.pixel_numba import AT, BIAS, FIXED, HELD, HERE, OTHER, STEP, copy, make_scratch
 
-FloatArray = NDArray[np.float64]
-
 
 @kernel
 def climb_tile(
     given: Histograms,
-    chosen: NDArray[np.int64],
+    chosen: IntArray,
     law: Law,
     limits: Limits,
     evaluate: Any,
     climb: Any,
     amplitudes: FloatArray,
-    fixed: NDArray[np.bool_],
-    tied: NDArray[np.bool_],
+    fixed: BoolArray,
+    tied: BoolArray,
     theta: FloatArray,
     loglik: FloatArray,
     covariance: FloatArray,

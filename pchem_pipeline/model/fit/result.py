@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.fit.status import describe
-from pchem_pipeline.model.law.parameters import FloatArray, PixelParameters
+from pchem_pipeline.model.law.parameters import PixelParameters
 
 #: What has an interval, in the order of the axis ``quantity``.
 INTERVAL_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")

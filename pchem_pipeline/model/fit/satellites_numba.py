@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, find_held, newton_step, sensible
 from pchem_pipeline.model.fit.search_numba import CLEAR_GAP, Tools, climb_neighbours, climb_on, next_start
@@ -42,8 +42,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     copy,
     histogram_of,
 )
-
-FloatArray = NDArray[np.float64]
 
 _SCREEN = 0.2  # of the rise asked of free satellites, seen from the fit without them
 #: steps of the other starts in units of that of a Poisson law without noise, third cumulant over variance

@@ -6,8 +6,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.base.variables import PARAMETERS
@@ -60,8 +60,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     Scratch,
     copy,
 )
-
-FloatArray = NDArray[np.float64]
 
 NO_DATA, TOO_FEW_BINS = int(FitStatus.NO_DATA), int(FitStatus.TOO_FEW_BINS)
 FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED = int(FitStatus.NOT_CONVERGED), int(FitStatus.GAIN_NOT_IDENTIFIED)
@@ -368,9 +366,7 @@ def expected_gap(n: float, theta: FloatArray) -> float:
 
 
 @kernel(borrows=True)
-def pearson(
-    weights: NDArray[np.float64], expectations: NDArray[np.float64], n_bins: int, n: float
-) -> tuple[float, int]:
+def pearson(weights: FloatArray, expectations: FloatArray, n_bins: int, n: float) -> tuple[float, int]:
     """Compare counts with what is expected of each DN, adjacent DN merged until 5 are expected.
 
     What is expected outside the window belongs to the last group, so that the expectations sum to ``n``.

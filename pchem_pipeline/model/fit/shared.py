@@ -20,11 +20,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.mass import LEAST_SEEN, sample_mass, sample_slopes, score_and_information
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-FloatArray = NDArray[np.float64]
 #: From the shared parameters (d,) and the pixels' (H, g, mu, sigma), shape (n, 4), to their law.
 Law = Callable[[FloatArray, FloatArray], SampleLaw]
 
@@ -56,7 +56,7 @@ class Samples:
         """Number of samples of a pixel, J."""
         return len(self.dark)
 
-    def illuminated(self, n_rows: int) -> NDArray[np.bool_]:
+    def illuminated(self, n_rows: int) -> BoolArray:
         """Tell which rows are of samples with electrons, shape (n_rows,)."""
         return np.asarray(np.tile(~np.array(self.dark), n_rows // self.n))
 
@@ -137,8 +137,8 @@ class SharedProblem:
     """
 
     counts: NDArray[np.integer]
-    origin: NDArray[np.int64]
-    kept: NDArray[np.bool_]
+    origin: IntArray
+    kept: BoolArray
     law: Law
     bounds: FloatArray
     scale: FloatArray
@@ -340,7 +340,7 @@ class Slopes:
     common: FloatArray
     score: FloatArray
     shared_score: FloatArray
-    free: NDArray[np.bool_]
+    free: BoolArray
 
     def step(self, damping: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the steps of own and shared parameters, and the rise promised in each pixel, nats."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.fit import engine, tile_numba
 from pchem_pipeline.model.law.inputs import kernel_counts, pack
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -13,7 +14,7 @@ _CENTRAL_LOBE = 0.6  # 1/sd: the central lobe of any sample has fallen by then
 _PADDING = 8  # frequencies for each bin
 
 
-def starting_points(counts: NDArray[np.integer], origin: NDArray[np.integer]) -> NDArray[np.float64]:
+def starting_points(counts: NDArray[np.integer], origin: NDArray[np.integer]) -> FloatArray:
     """Compute the starting points of every pixel.
 
     The empirical characteristic function of a PCD, ``phi(f) = mean exp(2 pi i f x)``, has
@@ -44,7 +45,7 @@ def starting_points(counts: NDArray[np.integer], origin: NDArray[np.integer]) ->
     return out
 
 
-def _highest_lobe(counts: NDArray[np.float64], origin: NDArray[np.integer]) -> NDArray[np.float64]:
+def _highest_lobe(counts: FloatArray, origin: NDArray[np.integer]) -> FloatArray:
     """Compute (H, g, mu, sigma) from the highest side lobe of the characteristic function."""
     shares = counts / counts.sum(axis=1, keepdims=True)
     bins = np.arange(counts.shape[1])

@@ -15,8 +15,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, counting, fused, simd_load, simd_store
@@ -80,7 +80,7 @@ _LINE_SCALES = (1.0, 0.85, 1.18, 0.7, 1.4)  # of the slope of the line
 _SMALLEST_EXPOSURE = 0.02
 
 
-def regression_basis() -> NDArray[np.float64]:
+def regression_basis() -> FloatArray:
     """Return ``1 - cos(2 pi f a)`` for every frequency f (rows) and every trial step a (columns)."""
     frequency = FREQUENCY_STEP * np.arange(1, N_FREQUENCIES + 1)
     satellite = LOBE_FIRST + LOBE_STEP * np.arange(N_LOBES)
@@ -88,7 +88,7 @@ def regression_basis() -> NDArray[np.float64]:
 
 
 @kernel(borrows=True)
-def _clenshaw(histogram: Histogram, first: int, end: int, work: NDArray[np.float64]) -> None:
+def _clenshaw(histogram: Histogram, first: int, end: int, work: FloatArray) -> None:
     """Leave b_0 and b_1 of Clenshaw's recurrence in ``work[2:4]``, from 2 cos(angle) in ``work[1]``.
 
     ``b_i = c_i + 2 cos(angle) b_{i+1} - b_{i+2}``, two DN at a time and all frequencies side by side; then
@@ -117,7 +117,7 @@ def _clenshaw(histogram: Histogram, first: int, end: int, work: NDArray[np.float
 
 
 @kernel(borrows=True)
-def ecf_power(histogram: Histogram, step: float, n_frequencies: int, work: NDArray[np.float64]) -> None:
+def ecf_power(histogram: Histogram, step: float, n_frequencies: int, work: FloatArray) -> None:
     """Leave the squared modulus of the ECF at ``step * (1 ... n)`` in ``work[0]``."""
     base = 2.0 * math.cos(math.tau * step)
     before, present = 2.0, base
@@ -160,10 +160,10 @@ def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
 
 @kernel(inline=True)
 def _regress(
-    basis: NDArray[np.float64],
-    power: NDArray[np.float64],
+    basis: FloatArray,
+    power: FloatArray,
     floor: float,
-    sums: NDArray[np.float64],
+    sums: FloatArray,
 ) -> tuple[float, float]:
     """Return (satellite frequency in 1/sd, H) of the best weighted regression over all trial steps.
 
@@ -229,7 +229,7 @@ def assemble(
     histogram: Histogram,
     a: float,
     exposure: float,
-    theta: NDArray[np.float64],
+    theta: FloatArray,
 ) -> tuple[bool, bool]:
     """Turn a step and a rough H into a start: noise from the satellite's height, bias from its phase.
 
@@ -248,7 +248,7 @@ def _on_lobe(
     a: float,
     exposure: float,
     lobe: tuple[float, float],
-    theta: NDArray[np.float64],
+    theta: FloatArray,
 ) -> bool:
     """Fill a start from modulus (unnormalised) and phase of the ECF at 1/a; tell whether it stands clear."""
     _, _, _, _, n, mean, variance = histogram
@@ -282,9 +282,9 @@ def _on_lobe(
 @kernel(borrows=True)
 def start_regression(
     histogram: Histogram,
-    basis: NDArray[np.float64],
-    work: NDArray[np.float64],
-    theta: NDArray[np.float64],
+    basis: FloatArray,
+    work: FloatArray,
+    theta: FloatArray,
 ) -> tuple[bool, bool]:
     """Start from the regression on log|phi|; ``work`` has seven rows.
 
@@ -382,7 +382,7 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
 
 
 @kernel(inline=True)
-def no_starts(heights: NDArray[np.float64]) -> None:
+def no_starts(heights: FloatArray) -> None:
     """Forget all starts."""
     for i in range(N_KEPT):
         heights[i] = -math.inf
@@ -390,7 +390,7 @@ def no_starts(heights: NDArray[np.float64]) -> None:
 
 @kernel(borrows=True)
 def _keep_rescaled(
-    pixel: Pixel, evaluate: Any, cells: bool, best: NDArray[np.float64], factor: float, scratch: Scratch
+    pixel: Pixel, evaluate: Any, cells: bool, best: FloatArray, factor: float, scratch: Scratch
 ) -> int:
     """Put a maximum among the starts with a longer step and the same means, bias and read noise in DN."""
     n, trial = pixel.facts.shape[0], scratch.small[HERE]
@@ -404,7 +404,7 @@ def _keep_rescaled(
 
 
 @kernel(borrows=True)
-def alias_of_step(pixel: Pixel, evaluate: Any, best: NDArray[np.float64], scratch: Scratch) -> int:
+def alias_of_step(pixel: Pixel, evaluate: Any, best: FloatArray, scratch: Scratch) -> int:
     """Put the comb of frequency ``1 - 1/a``, which whole numbers show at 1/a, among the starts.
 
     Returns:
@@ -430,7 +430,7 @@ def combs_of_step(pixel: Pixel, evaluate: Any, a: float, scratch: Scratch) -> in
 
 
 @kernel(inline=True)
-def _holds_one(histogram: Histogram, theta: NDArray[np.float64]) -> bool:
+def _holds_one(histogram: Histogram, theta: FloatArray) -> bool:
     """Tell whether the peak of one electron is there: a comb of half the step has nothing where this has it.
 
     Within a fourth of a step of it are more than 0.4 of its ``N H exp(-H)`` samples, the tail of the bias
@@ -448,7 +448,7 @@ def _holds_one(histogram: Histogram, theta: NDArray[np.float64]) -> bool:
 
 @kernel(borrows=True)
 def longer_steps(
-    pixel: Pixel, evaluate: Any, poor: bool, best: NDArray[np.float64], least: float, scratch: Scratch
+    pixel: Pixel, evaluate: Any, poor: bool, best: FloatArray, least: float, scratch: Scratch
 ) -> int:
     """Put combs of longer steps than a maximum's among the starts; return the evaluations.
 
@@ -480,9 +480,7 @@ def longer_steps(
 
 
 @kernel(borrows=True)
-def fill_theta(
-    pixel: Pixel, a: float, bias: float, noise2: float, cells: bool, theta: NDArray[np.float64]
-) -> bool:
+def fill_theta(pixel: Pixel, a: float, bias: float, noise2: float, cells: bool, theta: FloatArray) -> bool:
     """Fill ``theta`` for a step, a bias and a read noise: exposures from the means.
 
     Args:
@@ -553,7 +551,7 @@ def _line_start(
     pixel: Pixel,
     line: tuple[float, float, float],
     cells: bool,
-    theta: NDArray[np.float64],
+    theta: FloatArray,
 ) -> bool:
     """Fill ``theta`` with a start on the line of variance against mean, at a read noise in e-."""
     slope, x0, y0 = line
@@ -574,7 +572,7 @@ def _line_start(
 
 @kernel(inline=True)
 def _regression_start(
-    j: int, pixel: Pixel, basis: NDArray[np.float64], scratch: Scratch, theta: NDArray[np.float64]
+    j: int, pixel: Pixel, basis: FloatArray, scratch: Scratch, theta: FloatArray
 ) -> tuple[bool, bool]:
     """Fill ``theta`` with the start from the regression of sample j.
 
@@ -628,7 +626,7 @@ def fill_starts(
     attempt: int,
     quick: bool,
     pixel: Pixel,
-    basis: NDArray[np.float64],
+    basis: FloatArray,
     evaluate: Any,
     scratch: Scratch,
 ) -> tuple[bool, int]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from enum import IntFlag
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.variables import CHARGE_RATES
 
 
@@ -69,7 +69,7 @@ def flags_of(name: str) -> FitStatus:
     return FLAGGED if name in COUNTS_ELECTRONS else FLAGGED & ~of_bias
 
 
-def with_rivals_named(words: NDArray[np.int64], *, dark: bool, several: bool = False) -> NDArray[np.int64]:
+def with_rivals_named(words: IntArray, *, dark: bool, several: bool = False) -> IntArray:
     """Return status words that say of ambiguous pixels whether their rival differs in bias, gain or both.
 
     The search says so of one sample. Where bias frames hold the bias, the rival differs in gain alone.
@@ -86,7 +86,7 @@ def with_rivals_named(words: NDArray[np.int64], *, dark: bool, several: bool = F
     return np.where(ambiguous, named, words)
 
 
-def moves_gain(exposure: NDArray[np.float64], noise: NDArray[np.float64]) -> NDArray[np.bool_]:
+def moves_gain(exposure: FloatArray, noise: FloatArray) -> BoolArray:
     """Tell where a bias that is an electron off has a gain of its own, too, off by more than 3 %.
 
     With one electron more or less, mean and variance of the sample ask for a gain changed by ``1 / (2 H)``;

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.algebra_numba import enclose, invert_arrow, to_natural
@@ -60,8 +61,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     make_scratch,
 )
 
-FloatArray = NDArray[np.float64]
-
 # columns of `words`
 STATUS, EVALUATIONS, FREEDOM, LOWEST_DN, HIGHEST_DN, FRAMES = range(6)
 N_WORDS = 6
@@ -79,9 +78,9 @@ class Histograms(NamedTuple):
     """
 
     counts: NDArray[np.integer]
-    places: NDArray[np.int64]
-    origin: NDArray[np.int64]
-    dark: NDArray[np.bool_]
+    places: IntArray
+    origin: IntArray
+    dark: BoolArray
     mask: NDArray[np.uint8]
 
 
@@ -99,7 +98,7 @@ class Starts(NamedTuple):
     parameters: FloatArray
     gaps: FloatArray
     amplitudes: FloatArray
-    looked: NDArray[np.bool_]
+    looked: BoolArray
 
 
 class Answers(NamedTuple):
@@ -117,7 +116,7 @@ class Answers(NamedTuple):
     covariance: FloatArray
     moments: FloatArray
     out: FloatArray
-    words: NDArray[np.int64]
+    words: IntArray
 
 
 @kernel
@@ -136,7 +135,7 @@ def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
 
 
 @kernel(inline=True)
-def describe(pixel: Pixel, moments: FloatArray, words: NDArray[np.int64]) -> tuple[float, float]:
+def describe(pixel: Pixel, moments: FloatArray, words: IntArray) -> tuple[float, float]:
     """Fill moments, frames and extreme codes; return the fewest frames and the most occupied bins."""
     lowest, highest, n, least, occupied = 2**62, -(2**62), 0.0, math.inf, 0.0
     for j in range(pixel.facts.shape[0]):
@@ -259,7 +258,7 @@ def start_tile(given: Histograms, law: Law, basis: FloatArray, parameters: Float
 @kernel
 def fit_tile(
     given: Histograms,
-    chosen: NDArray[np.int64],
+    chosen: IntArray,
     law: Law,
     starts: Starts,
     limits: Limits,

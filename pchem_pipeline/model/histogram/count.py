@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.model.histogram.count_numba import (
     count_frames,
@@ -147,7 +148,7 @@ def most_bins(max_bins: int, dtype: np.dtype[Any]) -> int:
     return min(max_bins, 1 << (8 * dtype.itemsize))
 
 
-def pixels_by_range(frames: _Frames, max_bins: int) -> NDArray[np.int64]:
+def pixels_by_range(frames: _Frames, max_bins: int) -> IntArray:
     """Return how many pixels have which range of DN in the first frames of a stack, glitches left out.
 
     Of each pixel the most extreme samples are left out, the more the more frames there are. The sum over all
@@ -168,7 +169,7 @@ def pixels_by_range(frames: _Frames, max_bins: int) -> NDArray[np.int64]:
     return np.bincount(np.clip(widths, 1, max_bins + 1).ravel(), minlength=max_bins + 2)
 
 
-def choose_bins(pixels: NDArray[np.int64], max_bins: int) -> int:
+def choose_bins(pixels: IntArray, max_bins: int) -> int:
     """Return the number of bins that suits a sensor: the typical pixels, and the hot ones within reason.
 
     A pixel of range r in the first frames needs ``2 r + 16`` bins: of the range of some hundred frames, its

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.histogram.odd_frames import FAR, FEWEST_FRAMES
 from pchem_pipeline.model.histogram.spectrum import MOST_SAMPLES
 
-_FloatArray = NDArray[np.float64]
+_FloatArray = FloatArray
 
 #: Standard deviations beyond which a difference or a deviation of a single pixel does not count any more.
 _CLIP = 3.0

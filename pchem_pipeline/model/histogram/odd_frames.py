@@ -6,13 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 KINDS = ("empty", "copied", "far", "moved_x", "moved_y")
 #: Frames whose level, or spread, is farther than this many robust standard deviations from those around them
@@ -28,7 +25,7 @@ FAR_CHANCE = (2 + 2 * _PARTS) * 2.0 * float(special.ndtr(-FAR))
 def odd_frames(
     level: FloatArray,
     variance: FloatArray,
-    digest: NDArray[np.int64],
+    digest: IntArray,
     pixels: int,
     *,
     scores: FloatArray | None = None,
@@ -65,7 +62,7 @@ def odd_frames(
     return found | {kind: np.flatnonzero(frames) for kind, frames in some.items()}
 
 
-def _far(level: FloatArray, least: float) -> tuple[NDArray[np.bool_], float]:
+def _far(level: FloatArray, least: float) -> tuple[BoolArray, float]:
     """Return which frames are far from those around them, and how much frames scatter at least."""
     away, size = levels_apart(level), _around(level)
     # around a frame the levels spread by a drift, too, which the median at an end of the run does not follow
@@ -83,7 +80,7 @@ def _around(level: FloatArray) -> int:
     return min(_AROUND, max(level.size // 2, 1))
 
 
-def frame_scores(row_sum: NDArray[np.int64], row_sum_square: NDArray[np.int64], columns: int) -> FloatArray:
+def frame_scores(row_sum: IntArray, row_sum_square: IntArray, columns: int) -> FloatArray:
     """Compute normal scores of the levels and spreads of frames, of all rows and of parts of a frame.
 
     The level and the variance of a row are ranked among the frames (van der Waerden 1952). Of independent

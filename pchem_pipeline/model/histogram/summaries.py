@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.histogram.count_numba import update_range
 from pchem_pipeline.model.histogram.summaries_numba import add_products, sum_lines
 
@@ -34,8 +35,8 @@ class LineSums:
         column_sum: DN, sums over `ROW_GROUP` rows, (frame, row_group, x).
     """
 
-    row_sum: NDArray[np.int64]
-    row_sum_square: NDArray[np.int64]
+    row_sum: IntArray
+    row_sum_square: IntArray
     column_sum: NDArray[np.int32]
 
 
@@ -48,8 +49,8 @@ class BlockSums:
         block_sum_square: DN^2, (y, x).
     """
 
-    block_sum: NDArray[np.int64]
-    block_sum_square: NDArray[np.int64]
+    block_sum: IntArray
+    block_sum_square: IntArray
 
 
 @dataclass(frozen=True)
@@ -62,9 +63,9 @@ class CovarianceMaps:
         neighbour_covariance_y: with the pixel at y + 1, (y, x); NaN in the last row of each group.
     """
 
-    lag1_covariance: NDArray[np.float64]
-    neighbour_covariance_x: NDArray[np.float64]
-    neighbour_covariance_y: NDArray[np.float64]
+    lag1_covariance: FloatArray
+    neighbour_covariance_x: FloatArray
+    neighbour_covariance_y: FloatArray
 
 
 @dataclass(frozen=True)
@@ -77,8 +78,8 @@ class OpenSums:
         covariances: sums over the closed blocks: lag 1, x + 1, y + 1; DN^2, (3, y, x).
     """
 
-    sums: NDArray[np.int64]
-    covariances: NDArray[np.float64]
+    sums: IntArray
+    covariances: FloatArray
 
 
 def line_sums(frames: _Frames) -> LineSums:
@@ -95,14 +96,14 @@ def line_sums(frames: _Frames) -> LineSums:
     return LineSums(row_sum, row_sum_square, column_sum)
 
 
-def block_starts(n_frames: int, block_frames: int) -> NDArray[np.int64]:
+def block_starts(n_frames: int, block_frames: int) -> IntArray:
     """Return the first frame of each time block; the last block may be shorter than ``block_frames``."""
     return np.arange(0, n_frames, block_frames, dtype=np.int64)
 
 
 def frame_statistics(
-    row_sum: NDArray[np.int64], row_sum_square: NDArray[np.int64], columns: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    row_sum: IntArray, row_sum_square: IntArray, columns: int
+) -> tuple[FloatArray, FloatArray]:
     """Return mean and variance over the pixels of each frame, from its sums along rows.
 
     Args:
@@ -183,7 +184,7 @@ class SummaryAccumulator:
         down[-1] = np.nan
         return done, CovarianceMaps(lag, right, down)
 
-    def exchange(self, pieces: Iterable[_Frames], kept: NDArray[np.bool_]) -> BlockSums:
+    def exchange(self, pieces: Iterable[_Frames], kept: BoolArray) -> BlockSums:
         """Leave frames of a closed block out of the covariances; return the block's sums without them.
 
         Args:
@@ -215,13 +216,13 @@ class SummaryAccumulator:
         self._before[:] = frames[-1]
         self._in_block += frames.shape[0]
 
-    def _is_narrow(self, frames: _Frames) -> NDArray[np.bool_]:
+    def _is_narrow(self, frames: _Frames) -> BoolArray:
         """Tell for each row whether sums of products over the frames fit into 32 bits, (y,)."""
         low, high = self._before.astype(frames.dtype), self._before.astype(frames.dtype)
         update_range(frames, low, high)
         reach = np.maximum(high - self._reference, self._reference - low).max(axis=1).astype(np.float64)
         largest = np.maximum(reach, np.append(reach[1:], 0))
-        narrow: NDArray[np.bool_] = frames.shape[0] * reach * largest < np.iinfo(np.int32).max
+        narrow: BoolArray = frames.shape[0] * reach * largest < np.iinfo(np.int32).max
         return narrow
 
     def _close_block(self) -> BlockSums:

@@ -10,13 +10,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.normal_numba import normal_mass
-
-FloatArray = NDArray[np.float64]
 
 #: (Hermite, Charlier) orders: 1, the four directions of the PCD's parameters, then the tests.
 COLUMNS = (

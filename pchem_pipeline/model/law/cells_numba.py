@@ -16,8 +16,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST
@@ -123,14 +123,14 @@ class Law(NamedTuple):
         pattern: shift, in units of the amplitude, and weight of free satellites, shape (enough, 2).
     """
 
-    numbers: NDArray[np.float64]
-    own: NDArray[np.float64]
-    peaks: NDArray[np.float64]
-    n_peaks: NDArray[np.int64]
-    exposures: NDArray[np.float64]
-    added: NDArray[np.float64]
-    edge_shift: NDArray[np.float64]
-    pattern: NDArray[np.float64]
+    numbers: FloatArray
+    own: FloatArray
+    peaks: FloatArray
+    n_peaks: IntArray
+    exposures: FloatArray
+    added: FloatArray
+    edge_shift: FloatArray
+    pattern: FloatArray
 
 
 class Cells(NamedTuple):
@@ -156,7 +156,7 @@ class Cells(NamedTuple):
         outlier_share, outlier_mass: of samples that can be anything, and in each code.
     """
 
-    bins: NDArray[np.float64]
+    bins: FloatArray
     n_bins: int
     bottom: int
     top: int
@@ -164,9 +164,9 @@ class Cells(NamedTuple):
     first: float
     frames: float
     conditional: bool
-    peaks: NDArray[np.float64]
+    peaks: FloatArray
     n_peaks: int
-    mixtures: NDArray[np.float64]
+    mixtures: FloatArray
     count_law: int
     dispersion: float
     level_scale: float
@@ -202,7 +202,7 @@ class Component(NamedTuple):
 
 
 @kernel(inline=True)
-def _row(values: NDArray[np.float64], index: int) -> int:
+def _row(values: FloatArray, index: int) -> int:
     """Return the row of a pixel in an array with one row for all, or one for each."""
     return index if values.shape[1] > 1 else 0
 
@@ -313,7 +313,7 @@ def _level(k: float, cells: Cells) -> float:
 
 
 @kernel(borrows=True)
-def component(k: float, peak: int, theta: NDArray[np.float64], cells: Cells, reach: float) -> Component:
+def component(k: float, peak: int, theta: FloatArray, cells: Cells, reach: float) -> Component:
     """Return one electron number at one level; ``low >= high`` where it gives nothing to the cells."""
     a, analog2 = theta[_STEP], math.exp(theta[_VARIANCE])
     peaks = cells.peaks
@@ -337,9 +337,7 @@ def component(k: float, peak: int, theta: NDArray[np.float64], cells: Cells, rea
 
 
 @kernel(inline=True)
-def _list_numbers(
-    theta: NDArray[np.float64], cells: Cells, reach: float, cut: float, numbers: NDArray[np.float64]
-) -> int:
+def _list_numbers(theta: FloatArray, cells: Cells, reach: float, cut: float, numbers: FloatArray) -> int:
     """Fill the electron numbers that reach the cells, with their probabilities; return how many."""
     a, analog2, exposure = theta[_STEP], math.exp(theta[_VARIANCE]), math.exp(theta[_EXPOSURE])
     widest = farthest = 0.0
@@ -388,7 +386,7 @@ def _place_for(part: Component, place: int) -> tuple[int, int]:
 
 
 @kernel(borrows=True)
-def _fill_edges(bins: NDArray[np.float64], part: Component, edges: NDArray[np.float64], place: int) -> None:
+def _fill_edges(bins: FloatArray, part: Component, edges: FloatArray, place: int) -> None:
     """Fill tail, density and z times density at the edges within reach from column ``place`` on."""
     mean, inverse = part.mean, 1.0 / part.sd
     behind = place
@@ -415,15 +413,15 @@ def cell_of(mean: float, cells: Cells, low: int, high: int) -> int:
 
 @kernel(inline=True)
 def _add_component(
-    row: NDArray[np.float64],
+    row: FloatArray,
     peak: int,
     satellite: float,
     cells: Cells,
     part: Component,
-    edges: NDArray[np.float64],
+    edges: FloatArray,
     place: int,
     what: int,
-    room: NDArray[np.float64],
+    room: FloatArray,
 ) -> None:
     """Add what an electron number gives at one level to mass and slopes of the cells within reach."""
     share_slope = cells.peaks[SHARE_SLOPE, peak]
@@ -460,13 +458,13 @@ def _add_component(
 
 @kernel(borrows=True)
 def fill_masses(
-    theta: NDArray[np.float64],
+    theta: FloatArray,
     cells: Cells,
     stage: int,
     what: int,
-    numbers: NDArray[np.float64],
-    edges: NDArray[np.float64],
-    room: NDArray[np.float64],
+    numbers: FloatArray,
+    edges: FloatArray,
+    room: FloatArray,
 ) -> int:
     """Fill mass and slopes of all cells; return how many electron numbers there are.
 
@@ -504,12 +502,12 @@ def fill_masses(
 
 @kernel(borrows=True)
 def fill_far_enough(
-    theta: NDArray[np.float64],
+    theta: FloatArray,
     cells: Cells,
     what: int,
-    numbers: NDArray[np.float64],
-    edges: NDArray[np.float64],
-    room: NDArray[np.float64],
+    numbers: FloatArray,
+    edges: FloatArray,
+    room: FloatArray,
 ) -> tuple[int, float]:
     """Fill mass and slopes of the cells, exact also where an occupied one lies far out.
 
@@ -529,7 +527,7 @@ def fill_far_enough(
 
 
 @kernel(inline=True)
-def _log_mass(cells: Cells, room: NDArray[np.float64]) -> float:
+def _log_mass(cells: Cells, room: FloatArray) -> float:
     """Return the log-likelihood of the masses in the room."""
     total, inside = counting() * 0.0, 1.0
     for i in range(0, cells.n_bins, SIMD_WIDTH):
@@ -543,9 +541,7 @@ def _log_mass(cells: Cells, room: NDArray[np.float64]) -> float:
 
 
 @kernel(inline=True)
-def _sum_up(
-    cells: Cells, room: NDArray[np.float64], change: NDArray[np.float64], out: NDArray[np.float64]
-) -> float:
+def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
     """Return the log-likelihood of the masses in the room; fill score, squared scores and ratios.
 
     Given that a sample is in a code that is not set aside, its score is less by that of their whole mass.
@@ -587,9 +583,7 @@ def _sum_up(
 
 
 @kernel(inline=True)
-def _condition(
-    cells: Cells, room: NDArray[np.float64], change: NDArray[np.float64], out: NDArray[np.float64]
-) -> float:
+def _condition(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
     """Take off what all kept codes together give; return the change of the log-likelihood.
 
     With their mass M the log-likelihood is less by ``n log M``; the squared scores are about their mean,
@@ -624,7 +618,7 @@ def _condition(
 
 @kernel(inline=True)
 def _hermite_sums(
-    cells: Cells, part: Component, room: NDArray[np.float64], edges: NDArray[np.float64], place: int
+    cells: Cells, part: Component, room: FloatArray, edges: FloatArray, place: int
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over cells of ratio times the difference of Phi, phi, z phi, He2 phi, He3 phi."""
     mean, inverse = part.mean, 1.0 / part.sd
@@ -650,13 +644,13 @@ def _hermite_sums(
 
 @kernel(inline=True)
 def _subtract_curvature(
-    theta: NDArray[np.float64],
+    theta: FloatArray,
     cells: Cells,
     reach: float,
-    numbers: NDArray[np.float64],
-    edges: NDArray[np.float64],
-    room: NDArray[np.float64],
-    out: NDArray[np.float64],
+    numbers: FloatArray,
+    edges: FloatArray,
+    room: FloatArray,
+    out: FloatArray,
 ) -> None:
     """Take the second derivatives of the masses, times counts over mass, off the information."""
     information = out[INFORMATION:DAMPING]
@@ -699,7 +693,7 @@ def _subtract_curvature(
 
 
 @kernel(borrows=True)
-def own_theta(pixel: Pixel, j: int, theta: NDArray[np.float64], own: NDArray[np.float64]) -> None:
+def own_theta(pixel: Pixel, j: int, theta: FloatArray, own: FloatArray) -> None:
     """Fill a sample's own parameters from those of its pixel."""
     n = pixel.facts.shape[0]
     own[_EXPOSURE] = theta[j] if pixel.facts[j, DARK] == 0.0 else _NO_ELECTRONS
@@ -710,7 +704,7 @@ def own_theta(pixel: Pixel, j: int, theta: NDArray[np.float64], own: NDArray[np.
 
 
 @kernel(inline=True)
-def _expect(pixel: Pixel, j: int, cells: Cells, room: NDArray[np.float64]) -> None:
+def _expect(pixel: Pixel, j: int, cells: Cells, room: FloatArray) -> None:
     """Fill the counts expected of the codes that are not set aside."""
     inside = 1.0
     if cells.conditional:
@@ -721,9 +715,7 @@ def _expect(pixel: Pixel, j: int, cells: Cells, room: NDArray[np.float64]) -> No
         pixel.bins[j, EXPECTED, i] = cells.frames * cells.bins[KEPT, i] * room[MASS, i] / inside
 
 
-def evaluate_cells(
-    pixel: Pixel, theta: NDArray[np.float64], what: int, scratch: Scratch, out: NDArray[np.float64]
-) -> float:
+def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch, out: FloatArray) -> float:
     """Evaluate log-likelihood, score, squared scores and observed information of all samples of a pixel.
 
     Args:

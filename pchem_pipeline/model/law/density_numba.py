@@ -20,9 +20,7 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import LEAST_EXPONENT
 from pchem_pipeline.model.arithmetic.simd_math_numba import simd_exp, simd_log
@@ -71,8 +69,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     Pixel,
     Scratch,
 )
-
-FloatArray = NDArray[np.float64]
 
 # nats below the nearest component at which a component is left out: exp(-22) = 3e-10 moves estimates by some
 # 1e-7 standard errors; and of the log-likelihood alone

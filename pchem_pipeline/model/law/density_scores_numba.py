@@ -10,13 +10,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE
 from pchem_pipeline.model.law.density_numba import LOG_2PI
-
-FloatArray = NDArray[np.float64]
 
 #: Places of the posterior means of k, k^2, e, k e and e^2.
 K, KK, E, KE, EE = range(5)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -16,8 +17,8 @@ class DrawnHistograms(NamedTuple):
     """Counts (n, B), DN of bin 0 (n,), and the true (H, g, mu, sigma), shape (n, 4)."""
 
     counts: NDArray[np.uint32]
-    origin: NDArray[np.int64]
-    truth: NDArray[np.float64]
+    origin: IntArray
+    truth: FloatArray
 
 
 def draw_histograms(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE
 
@@ -110,7 +108,7 @@ def electron_number(
     dispersion: float,
     k: int,
     exposure: float,
-    mixtures: NDArray[np.float64],
+    mixtures: FloatArray,
 ) -> tuple[float, float, float]:
     """Return P(k) of a mixture of exposures and its first two derivatives in log exposure.
 

@@ -8,12 +8,11 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.law import electron_laws_numba
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.parameters import Parameters
 from pchem_pipeline.model.law.sample_law import CountLaw, SampleLaw
-
-FloatArray = NDArray[np.float64]
 
 _LAWS: dict[CountLaw, int] = {
     "poisson": electron_laws_numba.POISSON,

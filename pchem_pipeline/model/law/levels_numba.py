@@ -12,8 +12,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST, REACH, normal_mass, reach_of
@@ -33,9 +33,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     SHARE_SLOPE,
     Pixel,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _TOP_REACH = 12.0
 _SEEN = 7.5  # standard deviations within which samples are seen

@@ -7,14 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.model.law import mass_numba
 from pchem_pipeline.model.law.cells_numba import CORE, EXACT, NEAR
 from pchem_pipeline.model.law.inputs import pack, satellites_of
 from pchem_pipeline.model.law.parameters import Parameters, columns_of, usable_pixels
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-FloatArray = NDArray[np.float64]
 
 #: Mass of an occupied code, at least.
 LEAST_SEEN = 1e-60
@@ -27,7 +26,7 @@ _LEAST_TOLD = 1e-15
 
 def code_ranges(
     model: SampleLaw, maps: Parameters, satellites: tuple[ArrayLike, ArrayLike] | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[IntArray, IntArray]:
     """Return the first and last code that pixels show, DN, shape (n,); 0 and -1 without usable parameters.
 
     Args:
@@ -45,7 +44,7 @@ def code_ranges(
 
 def parts_of_similar_width(
     model: SampleLaw, maps: Parameters, limits: tuple[int, int] | None = None
-) -> Iterator[tuple[NDArray[np.intp], NDArray[np.int64], int]]:
+) -> Iterator[tuple[NDArray[np.intp], IntArray, int]]:
     """Give pixels in parts whose codes take little memory: those with as many codes come together.
 
     Args:

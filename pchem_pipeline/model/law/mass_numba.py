@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
@@ -31,9 +31,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     make_pixel,
     make_scratch,
 )
-
-FloatArray = NDArray[np.float64]
-
 
 _MOST_EXPOSURE = 1e6  # e-: each electron number costs, and cumulants may ask for 1e13 of them
 
@@ -67,7 +64,7 @@ def known_theta(parameters: FloatArray, centre: int, weight: float, theta: Float
 
 
 @kernel
-def find_reach(parameters: FloatArray, satellites: FloatArray, law: Law, out: NDArray[np.int64]) -> None:
+def find_reach(parameters: FloatArray, satellites: FloatArray, law: Law, out: IntArray) -> None:
     """Fill the first and last code that each pixel shows, DN, shape (n, 2); (0, -1) without parameters."""
     pixel, scratch = pixel_scratch(2, law)
     theta = scratch.small[OWN]
@@ -80,7 +77,7 @@ def find_reach(parameters: FloatArray, satellites: FloatArray, law: Law, out: ND
 
 @kernel
 def mass_tile(
-    first: NDArray[np.int64],
+    first: IntArray,
     parameters: FloatArray,
     satellites: FloatArray,
     law: Law,

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 
 
 def usable_pixels(
     quanta_exposure: FloatArray, conversion_gain: FloatArray, bias: FloatArray, read_noise_dn: FloatArray
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Tell which pixels have parameters that define a density (Hendrickson et al. 2023, eq. X_density).
 
     Args:
@@ -92,12 +92,12 @@ class UsablePixels(PixelParameters):
         """Return the number of pixels."""
         return int(self.quanta_exposure.size)
 
-    def of(self, pixels: NDArray[np.bool_] | NDArray[np.intp]) -> UsablePixels:
+    def of(self, pixels: BoolArray | NDArray[np.intp]) -> UsablePixels:
         """Return some of them."""
         return UsablePixels(*(column[pixels] for column in self.maps))
 
     @classmethod
-    def from_maps(cls, maps: Sequence[NDArray[np.floating]]) -> tuple[UsablePixels, NDArray[np.bool_]]:
+    def from_maps(cls, maps: Sequence[NDArray[np.floating]]) -> tuple[UsablePixels, BoolArray]:
         """Select the usable pixels of four maps.
 
         Args:

@@ -12,9 +12,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-_Array = NDArray[np.float64]
+from pchem_pipeline.base.arrays import FloatArray
+
+_Array = FloatArray
 
 
 class PosteriorMeans(NamedTuple):

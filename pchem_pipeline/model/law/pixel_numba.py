@@ -16,10 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH
-
-FloatArray = NDArray[np.float64]
 
 #: Shared parameters 1/g, mu - centre, v, q: their number, and their places after the last exposure.
 N_SHARED = 4
@@ -136,10 +135,10 @@ class Pixel(NamedTuple):
         longest_step: 1/g beyond which there is one Gaussian, DN.
     """
 
-    bins: NDArray[np.float64]
-    facts: NDArray[np.float64]
-    peaks: NDArray[np.float64]
-    mixtures: NDArray[np.float64]
+    bins: FloatArray
+    facts: FloatArray
+    peaks: FloatArray
+    mixtures: FloatArray
     centre: int
     longest_step: float
 
@@ -164,11 +163,11 @@ class Scratch(NamedTuple):
     coefficients: FloatArray
     log_factorials: FloatArray
     numbers: FloatArray
-    cells: NDArray[np.float64]
-    edges: NDArray[np.float64]
+    cells: FloatArray
+    edges: FloatArray
     small: FloatArray
-    flags: NDArray[np.bool_]
-    evaluations: NDArray[np.float64]
+    flags: BoolArray
+    evaluations: FloatArray
 
 
 @kernel
@@ -199,7 +198,7 @@ def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
 
 
 @kernel
-def make_pixel(dark: NDArray[np.bool_], n_bins: int, n_peaks: int, n_exposures: int) -> Pixel:
+def make_pixel(dark: BoolArray, n_bins: int, n_peaks: int, n_exposures: int) -> Pixel:
     """Return room for the histograms of a pixel.
 
     Args:

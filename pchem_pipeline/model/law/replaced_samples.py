@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class ReplacedSamples:
         # no sample lies beyond the codes
         return cls(stays, comes, np.minimum(excess, n_codes))
 
-    def of(self, pixels: NDArray[np.intp] | NDArray[np.bool_] | slice) -> ReplacedSamples:
+    def of(self, pixels: NDArray[np.intp] | BoolArray | slice) -> ReplacedSamples:
         """Return it for some of the pixels."""
         return ReplacedSamples(self.stays[pixels], self.comes[pixels], self.excess[pixels])
 

@@ -16,7 +16,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
+
 CountLaw = Literal["poisson", "negative_binomial", "borel", "trapped", "lost"]
 #: A number of all pixels, or one of each, shape (n,).
 Number = float | FloatArray
@@ -102,7 +103,7 @@ class SampleLaw:
     outlier_share: Number = 0.0
     outlier_codes: Number = 65536
     free_satellites: tuple[float, ...] = ()
-    may_have_satellites: NDArray[np.bool_] = field(default_factory=lambda: np.ones(1, np.bool_))
+    may_have_satellites: BoolArray = field(default_factory=lambda: np.ones(1, np.bool_))
     free_satellite_pattern: tuple[tuple[float, float], ...] = ((-1.0, 0.5), (1.0, 0.5))
     free_satellite_alarm: float = 1e-4
 
@@ -120,7 +121,7 @@ class SampleLaw:
         mine, plain = _values(self), _values(SampleLaw())
         return all(np.array_equal(mine[name], plain[name]) for name in plain)
 
-    def of(self, pixels: NDArray[np.intp] | NDArray[np.bool_] | slice) -> SampleLaw:
+    def of(self, pixels: NDArray[np.intp] | BoolArray | slice) -> SampleLaw:
         """Return the law of some of the pixels (an index, a mask or a slice along n)."""
         rows = {name: getattr(self, name) for name in (*_PER_PIXEL, *self._differing())}
         return replace(self, **{name: row[pixels] for name, row in rows.items() if row.shape[0] != 1})

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import gammaln
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.model.law import telegraph_numba
-
-FloatArray = NDArray[np.float64]
 
 # rise of the log-likelihood, nats, that the first and the second process must bring; pixels of constant
 # exposure reach the first by chance in about one of 340
@@ -61,7 +60,7 @@ class Telegraph:
 class _Series:
     """The samples of a pixel, and their law given the exposure."""
 
-    def __init__(self, samples: NDArray[np.integer], frames: NDArray[np.int64], pixel: FloatArray) -> None:
+    def __init__(self, samples: NDArray[np.integer], frames: IntArray, pixel: FloatArray) -> None:
         exposure, gain, bias, sigma = (float(v) for v in pixel)
         codes, place = np.unique(samples, return_inverse=True)
         self.samples = np.ascontiguousarray(place, np.int64)
@@ -139,9 +138,7 @@ def transitions(
     return start, moves
 
 
-def find_telegraph(
-    samples: NDArray[np.integer], frames: NDArray[np.int64], pixel: FloatArray
-) -> Telegraph | None:
+def find_telegraph(samples: NDArray[np.integer], frames: IntArray, pixel: FloatArray) -> Telegraph | None:
     """Return how a pixel's exposure blinks, or None where a constant one explains the samples as well.
 
     Args:

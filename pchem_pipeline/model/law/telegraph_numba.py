@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 
 _SMALL = 1e-200  # a probability below this is taken to its logarithm
@@ -14,12 +14,12 @@ _SMALL = 1e-200  # a probability below this is taken to its logarithm
 
 @kernel
 def filtered(
-    emission: NDArray[np.float64],
-    samples: NDArray[np.int64],
-    start: NDArray[np.float64],
-    moves: NDArray[np.float64],
-    gaps: NDArray[np.int64],
-    state: NDArray[np.float64],
+    emission: FloatArray,
+    samples: IntArray,
+    start: FloatArray,
+    moves: FloatArray,
+    gaps: IntArray,
+    state: FloatArray,
 ) -> float:
     """Return the log-likelihood of a series (the forward recursion, Baum et al. 1970), nats.
 

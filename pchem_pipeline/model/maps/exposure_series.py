@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.base.arrays import FloatArray
 
 _REWEIGHTINGS = 2
 _MOST_RESCALED = 100.0  # no variance is trusted to change by more

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
-from pchem_pipeline.model.law.parameters import FloatArray
 from pchem_pipeline.model.maps.ordered import Ordered
 
 GOOD, CAUTION, NO_VALUE = 0, 1, 2
@@ -101,7 +101,7 @@ def _root(variance: FloatArray) -> FloatArray:
 
 def electron_shifts(
     quanta_exposure: FloatArray, likelihood_gap: FloatArray, n_frames: int
-) -> tuple[NDArray[np.int64], FloatArray]:
+) -> tuple[IntArray, FloatArray]:
     """Return numbers of electrons m, and how probable it is that H, and the bias, is off by as many.
 
     The peaks say nothing of which of them is that of no electron; the width of the law of the electron number
@@ -130,8 +130,8 @@ def electron_shifts(
 
 
 def hot_pixels(
-    quanta_exposure: FloatArray, stderr: FloatArray, flagged: NDArray[np.bool_], sigmas: float
-) -> NDArray[np.bool_]:
+    quanta_exposure: FloatArray, stderr: FloatArray, flagged: BoolArray, sigmas: float
+) -> BoolArray:
     """Tell which pixels are hot: H above the median by more than so many ``1.4826 MAD`` of unflagged pixels.
 
     And by more than so many of its own standard errors: a flagged pixel may be hot, but not by the electrons
@@ -182,7 +182,7 @@ def status_counts(fit_status: NDArray[np.integer[Any]]) -> dict[str, int]:
 def summarise(
     values: FloatArray | Ordered,
     *,
-    left_out: NDArray[np.bool_] | None = None,
+    left_out: BoolArray | None = None,
     percentiles: tuple[float, ...] = (1, 5, 25, 50, 75, 95, 99),
     outlier_sigmas: float = 6.0,
 ) -> MapSummary:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Ordered:
     n_left_out: int = 0
 
     @classmethod
-    def of(cls, values: NDArray[Any] | Ordered, left_out: NDArray[np.bool_] | None = None) -> Ordered:
+    def of(cls, values: NDArray[Any] | Ordered, left_out: BoolArray | None = None) -> Ordered:
         """Sort a map; what is sorted already is returned as it is.
 
         Args:
@@ -109,7 +109,7 @@ class Ordered:
         """Return the values from low to high, both included."""
         return Ordered(self.values[self.n_below(low) : self.size - self.n_above(high)])
 
-    def histogram(self, edges: Sequence[float] | FloatArray) -> NDArray[np.int64]:
+    def histogram(self, edges: Sequence[float] | FloatArray) -> IntArray:
         """Return the values in each bin; the last edge belongs to the last bin."""
         ends = np.searchsorted(self.values, edges, "left")
         ends[-1] = np.searchsorted(self.values, edges[-1], "right")
@@ -121,7 +121,7 @@ class Ordered:
         return np.asarray(0.5 * (low + high) / self.size)
 
 
-def median_of(values: NDArray[Any], left_out: NDArray[np.bool_] | None = None) -> float:
+def median_of(values: NDArray[Any], left_out: BoolArray | None = None) -> float:
     """Return the median of a map, as :attr:`Ordered.median` in a third of the time; NaN of nothing.
 
     Args:

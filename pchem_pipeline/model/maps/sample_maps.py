@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.maps.exposure_series import exposure_line
 
 #: Slope and offset of the exposures over the light level.
 LEVEL_MAPS = ("charge_per_level", "dark_signal")
-FloatArray = NDArray[np.float64]
 
 
 def line_map_names(against: str, rate: str) -> tuple[str, ...]:

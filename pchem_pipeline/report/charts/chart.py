@@ -16,7 +16,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from pchem_pipeline.base.arrays import IntArray
+
 Values = NDArray[Any]
 Dash = Literal["-", "--", "-.", ":", "-...", ".."]
 Shape = Literal["o", "s", "x", "D", "d", "^", "v", "<", "P", "X", "*", "h", "|"]
@@ -382,7 +383,7 @@ def tick_rows(axis: Axis, width_mm: float) -> Axis:
     return replace(axis, ticks=tuple(ticks))
 
 
-def extremes(x: Values, y: Values, columns: int) -> NDArray[np.int64]:
+def extremes(x: Values, y: Values, columns: int) -> IntArray:
     """Return the indices of the lowest and the highest of each of so many stretches of points, in order.
 
     Drawn that wide or narrower they look like all points, which are kept where they are no more than two a

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.checks.run_differences import LIMIT, MapDifference
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
@@ -36,8 +36,6 @@ from pchem_pipeline.report.style.wording import (
     symbol,
     unit_text,
 )
-
-FloatArray = NDArray[np.float64]
 
 #: Hues and styles of the ensembles of runs.
 _HUES = ("ink", "blue", "vermilion", "green", "orange", "purple", "sky")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.discrepancy.where import PAIRS, map_of
 from pchem_pipeline.effects.framework.evidence import SCORES
@@ -46,8 +47,6 @@ from pchem_pipeline.report.figures.figure import (
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import count, short
-
-FloatArray = NDArray[np.float64]
 
 #: Colours end at least, and at most, at so many standard deviations.
 _LEAST, _MOST = 4.0, 12.0
@@ -265,14 +264,14 @@ def _sensor_chart(
 
 def _map_stack(
     each: PixelMap,
-    inside: NDArray[np.bool_] | None,
+    inside: BoolArray | None,
     flagged: Sequence[tuple[int, int]],
     origin: tuple[int, int],
 ) -> Stack:
     limit = _LEAST
     if each.far > 0:
         limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
-    beyond: NDArray[np.bool_] = np.abs(np.nan_to_num(each.z)) > BEYOND_DOUBT
+    beyond: BoolArray = np.abs(np.nan_to_num(each.z)) > BEYOND_DOUBT
     rings = np.zeros_like(beyond)
     for y, x in ((y - origin[0], x - origin[1]) for y, x in flagged):
         if 0 <= y < rings.shape[0] and 0 <= x < rings.shape[1]:
@@ -286,7 +285,7 @@ def _map_stack(
     )  # fmt: skip
 
 
-def _inside(each: PixelMap, origin: tuple[int, int]) -> NDArray[np.bool_] | None:
+def _inside(each: PixelMap, origin: tuple[int, int]) -> BoolArray | None:
     """Return the pixels of a map that its region holds, (y, x); None without a region.
 
     The region may go on beyond the map.
@@ -300,7 +299,7 @@ def _inside(each: PixelMap, origin: tuple[int, int]) -> NDArray[np.bool_] | None
     return region.mask((rows, columns))[y, x]
 
 
-def _outline(inside: NDArray[np.bool_], origin: tuple[int, int]) -> Line:
+def _outline(inside: BoolArray, origin: tuple[int, int]) -> Line:
     """Return the edges of a set of pixels."""
     padded = np.pad(inside, 1)
     y, x = origin

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
     Axis,
@@ -26,8 +27,6 @@ from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.figures.pixels import shown_bins
 from pchem_pipeline.report.style.wording import power_of_ten, scientific, short
-
-FloatArray = NDArray[np.float64]
 
 #: Suffix of a prediction to (name in the legend, hue, line style).
 _PREDICTIONS: dict[str, tuple[str, str, Dash]] = {

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
     LONGEST,
@@ -142,8 +143,6 @@ def _known(column: list[Any]) -> list[Any]:
     return ["" if isinstance(value, float) and value != value else value for value in column]
 
 
-FloatArray = NDArray[np.float64]
-
 #: Sensors with so few rows or columns are drawn as points, not as an image.
 _STRIP = 2
 #: Most channels of which each has a tick.
@@ -189,7 +188,7 @@ def sensor_stack(
     ends: tuple[float, float],
     label: str,
     *others: Mark,
-    ringed: NDArray[np.bool_] | None = None,
+    ringed: BoolArray | None = None,
     ring: str = "ink",
     origin: tuple[int, int] = (0, 0),
     title: str = "",

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.model.checks.multiple_testing import misfit
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import (
@@ -44,8 +45,6 @@ from pchem_pipeline.report.style.ranges import (
     robust_range,
 )
 from pchem_pipeline.report.style.wording import count, measured, percent, plain, short, stored_unit, symbol
-
-FloatArray = NDArray[np.float64]
 
 #: Bins of the histogram of a map at most; of a line of channels half as many.
 _MOST_BINS = 128
@@ -283,7 +282,7 @@ def status_counts(fit_status: NDArray[Any], words: Mapping[int, str]) -> list[tu
 
 
 def status_chart(
-    status: NDArray[Any], rows: Sequence[tuple[int, str, int]], unfitted: NDArray[np.bool_] | None = None
+    status: NDArray[Any], rows: Sequence[tuple[int, str, int]], unfitted: BoolArray | None = None
 ) -> Chart:
     """Return where fits failed or deserve caution, with a legend of sentences.
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.model.law.pcd import pcd, thresholds
 from pchem_pipeline.report.charts.chart import (
@@ -30,8 +31,6 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.style.wording import cut, measured, plain, short, stored_unit, symbol
-
-FloatArray = NDArray[np.float64]
 
 #: Letters of a line of the status.
 _STATUS_LETTERS = 52
@@ -109,7 +108,7 @@ def _fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
     return DataTable(columns, units), DataTable(facts, units, "parameters")
 
 
-def _codes(pixel: PixelFit) -> NDArray[np.int64]:
+def _codes(pixel: PixelFit) -> IntArray:
     return pixel.origin + np.arange(pixel.counts.size)
 
 
@@ -130,7 +129,7 @@ def _pixel_columns(pixel: PixelFit) -> dict[str, NDArray[Any]]:
     }
 
 
-def _density(pixel: PixelFit, dn: NDArray[np.int64]) -> FloatArray:
+def _density(pixel: PixelFit, dn: IntArray) -> FloatArray:
     """Return the density, or under a model with effects the mass, that a pixel's fit gives its codes."""
     return pcd(dn.astype(np.float64), *_theta(pixel.parameters)) if pixel.mass is None else pixel.mass
 

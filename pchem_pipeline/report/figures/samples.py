@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.report.charts.chart import Axis, Chart, Level, Line, Mark, Panel, Points, Stack
 from pchem_pipeline.report.data import ReportData, Samples
@@ -144,13 +145,13 @@ def _exposures_chart(table: DataTable, line: tuple[float, float, float]) -> Char
     return Chart((Stack((top, _residuals(places, table)), x, height_mm=92.0),))
 
 
-def _spread(table: DataTable, name: str) -> NDArray[np.float64]:
+def _spread(table: DataTable, name: str) -> FloatArray:
     """Return how far the 16 and 84 % percentiles lie from the median, as error bars."""
     ends = [table[f"{name} at {p} %"] - table[name] for p in (16, 84)]
     return np.abs(np.stack(ends, dtype=np.float64))
 
 
-def _residuals(places: NDArray[np.float64], table: DataTable) -> Panel:
+def _residuals(places: FloatArray, table: DataTable) -> Panel:
     """Return median residuals with their errors; without freedom there are none to speak of."""
     label, zero = "residual (e⁻)", Level(0.0, colour="bars", width=0.8)
     if "residual" not in table:

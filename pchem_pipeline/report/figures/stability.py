@@ -9,8 +9,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
@@ -18,8 +18,6 @@ from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, P
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.inspector import AT_ONCE
 from pchem_pipeline.report.style.wording import count, short
-
-FloatArray = NDArray[np.float64]
 
 #: Points of a curve at most; longer runs are averaged over frames, spectra over frequencies.
 _MOST_POINTS, _MOST_FREQUENCIES = 1200, 160

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
 from pchem_pipeline.model.maps.maps import hot_pixels
 from pchem_pipeline.report.data import ReportData
@@ -17,7 +18,6 @@ from pchem_pipeline.report.style.wording import measured, short, unit_text
 
 COLUMNS = ("quantity", "symbol", "value", "standard_error", "unit", "definition_here", "where_it_differs")
 
-FloatArray = NDArray[np.float64]
 
 _NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 #: Maps that the rows are made of; the last is there in the dark only.
@@ -138,7 +138,7 @@ class _Kept:
     """The values of some pixels in each map, NaN where there are none; a map is large, so none is kept."""
 
     stored: Mapping[str, NDArray[Any]]
-    pixels: NDArray[np.bool_]
+    pixels: BoolArray
     suffix: str = ""
 
     def __getitem__(self, name: str) -> FloatArray:
@@ -205,7 +205,7 @@ def _prnu(maps: _Kept, errors: _Kept, kind: str) -> EmvaRow:
     )  # fmt: skip
 
 
-def _dark_current(found: NDArray[Any] | None, kept: NDArray[np.bool_], kind: str) -> EmvaRow:
+def _dark_current(found: NDArray[Any] | None, kept: BoolArray, kind: str) -> EmvaRow:
     value: float | None = None
     error: float | None = None
     if kind == "dark" and found is not None and kept.any():

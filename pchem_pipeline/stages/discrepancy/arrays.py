@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import Float32Array, FloatArray
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 
-FloatArray = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 
@@ -78,7 +78,7 @@ def evidence_arrays(
     return found
 
 
-def _single(values: NDArray[Any]) -> NDArray[np.float32]:
+def _single(values: NDArray[Any]) -> Float32Array:
     return np.asarray(values, dtype=np.float32)
 
 

@@ -16,8 +16,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.compute.memory import resident_bytes
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.store.run_store import RunStore
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 #: Codes of the tables of a band at most, and rows at least.
 _MOST_CODES, _FEWEST_ROWS = 1 << 26, 8

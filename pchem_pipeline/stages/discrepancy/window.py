@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.families import box_sums, cumulative
 from pchem_pipeline.discrepancy.null import free_of_parameters
@@ -48,13 +49,13 @@ class Window:
         copied: frames of the run that are copies of earlier ones.
     """
 
-    numbers: NDArray[np.int64]
+    numbers: IntArray
     rows: tuple[int, int]
     columns: tuple[int, int]
     copied: tuple[int, ...] = ()
 
     @property
-    def times(self) -> NDArray[np.int64]:
+    def times(self) -> IntArray:
         """Frame numbers without the copies, which took no time."""
         return self.numbers - np.searchsorted(self.copied, self.numbers)
 
@@ -184,7 +185,7 @@ def within_memory(
 
 
 def _corner(
-    place: NDArray[np.bool_] | None, within: tuple[int, int, int, int], size: tuple[int, int]
+    place: BoolArray | None, within: tuple[int, int, int, int], size: tuple[int, int]
 ) -> tuple[int, int]:
     """Return first row and column of a window of some size: half in the place, else in the middle.
 
@@ -223,7 +224,7 @@ def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteg
 
 
 def frame_blocks(
-    source: FrameSource, numbers: NDArray[np.int64], rows: tuple[int, int], size: int
+    source: FrameSource, numbers: IntArray, rows: tuple[int, int], size: int
 ) -> Iterator[NDArray[np.unsignedinteger]]:
     """Yield at most so many successive frames of some rows at a time, (frame, y, x), DN.
 
@@ -280,7 +281,7 @@ def fewer_samples(
 
 
 def is_clear(
-    frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], *, n_run: int, block_frames: int
+    frames: NDArray[np.unsignedinteger], numbers: IntArray, *, n_run: int, block_frames: int
 ) -> bool:
     """Tell whether frames disagree with the plain model beyond any doubt, without simulating it.
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import PARAMETERS
@@ -102,7 +103,7 @@ class _Fitted:
     """
 
     pixels: UsablePixels
-    mask: NDArray[np.bool_]
+    mask: BoolArray
     origin: NDArray[np.int32]
     low: NDArray[np.int32]
     high: NDArray[np.int32]
@@ -276,7 +277,7 @@ def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
 
 def _sum_tile(
     store: RunStore, tile: Tile, job: _Job, chosen: PixelHistograms | None
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[IntArray, FloatArray]:
     """Return what a tile adds to the ensemble.
 
     Args:
@@ -319,7 +320,7 @@ def _sum_tile(
     return integers, floats
 
 
-def on_axis(content: dict[str, Any], axis: DnAxis) -> tuple[NDArray[np.int64], int]:
+def on_axis(content: dict[str, Any], axis: DnAxis) -> tuple[IntArray, int]:
     """Return the samples at each DN of an axis, and those beyond it; see `code_sums`."""
     place = np.array(content["dn"], np.int64) - axis.start
     samples = np.array(content["samples"], np.int64)
@@ -329,7 +330,7 @@ def on_axis(content: dict[str, Any], axis: DnAxis) -> tuple[NDArray[np.int64], i
     return found, int(samples[~inside].sum()) + int(content["outside"])
 
 
-def _ranges(store: RunStore, region: tuple[slice, slice]) -> list[NDArray[np.int64]]:
+def _ranges(store: RunStore, region: tuple[slice, slice]) -> list[IntArray]:
     """Return DN of bin 0, smallest and largest DN of the pixels of a region, (y, x)."""
     found = store.read_arrays("histogram", _HISTOGRAM, region)
     return [values.astype(np.int64) for values in found.values()]
@@ -348,7 +349,7 @@ def _errors(store: RunStore, tile: Tile) -> PixelErrors | None:
     return PixelErrors(np.stack(stderr, axis=1), flat, place.ravel(), share)
 
 
-def _inside(tile: Tile, part: tuple[slice, slice]) -> NDArray[np.bool_]:
+def _inside(tile: Tile, part: tuple[slice, slice]) -> BoolArray:
     """Return which pixels of a tile, in C order, are in a part of it."""
     mask = np.zeros((tile.y1 - tile.y0, tile.x1 - tile.x0), np.bool_)
     mask[part] = True
@@ -485,9 +486,7 @@ def _write_result(
     store.set_attributes("ensemble", plain(found | facts))
 
 
-def _true_pixels(
-    store: RunStore, job: _Job, tiles: list[Tile], mask: NDArray[np.bool_]
-) -> UsablePixels | None:
+def _true_pixels(store: RunStore, job: _Job, tiles: list[Tile], mask: BoolArray) -> UsablePixels | None:
     """Return the true parameters of the pixels with a value, if they are all that made the frames."""
     simulated = job.config.simulate
     if job.truth is None or simulated is None or simulated.effects:

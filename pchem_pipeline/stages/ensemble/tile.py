@@ -13,12 +13,13 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, Outcomes, number_tables
 from pchem_pipeline.model.ensemble.ensemble import curve_errors, mass_sums, tally
 from pchem_pipeline.model.ensemble.error_sample import PixelErrors
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
 from pchem_pipeline.model.law.inputs import kernel_counts
-from pchem_pipeline.model.law.parameters import FloatArray, UsablePixels
+from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
@@ -36,14 +37,14 @@ class PixelHistograms:
     origin: NDArray[np.integer[Any]]
     outside: NDArray[np.integer[Any]]
 
-    def of(self, chosen: NDArray[np.bool_] | tuple[slice, slice]) -> PixelHistograms:
+    def of(self, chosen: BoolArray | tuple[slice, slice]) -> PixelHistograms:
         """Return those of the chosen pixels."""
         if isinstance(chosen, np.ndarray) and chosen.all():
             return self
         return PixelHistograms(self.counts[chosen], self.origin[chosen], self.outside[chosen])
 
     @property
-    def samples(self) -> NDArray[np.int64]:
+    def samples(self) -> IntArray:
         """Number of samples of each pixel."""
         return np.asarray(self.counts.sum(axis=-1, dtype=np.int64) + self.outside)
 
@@ -65,9 +66,7 @@ class PixelHistograms:
         )
 
 
-def occupied(
-    origin: NDArray[Any], low: NDArray[Any], high: NDArray[Any], bins: int
-) -> tuple[NDArray[np.int64], int]:
+def occupied(origin: NDArray[Any], low: NDArray[Any], high: NDArray[Any], bins: int) -> tuple[IntArray, int]:
     """Return the first of so many bins, the same number for each pixel, between which all samples lie."""
     begin, end = np.clip(low - origin, 0, bins), np.clip(high + 1 - origin, 0, bins)
     size = max(1, int(np.max(end - begin)))
@@ -82,7 +81,7 @@ def ensemble_tile(
     law: SampleLaw | None = None,
     satellites: tuple[FloatArray, FloatArray] | None = None,
     errors: PixelErrors | None = None,
-) -> tuple[NDArray[np.int64], FloatArray]:
+) -> tuple[IntArray, FloatArray]:
     """Return what some pixels add to the ensemble.
 
     Args:
@@ -130,7 +129,7 @@ def ensemble_tile(
     return integers, floats
 
 
-def _numbers_of_samples(chosen: NDArray[np.int64], everything: NDArray[np.int64]) -> list[tuple[int, int]]:
+def _numbers_of_samples(chosen: IntArray, everything: IntArray) -> list[tuple[int, int]]:
     """Return the pairs of numbers of samples that occur; of frames all pixels have the same."""
     if np.all(chosen == chosen[:1]) and np.all(everything == everything[:1]):
         return [(int(chosen[0]), int(everything[0]))] if chosen.size else []
@@ -139,7 +138,7 @@ def _numbers_of_samples(chosen: NDArray[np.int64], everything: NDArray[np.int64]
 
 def _numbers(
     known: KnownPixels, histograms: PixelHistograms, axes: EnsembleAxes
-) -> tuple[NDArray[np.int64], int, Outcomes, NumberTables]:
+) -> tuple[IntArray, int, Outcomes, NumberTables]:
     """Return the samples of each electron number, those beyond, what is expected, and the tables."""
     origin = histograms.origin
     low, high = known.codes(histograms.counts, origin)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.variables import (
     FREE_SATELLITES,
     INTERVALS,
@@ -171,7 +172,7 @@ def _do_tile(
     return summary
 
 
-def _leave_out(arrays: Mapping[str, NDArray[Any]], excluded: NDArray[np.bool_]) -> None:
+def _leave_out(arrays: Mapping[str, NDArray[Any]], excluded: BoolArray) -> None:
     """Take the values of excluded pixels (y, x) out of the arrays of a tile, and give them their word."""
     for path, values in arrays.items():
         if values.dtype.kind == "f":
@@ -238,7 +239,7 @@ def keep_fit(context: StageContext) -> None:
     write_atomic(_start_file(store.path), buffer.getvalue())
 
 
-def kept_fit(store: Path, region: tuple[slice, slice]) -> NDArray[np.float64] | None:
+def kept_fit(store: Path, region: tuple[slice, slice]) -> FloatArray | None:
     """Return what `keep_fit` kept of a tile, or None."""
     place = _start_file(store)
     if not place.exists():

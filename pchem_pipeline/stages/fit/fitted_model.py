@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.run.model_versions import ModelVersion, Region, model_of, read_added_exposure
@@ -14,8 +15,6 @@ from pchem_pipeline.run.sensor import SensorInfo
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
     from pchem_pipeline.effects.framework.compose import AddedExposure
     from pchem_pipeline.effects.framework.effect import Effect
@@ -60,7 +59,7 @@ class FittedModel:
         places = pixel_places(store, region)
         return cls(version.effects, None if added is None else added.flat(), version, places)
 
-    def at(self, index: NDArray[np.int64]) -> FittedModel:
+    def at(self, index: IntArray) -> FittedModel:
         """Return the model of some of the pixels."""
         return replace(
             self,
@@ -68,7 +67,7 @@ class FittedModel:
             places=None if self.places is None else self.places.of(index),
         )
 
-    def law(self, maps: Sequence[NDArray[np.float64]], *, without: Sequence[str] = ()) -> SampleLaw:
+    def law(self, maps: Sequence[FloatArray], *, without: Sequence[str] = ()) -> SampleLaw:
         """Return the law of the samples of the pixels.
 
         Args:
@@ -86,9 +85,7 @@ def pixel_places(store: RunStore, region: Region | None = None) -> PixelPlaces:
     return PixelPlaces.of_block(region, sensor.shape, np.arange(frames))
 
 
-def fitted_satellites(
-    store: RunStore, region: Region | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def fitted_satellites(store: RunStore, region: Region | None = None) -> tuple[FloatArray, FloatArray] | None:
     """Return amplitude (e-) and weight of the free satellites of a region, shape (n,); None: none."""
     if not all(store.has(f"fit/{name}") for name in FREE_SATELLITES):
         return None

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
 from pchem_pipeline.effects.framework.compose import AddedExposure, PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
@@ -51,7 +52,7 @@ class TileFit:
 def fit_tile(
     histograms: Sequence[Mapping[str, NDArray[Any]]],
     how: TileFit,
-    start: NDArray[np.float64] | None = None,
+    start: FloatArray | None = None,
     added: AddedExposure | None = None,
     places: PixelPlaces | None = None,
 ) -> dict[str, dict[str, NDArray[Any]]]:
@@ -102,7 +103,7 @@ def fit_tile(
 def _fit_model(
     fit: Callable[..., FitResult],
     how: TileFit,
-    start: NDArray[np.float64] | None,
+    start: FloatArray | None,
     added: AddedExposure | None,
     places: PixelPlaces | None,
 ) -> FitResult:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
-from pchem_pipeline.model.histogram.odd_frames import KINDS, FloatArray, IntArray, left_out, odd_words
+from pchem_pipeline.model.histogram.odd_frames import KINDS, left_out, odd_words
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
 from pchem_pipeline.run.input import open_source

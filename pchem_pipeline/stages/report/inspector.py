@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, VARIABLES, Variable
 from pchem_pipeline.compute.executor import call_all
@@ -172,10 +173,10 @@ def inspector_data(
 def read_maps(
     store: RunStore,
     shape: tuple[int, int],
-    index: NDArray[np.int64],
+    index: IntArray,
     loaded: Mapping[str, NDArray[Any]] | None = None,
     threads: int = 1,
-) -> tuple[list[MapEntry], dict[str, NDArray[np.float64]]]:
+) -> tuple[list[MapEntry], dict[str, FloatArray]]:
     """Read every stored map: packed, the important ones first, until the page is full; exact for some pixels.
 
     Args:
@@ -195,7 +196,7 @@ def read_maps(
     budget = min(_MAPS_BUDGET * max(1.0, n / 512**2) ** _MAPS_POWER, _MOST_BYTES)
     order = sorted(listed, key=lambda entry: _importance(entry.path))
     found: dict[str, MapEntry] = {}
-    exact: dict[str, NDArray[np.float64]] = {}
+    exact: dict[str, FloatArray] = {}
     for start in range(0, len(order), threads):
         some = order[start : start + threads]
         tasks = [functools.partial(_coded, maps, entry, index, budget > 0) for entry in some]
@@ -221,9 +222,7 @@ def _is_packed(entry: MapEntry | None) -> bool:
     return entry is not None and entry.packed is not None
 
 
-def _coded(
-    maps: StoredMaps, entry: MapEntry, index: NDArray[np.int64], pack: bool
-) -> tuple[MapEntry, NDArray[np.float64]]:
+def _coded(maps: StoredMaps, entry: MapEntry, index: IntArray, pack: bool) -> tuple[MapEntry, FloatArray]:
     """Return a map in few bytes, or as a multiple of another, and its values at some pixels, shape (n,).
 
     It is packed only where asked for, and no multiple.
@@ -294,9 +293,7 @@ def _proportional(values: NDArray[Any], others: NDArray[Any], factor: float) -> 
     return np.allclose(values[known], factor * others[known], rtol=1e-9, atol=0.0)
 
 
-def deciding_parameters(
-    columns: Sequence[NDArray[np.float64]], model: FittedModel
-) -> NDArray[np.float64] | None:
+def deciding_parameters(columns: Sequence[FloatArray], model: FittedModel) -> FloatArray | None:
     """Return the parameters whose thresholds are drawn, (4, n); None where these are the fitted ones.
 
     Args:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.model.fit.status import MEANINGS, describe
 from pchem_pipeline.model.law.mass import sample_mass
@@ -39,7 +40,7 @@ Chosen = tuple[str, int, int]
 
 
 def choose_pixels(
-    read_noise_e: NDArray[np.float64], quanta_exposure: NDArray[np.float64], fit_status: NDArray[Any]
+    read_noise_e: FloatArray, quanta_exposure: FloatArray, fit_status: NDArray[Any]
 ) -> list[Chosen]:
     """Choose four pixels at low and high read noise and low and high exposure (fig:plot_per_pixel_fits).
 
@@ -74,10 +75,10 @@ def choose_pixels(
 
 
 def _nearest(
-    maps: Sequence[NDArray[np.float64]],
+    maps: Sequence[FloatArray],
     ordered: Sequence[Ordered],
     ranks: Sequence[float],
-    free: NDArray[np.bool_],
+    free: BoolArray,
 ) -> tuple[int, int]:
     """Return the free pixel whose values have ranks nearest to given ones; ranks are in 0..1.
 
@@ -99,7 +100,7 @@ def _nearest(
         reach *= 2.0
 
 
-def pixel_index(chosen: Sequence[Chosen], shape: tuple[int, int]) -> NDArray[np.int64]:
+def pixel_index(chosen: Sequence[Chosen], shape: tuple[int, int]) -> IntArray:
     """Return ``y * nx + x`` of chosen pixels."""
     return np.array([y * shape[1] + x for _, y, x in chosen], dtype=np.int64)
 
@@ -109,7 +110,7 @@ def pixel_fits(
     maps: Mapping[str, Any],
     fit: Mapping[str, Any],
     histograms: PixelHistograms,
-    masses: Sequence[NDArray[np.float64]],
+    masses: Sequence[FloatArray],
     *,
     channel: bool = False,
 ) -> list[PixelFit]:
@@ -146,8 +147,8 @@ def pixel_fits(
 
 
 def bin_masses(
-    columns: Sequence[NDArray[np.float64]], histograms: PixelHistograms, model: FittedModel
-) -> list[NDArray[np.float64]]:
+    columns: Sequence[FloatArray], histograms: PixelHistograms, model: FittedModel
+) -> list[FloatArray]:
     """Return the probability of each bin of n pixels under a model with effects; NaN without parameters.
 
     None are returned under a model without effects, whose law is the PCD.
@@ -180,7 +181,7 @@ class ChosenPixels:
         reasons: words and indices; the even sample is not among them.
     """
 
-    index: NDArray[np.int64]
+    index: IntArray
     reasons: tuple[tuple[str, tuple[int, ...]], ...]
 
 
@@ -229,11 +230,11 @@ def choose_inspected(
     return ChosenPixels(index, tuple((words, where) for words, where in listed if where))
 
 
-def _places(pixels: Sequence[tuple[int, int]], nx: int) -> NDArray[np.int64]:
+def _places(pixels: Sequence[tuple[int, int]], nx: int) -> IntArray:
     return np.array([y * nx + x for y, x in pixels], dtype=np.int64)
 
 
-def _smallest(values: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+def _smallest(values: FloatArray, n: int) -> IntArray:
     """Return the places of the n smallest values in their order, of equal ones the first."""
     some = some_of(values)
     some = some[np.isfinite(some)]
@@ -244,7 +245,7 @@ def _smallest(values: NDArray[np.float64], n: int) -> NDArray[np.int64]:
     return np.asarray(known[order], dtype=np.int64)
 
 
-def _flagged(status: NDArray[Any], rng: np.random.Generator) -> list[tuple[str, NDArray[np.int64]]]:
+def _flagged(status: NDArray[Any], rng: np.random.Generator) -> list[tuple[str, IntArray]]:
     """Return some pixels of each reason for caution or failure, drawn at random, in their order."""
     found = []
     for bit, words in MEANINGS.items():
@@ -255,7 +256,7 @@ def _flagged(status: NDArray[Any], rng: np.random.Generator) -> list[tuple[str, 
     return found
 
 
-def _extreme(maps: Mapping[str, NDArray[Any]]) -> list[tuple[str, NDArray[np.int64]]]:
+def _extreme(maps: Mapping[str, NDArray[Any]]) -> list[tuple[str, IntArray]]:
     found = []
     for name in MAP_NAMES:
         if name not in maps:
@@ -272,7 +273,7 @@ def _extreme(maps: Mapping[str, NDArray[Any]]) -> list[tuple[str, NDArray[np.int
     return found
 
 
-def _even(ny: int, nx: int, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _even(ny: int, nx: int, n: int, rng: np.random.Generator) -> IntArray:
     """Return about ``n`` pixels, one at random in each cell of a grid, in random order."""
     rows = int(np.clip(round((n * ny / nx) ** 0.5), 1, ny))
     columns = int(np.clip(round(n / rows), 1, nx))

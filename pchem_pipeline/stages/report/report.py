@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.compute.executor import Beside, beside
@@ -167,7 +168,7 @@ class _Pixels:
     fits: list[PixelFit]
     full: ChosenPixels
     histograms: PixelHistograms
-    masses: list[NDArray[np.float64]]
+    masses: list[FloatArray]
 
 
 def _of_pixels(store: RunStore, run: StoredRun, config: RunConfig) -> _Pixels:
@@ -197,7 +198,7 @@ def _inspector(store: RunStore, run: StoredRun, pixels: _Pixels, threads: int) -
     return inspector_data(run.name, shape, maps, sample)
 
 
-def _parameters(run: StoredRun, index: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+def _parameters(run: StoredRun, index: IntArray) -> list[FloatArray]:
     """Return (H, g, mu, sigma) of some pixels."""
     return [run.maps[name].reshape(-1)[index] for name in PARAMETERS]
 

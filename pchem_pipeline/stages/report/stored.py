@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.variables import (
     CHARGE_RATES,
     FREE_SATELLITES,
@@ -49,9 +50,9 @@ class PixelHistograms:
         satellites: amplitude (e-) and weight of the satellite levels that their fits left free; (2, n).
     """
 
-    origin: NDArray[np.int64]
+    origin: IntArray
     counts: list[NDArray[np.integer[Any]]]
-    satellites: NDArray[np.float64]
+    satellites: FloatArray
 
     def of(self, part: slice) -> PixelHistograms:
         """Return the histograms of successive pixels."""
@@ -83,7 +84,7 @@ class StoredRun:
     sensor: SensorInfo
     maps: Mapping[str, NDArray[Any]]
     fit: Mapping[str, NDArray[Any]]
-    intervals: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
+    intervals: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     truth: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     facts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -135,7 +136,7 @@ def read_run(store: RunStore, threads: int = 1) -> StoredRun:
     )  # fmt: skip
 
 
-def read_histograms(store: RunStore, index: NDArray[np.int64], shape: tuple[int, int]) -> PixelHistograms:
+def read_histograms(store: RunStore, index: IntArray, shape: tuple[int, int]) -> PixelHistograms:
     """Read the histograms of pixels.
 
     Args:

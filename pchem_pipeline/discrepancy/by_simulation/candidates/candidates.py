@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR,
@@ -36,7 +36,6 @@ from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 from pchem_pipeline.effects.framework.registry import broken_plugins, effect_classes
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, POSSIBLE
 
-FloatArray = NDArray[np.float64]
 Vector = Mapping[str, float]
 #: Runs replicates and returns their statistics in the same order; an exception in place of those that failed.
 Mapper = Callable[[Sequence[Replicate]], "list[Vector | Exception]"]

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, log_density
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
@@ -33,8 +33,6 @@ from pchem_pipeline.discrepancy.by_simulation.sets.refits import (
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import CERTAIN
-
-FloatArray = NDArray[np.float64]
 
 _TRIAL = 0.25  # step of the logarithm of a number by which its slope is measured
 _MOST = 6  # numbers of a set

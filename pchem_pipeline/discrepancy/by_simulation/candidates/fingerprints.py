@@ -16,14 +16,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.null import Covariance
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import OUTLYING, POSSIBLE, PRICE
-
-FloatArray = NDArray[np.float64]
 
 _REWEIGHTINGS = 3
 _LEAK = 0.1
@@ -85,7 +83,7 @@ class Noise:
     model_error: float
     events: FloatArray | float = 0.0
 
-    def among(self, kept: NDArray[np.bool_]) -> Noise:
+    def among(self, kept: BoolArray) -> Noise:
         """Return the noise of some of the statistics, (m,)."""
         events = np.broadcast_to(self.events, kept.shape)[kept]
         return replace(self, covariance=self.covariance.among(kept), events=events)
@@ -111,7 +109,7 @@ class SetFit:
     hypotheses: tuple[Hypothesis, ...]
     factors: FloatArray
     stderr: FloatArray
-    certain: NDArray[np.bool_]
+    certain: BoolArray
 
     @property
     def parts(self) -> FloatArray:
@@ -201,7 +199,7 @@ def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -
     return SetFit(tuple(hypotheses), factors, stderr, counted(columns * factors[:, None], shift, noise))
 
 
-def counted(parts: FloatArray, shift: FloatArray, noise: Noise) -> NDArray[np.bool_]:
+def counted(parts: FloatArray, shift: FloatArray, noise: Noise) -> BoolArray:
     """Tell which effects an exact count asks for, however few events it has, shape (e,).
 
     Args:

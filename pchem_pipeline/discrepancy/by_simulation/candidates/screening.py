@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import (
     MOST_HYPOTHESES,
     ReplicateSimulator,
@@ -28,8 +26,6 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Histo
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
-
-FloatArray = NDArray[np.float64]
 
 _MOST_BESIDE = 2  # hypotheses of one effect beside a single other one
 _DOUBT = 0.2  # of the logarithm of a factor that was fitted without the effects beside it

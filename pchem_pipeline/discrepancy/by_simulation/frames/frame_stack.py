@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, IntArray
 from pchem_pipeline.discrepancy.by_simulation.frames.suspects import with_ends
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence
 from pchem_pipeline.discrepancy.splits import Splits, block_length, split_frames
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-
-IntArray = NDArray[np.int64]
 
 _BLOCKS_IN_A_RANGE, _SHORTEST_BLOCK = 15, 10  # frames
 
@@ -170,11 +169,11 @@ class FrameStack:
         """Return how many samples of the train and test frames are in a part."""
         return int(part.frames(self.seen_numbers).sum()) * int(self.inside(part).sum())
 
-    def samples_of(self, part: Part) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def samples_of(self, part: Part) -> tuple[BoolArray, BoolArray]:
         """Return which of the train and test frames, (frame,), and which pixels, (y, x), are a part."""
         return part.frames(self.seen_numbers), self.inside(part)
 
-    def inside(self, part: Part) -> NDArray[np.bool_]:
+    def inside(self, part: Part) -> BoolArray:
         """Return which of the pixels lie in a part, (y, x)."""
         window = self.window or SensorWindow.whole(self.stack.shape)
         return window.mask(part.region)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.ndimage import binary_dilation
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.laws import FAR, chi_square
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES, FrameBlocks, Samples
@@ -37,10 +38,6 @@ from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import When
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 #: Of a place among all places of all maps: maps rest on fits, whose errors are not quite normal. What is
 #: found among pairs, series and rare samples rests on the order of the frames and the number of samples.

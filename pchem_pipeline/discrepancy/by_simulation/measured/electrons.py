@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.by_simulation.measured.modes import CodeScores
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
     Distance,
@@ -24,10 +25,6 @@ from pchem_pipeline.effects.estimators.charge_sums import charlier_information
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.operators.fate import ElectronMode, EmpiricalElectrons, Fate
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 _PLACES: tuple[Distance, ...] = ((1, 0, 0), (2, 0, 0), (3, 0, 0), (0, 0, 1), (0, 1, 0))
 _OWN: Distance = (0, 0, 0)
@@ -86,7 +83,7 @@ def electron_chances(samples: PartSamples) -> Electrons:
 
 
 def _together(
-    u: NDArray[np.float32], numbers: IntArray, exposure: FloatArray, spread: FloatArray, place: Distance
+    u: Float32Array, numbers: IntArray, exposure: FloatArray, spread: FloatArray, place: Distance
 ) -> Chances:
     """Return how electrons go with those at a place, per electron and per pair of them.
 

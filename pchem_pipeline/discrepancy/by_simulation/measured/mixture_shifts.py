@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import Distance, Measurement
 from pchem_pipeline.discrepancy.observe.digital import equal_squares
@@ -28,9 +29,6 @@ from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.significance import DECISIVE
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _MOST_PIXELS = 600  # that stand for all
 _MOST_SAMPLES = 60_000  # that stand for all where each has a neighbour
@@ -312,7 +310,7 @@ def _measured_towards(
 
 
 def without_squares(
-    frames: NDArray[np.unsignedinteger], usable: NDArray[np.bool_], effects: Sequence[Effect]
+    frames: NDArray[np.unsignedinteger], usable: BoolArray, effects: Sequence[Effect]
 ) -> NDArray[np.unsignedinteger]:
     """Return frames in which squares that effects likely averaged are replaced by the pixels' other samples.
 
@@ -330,7 +328,7 @@ def without_squares(
     return frames
 
 
-def _in_equal_squares(frames: NDArray[np.unsignedinteger], parity: tuple[int, int]) -> NDArray[np.bool_]:
+def _in_equal_squares(frames: NDArray[np.unsignedinteger], parity: tuple[int, int]) -> BoolArray:
     """Return which samples lie in squares of equal ones, from a parity on, (frame, y, x)."""
     found = np.zeros(frames.shape, np.bool_)
     first = frames[:, parity[0] :: 2, parity[1] :: 2]
@@ -343,7 +341,7 @@ def _in_equal_squares(frames: NDArray[np.unsignedinteger], parity: tuple[int, in
     return found
 
 
-def _chosen(usable: NDArray[np.bool_], n_frames: int) -> tuple[IntArray, IntArray]:
+def _chosen(usable: BoolArray, n_frames: int) -> tuple[IntArray, IntArray]:
     """Return pixels of whole rows that stand for all, and frames that have earlier ones."""
     rows = np.flatnonzero(usable.any(axis=1))
     groups = np.array_split(rows, max(-(-rows.size // _ROWS_TOGETHER), 1))

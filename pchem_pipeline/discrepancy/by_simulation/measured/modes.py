@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.discrepancy.by_simulation.measured.mixture_shifts import share_of
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
     FARTHEST,
@@ -36,10 +37,6 @@ from pchem_pipeline.effects.operators.empirical_noise import (
 )
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, CERTAIN, DECISIVE, POSSIBLE
 from pchem_pipeline.model.law.pcd import pcd_posterior
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 _CHANGED: tuple[Changed, ...] = ("offset", "gain", "light", "noise")
 _CLEAR = 15.0  # nats

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.by_simulation.measured.modes import MADE
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
     FARTHEST,
@@ -36,10 +37,6 @@ from pchem_pipeline.effects.operators.empirical_noise import (
     spectrum,
 )
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 _SHARED: tuple[Shared, ...] = ("frame", "row", "column", "sample")
 _LINES: tuple[Shared, ...] = ("row", "column")
@@ -100,7 +97,7 @@ def residual_covariances(samples: PartSamples) -> Covariances:
     return Covariances(found, {of: _line(*turned[of]) for of in _LINES if of in samples.whole_lines})
 
 
-def _line(u: NDArray[np.float32], inside: BoolArray) -> Line:
+def _line(u: Float32Array, inside: BoolArray) -> Line:
     """Return the mean products of two columns in the same row."""
     # a fast product needs the samples of a line side by side
     lines = (np.ascontiguousarray(block) for block in u.swapaxes(0, 1))
@@ -110,7 +107,7 @@ def _line(u: NDArray[np.float32], inside: BoolArray) -> Line:
 
 
 def _of_step(
-    one: NDArray[np.float32], two: NDArray[np.float32], inside: BoolArray, step: int
+    one: Float32Array, two: Float32Array, inside: BoolArray, step: int
 ) -> dict[tuple[Shared, Lag], Covariance]:
     """Return the covariances of frames with those ``step`` later."""
     far_y, far_x = (min(FARTHEST, (size - 1) // 4) for size in inside.shape)
@@ -163,9 +160,7 @@ class _Pairs(NamedTuple):
     frame: FloatArray
 
     @classmethod
-    def of(
-        cls, one: NDArray[np.float32], two: NDArray[np.float32], down: range, right: range, starts: IntArray
-    ) -> _Pairs:
+    def of(cls, one: Float32Array, two: Float32Array, down: range, right: range, starts: IntArray) -> _Pairs:
         """Return those of frames (n, y, x) with others, at distances of rows and columns, by group of frames.
 
         ``starts`` are the first frames of the groups.

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import Distance, Measurement, PartSamples
 from pchem_pipeline.discrepancy.observe.digital import GROUP
 from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples, Follows
@@ -30,8 +30,6 @@ from pchem_pipeline.effects.operators.couple import (
 )
 from pchem_pipeline.model.arithmetic.significance import CLEAR, DECISIVE
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Mirrored = tuple[Axis, ...]
 
 _MIRRORED: tuple[Mirrored, ...] = ((), ("rows",), ("columns",), ("rows", "columns"))

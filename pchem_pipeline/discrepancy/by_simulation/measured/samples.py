@@ -10,14 +10,13 @@ from typing import NamedTuple, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, IntArray
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.observe.sums import FrameBlocks, Samples, laws_of_frames
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
 
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 #: Frames, rows and columns between two samples.
 Distance = tuple[int, int, int]
 #: Frames, rows and columns between samples that are compared, at most.
@@ -78,7 +77,7 @@ class PartSamples:
             self.known[measure] = measure(self)
         return cast(Answer, self.known[measure])
 
-    def scores(self, kind: int, inside: BoolArray, *box: slice) -> NDArray[np.float32]:
+    def scores(self, kind: int, inside: BoolArray, *box: slice) -> Float32Array:
         """Return expected electrons (kind 0) or readout residuals (1) of the pixels inside of a box.
 
         Each beyond its mean, in its standard deviation, 0 where it is not known, shape (frame, y, x).

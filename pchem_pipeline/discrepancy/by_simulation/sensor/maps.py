@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import (
     MANY_MISTAKEN,
@@ -30,8 +31,6 @@ from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-FloatArray = NDArray[np.float64]
 
 #: Of the parameters of a pixel, in their order.
 UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
@@ -75,7 +74,7 @@ class Refit:
 
     maps: PixelMaps
     moved: Mapping[str, Mapping[str, Any]]
-    covariance: NDArray[np.float64]
+    covariance: FloatArray
     components: int = 1
     evaluations: float = 0.0
     added: AddedExposure | None = None
@@ -86,9 +85,9 @@ def refit_maps(
     frames: NDArray[np.unsignedinteger],
     maps: PixelMaps,
     effects: Sequence[Effect],
-    covariance: NDArray[np.float64],
+    covariance: FloatArray,
     added: AddedExposure | None = None,
-    numbers: NDArray[np.int64] | None = None,
+    numbers: IntArray | None = None,
 ) -> Refit:
     """Fit the pixels of some frames with effects in their law.
 
@@ -159,7 +158,7 @@ def refit_maps(
     return Refit(new_maps, moved, covariance, law.components, evaluations, added, learnt)
 
 
-def _acted_on(effects: Sequence[Effect], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def _acted_on(effects: Sequence[Effect], shape: tuple[int, int]) -> BoolArray:
     """Return the pixels, (y, x), that any of the effects is about: all of them where one has no place."""
     regions = [effect.region for effect in effects]
     inside = [np.ones(shape, np.bool_) if region is None else region.mask(shape) for region in regions]
@@ -227,7 +226,7 @@ def _of_usual_noise(near: FloatArray, fitted: FloatArray) -> FloatArray:
     return found
 
 
-def _likelier(one: FitResult, other: FitResult) -> NDArray[np.bool_]:
+def _likelier(one: FitResult, other: FitResult) -> BoolArray:
     """Tell which pixels a fit explains clearly better than another one, shape (n,)."""
     with np.errstate(invalid="ignore"):
         return np.asarray(one.log_likelihood > other.log_likelihood + CLEARLY)
@@ -237,9 +236,9 @@ def expected_codes(
     maps: PixelMaps,
     effects: Sequence[Effect],
     codes: NDArray[np.integer],
-    numbers: NDArray[np.int64],
+    numbers: IntArray,
     added: AddedExposure | None = None,
-) -> NDArray[np.float64] | None:
+) -> FloatArray | None:
     """Return the samples that a model expects at each code, all usable pixels together.
 
     Args:
@@ -263,13 +262,13 @@ def expected_codes(
     return np.asarray(numbers.size * sample_mass(law, flat, codes, smallest=1e-50).sum(axis=0))
 
 
-def _places(maps: PixelMaps, numbers: NDArray[np.int64]) -> PixelPlaces:
+def _places(maps: PixelMaps, numbers: IntArray) -> PixelPlaces:
     """Return the places of all pixels, in frames of some numbers."""
     ny, nx = maps.usable.shape
     return PixelPlaces.of_block(None, (ny, nx), numbers)
 
 
-def change_of(difference: NDArray[np.float64], stderr: NDArray[np.float64], unit: str) -> dict[str, Any]:
+def change_of(difference: FloatArray, stderr: FloatArray, unit: str) -> dict[str, Any]:
     """Return the median of a change of a parameter over the pixels, and the same in standard errors."""
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = difference / stderr
@@ -293,8 +292,8 @@ class Sensor:
     """
 
     posterior: Posterior
-    drawn: NDArray[np.bool_]
-    usable: NDArray[np.bool_]
+    drawn: BoolArray
+    usable: BoolArray
     lost: float = 0.0
 
     def draw(self, seed: int) -> PixelMaps:
@@ -332,7 +331,7 @@ class Sensor:
         return replace(maps, usable=self.usable & self.drawn)
 
 
-def _require(pixels: NDArray[np.bool_]) -> None:
+def _require(pixels: BoolArray) -> None:
     """Raise a NotFittedError unless there is one of these pixels."""
     if not pixels.any():
         raise NotFittedError("no pixel can be fitted with it")
@@ -340,7 +339,7 @@ def _require(pixels: NDArray[np.bool_]) -> None:
 
 def learn_sensor(
     frames: NDArray[np.unsignedinteger],
-    numbers: NDArray[np.int64],
+    numbers: IntArray,
     fit: Refit,
     effects: Sequence[Effect],
     mistaken: float,

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.effort import MOST_LEARNT_FROM
 from pchem_pipeline.model.arithmetic.robust import robust_sd
@@ -31,9 +32,6 @@ from pchem_pipeline.model.fit.shared import LOWEST_LOG_VARIANCE, to_parameters, 
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _TAILS = 8.0  # degrees of freedom of Student's t: pixels far from the others are no reason to widen T
 _ROUNDS = 8  # of parabolas, each followed by EM
@@ -306,7 +304,7 @@ class _Maxima:
     def _parabolas(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         return self.theta, self.value, self.score, self.information
 
-    def _among(self, kinds: NDArray[np.bool_] | slice, pixels: NDArray[np.intp] | slice) -> _Maxima:
+    def _among(self, kinds: BoolArray | slice, pixels: NDArray[np.intp] | slice) -> _Maxima:
         theta, value, score, information = (each[kinds][:, pixels] for each in self._parabolas)
         return _Maxima(theta, value, score, information, self.widening[pixels])
 

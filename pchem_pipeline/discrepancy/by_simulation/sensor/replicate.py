@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps, observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_statistics
@@ -46,17 +47,17 @@ class Acquisition:
         window: of the sensor that is simulated; None: all of it.
     """
 
-    numbers: NDArray[np.int64]
+    numbers: IntArray
     n_run: int
     block_frames: int
     bit_depth: int
     integration_time: float = 1.0
-    other: NDArray[np.int64] | None = None
+    other: IntArray | None = None
     parts: tuple[Part, ...] = ()
     window: SensorWindow | None = None
 
     def observe(
-        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], maps: PixelMaps | None = None
+        self, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps | None = None
     ) -> Evidence:
         """Return the evidence of frames, (frame, y, x), DN, with these numbers: of the pixels of near maps.
 
@@ -73,7 +74,7 @@ class Acquisition:
         )
 
     def statistics(
-        self, frames: NDArray[np.unsignedinteger], numbers: NDArray[np.int64], evidence: Evidence
+        self, frames: NDArray[np.unsignedinteger], numbers: IntArray, evidence: Evidence
     ) -> dict[str, float]:
         """Return the statistics of frames with this evidence, those of the parts included, by name."""
         own = frames, numbers, evidence.maps, self.parts
@@ -128,10 +129,10 @@ class Replicate:
         """Simulate, and fit the frames of the first part, from nothing, without any effect."""
         return fitted_maps(self.simulated(), ~self.maps.usable)
 
-    def _observed(self) -> Iterator[tuple[NDArray[np.unsignedinteger], NDArray[np.int64], Evidence]]:
+    def _observed(self) -> Iterator[tuple[NDArray[np.unsignedinteger], IntArray, Evidence]]:
         """Simulate; yield the frames of each part, their numbers and their evidence."""
         taken, start = self.acquisition, self.maps
-        parts: tuple[NDArray[np.int64], ...] = (taken.numbers,)
+        parts: tuple[IntArray, ...] = (taken.numbers,)
         if taken.other is None:
             seen = taken.numbers
             frames = simulate_frames(self.maps, self.effects, self.seed, taken)
@@ -193,7 +194,7 @@ def truth_of(maps: PixelMaps) -> TruthMaps:
     )
 
 
-def _runs(numbers: NDArray[np.int64]) -> list[tuple[int, int]]:
+def _runs(numbers: IntArray) -> list[tuple[int, int]]:
     """Return the ranges of consecutive frame numbers, ends excluded."""
     breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
     return [(int(run[0]), int(run[-1]) + 1) for run in np.split(numbers, breaks)]

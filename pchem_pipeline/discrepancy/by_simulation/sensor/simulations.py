@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
@@ -97,9 +98,7 @@ class Simulations:
         self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags, learnt=fit.learnt)
         return fit
 
-    def expected(
-        self, model: tuple[Effect, ...], evidence: Evidence, numbers: NDArray[np.int64]
-    ) -> NDArray[np.float64] | None:
+    def expected(self, model: tuple[Effect, ...], evidence: Evidence, numbers: IntArray) -> FloatArray | None:
         """Return the samples that a model expects at each code of some evidence; see `expected_codes`."""
         fit, codes = self.mapped(model).fit, evidence.code.first + np.arange(evidence.code.observed.size)
         return expected_codes(fit.maps, self.frames.effects(model), codes, numbers, fit.added)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray
 from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
@@ -26,9 +27,6 @@ from pchem_pipeline.effects.framework.effect import Effect, tag_of
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.significance import DECISIVE, NO_DIFFERENCE
 from pchem_pipeline.model.histogram.count import histogram_frames
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _log = logging.getLogger(__name__)
 
@@ -361,7 +359,7 @@ def _electrons_off(sets: SetComparison, fitted: FittedSet, electrons: float) -> 
     return max(fitted, other, both, key=lambda one: float(one.fit.log_likelihood.sum()))
 
 
-def _likelier(one: FittedSet, other: FittedSet) -> NDArray[np.bool_]:
+def _likelier(one: FittedSet, other: FittedSet) -> BoolArray:
     """Tell which pixels a fit explains clearly better than another one, (n,)."""
     return np.asarray(one.fit.log_likelihood > other.fit.log_likelihood + CLEARLY)
 

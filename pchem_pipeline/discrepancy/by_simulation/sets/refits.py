@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
     Hypothesis,
@@ -31,8 +31,6 @@ from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, FALSE_ALARM, NO_DIFFERENCE, OUTLYING
-
-FloatArray = NDArray[np.float64]
 
 _SPLITS = 2  # train and test frames, whose mean is explained
 #: Replicates at each strength on the way.
@@ -395,7 +393,7 @@ class Refitter:
         little = one.chance - one.score < _LITTLE * (one.chance - self.nothing)
         return little or self.passes_goodness_of_fit(one)
 
-    def kept(self, hypotheses: Sequence[Hypothesis]) -> NDArray[np.bool_]:
+    def kept(self, hypotheses: Sequence[Hypothesis]) -> BoolArray:
         """Return which statistics tell strengths.
 
         A part was chosen because it stands out: what acts everywhere would come out too strong by it.

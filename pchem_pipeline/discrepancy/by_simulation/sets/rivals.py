@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR,
     Hypothesis,
@@ -25,8 +25,6 @@ from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refit
 from pchem_pipeline.discrepancy.by_simulation.sets.search import LOOSE, Search, Trial
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
-
-FloatArray = NDArray[np.float64]
 
 _UNTOUCHED = 0.5  # of what an effect does to a statistic, the most by which others may move one of its own
 
@@ -179,7 +177,7 @@ def _try_placebo(
         search.trials.append(trial)
 
 
-def own_statistics(own: FloatArray, others: FloatArray, noise: FloatArray) -> NDArray[np.bool_]:
+def own_statistics(own: FloatArray, others: FloatArray, noise: FloatArray) -> BoolArray:
     """Return which statistics an effect moves, and others leave alone, (m,).
 
     Args:
