@@ -495,8 +495,7 @@ def test_addresses_of_nothing_do_no_harm(open_tab: Any, store: RunStore, hash_: 
     assert tab.page.get_attribute("#inspector-app", "data-map") == "maps/read_noise_e"
 
 
-@pytest.mark.parametrize("width", [360, 800, 1280])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (800, "dark"), (1280, "light")])
 def test_it_fits_every_width_in_light_and_dark(
     open_tab: Any, store: RunStore, width: int, scheme: str
 ) -> None:
@@ -558,8 +557,7 @@ NAMES = (
 )
 
 
-@pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize("channels", [False, True], ids=["pixels", "channels"])
+@pytest.mark.parametrize(("width", "channels"), [(390, False), (1280, True), (390, True)])
 def test_names_in_all_scripts_keep_the_page_as_wide_as_the_window(
     open_tab: Any, tmp_path: Path, width: int, channels: bool
 ) -> None:

@@ -1,16 +1,12 @@
 """The joint fit against dense algebra, finite differences, plain numpy EM, iminuit and the single fit."""
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers.bounds import cramer_rao
 from helpers.drawn_pixels import draw
 from helpers.em_trace import LIMITS, evaluated
-from helpers.plain_law import pcd_mass
 from helpers.reference_pchem import Theta, memberships
-from iminuit import Minuit
 
 from pchem_pipeline.model.errors import algebra_numba
 from pchem_pipeline.model.fit import tile_numba
@@ -26,8 +22,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     CENTRE,
     DAMPING,
     DERIVATIVES,
-    EXPECTATIONS,
-    EXPECTED,
     FIRST,
     HELD,
     INFORMATION,
@@ -136,20 +130,6 @@ def test_score_and_information_are_the_derivatives(pixel, exact):
         )
 
 
-def test_the_plain_loop_does_what_the_compiled_one_does():
-    tiny = Series(draw_series(np.random.default_rng(2), [0.5, 0.0], 0.3, 1, step=4.0, n_frames=12))
-    theta = tiny.theta([0.6, 0.0], 4.2, 100.0, np.log(1.6))
-    value = tiny(theta, True)
-    at = tiny.at.copy()
-    plain = cells_numba.evaluate_cells(tiny.pixel, theta, EXPECTATIONS, tiny.scratch, tiny.at)
-    assert plain == pytest.approx(value, rel=1e-12)
-    np.testing.assert_allclose(tiny.at[:, :DAMPING], at[:, :DAMPING], rtol=1e-9, atol=1e-9)
-    for j in range(2):
-        x, _ = tiny.codes(j)
-        expected = 12 * pcd_mass(x, (0.6, 0.0)[j], 1 / 4.2, 100.0, np.sqrt(1.6) / 4.2)
-        np.testing.assert_allclose(tiny.pixel.bins[j, EXPECTED, : x.size], expected, atol=1e-9)
-
-
 @pytest.mark.parametrize("exact", [False, True])
 def test_the_arrow_is_solved_and_inverted_as_a_whole(pixel, exact):
     theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
@@ -219,42 +199,6 @@ def test_one_sample_is_the_single_fit(settings):
         np.diagonal(joint.covariance, axis1=1, axis2=2), errors**2, rtol=1e-3 if close < 1e-3 else 0.05
     )
     assert (joint.fit_status == single.fit_status).all()
-
-
-def minus_log_likelihood(series, pixel, h1, h2, g, mu, sigma):
-    value = 0.0
-    noise = g * np.sqrt(max(sigma**2 - 1 / 12, 1e-9))
-    for counts, origin, h in zip(series.counts, series.origins, (h1, h2, 0.0), strict=True):
-        c = counts[pixel]
-        x = origin[pixel] + np.flatnonzero(c)
-        value -= c[c > 0] @ np.log(pcd_mass(x, h, g, mu, noise))
-    return value
-
-
-def test_iminuit_finds_the_same_maximum():
-    series = draw_series(np.random.default_rng(8), [0.8, 3.0, 0.0], 0.6, 2)
-    joint = fit_histograms(series.counts, series.origins, dark=series.dark, settings=EXACT)
-    for pixel in range(2):
-        found = Minuit(partial(minus_log_likelihood, series, pixel), 0.7, 2.8, 0.105, 101.0, 6.1)
-        found.errordef = Minuit.LIKELIHOOD
-        found.limits = [(0.01, 20), (0.01, 20), (0.02, 1), (80, 120), (1, 20)]
-        found.migrad()
-        found.hesse()
-        order = [0, 1, 3, 4, 5]
-        mine = np.concatenate(
-            [
-                joint.quanta_exposure[pixel, :2],
-                [joint.conversion_gain[pixel], joint.bias[pixel], joint.read_noise_dn[pixel]],
-            ]
-        )
-        errors = np.sqrt(np.diagonal(joint.covariance[pixel])[order])
-        np.testing.assert_allclose(mine, np.array(found.values), atol=0.02 * errors.min(), rtol=1e-2)
-        assert (np.abs(mine - np.array(found.values)) < 0.02 * errors).all()
-        # iminuit has the observed information, the fit the expected one
-        np.testing.assert_allclose(errors, np.array(found.errors), rtol=0.08)
-        exposures = joint.quanta_exposure[pixel]
-        bound = cramer_rao(exposures, mine[2], mine[4], series.counts[0][pixel].sum())
-        np.testing.assert_allclose(errors, np.sqrt(np.diagonal(bound)[order]), rtol=0.04)
 
 
 def test_a_pixel_does_not_depend_on_the_others():

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.model.histogram import count_numba
 from pchem_pipeline.model.histogram.count import (
-    HistogramAccumulator,
     choose_bins,
     counts_dtype,
     histogram_frames,
@@ -131,11 +130,3 @@ class TestChoiceOfBins:
         assert not result.over.any()
         assert not result.under.any()
         assert result.counts.shape[2] <= 256
-
-
-def test_empty_block_changes_nothing():
-    frames = pcd_like(10, (40, 2, 2))
-    one = HistogramAccumulator((2, 2), 128, 40)
-    one.add(frames[:0])
-    one.add(frames)
-    np.testing.assert_array_equal(one.finish().counts, histogram_frames(frames, bins=128).counts)

@@ -32,7 +32,7 @@ from pchem_pipeline.report.figures.ensemble import (
 )
 from pchem_pipeline.report.figures.figure import DataTable, csv_text
 from pchem_pipeline.report.figures.maps import map_chart, map_tables, status_chart, status_counts
-from pchem_pipeline.report.figures.pixels import pixels_chart, shown_bins
+from pchem_pipeline.report.figures.pixels import pixels_chart
 from pchem_pipeline.report.figures.stability import (
     frame_table,
     line_spectra,
@@ -95,11 +95,6 @@ def test_a_bin_far_out_does_not_stretch_the_axis(pixel: PixelFit) -> None:
     assert np.ptp(figure.axes[0].get_xlim()) < 400
     assert "1 outside the axis" in texts(figure)
     drawn(figure)
-
-
-def test_shown_bins_refuse_an_empty_histogram() -> None:
-    with pytest.raises(ValueError, match="empty"):
-        shown_bins(np.zeros(3))
 
 
 def _map(kind: str) -> np.ndarray:
@@ -180,14 +175,6 @@ def test_fit_status_map_has_a_legend_of_words(shape: tuple[int, int]) -> None:
         assert f"{MEANINGS[bit]}: 1" in words
     assert f"good fit: {status.size - 2}" in words
     drawn(figure)
-
-
-def test_pixels_that_no_fit_has_reached_are_not_called_good() -> None:
-    status, missing = np.zeros((6, 8), dtype=np.uint16), np.zeros((6, 8), dtype=bool)
-    missing[:2] = True
-    words = texts(draw_chart(LOOK, status_chart(status, status_counts(status, WORDS), missing)))
-    assert "not fitted yet: 16 (33 %)" in words
-    assert "good fit: 32 (67 %)" in words
 
 
 def test_every_status_at_once_and_unknown_bits() -> None:

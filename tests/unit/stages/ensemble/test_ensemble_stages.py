@@ -261,14 +261,15 @@ def test_electron_stack(finished: StageContext) -> None:
     np.testing.assert_array_equal(ensemble["electron_counts"], np.bincount(use, minlength=ensemble["k"].size))
 
 
-@pytest.mark.parametrize(("tile", "backend"), [(8, "serial"), (64, "threads"), (16, "pickled")])
+@pytest.mark.parametrize(
+    ("tile", "executor"),
+    [(64, make_executor(ComputeSettings(backend="threads", workers=3))), (32, PickledTasks())],
+    ids=["threads", "pickled"],
+)
 def test_result_depends_on_neither_tile_nor_backend(
-    finished: StageContext, tmp_path: Path, tile: int, backend: str
+    finished: StageContext, tmp_path: Path, tile: int, executor: Executor
 ) -> None:
     shutil.copytree(finished.base_dir / "frames", tmp_path / "frames")
-    executor = PickledTasks() if backend == "pickled" else None
-    if backend == "threads":
-        executor = make_executor(ComputeSettings(backend="threads", workers=3))
     context = make_context(tmp_path, tile=tile, executor=executor, frames=250)
     for stage in ("simulate", "ingest", "histogram"):
         execute(stage, context)
@@ -278,21 +279,6 @@ def test_result_depends_on_neither_tile_nor_backend(
     assert_same(ensemble_of(context.store), ensemble_of(finished.store))
     for name in ("maps/read_noise_e", "maps/quality", "electrons/electron_number"):
         np.testing.assert_array_equal(context.store.read(name), finished.store.read(name))
-
-
-def test_tiles_come_in_any_order_and_the_axes_follow(
-    finished: StageContext, prepared: Path, tmp_path: Path
-) -> None:
-    fresh_copy(prepared, tmp_path)
-    some = make_context(tmp_path, frames=250, options=Options(roi=(0, 16, 0, NX)))
-    write_fit(some)
-    assert execute("ensemble", some).state == "partial"
-    facts = some.store.attributes("ensemble")
-    assert facts["n_pixels"] + facts["n_pixels_without_value"] == 16 * NX
-    assert facts["tiles_missing"] == 6
-    context = make_context(tmp_path, frames=250)
-    assert execute("ensemble", context).state == "complete"
-    assert_same(ensemble_of(context.store), ensemble_of(finished.store))
 
 
 def test_tiles_that_the_fit_finishes_later_are_added(

@@ -242,7 +242,7 @@ def test_odd_frames_are_in_no_sums_and_empty_ones_in_no_histogram(tmp_path, fram
     odd[:2] += 400
     odd[130:133] = 0
     odd[290, 3, 4:9] = 60_000  # the track of a particle is no odd frame
-    context = make_context(tmp_path / "odd", odd, tile=8)
+    context = make_context(tmp_path / "odd", odd)
     for _ in range(2):
         assert execute("histogram", context).state == "complete"
         left_out = [0, 1, 130, 131, 132]
