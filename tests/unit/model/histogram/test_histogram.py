@@ -5,7 +5,6 @@ import pytest
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.model.histogram import count_numba
 from pchem_pipeline.model.histogram.count import (
     choose_bins,
     counts_dtype,
@@ -56,13 +55,6 @@ def test_an_early_glitch_does_not_take_the_window_with_it():
     assert np.all(result.over == 1)
     assert np.all(result.under == 0)
     assert np.all(result.counts.sum(axis=2) == 599)
-
-
-def test_densest_origin_holds_most_of_the_values():
-    values = np.array([5, 200, 201, 210, 400, 402, 403, 404, 4095], np.uint16)
-    origin = count_numba.densest_origin(values, 32)
-    assert origin <= 400
-    assert origin + 32 > 404
 
 
 def test_more_than_24_bits_are_refused():

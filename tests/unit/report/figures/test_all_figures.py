@@ -177,6 +177,14 @@ def test_fit_status_map_has_a_legend_of_words(shape: tuple[int, int]) -> None:
     drawn(figure)
 
 
+def test_pixels_that_no_fit_has_reached_are_not_called_good() -> None:
+    status, missing = np.zeros((6, 8), dtype=np.uint16), np.zeros((6, 8), dtype=bool)
+    missing[:2] = True
+    words = texts(draw_chart(LOOK, status_chart(status, status_counts(status, WORDS), missing)))
+    assert "not fitted yet: 16 (33 %)" in words
+    assert "good fit: 32 (67 %)" in words
+
+
 def test_every_status_at_once_and_unknown_bits() -> None:
     status = (1 << np.arange(16, dtype=np.uint16)).reshape(2, 8)
     known = {bit: text for bit, text in WORDS.items() if int(bit) != 1 << 15}

@@ -148,7 +148,7 @@ def _bytes_read() -> int:
     return int(facts["rchar"])
 
 
-@pytest.mark.parametrize("name", ["npy", "raw", "tiff", "fits"])
+@pytest.mark.parametrize("name", ["npy", "raw", "tiff"])
 def test_every_byte_is_read_once(tmp_path, frames, name):
     WRITERS[name](tmp_path, np.concatenate([frames] * 3))
     size = sum(path.stat().st_size for path in tmp_path.iterdir())
