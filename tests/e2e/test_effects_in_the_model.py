@@ -74,11 +74,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     run_stages(find_run(path), ["simulate", "ingest", "histogram", "fit", "maps", "ensemble"], QUIET)
     store = RunStore.open(folder / "run.zarr")
     assert not any(store.has(f"fit/{name}") for name in FREE_SATELLITES)
-    before = {
-        "pulls": mean_pulls(store),
-        "facts": dict(store.attributes("ensemble")),
-        "fit": fitted(store),
-    }
+    before = {"pulls": mean_pulls(store), "facts": dict(store.attributes("ensemble")), "fit": fitted(store)}
     configured(folder, EFFECTS)
     before["states"] = states(path)
     run_stages(find_run(path), ["fit", "maps", "ensemble", "report"], QUIET)

@@ -5,12 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.model.histogram.count import (
-    choose_bins,
-    counts_dtype,
-    histogram_frames,
-    pixels_by_range,
-)
+from pchem_pipeline.model.histogram.count import choose_bins, counts_dtype, histogram_frames, pixels_by_range
 
 
 def pcd_like(seed: int, shape: tuple[int, int, int], dtype: type = np.uint16) -> NDArray[np.unsignedinteger]:

@@ -15,13 +15,7 @@ from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import COLUMN_MM, PAGE_MM, Chart
-from pchem_pipeline.report.charts.on_paper import (
-    Drawing,
-    Look,
-    draw_chart,
-    drawing_bytes,
-    small_png,
-)
+from pchem_pipeline.report.charts.on_paper import Drawing, Look, draw_chart, drawing_bytes, small_png
 from pchem_pipeline.report.data import PixelFit
 from pchem_pipeline.report.figures.ensemble import (
     component_table,

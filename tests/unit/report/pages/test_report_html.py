@@ -240,10 +240,7 @@ def test_all_pixels_failed() -> None:
     assert "no pixel has a value" in page.text
     assert "not known" not in sentence(all_failed())
     assert [answer.level for answer in answers(all_failed())] == ["serious", "serious"]
-    assert {str(a["id"]) for a in page.of("figure")} == {
-        "figure-pixel_fits",
-        "figure-fit_status",
-    }
+    assert {str(a["id"]) for a in page.of("figure")} == {"figure-pixel_fits", "figure-fit_status"}
 
 
 def test_ready_made_histograms_are_channels_and_say_what_is_left_out() -> None:

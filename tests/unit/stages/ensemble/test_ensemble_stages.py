@@ -416,11 +416,7 @@ def test_ready_made_histograms(tmp_path: Path, n_samples: tuple[int, int]) -> No
         row += np.bincount(dn.astype(int), minlength=250)
     np.savez(tmp_path / "spectra.npz", dn=np.arange(250), counts=counts)
     config = RunConfig.model_validate({"input": {"files": ["spectra.npz"], "format": "histogram"}})
-    context = StageContext(
-        config,
-        tmp_path,
-        RunStore.create(tmp_path / "run.zarr"),
-    )
+    context = StageContext(config, tmp_path, RunStore.create(tmp_path / "run.zarr"))
     for stage in ("ingest", "histogram"):
         assert execute(stage, context).state == "complete"
     for i, name in enumerate(PARAMETERS):

@@ -114,14 +114,7 @@ def test_the_limit_is_shared_by_the_workers():
 
 @pytest.mark.parametrize(
     ("limit", "allowed", "mebibytes"),
-    [
-        (None, None, 640),
-        (8192, None, 640),
-        (400, None, 140),
-        (200, None, 16),
-        (400, 440, 90),
-        (300, 640, 40),
-    ],
+    [(None, None, 640), (8192, None, 640), (400, None, 140), (200, None, 16), (400, 440, 90), (300, 640, 40)],
 )
 def test_a_band_fits_into_the_memory_of_a_worker_and_of_the_run(limit, allowed, mebibytes):
     content = {"input": {"files": ["a.raw"]}, "compute": {"max_memory": allowed}}

@@ -69,13 +69,7 @@ def make_context(
     if not store.records.read("ingest"):
         info = SensorInfo("frames", *frames.shape, str(frames.dtype), None, None, mode, {})
         ingest(store, info, frames if mode == "copy" else None)
-    return StageContext(
-        config,
-        folder,
-        store,
-        executor or SerialExecutor(),
-        options=options or Options(),
-    )
+    return StageContext(config, folder, store, executor or SerialExecutor(), options=options or Options())
 
 
 def contents(store: RunStore) -> dict[str, NDArray]:

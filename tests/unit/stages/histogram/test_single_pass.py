@@ -80,12 +80,7 @@ def make_context(folder: Path, store: str, *, workers: int = 2, **sections: dict
     content["histogram"] = {"block_frames": 96, "window_frames": 64, **content.get("histogram", {})}
     content["compute"] = {"workers": workers, **content.get("compute", {})}
     config = RunConfig.model_validate(content)
-    return StageContext(
-        config,
-        folder,
-        RunStore.create(folder / store),
-        make_executor(config.compute),
-    )
+    return StageContext(config, folder, RunStore.create(folder / store), make_executor(config.compute))
 
 
 def run_both(context: StageContext) -> StageContext:
