@@ -132,6 +132,16 @@ def test_pixels_whose_bias_may_be_an_electron_off_do_not_count() -> None:
     np.testing.assert_array_equal(bias_weight(np.zeros(3)), 1.0)  # nothing else to go by
 
 
+def test_moment_errors_of_equal_poisson_pixels() -> None:
+    # g = 1 and hardly any noise: mean and variance of n Poisson(H) counts, known in closed form
+    ones = np.ones(50)
+    errors = moment_errors(UsablePixels(4.0 * ones, ones, 0.0 * ones, 1e-6 * ones), 200)
+    n = 50 * 200
+    assert errors["mean"] == pytest.approx(np.sqrt(4.0 / n))
+    assert errors["variance"] == pytest.approx(np.sqrt((4.0 + 2 * 16.0) / n))
+    assert errors["nuced_variance"] == pytest.approx(errors["variance"])
+
+
 def test_moment_errors_are_those_of_repeated_captures() -> None:
     pixels, rng, n = make_pixels(600), np.random.default_rng(14), 400
     h, g, mu, sigma = pixels.maps
