@@ -80,6 +80,11 @@ def test_profiles_have_mean_zero_and_the_range_of_the_drift(shape, drift):
         assert h[-1] - h[0] == pytest.approx(drift * 2.0, rel=1e-9)
 
 
+def test_a_drift_never_makes_the_exposure_negative():
+    effect = ExposureDrift(drift=2.0, path=(0.0, 1.0, 1.0, 1.0, 1.0))
+    assert exposures(effect, np.ones((1, 1)), 100).min() == 0.0
+
+
 @pytest.mark.parametrize("correlation", [0.0, 4.0])
 def test_flicker_has_its_rms_and_memory(correlation):
     n = 40_000

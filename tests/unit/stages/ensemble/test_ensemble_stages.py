@@ -290,7 +290,8 @@ def test_tiles_that_the_fit_finishes_later_are_added(
     state = execute("ensemble", context)
     assert state.state == "failed"
     assert re.search(r"fit of \S+ is not finished", state.why)
-    assert context.store.attributes("ensemble")["n_pixels"] == 16 * NX - 1
+    facts = context.store.attributes("ensemble")
+    assert (facts["n_pixels"], facts["tiles_missing"]) == (16 * NX - 1, 6)
     write_fit(context)
     again = make_context(tmp_path, frames=250)
     assert execute("ensemble", again).state == "complete"
