@@ -54,6 +54,22 @@ def test_one_sample_is_the_single_fit(settings):
     assert (joint.fit_status == single.fit_status).all()
 
 
+def test_plain_em_ends_at_the_same_maximum():
+    series = draw_series(np.random.default_rng(8), [0.8, 3.0, 0.0], 0.25, 3)
+    newton, em = (
+        fit_histograms(
+            series.counts,
+            series.origins,
+            dark=series.dark,
+            settings=FitSettings(algorithm=each, likelihood="density"),
+        )
+        for each in ("newton", "em")
+    )
+    np.testing.assert_allclose(em.quanta_exposure[:, :2], newton.quanta_exposure[:, :2], rtol=1e-4)
+    for name in ("conversion_gain", "bias", "read_noise_dn"):
+        np.testing.assert_allclose(getattr(em, name), getattr(newton, name), rtol=1e-4)
+
+
 def test_a_pixel_does_not_depend_on_the_others():
     series = draw_series(np.random.default_rng(4), [0.6, 2.5], 0.5, 4)
     together = fit_histograms(series.counts, series.origins)
