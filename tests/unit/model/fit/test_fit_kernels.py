@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 from scipy.stats import norm, poisson
 
+from pchem_pipeline.model.fit import climb_numba
 from pchem_pipeline.model.law import pixel_numba
 from pchem_pipeline.model.law.likelihood import density_likelihood
 from pchem_pipeline.model.law.pixel_numba import (
@@ -35,8 +36,11 @@ CASES = [
     (4.0, 10.0, 1.3),
     (60.0, 9.0, 0.3),
     (3.0, 12.0, 0.1),
+    (3.0, 11.0, 0.53),
     (3.0, 4.0, 0.53),
+    (3.0, 4.0, 0.2),
     (3.0, 1.7, 0.45),
+    (3.0, 1.7, 0.3),
 ]
 N = 3000
 
@@ -151,6 +155,29 @@ def test_far_values_have_the_density_of_the_nearest_component() -> None:
         k = np.arange(60)
         terms = poisson.logpmf(k, 1.0) + norm.logpdf(x[:, None], theta.bias + 11.0 * k, sigma)
         assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)
+
+
+def test_a_tied_step_leaves_the_noise_in_electrons() -> None:
+    sample, centre, _, theta = prepare(CASES[2])
+    point = internal(theta, centre)
+    at, h = sample.scratch.evaluations[AT], 1e-4
+
+    def score(p: NDArray[np.float64]) -> NDArray[np.float64]:
+        run(sample, p)
+        climb_numba.tie_noise(p, at, 0.0)
+        return sample.at[SCORE].copy()
+
+    def moved(step: float) -> NDArray[np.float64]:
+        p = point.copy()
+        p[1] += step
+        p[3] = point[3] + 2 * np.log(p[1] / point[1])
+        return p
+
+    score(point)
+    information = sample.at[INFORMATION + 1, 1]
+    slope = (run(sample, moved(h)) - run(sample, moved(-h))) / (2 * h)
+    assert score(point)[1] == pytest.approx(slope, rel=1e-6)
+    assert information == pytest.approx(-(score(moved(h))[1] - score(moved(-h))[1]) / (2 * h), rel=1e-6)
 
 
 def test_no_kernel_lets_the_compiler_choose_the_bits() -> None:
