@@ -201,7 +201,7 @@ def test_without_summaries(tmp_path, frames, expected):
 
 def test_too_little_memory_is_said(tmp_path, frames):
     wide = np.zeros((70, 3, 12000), np.uint8)
-    context = make_context(tmp_path, wide, band_memory=16, window_frames=70)
+    context = make_context(tmp_path, wide, tile=256, band_memory=16, window_frames=70)
     assert execute("histogram", context).state == "complete"
     assert any("more than histogram.band_memory" in note for note in context.notes)
 
