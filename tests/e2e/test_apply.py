@@ -301,28 +301,6 @@ def stated_and_right(output, electrons, at):
     )
 
 
-def test_a_number_at_the_limit_of_the_adc_is_as_often_right_as_it_says(shell):
-    """The limit is seen in the frames alone; a sample there is any electron number from some on."""
-    rng = np.random.default_rng(64)
-    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.2, 0.3))
-    tifffile.imwrite(shell.folder / "dark.tif", camera.frames(rng, 2.0, 2000)[1])
-    shell.ok(
-        "run", "dark.tif", "--store", "run.zarr", "--integration-time", "1", "--until", "maps", "--quiet"
-    )
-    electrons, dn = camera.frames(rng, 2.0, 300)
-    for limit in (125, 145):
-        frames = np.minimum(dn, limit).astype(np.uint16)
-        tifffile.imwrite(shell.folder / f"{limit}.tif", frames)
-        shell.ok("apply", "run.zarr", f"{limit}.tif", "--output", f"{limit}.zarr")
-        for at in (frames == limit, frames < limit):
-            stated, right = stated_and_right(shell.folder / f"{limit}.zarr", electrons, at)
-            assert abs(right - stated) < 4 * np.sqrt(0.25 / at.sum()) + 0.003
-        # two neighbouring numbers alone would be right in less
-        assert stated_and_right(shell.folder / f"{limit}.zarr", electrons, frames == limit)[0] < 0.8
-        exposure = opened(shell.folder / f"{limit}.zarr").exposure.values
-        assert abs(np.nanmedian(exposure) - 2.0) < 0.03
-
-
 ROW_NOISE = 2.5  # DN: 0.24 e-, as much as the read noise
 
 

@@ -204,19 +204,6 @@ def test_refusals_of_a_run_leave_neither_store_nor_yaml(shell):
         assert sorted(path.name for path in shell.folder.iterdir()) == ["a.npy", "a.yaml", "notes"], command
 
 
-def test_a_joint_run_that_is_refused_leaves_no_yaml(shell, finished):
-    shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
-    (shell.folder / "notes").write_text("of mine")
-    (shell.folder / "other.yaml").write_text(
-        (shell.folder / "run.yaml").read_text().replace("run.zarr", "o.zarr")
-    )
-    result = shell("joint", "run.yaml", "other.yaml", "--store", "notes")
-    assert result.code == 2
-    assert "has the same frames" in result.last
-    assert not (shell.folder / "notes.yaml").exists()
-    assert (shell.folder / "notes").read_text() == "of mine"
-
-
 def test_a_run_in_place_of_frames_is_one_line(shell, finished):
     shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
     result = shell("apply", "run.yaml", "run.zarr", "--output", "calibrated.zarr")

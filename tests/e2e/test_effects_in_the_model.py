@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
 from pchem_pipeline.commands.plan import PlanRequest, make_plan
@@ -62,10 +61,6 @@ def mean_pulls(store: RunStore) -> dict[str, float]:
     return found
 
 
-def fitted(store: RunStore) -> dict[str, NDArray[Any]]:
-    return {name: store.read(f"fit/{name}") for name in (*PARAMETERS, "correlation", "fit_status")}
-
-
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """The folder of the run, extended, and what was seen of it before."""
@@ -74,11 +69,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     run_stages(find_run(path), ["simulate", "ingest", "histogram", "fit", "maps", "ensemble"], QUIET)
     store = RunStore.open(folder / "run.zarr")
     assert not any(store.has(f"fit/{name}") for name in FREE_SATELLITES)
-    before = {
-        "pulls": mean_pulls(store),
-        "facts": dict(store.attributes("ensemble")),
-        "fit": fitted(store),
-    }
+    before = {"pulls": mean_pulls(store), "facts": dict(store.attributes("ensemble"))}
     configured(folder, EFFECTS)
     before["states"] = states(path)
     run_stages(find_run(path), ["fit", "maps", "ensemble", "report"], QUIET)
@@ -167,13 +158,3 @@ def test_the_inspector_holds_the_law_of_the_extended_model(both) -> None:
     assert facts["model"].startswith("PCD + ")
     assert facts["sample"]["deciding"]
     assert facts["sample"]["masses"] == 300
-
-
-def test_back_to_the_plain_model_is_back_to_the_plain_fit(both) -> None:
-    path, before = both
-    configured(path.parent, [])
-    run_stages(find_run(path), ["fit"], QUIET)
-    store = RunStore.open(path.parent / "run.zarr")
-    for name, values in before["fit"].items():
-        np.testing.assert_array_equal(store.read(f"fit/{name}"), values, err_msg=name)
-    assert not any(store.has(f"fit/{name}") for name in FREE_SATELLITES)

@@ -59,10 +59,7 @@ TABLE = {
     "files gone, no histogram": (_no_files_and_no_histogram, (OK, OK, OK, INPUT, OK, OK, INPUT)),
 }
 #: Where the frames stay in the files, what differs from this.
-REFERENCED = {
-    "files refused, then gone": {},
-    "files gone, no histogram": {"histogram": INPUT, "run": INPUT},
-}
+REFERENCED = {"files refused, then gone": {}, "files gone, no histogram": {"histogram": INPUT, "run": INPUT}}
 
 
 def _invoke(folder, command, *options):

@@ -231,17 +231,9 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, tmp_path):
             {},
             "is not above 1 of sample dark_1s.zarr",
         ),
-        (
-            [("dark_1s.zarr", ""), ("small.yaml", "")],
-            {},
-            "has 8 x 8 pixels, sample dark_1s.zarr 8 x 12",
-        ),
+        ([("dark_1s.zarr", ""), ("small.yaml", "")], {}, "has 8 x 8 pixels, sample dark_1s.zarr 8 x 12"),
         ([("dark_1s.zarr", ""), ("twelve.yaml", "")], {}, "has 12 bits, sample dark_1s.zarr 14"),
-        (
-            [("dark_1s.zarr", ""), ("twin.yaml", "")],
-            {},
-            "has the same frames as sample dark_1s.zarr",
-        ),
+        ([("dark_1s.zarr", ""), ("twin.yaml", "")], {}, "has the same frames as sample dark_1s.zarr"),
         (
             [("timeless.yaml", ""), ("dark_2s.zarr", "")],
             {},

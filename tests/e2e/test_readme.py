@@ -56,11 +56,7 @@ def test_the_two_commands_are_there_and_the_demo_runs(shell):
     for line in block.splitlines():
         script = ROOT / line.split()[0]
         assert os.access(script, os.X_OK)
-    environment = {
-        **os.environ,
-        "PCHEM_NO_INSTALL": "1",
-        "PCHEM_VENV": str(Path(sys.executable).parents[1]),
-    }
+    environment = {**os.environ, "PCHEM_NO_INSTALL": "1", "PCHEM_VENV": str(Path(sys.executable).parents[1])}
     command = [str(ROOT / "scripts" / "demo"), "out", "--size", "16", "--frames", "1500"]
     result = subprocess.run(
         command, cwd=shell.folder, env=environment, capture_output=True, text=True, timeout=500

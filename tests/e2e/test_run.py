@@ -77,8 +77,7 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
 
 
 @pytest.mark.parametrize(
-    ("tile", "backend", "mode"),
-    [(16, "serial", "reference"), (64, "processes", "copy"), (8, "distributed", "reference")],
+    ("tile", "backend", "mode"), [(64, "processes", "copy"), (8, "distributed", "reference")]
 )
 def test_neither_tiling_nor_backend_nor_mode_changes_the_answer(shell, frames, finished, tile, backend, mode):
     text = RUN.replace("tile: 8", f"tile: {tile}").replace("bit_depth", f"mode: {mode}, bit_depth")

@@ -60,8 +60,10 @@ def expected(target: Target) -> tuple[NDArray[Any], NDArray[np.uint32]]:
     return simulate_block(draw_truth(settings), settings, (0, settings.n_frames))
 
 
-@pytest.mark.parametrize("frames_per_file", [None, 5])
-@pytest.mark.parametrize("format", ["tiff", "fits", "hdf5", "npy", "raw", "zarr"])
+@pytest.mark.parametrize(
+    ("format", "frames_per_file"),
+    [("tiff", None), *((each, 5) for each in ("tiff", "fits", "hdf5", "npy", "raw", "zarr"))],
+)
 def test_every_format_holds_the_frames_and_the_store_the_truth(tmp_path, format, frames_per_file):
     target = prepare(tmp_path, backend="threads", format=format, frames_per_file=frames_per_file)
     assert simulated(target) == "complete"

@@ -150,7 +150,7 @@ def test_every_operation_fails_once(tmp_path, monkeypatch, before, step):
     assert refused > 0.9 * len(range(3, total, step))
 
 
-@pytest.mark.parametrize("step", [4, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("step", [6, pytest.param(1, marks=pytest.mark.long)])
 @pytest.mark.parametrize("before", [None, 0.25], ids=["new", "over older results"])
 def test_a_power_cut_at_any_moment(tmp_path, monkeypatch, before, step):
     expected = run(tmp_path / "expected.zarr")

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import tifffile
-from astropy.io import fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -83,44 +82,3 @@ def test_windows_of_tiff(
                 options = {"compression": compression, "rowsperstrip": rows, "metadata": None}
                 writer.write(frame, photometric="minisblack", **options)
         check(data, path, stack)
-
-
-@settings(max_examples=15, deadline=None)
-@given(data=st.data(), stack=stacks(), compressed=st.booleans())
-def test_windows_of_fits(data: st.DataObject, stack: NDArray[Any], compressed: bool) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.fits"
-        (fits.CompImageHDU(stack) if compressed else fits.PrimaryHDU(stack)).writeto(path)
-        check(data, path, stack)
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    data=st.data(),
-    stack=stacks(),
-    order=st.sampled_from(["little", "big"]),
-    header=st.integers(0, 40),
-    padding=st.integers(0, 20),
-    shift=st.integers(0, 5),
-)
-def test_windows_of_raw(
-    data: st.DataObject, stack: NDArray[Any], order: str, header: int, padding: int, shift: int
-) -> None:
-    stack = stack >> stack.dtype.type(shift)
-    stored = (stack << stack.dtype.type(shift)).astype(
-        stack.dtype.newbyteorder(">" if order == "big" else "<")
-    )
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.raw"
-        path.write_bytes(bytes(header) + b"".join(frame.tobytes() + b"\x99" * padding for frame in stored))
-        check(
-            data,
-            path,
-            stack,
-            shape=stack.shape,
-            dtype=stack.dtype.name,
-            byte_order=order,
-            header_bytes=header,
-            frame_padding_bytes=padding,
-            bit_shift=shift,
-        )

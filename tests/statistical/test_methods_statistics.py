@@ -83,7 +83,7 @@ def test_emva_gives_the_sensor_one_gain():
 
 @pytest.mark.parametrize(("exposure", "noise"), [(2.0, 0.3), (2.0, 0.6), (6.0, 0.4)])
 def test_likelihood_with_a_dark_sample_beats_photon_transfer_and_no_bound(exposure, noise):
-    given, truth = pixels((exposure, 0.0), noise, 400)
+    given, truth = pixels((exposure, 0.0), noise, 200)
     errors, _ = log_errors("dark_and_bright_mle", given, truth, MethodsSettings(em_tolerance=1e-7))
     shared = N * (shared_information(exposure, noise) + shared_information(0.0, noise))
     bound = np.sqrt(inverse_information(shared)[0, 0])

@@ -116,11 +116,6 @@ def test_ser_and_raw(tmp_path: Path) -> None:
     assert facts(tmp_path / "a.raw", format="raw") == CameraFacts("R", None, -5.0, None)
 
 
-def test_files_without_facts_have_none(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", STACK)
-    assert facts(tmp_path / "a.npy") == CameraFacts()
-
-
 def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
     for i, temperature in enumerate((-20.0, -20.4, -17.0)):
         image = fits.PrimaryHDU(STACK[i])
@@ -326,9 +321,9 @@ def test_every_format_with_attributes_takes_the_same_names(tmp_path: Path) -> No
         attributes = file.create_dataset("frames", data=frames).attrs
         attributes["exposure_time"], attributes["exposure_time_units"] = np.array([20.0]), "ms"
         attributes["bit_depth_readout"] = np.array([12])
-    array = zarr.create_array(str(tmp_path / "a.zarr"), shape=frames.shape, dtype=frames.dtype)
+    array = zarr.create_array(str(tmp_path / "capture"), shape=frames.shape, dtype=frames.dtype)
     array[:] = frames
     array.attrs.update(exposure_time=20, exposure_time_units="ms", bit_depth_readout=12)
-    for name in ("a.h5", "a.zarr"):
+    for name in ("a.h5", "capture"):
         with opened(tmp_path / name) as stack:
             assert (stack.integration_time, stack.bit_depth) == (pytest.approx(0.02), 12)

@@ -21,7 +21,7 @@ from pchem_pipeline.frames.inspect import _gaps
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import natural_key, resolve_files
 from pchem_pipeline.frames.settings import InputSettings
-from pchem_pipeline.frames.writing import WRITERS, write_frames
+from pchem_pipeline.frames.writing import write_frames
 
 STACK = np.random.default_rng(15).integers(0, 4096, (12, 17, 19)).astype(np.uint16)
 
@@ -98,17 +98,6 @@ def test_mixed_formats_are_concatenated(tmp_path: Path) -> None:
     for t0, t1 in [(0, 1), (4, 6), (5, 6), (3, 10), (11, 12)]:
         np.testing.assert_array_equal(reader.read(t0, t1, 3, 14), STACK[t0:t1, 3:14])
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(reader)).read(), STACK)
-
-
-@pytest.mark.parametrize("format", WRITERS)
-def test_range_and_region(tmp_path: Path, format: str) -> None:
-    write_frames(format, tmp_path / "a", iter([STACK]), STACK.shape, "uint16", frames_per_file=5)
-    settings = InputSettings(files=("a_*",), roi=(2, 13, 4, 18), frame_range=(3, 11))
-    reader = open_frames(settings, tmp_path)
-    wanted = STACK[3:11, 2:13, 4:18]
-    assert reader.shape == wanted.shape
-    np.testing.assert_array_equal(reader.read(), wanted)
-    np.testing.assert_array_equal(reader.read(1, 6, 3, 5), wanted[1:6, 3:5])
 
 
 def test_region_through_a_small_scratch_buffer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,7 +36,7 @@ def blocks(stack: NDArray[Any], size: int) -> Iterator[NDArray[Any]]:
 
 @pytest.mark.parametrize("format", WRITERS)
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "uint32"])
-@pytest.mark.parametrize(("size", "per_file"), [(4, None), (13, None), (4, 1), (5, 3), (2, 6)])
+@pytest.mark.parametrize(("size", "per_file"), [(4, None), (4, 1), (5, 3)])
 def test_round_trip(tmp_path: Path, format: str, dtype: str, size: int, per_file: int | None) -> None:
     stack = make_stack(dtype)
     if format == "ser" and dtype == "uint32":

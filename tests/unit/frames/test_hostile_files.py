@@ -4,7 +4,6 @@ import bz2
 import gzip
 import io
 import json
-import lzma
 import os
 import pickle
 import struct
@@ -31,7 +30,7 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.run_store import RunStore, _refuse_links
 
 STACK = np.random.default_rng(2).integers(0, 4096, (40, 16, 16)).astype(np.uint16)
-BOMB = 1 << 28
+BOMB = 1 << 24
 
 
 @contextmanager
@@ -47,27 +46,14 @@ def deflated() -> bytes:
     return zlib.compress(bytes(BOMB), 9)
 
 
-@pytest.mark.parametrize("codec", ["zlib", "gzip", "zstd", "blosc"])
+@pytest.mark.parametrize("codec", ["zlib", "gzip", "zstd", "blosc", "bz2", "lz4", "lzma"])
 def test_zarr(tmp_path: Path, codec: str) -> None:
-    path, old = tmp_path / "a.zarr", codec == "zlib"
-    coded = {"id": "zlib", "level": 1} if old else {"name": codec, "configuration": {}}
-    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded, zarr_format=2 if old else 3)
+    path, new = tmp_path / "a.zarr", codec in ("gzip", "zstd", "blosc")
+    coder = numcodecs.get_codec({"id": codec})
+    coded = {"name": codec, "configuration": {}} if new else coder
+    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded, zarr_format=3 if new else 2)
     read(path)
-    bomb = {"zlib": zlib, "gzip": gzip, "zstd": numcodecs.Zstd(), "blosc": numcodecs.Blosc()}[codec]
-    coder = bomb.encode if hasattr(bomb, "encode") else bomb.compress
-    (path / ("1.0.0" if old else "c/1/0/0")).write_bytes(coder(bytes(BOMB)))
-    with refused_at_once(r"a\.zarr: damaged: a piece of \d+ bytes unpacks to more than"):
-        read(path)
-
-
-@pytest.mark.parametrize("codec", ["bz2", "lz4", "lzma"])
-def test_zarr_of_other_codecs(tmp_path: Path, codec: str) -> None:
-    path, coder = tmp_path / "a.zarr", {"bz2": bz2, "lz4": numcodecs.LZ4(), "lzma": lzma}[codec]
-    coded = numcodecs.get_codec({"id": codec})
-    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded, zarr_format=2)
-    read(path)
-    bomb = coder.encode(bytes(BOMB)) if codec == "lz4" else coder.compress(bytes(BOMB >> 4))
-    (path / "1.0.0").write_bytes(bomb)
+    (path / ("c/1/0/0" if new else "1.0.0")).write_bytes(coder.encode(bytes(BOMB)))
     with refused_at_once(r"a\.zarr: damaged: a piece of \d+ bytes unpacks to more than"):
         read(path)
 
@@ -98,8 +84,7 @@ def test_shards_are_many_pieces(tmp_path: Path, codec: str, place: str) -> None:
     data = (path / "c/0/0/0").read_bytes()
     first, size = (0 if place == "start" else len(data) - 324), 320
     index = np.frombuffer(data[first : first + size], "<u8").reshape(20, 2).copy()
-    coder = {"gzip": gzip, "zstd": numcodecs.Zstd(), "blosc": numcodecs.Blosc()}[codec]
-    bomb = coder.compress(bytes(BOMB)) if codec == "gzip" else coder.encode(bytes(BOMB))
+    bomb = numcodecs.get_codec({"id": codec}).encode(bytes(BOMB))
     index[7] = (324 if place == "start" else 0), len(bomb)
     coded_index = index.tobytes() + bytes(4)
     (path / "c/0/0/0").write_bytes(coded_index + bomb if place == "start" else bomb + coded_index)
@@ -203,7 +188,7 @@ def test_npz(tmp_path: Path) -> None:
     np.save(member, np.zeros(8, np.int64))
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("dn.npy", member.getvalue())
-        archive.writestr("counts.npy", bytes(BOMB + 1))
+        archive.writestr("counts.npy", bytes((1 << 28) + 1))
     with refused_at_once(r"bytes unpacked, too large for histograms"):
         read_histograms(InputSettings(files=("a.npz",)), tmp_path)
 

@@ -325,18 +325,6 @@ def test_offsets_follow_the_bit_before():
     assert abs(apart / (effect.side * effect.strength) - 1) < 0.05
 
 
-def test_repeated_lines_are_those_before_them():
-    for seed in (1, 2, 3):
-        hiding, plain = hide(("repeated_lines",), 20.0, seed, SHAPE, FRAMES), made(seed=seed).frames
-        (effect,) = hiding.effects
-        found, before = (np.moveaxis(f, effect.axis + 1, 1) for f in (hiding.frames, plain))
-        changed = (found != before).any(axis=2)
-        t, y = np.nonzero(changed)
-        np.testing.assert_array_equal(found[t, y], before[t, y - 1])
-        n = changed[:, 1:].size
-        assert abs(changed.sum() - n * effect.strength) < 5 * np.sqrt(n * effect.strength)
-
-
 def test_misplaced_lines_hold_the_samples_of_others():
     moves = set()
     for seed in range(12):

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.simulate.distributions import Constant, Gamma, LogNormal, LogUniform, Normal, Uniform
+from pchem_pipeline.simulate.distributions import Gamma, LogNormal, LogUniform, Normal, Uniform
 from pchem_pipeline.simulate.maps import draw_truth, truncated_quantile
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import Defect
@@ -48,10 +48,6 @@ def test_quantiles_agree_with_scipy_and_truncation_keeps_the_shape(distribution,
 def test_bounds_that_leave_nothing_are_refused():
     with pytest.raises(ConfigError, match="exclude the whole"):
         truncated_quantile(Normal(mean=0, std=1, minimum=50), np.array([0.5]))
-
-
-def test_constants_need_no_bounds():
-    assert (truncated_quantile(Constant(value=4), np.array([0.1, 0.9])) == 4).all()
 
 
 def test_constant_maps_and_derived_noise():

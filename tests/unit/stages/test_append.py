@@ -46,11 +46,7 @@ def target(folder: Path, store: str, files: tuple[str, ...] = ("f*.npy",), **sec
 
 @pytest.mark.parametrize(
     ("cuts", "mode", "summaries"),
-    [
-        ((301, 650), "reference", True),
-        ((192, 480), "copy", True),
-        ((90,), "copy", False),
-    ],
+    [((301, 650), "reference", True), ((192, 480), "copy", True), ((90,), "copy", False)],
 )
 def test_the_result_is_that_of_all_frames(tmp_path, monkeypatch, frames, cuts, mode, summaries):
     monkeypatch.setattr("pchem_pipeline.stages.ingest._CHUNK", (32, 16, 16))

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from helpers.places import SIPM
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -220,52 +219,12 @@ def test_stated_time_is_kept_apart_from_the_configured_one(tmp_path: Path) -> No
     assert configured.sensor.integration_time == 2.0
 
 
-def test_file_that_vanishes_while_copying(
-    tmp_path: Path, small_chunks: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_stack(tmp_path / "cam")
-    real = ingest._copy
-
-    def copy(unit: ingest.CopyUnit, store: RunStore, **rest: Any) -> None:
-        if unit.t0 == 16:
-            (tmp_path / "cam" / "f11.tif").unlink(missing_ok=True)
-        real(unit, store, **rest)
-
-    monkeypatch.setattr(ingest, "_copy", copy)
-    with pytest.raises(
-        InputError, match=r"f11\.tif: the file disappeared while it was being read; restore"
-    ) as caught:
-        run(make_context(tmp_path))
-    assert caught.value.exit_code == 4
-    monkeypatch.setattr(ingest, "_copy", real)
-    write_stack(tmp_path / "cam")
-    context = make_context(tmp_path)
-    assert status(STAGES["ingest"], context).words().startswith("partial 4 of 12")
-    assert run(context).state == "complete"
-    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
-
-
 def test_small_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_stack(tmp_path / "cam")
     monkeypatch.setattr(RunStore, "free_bytes", lambda self: 1000)
     context = make_context(tmp_path)
     run(context)
     assert any("set input.mode: reference" in note for note in context.notes)
-
-
-def test_ready_made_histograms(tmp_path: Path) -> None:
-    context = make_context(tmp_path, files=[str(SIPM / "*.csv")])
-    assert run(context).state == "complete"
-    sensor = SensorInfo.read(context.store)
-    assert sensor.kind == "histograms"
-    assert sensor.shape == (1, 6)
-    assert sensor.names[-1] == "M11_LED_dark"
-    assert sensor.n_frames == 19107824
-    assert sensor.dtype == "uint16"
-    assert sensor.integration_time is None
-    assert not context.store.has("frames/dn")
-    assert len(sensor.identity["files"]) == 6
-    assert run(make_context(tmp_path, files=[str(SIPM / "*.csv")])).state == "complete"
 
 
 def test_sidecar_belongs_to_the_content(tmp_path: Path) -> None:

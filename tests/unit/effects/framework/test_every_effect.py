@@ -84,11 +84,7 @@ EVERY: list[Effect] = [
     *(make("misplaced_lines", share=0.3, move=move, lines="columns") for move in ("swapped", "line_twice")),
     make("black_clamp", follow=1.0, rows=(0, 2)),
     make("read_order_noise", noise_dn=1.0, taps=2),
-    make(
-        "empirical",
-        share=0.4,
-        moves=[{"towards": (-1, 0, 0), "part": 0.5}, {"towards": (0, 1, 0)}],
-    ),
+    make("empirical", share=0.4, moves=[{"towards": (-1, 0, 0), "part": 0.5}, {"towards": (0, 1, 0)}]),
     make(
         "empirical_noise",
         noise_dn=3.0,

@@ -101,48 +101,6 @@ def test_what_cannot_be_said_is_refused_in_one_line():
         mass([EFFECTS[0].at_place(Region(columns=((2, 9),)))])
 
 
-def plain_numpy_frames(rng, n_frames, row_noise, frames=slice(None)):
-    """Return frames with row noise in the region and frames, by another hand than the simulator's."""
-    charge = rng.poisson(EXPOSURE, (n_frames, *SHAPE))
-    x = BIAS + charge / GAIN + rng.normal(0.0, np.sqrt(SIGMA**2 - 1 / 12), charge.shape)
-    offsets = np.zeros((n_frames, SHAPE[0], 1))
-    offsets[frames] = rng.normal(0.0, row_noise, offsets[frames].shape)
-    x[:, :, 2:4] += offsets
-    return np.rint(x).astype(np.uint16)
-
-
-def test_the_fit_with_a_placed_effect_finds_the_read_noise_of_all_pixels():
-    n = 6000
-    frames = plain_numpy_frames(np.random.default_rng(11), n, 2.0)
-    histograms = histogram_frames(frames)
-    counts = histograms.counts.reshape(8, -1)
-    effect = make("row_noise", row_noise_dn=2.0)
-    inside = REGION.mask(SHAPE).ravel()
-
-    def fitted(effects):
-        law = sample_law(effects, maps(), places=PixelPlaces.of_block(None, SHAPE, np.arange(n)))
-        return fit_histograms(counts, histograms.origin.ravel(), law=law)
-
-    placed = fitted([effect.at_place(REGION)])
-    error = 5.0 * np.sqrt(placed.covariance[:, 3, 3])
-    assert (np.abs(placed.read_noise_dn - SIGMA) < error).all()
-    # and the test can fail: everywhere, or nowhere, is wrong for half of the pixels
-    assert (np.abs(fitted([effect]).read_noise_dn - SIGMA) > error)[~inside].all()
-    assert (np.abs(fitted([]).read_noise_dn - SIGMA) > error)[inside].all()
-
-
-def test_the_fit_with_an_effect_in_some_frames_finds_the_read_noise():
-    n = 8000
-    frames = plain_numpy_frames(np.random.default_rng(12), n, 6.0, slice(0, n // 4))
-    histograms = histogram_frames(frames)
-    effect = make("row_noise", row_noise_dn=6.0).at_place(REGION, When(range=((0, n // 4),)))
-    law = sample_law([effect], maps(), places=PixelPlaces.of_block(None, SHAPE, np.arange(n)))
-    found = fit_histograms(histograms.counts.reshape(8, -1), histograms.origin.ravel(), law=law)
-    error = np.sqrt(found.covariance[:, 3, 3])
-    assert (np.abs(found.read_noise_dn - SIGMA) < 5.0 * error).all()
-    assert (found.goodness_p > 1e-4).all()
-
-
 def test_free_satellites_are_looked_for_inside_only():
     effect = next(iter(effect_class("rts_noise").typical())).at_place(REGION)
     law = sample_law([effect], maps(), places=places())

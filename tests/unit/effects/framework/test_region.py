@@ -24,11 +24,7 @@ def expected_mask(condition):
         ({"columns": [12, 16]}, lambda y, x: (x >= 12) & (x < 16), "columns 12 to 15"),
         ({"columns": 7}, lambda y, x: x == 7, "column 7"),
         ({"columns": "12:16"}, lambda y, x: (x >= 12) & (x < 16), "columns 12 to 15"),
-        (
-            {"rows": [[0, 2], [5, 6]]},
-            lambda y, x: (y < 2) | (y == 5),
-            "rows 0 to 1 and 5",
-        ),
+        ({"rows": [[0, 2], [5, 6]]}, lambda y, x: (y < 2) | (y == 5), "rows 0 to 1 and 5"),
         (
             {"rows": [3, 10], "columns": [4, 8]},
             lambda y, x: (y >= 3) & (y < 10) & (x >= 4) & (x < 8),

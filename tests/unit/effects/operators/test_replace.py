@@ -10,9 +10,7 @@ from pchem_pipeline.discrepancy.observe.misplaced import own_lines
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted
-from pchem_pipeline.effects.operators.offsets import (
-    RowNoise,
-)
+from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.effects.operators.replace import (
     BitErrors,
     MisplacedLines,

@@ -70,7 +70,7 @@ def test_many_threads_read_one_stack_of_files(tmp_path: Path, layout: str) -> No
     reader, rng = opened(tmp_path), np.random.default_rng(4)
     windows = [
         (*np.sort(rng.choice(7, 2, replace=False)), *np.sort(rng.choice(22, 2, replace=False)))
-        for _ in range(120)
+        for _ in range(60)
     ]
 
     def task(window: tuple[int, int, int, int]) -> bool:

@@ -12,7 +12,6 @@ from helpers.camera_files import opened, read, refused
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.formats.raw import RawReader
 from pchem_pipeline.frames.formats.ser import SerReader
 from pchem_pipeline.frames.settings import InputSettings
 
@@ -192,9 +191,3 @@ def test_ser_refusals(tmp_path: Path) -> None:
     ]:
         path.write_bytes(data)
         refused(words, path)
-
-
-def test_reader_of_a_missing_file(tmp_path: Path) -> None:
-    for cls in (RawReader, SerReader):
-        with pytest.raises(InputError, match="cannot be read"):
-            cls.open(tmp_path / "none", InputSettings(shape=(2, 2), dtype="uint8"))

@@ -46,7 +46,7 @@ def converted(frames: np.ndarray, pixels: KnownPixels) -> np.ndarray:
 @pytest.mark.parametrize("case", CASES)
 def test_thresholds_are_where_the_largest_membership_changes(case: tuple[float, ...]) -> None:
     h, g, mu, sigma = case
-    x = np.linspace(mu - 4 / g, mu + 60 / g, 20_001)
+    x = np.linspace(mu - 4 / g, mu + 60 / g, 4001)
     table = thresholds(h, g, mu, sigma, 399)
     assert np.all(np.diff(table) > 0)
     np.testing.assert_array_equal(np.searchsorted(table, x), membership_argmax(x, *case))

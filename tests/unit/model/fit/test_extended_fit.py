@@ -6,14 +6,12 @@ import functools
 import numpy as np
 import pytest
 from helpers.extended_reference import LAWS
-from helpers.plain_law import pcd_mass
 from numpy.typing import NDArray
 from scipy.optimize import root
 
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
-from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -94,23 +92,6 @@ def test_fit_is_where_the_gradient_vanishes(name: str) -> None:
     np.testing.assert_allclose(
         extended.log_likelihood, log_likelihood(counts, origins(5), extended, model), rtol=1e-13
     )
-
-
-def test_neutral_fit_agrees_with_an_independent_likelihood_and_with_the_plain_one() -> None:
-    counts = drawn(SampleLaw(), TRUTH)
-    plain = fit_histograms(counts, origins(5))
-    extended = fit_histograms(counts, origins(5), law=SampleLaw(), start=plain)
-    # density and exact mass differ by terms of order 1/24 of the second derivative, which sigma takes up
-    assert (abs(columns(extended) - columns(plain)) < 0.01 * stderr(plain)).all()
-    np.testing.assert_allclose(stderr(extended), stderr(plain), rtol=1e-4)
-    exposure, gain, bias, sigma = columns(extended).T[..., None]
-    analog = gain * np.sqrt(sigma**2 - 1 / 12)
-    mass = pcd_mass(np.arange(FIRST, FIRST + N_CODES), exposure, gain, bias, analog)
-    expected = np.where(counts > 0, counts * np.log(np.maximum(mass, 1e-300)), 0.0).sum(axis=1)
-    np.testing.assert_allclose(extended.log_likelihood, expected, rtol=1e-12)
-    assert (extended.fit_status == 0).all()
-    assert np.isnan(extended.satellite_amplitude_e).all()
-    assert not extended.satellite_weight.any()
 
 
 def test_pixels_do_not_influence_each_other() -> None:
@@ -229,50 +210,6 @@ def test_free_satellites_are_found_where_they_are_and_nowhere_else() -> None:
     )
     mass = sample_mass(law, extended, np.arange(FIRST, FIRST + N_CODES))
     np.testing.assert_allclose(mass.sum(axis=1), 1.0, atol=1e-6)
-
-
-def test_telegraph_levels_are_found_where_the_plain_fit_is_astray() -> None:
-    """Steps near 1 e- are taken for electrons: the fit alone is off by one, or finds another comb."""
-    n = 60
-    rng = np.random.default_rng(21)
-    truth = [rng.uniform(0.6, 3.2, n), 1 / rng.normal(12.0, 0.2, n), np.full(n, 100.0), np.full(n, 3.9)]
-    amplitude, weight = rng.uniform(0.9, 1.35, n), rng.uniform(0.3, 0.48, n)
-    shares = np.stack([0.5 * weight, 1 - weight, 0.5 * weight], axis=1)
-    shifts = np.stack([-amplitude, 0 * amplitude, amplitude], axis=1)
-    counts = drawn(SampleLaw().with_noise(shares, shift_e=shifts), truth)
-    plain = fit_histograms(counts, origins(n))
-    law = SampleLaw().with_free_satellites([0.5, 0.7, 1.0, 1.4, 2.0], alarm=1e-3)
-    extended = fit_histograms(counts, origins(n), law=law, start=plain)
-    astray = abs(columns(plain) - np.stack(truth, axis=1))[:, 0] > 0.5
-    assert astray.mean() > 0.5
-    found = extended.satellite_weight > 0
-    assert found.mean() > 0.9
-    off = abs(columns(extended) - np.stack(truth, axis=1))[:, 0] > 0.5
-    assert off.mean() < 0.1
-    # between the amplitudes of the grid, too, the fit is likelier than the truth
-    of_truth = log_likelihood(counts, origins(n), truth, law, satellites=(amplitude, weight))
-    assert (extended.log_likelihood > of_truth)[found & ~off].all()
-    pulls = (columns(extended) - np.stack(truth, axis=1))[found & ~off] / stderr(extended)[found & ~off]
-    # the amplitude's own uncertainty is not in the errors, so single pulls are wider; their mean is not
-    assert (abs(pulls.mean(axis=0)) < 5 * pulls.std(axis=0) / np.sqrt(len(pulls))).all()
-    assert (abs(np.median(pulls, axis=0)) < 1.0).all()
-
-
-def test_one_hit_does_not_move_a_fit_that_allows_for_outliers() -> None:
-    counts = drawn(SampleLaw(), TRUTH)
-    clean = fit_histograms(counts, origins(5))
-    hit = counts.copy()
-    hit[:, N_CODES - 1] += 1
-    start = fit_histograms(hit, origins(5))
-    law, off = SampleLaw(), FitSettings(tail_guard=0.0)
-    careless = fit_histograms(hit, origins(5), law=law, start=start, settings=off)
-    careful = fit_histograms(hit, origins(5), law=law.with_outliers(1e-4), start=start, settings=off)
-    guarded = fit_histograms(hit, origins(5), law=law, start=start)
-    moved = [abs(columns(fit) - columns(clean)) / stderr(clean) for fit in (careless, careful, guarded)]
-    assert moved[0].max() > 0.2
-    assert moved[1].max() < 0.02
-    assert moved[2].max() < 0.02
-    np.testing.assert_allclose(guarded.outlier_share, 1 / (FRAMES + 1))
 
 
 def test_a_law_without_limits_is_cut_where_the_adc_cuts() -> None:

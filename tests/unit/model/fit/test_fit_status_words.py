@@ -129,11 +129,7 @@ def test_adc_limits() -> None:
     pixel = draw(np.random.default_rng(1), 2.0, 11.0, 0.3)
     seen = pixel.origin[0] + np.flatnonzero(pixel.counts[0])
     low, high = int(seen[0]), int(seen[-1])
-    cases = (
-        ((low, high + 9), True),
-        ((low - 9, high), True),
-        ((low - 1, high + 1), False),
-    )
+    cases = (((low, high + 9), True), ((low - 9, high), True), ((low - 1, high + 1), False))
     for limits, expected in cases:
         result = fit_histograms(pixel.counts, pixel.origin, adc_limits=limits)
         assert bool(word(result) & FitStatus.ADC_LIMIT) is expected

@@ -1,42 +1,14 @@
 """The joint fit against dense algebra, finite differences, plain numpy EM, iminuit and the single fit."""
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers.bounds import cramer_rao
 from helpers.drawn_pixels import draw
-from helpers.em_trace import LIMITS, evaluated
-from helpers.plain_law import pcd_mass
-from helpers.reference_pchem import Theta, memberships
-from iminuit import Minuit
 
-from pchem_pipeline.model.errors import algebra_numba
-from pchem_pipeline.model.fit import tile_numba
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.climb_numba import em_step
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.model.law import cells_numba
-from pchem_pipeline.model.law.inputs import pack
-from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood
-from pchem_pipeline.model.law.pixel_numba import (
-    AT,
-    CENTRE,
-    DAMPING,
-    DERIVATIVES,
-    EXPECTATIONS,
-    EXPECTED,
-    FIRST,
-    HELD,
-    INFORMATION,
-    N_BINS,
-    SCORE,
-    WEIGHT,
-    make_scratch,
-)
-from pchem_pipeline.model.law.sample_law import SampleLaw
 
 EXACT = FitSettings(likelihood="exact")
 
@@ -66,145 +38,6 @@ def draw_series(rng, exposures, noise_e, n_pixels, *, step=10.0, bias=100.3, n_f
     return Drawn(counts, origins, [exposure == 0 for exposure in exposures])
 
 
-class Series:
-    """One pixel of a series as the loops take it."""
-
-    def __init__(self, series):
-        places = np.concatenate([[0], np.cumsum([c.shape[1] for c in series.counts])]).astype(np.int64)
-        counts = np.concatenate([c[:1] for c in series.counts], axis=1).astype(np.uint32)
-        origin = np.array([[o[0] for o in series.origins]], np.int64)
-        given = tile_numba.Histograms(
-            counts, places, origin, np.array(series.dark), np.zeros(counts.shape, np.uint8)
-        )
-        law = pack([SampleLaw()] * len(series.counts), 1)
-        self.pixel = tile_numba.load_pixel(given, 0, tile_numba.make_room(given, law))
-        cells_numba.resolve(law, 0, 0.0, self.pixel)
-        self.scratch = make_scratch(len(series.counts), int(np.diff(places).max()), True)
-        self.at = self.scratch.evaluations[AT]
-        self.dark = np.array(series.dark)
-
-    def theta(self, exposures, step, bias, v):
-        log = [np.log(h) if h > 0 else -60.0 for h in exposures]
-        return np.array([*log, step, bias - self.pixel.centre, v, 0.0])
-
-    def codes(self, j):
-        """Values from the bias's own zero, and counts, of a sample."""
-        facts = self.pixel.facts[j]
-        n = int(facts[N_BINS])
-        first = self.pixel.centre + facts[CENTRE] + facts[FIRST]
-        return first + np.arange(n), self.pixel.bins[j, WEIGHT, :n]
-
-    def __call__(self, theta, exact):
-        likelihood = cells_likelihood() if exact else density_likelihood()
-        return evaluated(self.pixel, theta, DERIVATIVES, likelihood, self.scratch)
-
-    def dense(self):
-        """Score and information of all but the weight of satellites as one vector and matrix."""
-        n = self.dark.size
-        score, matrix = np.zeros(n + 3), np.zeros((n + 3, n + 3))
-        for j in range(n):
-            where = [j, n, n + 1, n + 2]
-            score[where] += self.at[j, SCORE, :4]
-            lower = np.tril(self.at[j, INFORMATION : INFORMATION + 4, :4])
-            matrix[np.ix_(where, where)] += lower + np.tril(lower, -1).T
-        return score, matrix
-
-
-@pytest.fixture
-def pixel():
-    return Series(draw_series(np.random.default_rng(5), [0.7, 3.0, 0.0], 0.35, 1, n_frames=600))
-
-
-@pytest.mark.parametrize("exact", [False, True])
-def test_score_and_information_are_the_derivatives(pixel, exact):
-    theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
-    free = [0, 1, 3, 4, 5]
-    pixel(theta, exact)
-    score, information = pixel.dense()
-    for i in free:
-        h = 1e-4 * max(1.0, abs(theta[i]))
-        ends = []
-        for sign in (1, -1):
-            moved = theta.copy()
-            moved[i] += sign * h
-            value = pixel(moved, exact)
-            ends.append((value, pixel.dense()[0]))
-        assert score[i] == pytest.approx((ends[0][0] - ends[1][0]) / (2 * h), rel=1e-5, abs=1e-3)
-        slope = -(ends[0][1] - ends[1][1]) / (2 * h)
-        np.testing.assert_allclose(
-            information[i, free], slope[free], rtol=1e-4, atol=1e-3 * np.abs(slope).max()
-        )
-
-
-def test_the_plain_loop_does_what_the_compiled_one_does():
-    tiny = Series(draw_series(np.random.default_rng(2), [0.5, 0.0], 0.3, 1, step=4.0, n_frames=12))
-    theta = tiny.theta([0.6, 0.0], 4.2, 100.0, np.log(1.6))
-    value = tiny(theta, True)
-    at = tiny.at.copy()
-    plain = cells_numba.evaluate_cells(tiny.pixel, theta, EXPECTATIONS, tiny.scratch, tiny.at)
-    assert plain == pytest.approx(value, rel=1e-12)
-    np.testing.assert_allclose(tiny.at[:, :DAMPING], at[:, :DAMPING], rtol=1e-9, atol=1e-9)
-    for j in range(2):
-        x, _ = tiny.codes(j)
-        expected = 12 * pcd_mass(x, (0.6, 0.0)[j], 1 / 4.2, 100.0, np.sqrt(1.6) / 4.2)
-        np.testing.assert_allclose(tiny.pixel.bins[j, EXPECTED, : x.size], expected, atol=1e-9)
-
-
-@pytest.mark.parametrize("exact", [False, True])
-def test_the_arrow_is_solved_and_inverted_as_a_whole(pixel, exact):
-    theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
-    pixel(theta, exact)
-    held = pixel.scratch.flags[HELD]
-    held[:] = [False, False, True, False, False, False, True]
-    step = np.empty(7)
-    squared = algebra_numba.solve_arrow(pixel.at, 0.0, pixel.scratch, step)
-    score, matrix = pixel.dense()
-    free = [0, 1, 3, 4, 5]
-    wanted = np.linalg.solve(matrix[np.ix_(free, free)], score[free])
-    np.testing.assert_allclose(step[free], wanted, rtol=1e-8)
-    assert squared == pytest.approx(wanted @ score[free], rel=1e-8)
-    assert step[2] == step[6] == 0
-    pixel.at[:, SCORE] = 0.0
-    covariance = np.empty((7, 7))
-    assert algebra_numba.invert_arrow(pixel.at, theta, held, covariance)
-    scale = np.array([np.exp(-theta[0]), np.exp(-theta[1]), 1, 1, 1])
-    own = matrix[np.ix_(free, free)] * scale[:, None] * scale
-    np.testing.assert_allclose(covariance[np.ix_(free, free)], np.linalg.inv(own), rtol=1e-7)
-    assert (covariance[[2, 6]] == 0).all()
-    pixel.at[:, INFORMATION:DAMPING] = 1.0  # singular
-    assert np.isnan(algebra_numba.solve_arrow(pixel.at, 0.0, pixel.scratch, step))
-    assert not algebra_numba.invert_arrow(pixel.at, theta, held, covariance)
-
-
-def test_an_em_step_is_that_of_the_paper_with_all_samples(pixel):
-    theta = pixel.theta([0.8, 2.7, 0.0], 9.7, 100.9, np.log(13.0))
-    pixel(theta, False)
-    out = np.empty(7)
-    limits = LIMITS._replace(bound=-20.0)
-    assert em_step(pixel.pixel, theta, pixel.at, limits, out)
-    a, b, c, x1, x2, n, mean_k = [], [], [], [], [], [], []
-    for j, exposure in enumerate((0.8, 2.7, 0.0)):
-        codes, weights = pixel.codes(j)
-        x = np.repeat(codes, weights.astype(int))
-        k = np.zeros((x.size, 1))
-        gamma = np.ones((x.size, 1))
-        if exposure > 0:
-            gamma = memberships(x, Theta(exposure, 1 / 9.7, 100.9, np.sqrt(13.0)))
-            k = np.arange(gamma.shape[1])[None, :]
-        k1, k2 = (gamma * k).sum(axis=1), (gamma * k**2).sum(axis=1)
-        mean_k.append(k1.mean())
-        for total, value in zip(
-            (a, b, c, x1, x2, n), (k1, k2, x * k1, x, x**2, np.ones(x.size)), strict=True
-        ):
-            total.append(value.sum())
-    a, b, c, x1, x2 = (sum(total) / sum(n) for total in (a, b, c, x1, x2))
-    step = (c - x1 * a) / (b - a**2)
-    bias = x1 - a * step
-    variance = x2 - x1**2 - (b - a**2) * step**2
-    np.testing.assert_allclose(np.exp(out[:2]), mean_k[:2], rtol=1e-9)
-    np.testing.assert_allclose(out[3:6], [step, bias - pixel.pixel.centre, np.log(variance)], rtol=1e-8)
-
-
 @pytest.mark.parametrize("settings", [FitSettings(), EXACT])
 def test_one_sample_is_the_single_fit(settings):
     drawn = draw(np.random.default_rng(3), [0.5, 2.0, 6.0], 10.0, 0.3)
@@ -221,40 +54,20 @@ def test_one_sample_is_the_single_fit(settings):
     assert (joint.fit_status == single.fit_status).all()
 
 
-def minus_log_likelihood(series, pixel, h1, h2, g, mu, sigma):
-    value = 0.0
-    noise = g * np.sqrt(max(sigma**2 - 1 / 12, 1e-9))
-    for counts, origin, h in zip(series.counts, series.origins, (h1, h2, 0.0), strict=True):
-        c = counts[pixel]
-        x = origin[pixel] + np.flatnonzero(c)
-        value -= c[c > 0] @ np.log(pcd_mass(x, h, g, mu, noise))
-    return value
-
-
-def test_iminuit_finds_the_same_maximum():
-    series = draw_series(np.random.default_rng(8), [0.8, 3.0, 0.0], 0.6, 2)
-    joint = fit_histograms(series.counts, series.origins, dark=series.dark, settings=EXACT)
-    for pixel in range(2):
-        found = Minuit(partial(minus_log_likelihood, series, pixel), 0.7, 2.8, 0.105, 101.0, 6.1)
-        found.errordef = Minuit.LIKELIHOOD
-        found.limits = [(0.01, 20), (0.01, 20), (0.02, 1), (80, 120), (1, 20)]
-        found.migrad()
-        found.hesse()
-        order = [0, 1, 3, 4, 5]
-        mine = np.concatenate(
-            [
-                joint.quanta_exposure[pixel, :2],
-                [joint.conversion_gain[pixel], joint.bias[pixel], joint.read_noise_dn[pixel]],
-            ]
+def test_plain_em_ends_at_the_same_maximum():
+    series = draw_series(np.random.default_rng(8), [0.8, 3.0, 0.0], 0.25, 3)
+    newton, em = (
+        fit_histograms(
+            series.counts,
+            series.origins,
+            dark=series.dark,
+            settings=FitSettings(algorithm=each, likelihood="density"),
         )
-        errors = np.sqrt(np.diagonal(joint.covariance[pixel])[order])
-        np.testing.assert_allclose(mine, np.array(found.values), atol=0.02 * errors.min(), rtol=1e-2)
-        assert (np.abs(mine - np.array(found.values)) < 0.02 * errors).all()
-        # iminuit has the observed information, the fit the expected one
-        np.testing.assert_allclose(errors, np.array(found.errors), rtol=0.08)
-        exposures = joint.quanta_exposure[pixel]
-        bound = cramer_rao(exposures, mine[2], mine[4], series.counts[0][pixel].sum())
-        np.testing.assert_allclose(errors, np.sqrt(np.diagonal(bound)[order]), rtol=0.04)
+        for each in ("newton", "em")
+    )
+    np.testing.assert_allclose(em.quanta_exposure[:, :2], newton.quanta_exposure[:, :2], rtol=1e-4)
+    for name in ("conversion_gain", "bias", "read_noise_dn"):
+        np.testing.assert_allclose(getattr(em, name), getattr(newton, name), rtol=1e-4)
 
 
 def test_a_pixel_does_not_depend_on_the_others():

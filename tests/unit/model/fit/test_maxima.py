@@ -15,33 +15,9 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 #: 3,000 frames of H = 3.6 e-, 1/g = 2.01 DN, mu = 95.8 DN and a read noise of 0.53 DN, from 95 DN on.
 COMB = [
-    19,
-    58,
-    81,
-    192,
-    127,
-    371,
-    190,
-    481,
-    159,
-    432,
-    118,
-    307,
-    94,
-    159,
-    34,
-    78,
-    25,
-    35,
-    4,
-    22,
-    5,
-    4,
-    1,
-    2,
-    1,
-    1,
-]
+    19, 58, 81, 192, 127, 371, 190, 481, 159, 432, 118, 307, 94, 159, 34, 78, 25, 35, 4, 22, 5, 4,
+    1, 2, 1, 1,
+]  # fmt: skip
 
 
 def drawn(

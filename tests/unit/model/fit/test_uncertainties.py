@@ -10,12 +10,10 @@ from pchem_pipeline.base.variables import INTERVALS, interval_names
 from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, misfit, poorest
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors
-from pchem_pipeline.model.errors import information_numba
 from pchem_pipeline.model.errors.fisher import correlations, covariance_from
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import INTERVAL_NAMES, FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
-from pchem_pipeline.model.law import density_scores_numba
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.pcd import log_pcd, pcd_posterior
@@ -97,22 +95,6 @@ def test_the_interval_of_the_noise_in_electrons_is_a_profile_too() -> None:
     assert (other.upper + other.lower) / (other.upper - other.lower) > 0.02
 
 
-@pytest.mark.parametrize("case", [*CASES, (5.0, 10.0, 0.8)])
-def test_the_score_of_a_sample_is_the_slope_of_its_density(case: tuple[float, float, float]) -> None:
-    h, a, noise = case
-    at = np.array([h, 1 / a, 100.3, noise * a])
-    score, means = np.empty(4), np.empty(5)
-    for x in (80.0, 100.0, 104.0, 131.0, 170.0):
-        density_scores_numba.posterior(x, h, a, 100.3, noise * a, means)
-        density_scores_numba.density_scores(means, h, a, noise * a, score)
-        for i in range(4):
-            up, down = at.copy(), at.copy()
-            up[i] *= 1 + 1e-6
-            down[i] *= 1 - 1e-6
-            numeric = float((log_pcd(np.array([x]), *up) - log_pcd(np.array([x]), *down))[0]) / (2e-6 * at[i])
-            assert score[i] == pytest.approx(numeric, rel=1e-4, abs=1e-5)
-
-
 @pytest.mark.parametrize("law", [SampleLaw(), SampleLaw().with_noise([0.5, 0.5], shift_e=[0.0, 0.5])])
 def test_variance_of_a_curve_follows_from_its_slopes(law: SampleLaw) -> None:
     rng = np.random.default_rng(5)
@@ -138,19 +120,6 @@ def test_variance_of_a_curve_follows_from_its_slopes(law: SampleLaw) -> None:
             sums += np.einsum("ix,ij,jx->x", each, known, each)
     for sums, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(sums, wanted, rtol=1e-4, atol=1e-8 * wanted.max())
-
-
-def test_groups_of_single_dn_determine_all_four_parameters() -> None:
-    pixel, at, covariance = fitted(CASES[0])
-    known = np.empty(2)
-    origin = np.repeat(pixel.origin, 2)
-    last = origin + pixel.counts.shape[1] - 1
-    frames = np.array([1e9, 300.0])  # no DN but the farthest are merged; many are
-    scaled = covariance * np.array([N / 1e9, N / 300.0])[:, None, None]
-    information_numba.grouped_trace(origin, last, frames, np.repeat(at[None], 2, axis=0), scaled, known)
-    # the covariance is of the observed information, 2 % off the expected one
-    assert known[0] == pytest.approx(4.0, abs=0.2)
-    assert 2.0 < known[1] < 3.9
 
 
 def test_covariance_is_six_correlations_and_four_errors() -> None:

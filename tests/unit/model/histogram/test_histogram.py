@@ -5,14 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.model.histogram import count_numba
-from pchem_pipeline.model.histogram.count import (
-    HistogramAccumulator,
-    choose_bins,
-    counts_dtype,
-    histogram_frames,
-    pixels_by_range,
-)
+from pchem_pipeline.model.histogram.count import choose_bins, counts_dtype, histogram_frames, pixels_by_range
 
 
 def pcd_like(seed: int, shape: tuple[int, int, int], dtype: type = np.uint16) -> NDArray[np.unsignedinteger]:
@@ -57,13 +50,6 @@ def test_an_early_glitch_does_not_take_the_window_with_it():
     assert np.all(result.over == 1)
     assert np.all(result.under == 0)
     assert np.all(result.counts.sum(axis=2) == 599)
-
-
-def test_densest_origin_holds_most_of_the_values():
-    values = np.array([5, 200, 201, 210, 400, 402, 403, 404, 4095], np.uint16)
-    origin = count_numba.densest_origin(values, 32)
-    assert origin <= 400
-    assert origin + 32 > 404
 
 
 def test_more_than_24_bits_are_refused():
@@ -131,11 +117,3 @@ class TestChoiceOfBins:
         assert not result.over.any()
         assert not result.under.any()
         assert result.counts.shape[2] <= 256
-
-
-def test_empty_block_changes_nothing():
-    frames = pcd_like(10, (40, 2, 2))
-    one = HistogramAccumulator((2, 2), 128, 40)
-    one.add(frames[:0])
-    one.add(frames)
-    np.testing.assert_array_equal(one.finish().counts, histogram_frames(frames, bins=128).counts)

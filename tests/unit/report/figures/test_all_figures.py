@@ -15,13 +15,7 @@ from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.model.fit.status import MEANINGS, FitStatus
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import COLUMN_MM, PAGE_MM, Chart
-from pchem_pipeline.report.charts.on_paper import (
-    Drawing,
-    Look,
-    draw_chart,
-    drawing_bytes,
-    small_png,
-)
+from pchem_pipeline.report.charts.on_paper import Drawing, Look, draw_chart, drawing_bytes, small_png
 from pchem_pipeline.report.data import PixelFit
 from pchem_pipeline.report.figures.ensemble import (
     component_table,
@@ -32,7 +26,7 @@ from pchem_pipeline.report.figures.ensemble import (
 )
 from pchem_pipeline.report.figures.figure import DataTable, csv_text
 from pchem_pipeline.report.figures.maps import map_chart, map_tables, status_chart, status_counts
-from pchem_pipeline.report.figures.pixels import pixels_chart, shown_bins
+from pchem_pipeline.report.figures.pixels import pixels_chart
 from pchem_pipeline.report.figures.stability import (
     frame_table,
     line_spectra,
@@ -95,11 +89,6 @@ def test_a_bin_far_out_does_not_stretch_the_axis(pixel: PixelFit) -> None:
     assert np.ptp(figure.axes[0].get_xlim()) < 400
     assert "1 outside the axis" in texts(figure)
     drawn(figure)
-
-
-def test_shown_bins_refuse_an_empty_histogram() -> None:
-    with pytest.raises(ValueError, match="empty"):
-        shown_bins(np.zeros(3))
 
 
 def _map(kind: str) -> np.ndarray:

@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from helpers.packed_maps import unpack_map
 
-from pchem_pipeline.report.inspector import (
-    Scale,
-    choose_scale,
-    pack_counts,
-    pack_map,
-    varints,
-)
+from pchem_pipeline.report.inspector import Scale, choose_scale, pack_counts, pack_map, varints
 
 
 def read_varints(data: bytes) -> list[int]:

@@ -157,10 +157,7 @@ def test_the_legend_over_the_scatter_of_lines_covers_no_point() -> None:
         ),
         ({"unfitted": 7}, " Not compared: 7 pixels without a reliable fit."),
         (
-            {
-                "unfitted": 7,
-                "places": [{"map": "unfitted", "region": {"columns": [[2, 5]]}, "p": 1e-6}],
-            },
+            {"unfitted": 7, "places": [{"map": "unfitted", "region": {"columns": [[2, 5]]}, "p": 1e-6}]},
             ", clustered in columns 2 to 4.",
         ),
     ],

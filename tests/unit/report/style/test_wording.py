@@ -70,21 +70,14 @@ IN_WORDS = {
         ((1234.0,), "1.2×10³"),
         ((INF,), "not known"),
     ],
-    signed: [
-        ((1.24,), "+1.2"),
-        ((-0.3,), "−0.3"),
-        ((-0.04,), "0.0"),
-        ((0.0,), "0.0"),
-        ((NAN,), "not known"),
-    ],
+    signed: [((1.24,), "+1.2"), ((-0.3,), "−0.3"), ((-0.04,), "0.0"), ((0.0,), "0.0"), ((NAN,), "not known")],
     count: [((1, "pixel"), "1 pixel"), ((17_750, "frame"), "17,750 frames")],
     unit_text: [(("e-/DN",), "e⁻/DN"), (("1",), ""), (("furlong",), "furlong")],
 }
 
 
 @pytest.mark.parametrize(
-    ("words", "given", "text"),
-    [(words, *case) for words, cases in IN_WORDS.items() for case in cases],
+    ("words", "given", "text"), [(words, *case) for words, cases in IN_WORDS.items() for case in cases]
 )
 def test_numbers_in_words(words: Callable[..., str], given: tuple[object, ...], text: str) -> None:
     assert words(*given) == text

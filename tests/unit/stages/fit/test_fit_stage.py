@@ -138,10 +138,7 @@ def test_the_shown_sample_stands_where_a_run_of_one_has_its_own():
 
 @pytest.mark.parametrize(
     "settings",
-    [
-        FitSettings(),
-        FitSettings(likelihood="exact", errors="sandwich", intervals="profile"),
-    ],
+    [FitSettings(), FitSettings(likelihood="exact", errors="sandwich", intervals="profile")],
     ids=["information", "sandwich and profile"],
 )
 def test_effects_go_with_several_samples(settings):

@@ -69,13 +69,7 @@ def make_context(
     if not store.records.read("ingest"):
         info = SensorInfo("frames", *frames.shape, str(frames.dtype), None, None, mode, {})
         ingest(store, info, frames if mode == "copy" else None)
-    return StageContext(
-        config,
-        folder,
-        store,
-        executor or SerialExecutor(),
-        options=options or Options(),
-    )
+    return StageContext(config, folder, store, executor or SerialExecutor(), options=options or Options())
 
 
 def contents(store: RunStore) -> dict[str, NDArray]:
@@ -207,7 +201,7 @@ def test_without_summaries(tmp_path, frames, expected):
 
 def test_too_little_memory_is_said(tmp_path, frames):
     wide = np.zeros((70, 3, 12000), np.uint8)
-    context = make_context(tmp_path, wide, band_memory=16, window_frames=70)
+    context = make_context(tmp_path, wide, tile=256, band_memory=16, window_frames=70)
     assert execute("histogram", context).state == "complete"
     assert any("more than histogram.band_memory" in note for note in context.notes)
 
@@ -242,7 +236,7 @@ def test_odd_frames_are_in_no_sums_and_empty_ones_in_no_histogram(tmp_path, fram
     odd[:2] += 400
     odd[130:133] = 0
     odd[290, 3, 4:9] = 60_000  # the track of a particle is no odd frame
-    context = make_context(tmp_path / "odd", odd, tile=8)
+    context = make_context(tmp_path / "odd", odd)
     for _ in range(2):
         assert execute("histogram", context).state == "complete"
         left_out = [0, 1, 130, 131, 132]

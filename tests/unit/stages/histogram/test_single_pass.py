@@ -80,12 +80,7 @@ def make_context(folder: Path, store: str, *, workers: int = 2, **sections: dict
     content["histogram"] = {"block_frames": 96, "window_frames": 64, **content.get("histogram", {})}
     content["compute"] = {"workers": workers, **content.get("compute", {})}
     config = RunConfig.model_validate(content)
-    return StageContext(
-        config,
-        folder,
-        RunStore.create(folder / store),
-        make_executor(config.compute),
-    )
+    return StageContext(config, folder, RunStore.create(folder / store), make_executor(config.compute))
 
 
 def run_both(context: StageContext) -> StageContext:
@@ -148,7 +143,7 @@ def _bytes_read() -> int:
     return int(facts["rchar"])
 
 
-@pytest.mark.parametrize("name", ["npy", "raw", "tiff", "fits"])
+@pytest.mark.parametrize("name", ["npy", "raw", "tiff"])
 def test_every_byte_is_read_once(tmp_path, frames, name):
     WRITERS[name](tmp_path, np.concatenate([frames] * 3))
     size = sum(path.stat().st_size for path in tmp_path.iterdir())
