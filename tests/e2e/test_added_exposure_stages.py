@@ -28,7 +28,7 @@ def states(path: Path) -> dict[str, str]:
 def test_exposure_of_blinking_pixels_is_their_steady_one(tmp_path: Path) -> None:
     content = {
         "run": {"tile": 8},
-        "simulate": {"shape": [12, 16], "n_frames": 2400, "seed": 3, "format": "npy", "effects": [BLINKING]},
+        "simulate": {"shape": [16, 20], "n_frames": 2400, "seed": 3, "format": "npy", "effects": [BLINKING]},
         "discrepancy": {
             "replicates": 20,
             "extended_replicates": 12,
@@ -51,7 +51,7 @@ def test_exposure_of_blinking_pixels_is_their_steady_one(tmp_path: Path) -> None
     assert states(path)["discrepancy"] == "complete"
     assert states(path)["fit"] == "stale - model 1 -> 2"
     blinks = (before - truth) / stderr > 6
-    assert 6 < blinks.sum() < 25
+    assert 12 < blinks.sum() < 40
     added = store.read("model/0002/added_exposure")
     assert ((added > 0).any(axis=0) & blinks).sum() > 0.9 * blinks.sum()
     run_stages(find_run(path), ["fit", "maps", "ensemble", "electrons"], QUIET)
