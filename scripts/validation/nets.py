@@ -223,14 +223,9 @@ def joint(at: Folder) -> None:
                 frames[:, 0, 0] = 100.0
             runs.append(at.run(f"{name}_{length:g}s", frames, max(length, 0.001)))
         likelihood = "exact" if name.endswith("exact") else "density"
-        samples = [{"run": run} for run in runs[:3]] + [{"run": runs[3], "kind": "bias"}]
-        content = {
-            "samples": samples,
-            "joint": {"store": f"{name}.zarr", "tile": 8},
-            "fit": {"likelihood": likelihood},
-        }
-        (at.path / f"{name}.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
-        at.pchem("joint", f"{name}.yaml")
+        samples = [*({"run": run} for run in runs[:3]), {"run": runs[3], "bias": True}]
+        run = at.run(name, None, input={"samples": samples}, fit={"likelihood": likelihood})
+        at.pchem("joint", run)
 
 
 def hidden(at: Folder) -> None:
