@@ -40,7 +40,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.settings import Section
 from pchem_pipeline.effects.framework.region import Region, Span, When
@@ -50,6 +49,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
     from pchem_pipeline.effects.framework.compose import AddedExposure
     from pchem_pipeline.effects.framework.context import EffectContext
     from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps

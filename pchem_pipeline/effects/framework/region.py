@@ -33,11 +33,11 @@ from pydantic import (
     model_validator,
 )
 
-from pchem_pipeline.base.arrays import BoolArray, IntArray
 from pchem_pipeline.base.settings import Section
 
 if TYPE_CHECKING:
     pass
+    from pchem_pipeline.base.arrays import BoolArray, IntArray
 
 Quadrant = Literal["top left", "top right", "bottom left", "bottom right"]
 
