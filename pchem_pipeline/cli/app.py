@@ -135,15 +135,14 @@ def run(
     Stages that are up to date are skipped. stdout has the path of the report, stderr the rest.
     """
     from pchem_pipeline.commands.first_screen import run_to_first_screen
-    from pchem_pipeline.commands.new_run import find_or_start, run_new
+    from pchem_pipeline.commands.new_run import find_or_start
     from pchem_pipeline.runner.session import cropped, up_to
 
     target, is_new = find_or_start(targets, store, given, command.options.roi)
     if is_new:
         target, command = cropped(target, command)
     stages = up_to(until, pipeline_of(target.config))
-    do = run_new if is_new else run_to_first_screen
-    do(target, stages, command, typer.echo, strict=strict)
+    run_to_first_screen(target, stages, command, typer.echo, is_new=is_new, strict=strict)
 
 
 @app.command()
@@ -202,11 +201,11 @@ def joint(
     One gain, bias and read noise per pixel; charge rate from the slope of H. Missing histograms are made.
     """
     from pchem_pipeline.commands.first_screen import run_to_first_screen
-    from pchem_pipeline.commands.new_run import find_joint, run_new
+    from pchem_pipeline.commands.new_run import find_joint
 
     target, is_new = find_joint(targets, bias or [], store, against)
-    do = run_new if is_new else run_to_first_screen
-    do(target, pipeline_of(target.config), command, typer.echo, strict=strict)
+    stages = pipeline_of(target.config)
+    run_to_first_screen(target, stages, command, typer.echo, is_new=is_new, strict=strict)
 
 
 app.command()(apply)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import IncompleteRunError, NotBelievedError, quoted
+from pchem_pipeline.commands.new_run import first_try
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import Command, run_stages
@@ -24,6 +26,7 @@ def run_to_first_screen(
     command: Command,
     say: Callable[[str], None],
     *,
+    is_new: bool = False,
     strict: bool = False,
 ) -> None:
     """Bring stages up to date; then tell the report's first screen on stderr and its path by ``say``.
@@ -35,6 +38,7 @@ def run_to_first_screen(
         stages: what is to be done, in order; without the report its store is told alone.
         command: what the command line asked for.
         say: writes a line of results.
+        is_new: whether the YAML of the run is to be written first.
         strict: answers that are serious are an error.
 
     Raises:
@@ -44,14 +48,15 @@ def run_to_first_screen(
     if command.options.dry_run:
         run_stages(target, stages, command)
         return
-    try:
-        run_stages(target, stages, command)
-    except IncompleteRunError:
-        _tell(target, stages, command, say, warn=True)
-        raise
-    serious = _tell(target, stages, command, say, warn=not strict)
-    if strict and serious:
-        raise NotBelievedError(f"--strict: {serious}")
+    with first_try(target) if is_new else contextlib.nullcontext():
+        try:
+            run_stages(target, stages, command)
+        except IncompleteRunError:
+            _tell(target, stages, command, say, warn=True)
+            raise
+        serious = _tell(target, stages, command, say, warn=not strict)
+        if strict and serious:
+            raise NotBelievedError(f"--strict: {serious}")
 
 
 def _tell(

@@ -7,14 +7,13 @@ import glob
 import os
 import re
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
 from pchem_pipeline.commands.compare.settings import settings_that_differ
-from pchem_pipeline.commands.first_screen import run_to_first_screen
 from pchem_pipeline.config.load import (
     dump_config,
     load_config,
@@ -26,7 +25,7 @@ from pchem_pipeline.config.load import (
 from pchem_pipeline.config.template import SCHEMA_NAME, commented_config, json_schema
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.target import Target, find_run
-from pchem_pipeline.runner.session import Command, nothing_left_of_a_refusal
+from pchem_pipeline.runner.session import nothing_left_of_a_refusal
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath, place_of
@@ -154,23 +153,6 @@ def _laid_over(there: Any, stated: Any) -> Any:
     if sections and all(isinstance(each, Mapping) for each in (*there, *stated)):
         return [_laid_over(one, other) for one, other in zip(there, stated, strict=True)]
     return stated
-
-
-def run_new(
-    target: Target,
-    stages: Sequence[str],
-    command: Command,
-    say: Callable[[str], None],
-    *,
-    strict: bool = False,
-) -> None:
-    """Write the YAML of a run where it is not there with its settings, and do its stages.
-
-    Raises:
-        PchEmError: a stage cannot be done; the message says why.
-    """
-    with contextlib.nullcontext() if command.options.dry_run else first_try(target):
-        run_to_first_screen(target, stages, command, say, strict=strict)
 
 
 @contextlib.contextmanager

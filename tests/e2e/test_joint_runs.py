@@ -10,7 +10,8 @@ from helpers.commands import Shell
 from helpers.places import ROOT
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
-from pchem_pipeline.commands.new_run import find_joint, run_new
+from pchem_pipeline.commands.first_screen import run_to_first_screen
+from pchem_pipeline.commands.new_run import find_joint
 from pchem_pipeline.commands.notebook import open_run
 from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.discrepancy.verdict import read_verdict
@@ -274,11 +275,11 @@ def test_a_refused_list_leaves_its_name_free(joint):
     for runs in (["dark_2s.yaml", "dark_1s.yaml"], ["dark_1s.yaml", "dark_1s.zarr"]):
         target, _ = find_joint([joint / run for run in runs], store=store)
         with pytest.raises(ConfigError, match=r"is not above|is the run of"):
-            run_new(target, PIPELINE, QUIET, print)
+            run_to_first_screen(target, PIPELINE, QUIET, print, is_new=True)
         assert not store.with_suffix(".yaml").exists()
     kept = write(joint, "kept", [("dark_2s.zarr", ""), ("dark_1s.zarr", "")])
     with pytest.raises(ConfigError):
-        run_new(find_joint([kept])[0], PIPELINE, QUIET, print)
+        run_to_first_screen(find_joint([kept])[0], PIPELINE, QUIET, print, is_new=True)
     assert kept.exists()
 
 

@@ -248,7 +248,7 @@ class ReplicateSimulator:
         """
         if not hypotheses:
             return []
-        hypotheses = self._visible(hypotheses)
+        hypotheses = self._visible(hypotheses, told)
         fits = [fit_set([h], shift, noise) for h in hypotheses]
         scores = np.array([fit.log_score(shift, noise) for fit in fits])
         order = np.argsort(-scores, kind="stable")
@@ -270,12 +270,16 @@ class ReplicateSimulator:
         better = {i: sharp.get(id(one.effect), one) for i, one in best_of.items()}
         return [better.get(int(i), hypotheses[i]) for i in order]
 
-    def _visible(self, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Return hypotheses, four times as strong those that chance hides at the strength as guessed.
+    def _visible(self, hypotheses: Sequence[Hypothesis], told: Sequence[Effect]) -> list[Hypothesis]:
+        """Return hypotheses, four times as strong where chance hides all that they do, unless they are told.
 
-        Of what drowns a little more strength may move much: no factor of its fingerprint tells.
+        A fingerprint that is lost in chance cannot be scaled to the data.
         """
-        faint = {id(h): h.rescaled(_STRONGER) for h in hypotheses if np.abs(h.fingerprint).max() < CERTAIN}
+        faint = {
+            id(h): h.rescaled(_STRONGER)
+            for h in hypotheses
+            if np.abs(h.fingerprint).max() < CERTAIN and not any(h.effect is effect for effect in told)
+        }
         seen = {id(h.effect): h for h in self.fingerprints(list(faint.values()))}
         return [seen.get(id(faint.get(id(h))), h) for h in hypotheses]
 
