@@ -24,8 +24,8 @@ _ASKED = 2.0e-6
 _AMBIGUOUS = 4.0
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
 _LEAST, _OF_NULL = 170.0, 6.0
-#: Share of that which is kept for measuring what no effect explains.
-_KEPT = 0.25
+#: Shares of that which are kept for measuring what no effect explains, and for the choice among the sets.
+_KEPT, _FOR_CHOICE = 0.25, 0.2
 #: The same that is left for fits, whatever it cost to find out what candidates would do.
 _FOR_FITS = 0.4
 
@@ -57,7 +57,8 @@ class Effort:
         share: times what a search may cost by default; None: no limit.
         spent: CPU seconds by count.
         most: the same at which nothing more is begun; infinite until the null distribution is there.
-        kept: of that, for the end.
+        kept: for what no effect explains.
+        for_choice: for the choice among the sets that were tried.
         for_fits: the least that is left for fits of candidates once they are compared.
         tried: tags of all effects with which the pixels were fitted.
         ambiguous: share of the pixels whose bias may be off by an electron.
@@ -68,6 +69,7 @@ class Effort:
     spent: float = 0.0
     most: float = math.inf
     kept: float = 0.0
+    for_choice: float = 0.0
     for_fits: float = 0.0
     tried: set[str] = field(default_factory=set)
     ambiguous: float = 0.0
@@ -76,7 +78,8 @@ class Effort:
     def begin(self) -> None:
         """Set the limit, now that the null distribution has been paid."""
         limit = math.inf if self.share is None else self.share * max(_LEAST, _OF_NULL * self.spent)
-        self.most, self.kept = self.spent + (1.0 - _KEPT) * limit, _KEPT * limit
+        self.kept, self.for_choice = _KEPT * limit, _FOR_CHOICE * limit
+        self.most = self.spent + (1.0 - _KEPT - _FOR_CHOICE) * limit
         # one that was asked to be short is as short as that
         short = self.share is not None and self.share < 1.0
         self.for_fits = 0.0 if short else _FOR_FITS * limit
@@ -85,30 +88,33 @@ class Effort:
         """Let something be left for fits: a search that asks all candidates and fits none is in vain."""
         self.most = max(self.most, self.spent + self.for_fits)
 
-    def release(self) -> None:
-        """Let what was kept be spent, all of it: what had no limit may have gone beyond."""
+    def measure(self) -> None:
+        """Let what was kept for it be spent, all of it: what had no limit may have gone beyond."""
         self.most, self.kept = max(self.most, self.spent) + self.kept, 0.0
+
+    def choose(self) -> None:
+        """Likewise for the choice: a set that is not found for it would have cost all of the search."""
+        self.most, self.for_choice = max(self.most, self.spent) + self.for_choice, 0.0
 
     def simulate(self, samples: int, pixels: int, fits: int) -> None:
         """Count a simulated stack, whose pixels are fitted so many times."""
         self.spent += _SAMPLE * samples + _FIT * self._hard * pixels * fits
 
-    def refit(
-        self, pixels: int, components: int, evaluations: float, tags: Iterable[str], *, learnt: bool = True
-    ) -> None:
-        """Count a fit of all pixels with effects, and what it teaches.
+    def refit(self, pixels: int, components: int, evaluations: float, tags: Iterable[str]) -> None:
+        """Count a fit of all pixels with effects.
 
         Args:
             pixels: that were fitted.
             components: of their law.
             evaluations: of the likelihood of a pixel, on average.
             tags: of the effects.
-            learnt: whether a sensor is learnt by that law; from maps alone that costs next to nothing.
         """
-        work = self._hard * pixels * components * (_REFIT + _REFIT_BY * evaluations)
-        learning = (_LEARN + _LEARN_BY * components) * min(pixels, MOST_LEARNT_FROM)
-        self.spent += work + (learning if learnt else 0.0)
+        self.spent += self._hard * pixels * components * (_REFIT + _REFIT_BY * evaluations)
         self.tried |= set(tags)
+
+    def learn(self, pixels: int, components: int) -> None:
+        """Count what is learnt of the sensor from pixels, whose law has so many components."""
+        self.spent += (_LEARN + _LEARN_BY * components) * min(pixels, MOST_LEARNT_FROM)
 
     def ask(self, samples: int) -> None:
         """Count a look at samples for guesses of all effects, or for what none of them explains."""

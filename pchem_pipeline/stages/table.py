@@ -133,7 +133,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=12,
+        version=13,
         upstream=("ingest",),
         settings=("discrepancy",),
         writes=("discrepancy",),

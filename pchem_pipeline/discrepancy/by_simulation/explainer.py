@@ -150,7 +150,7 @@ class FrameExplainer(Explainer[Screened]):
     ) -> FrameExplainer:
         """Simulate and observe the fitted model, refit included: the null distribution of the statistics."""
         effort = Effort(settings.effort, ambiguous=observed.plain.ambiguous)
-        work = Simulations(observed, mapper, settings.seed, effort)
+        work = Simulations(observed, mapper, settings.seed, effort, model)
         vectors = work.replicates(model, work.mapped(model).sensor, "r0", settings.replicates)
         own = observed.statistics()
         names = observed.names([*own, *vectors])
@@ -210,16 +210,17 @@ class FrameExplainer(Explainer[Screened]):
         sets = Search(refitter, HistogramLikelihood(self._likelihood))
         own, measured = (explanation.hypotheses, explanation.sets), self._measured(refitter)
         compare(sets, *own, lambda best: self._left_by(best, refitter), measured, settings.max_rounds)
-        if sets.limit is not None and not sets.complete:
-            tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
-            tried = self.work.effort.tried
-            self.limit = EffortSpentError(sets.limit.doing, (t for t in tags if t not in tried)).words()
-        # what was found is not lost for the little that is left to do: no limit
-        sets.refitter = refitter = replace(refitter, allow=lambda _: None)
+        self.work.effort.choose()
+        # what was chosen is not lost for the little that is left to do: no limit
+        refitter = replace(refitter, allow=lambda _: None)
         told = disagrees(null, self.prepared.z, settings.significance)
         doubtful: tuple[Comparison, Refitted] | None = None
         for _ in range(_MOST_JUDGED):
             found = chosen(sets, explanation.hypotheses)
+            if sets.limit is not None and not sets.complete:
+                tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
+                tried = self.work.effort.tried
+                self.limit = EffortSpentError(sets.limit.doing, (t for t in tags if t not in tried)).words()
             if found is None:
                 break
             added = refitter.sharpened(found.chosen, settings.extended_replicates)
@@ -250,7 +251,7 @@ class FrameExplainer(Explainer[Screened]):
         unexplained = Unexplained(self.work, refitter, self.prepared.defects)
 
         def measured(kept: tuple[Hypothesis, ...]) -> Iterator[Refitted]:
-            self.work.effort.release()
+            self.work.effort.measure()
             return unexplained.measured(kept)
 
         return measured

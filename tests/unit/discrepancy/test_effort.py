@@ -30,17 +30,22 @@ def test_work_is_counted_and_refused_once_the_limit_is_reached():
     with pytest.raises(EffortSpentError, match="b"):
         effort.check("b")
     assert effort.tried == {"row_noise"}
-    # a quarter is kept for the end
-    effort.spent = null + 0.8 * 6.0 * null
+    # a quarter is kept for what is measured, a fifth for the choice
+    effort.spent = null + 0.6 * 6.0 * null
     with pytest.raises(EffortSpentError):
         effort.check("c")
-    effort.release()
+    effort.measure()
     effort.check("d")
     # also where what has no limit went beyond
     effort.begin()
     effort.spent, kept = effort.most + null, effort.kept
-    effort.release()
+    effort.measure()
     assert kept > 0.0
+    assert effort.most - effort.spent == pytest.approx(kept)
+    effort.spent, kept = effort.most, effort.for_choice
+    effort.choose()
+    effort.check("e")
+    effort.choose()  # once
     assert effort.most - effort.spent == pytest.approx(kept)
 
 
@@ -48,7 +53,8 @@ def test_a_small_search_has_its_least_and_one_without_a_limit_none():
     small, double, free = Effort(1.0), Effort(2.0), Effort(None)
     for effort in (small, double, free):
         effort.begin()
-        effort.release()
+        effort.measure()
+        effort.choose()
     assert double.most == 2.0 * small.most > 0.0
     assert math.isinf(free.most)
 
@@ -57,9 +63,9 @@ def test_however_much_the_candidates_cost_some_is_left_to_fit_them():
     """Of a strong glow in bursts 115 guesses were simulated, and none was fitted."""
     effort = Effort(1.0)
     effort.begin()
-    limit = effort.most + effort.kept
+    limit = effort.most + effort.kept + effort.for_choice
     effort.leave_for_fits()
-    assert effort.most + effort.kept == limit  # enough is left
+    assert effort.most + effort.kept + effort.for_choice == limit  # enough is left
     effort.spent = effort.most + 50.0
     effort.leave_for_fits()
     effort.check("a candidate was fitted")
@@ -87,9 +93,8 @@ def test_work_costs_what_makes_it_long():
     assert spent(lambda e: e.refit(10**6, mixed.components, 8.0, [])) > 2.9 * plain
     # that hardly arrives
     assert spent(lambda e: e.refit(10**6, 1, 1000.0, [])) > 10.0 * plain
-    # levels that every pixel is free to have: the sensor is taken from the maps
-    free = spent(lambda e: e.refit(1000, 15, 20.0, [], learnt=False))
-    assert free < 0.4 * spent(lambda e: e.refit(1000, 15, 20.0, []))
+    # a sensor that is learnt, from so many pixels at most
+    assert spent(lambda e: e.learn(1000, 15)) == spent(lambda e: e.learn(10**6, 15)) > 1.0
     # pixels that are not identified
     usual, poor = (spent(lambda e: e.simulate(0, 10**6, 3), share) for share in (0.0, 0.9))
     assert 4.0 * usual < poor < 6.0 * usual

@@ -69,7 +69,6 @@ class Refit:
         components: of the law of a sample, with all effects.
         evaluations: of the likelihood of a pixel, on average.
         added: exposure beside H that the effects add to each pixel, (j, y, x); None: it counts as part of H.
-        learnt: whether the sensor is learnt by the law.
     """
 
     maps: PixelMaps
@@ -78,7 +77,6 @@ class Refit:
     components: int = 1
     evaluations: float = 0.0
     added: AddedExposure | None = None
-    learnt: bool = True
 
 
 def refit_maps(
@@ -154,8 +152,7 @@ def refit_maps(
     }
     new_maps = PixelMaps.known(new, good.reshape(shape))
     covariance = fit.covariance[:, :4, :4].reshape(*shape, 4, 4)
-    evaluations, learnt = float(fit.n_iterations.mean()), not law.free_satellites
-    return Refit(new_maps, moved, covariance, law.components, evaluations, added, learnt)
+    return Refit(new_maps, moved, covariance, law.components, float(fit.n_iterations.mean()), added)
 
 
 def _acted_on(effects: Sequence[Effect], shape: tuple[int, int]) -> BoolArray:
@@ -301,6 +298,26 @@ class Sensor:
         values = np.full((*self.drawn.shape, 4), np.nan)
         values[self.drawn] = self.posterior.draw(np.random.default_rng(seed))
         return PixelMaps.known(np.moveaxis(values, -1, 0), self.drawn)
+
+    def refitted(self, before: PixelMaps, after: PixelMaps) -> Sensor:
+        """Return it under another model: each pixel moves as its fit does, one without a fit as most do.
+
+        The samples are the same, and so is nearly all that chance makes of both fits.
+
+        Args:
+            before: fits under the model by which it was learnt.
+            after: fits of the same frames under the other one.
+
+        Raises:
+            NotFittedError: no pixel is fitted under both.
+        """
+        both = (before.usable & after.usable)[self.drawn]
+        _require(both)
+        old, new = (np.stack([m[self.drawn] for m in fit.maps], axis=1)[both] for fit in (before, after))
+        moves = to_theta(new) - to_theta(old)
+        change = np.tile(np.median(moves, axis=0), (both.size, 1))
+        change[both] = moves
+        return replace(self, posterior=self.posterior.moved(change), usable=after.usable)
 
     def corrected(self, wanted: PixelMaps, simulated: PixelMaps) -> Sensor:
         """Return sensors of which plain fits come out as wanted, given those of one that was simulated.

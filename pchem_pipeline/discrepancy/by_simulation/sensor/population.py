@@ -100,9 +100,9 @@ class Posterior:
         return to_parameters(self.theta[best, np.arange(best.size)])
 
     def moved(self, change: FloatArray) -> Posterior:
-        """Return it with another theta in all pixels, by ``change``, shape (4,)."""
-        population = replace(self.population, centre=self.population.centre + change)
-        return replace(self, population=population, theta=self.theta + change)
+        """Return it with another theta in all pixels, by ``change``, shape (4,), or (n, 4) of each."""
+        centre = self.population.centre + np.median(np.atleast_2d(change), axis=0)
+        return replace(self, population=replace(self.population, centre=centre), theta=self.theta + change)
 
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """Draw (H, g, mu, sigma) of every pixel, shape (n, 4), the centre of all within its error.

@@ -58,7 +58,7 @@ class Simulations:
         mapper: runs the simulated stacks.
         seed: root of all random numbers.
         effort: counts the work.
-        lost: share of the pixels that the plain fit mistakes; None: not learnt yet.
+        given: effects that the model had before the search.
         known: the models that were mapped of late.
     """
 
@@ -66,7 +66,7 @@ class Simulations:
     mapper: Mapper
     seed: int
     effort: Effort
-    lost: float | None = None
+    given: tuple[Effect, ...] = ()
     known: dict[tuple[Effect, ...], Mapped] = field(default_factory=dict)
 
     @property
@@ -81,11 +81,7 @@ class Simulations:
 
     def refit(self, model: tuple[Effect, ...]) -> Refit:
         """Return the fit of the seen frames under a model."""
-        return self._refit_of(self.own_samples(model), model)
-
-    def _refit_of(self, frames: NDArray[np.unsignedinteger], model: tuple[Effect, ...]) -> Refit:
-        """Return the fit of frames, each sample that of its pixel, under a model."""
-        plain = self.plain
+        frames, plain = self.own_samples(model), self.plain
         assert plain.covariance is not None
         if not model:
             return Refit(plain.maps, {}, plain.covariance)
@@ -95,7 +91,7 @@ class Simulations:
         added = added_exposures(steady, frames, numbers, plain.maps)
         fit = refit_maps(frames, plain.maps, own, plain.covariance, added, numbers)
         tags = (effect.tag for effect in model)
-        self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags, learnt=fit.learnt)
+        self.effort.refit(plain.maps.usable.size, fit.components, fit.evaluations, tags)
         return fit
 
     def expected(self, model: tuple[Effect, ...], evidence: Evidence, numbers: IntArray) -> FloatArray | None:
@@ -116,27 +112,45 @@ class Simulations:
             NotFittedError: hardly a pixel can be fitted with the model.
         """
         if model not in self.known:
-            frames = self.own_samples(model)
-            fit = self._refit_of(frames, model)
-            sensor = self._learnt(frames, fit, model)
-            self.lost = sensor.lost
+            fit, (first, sensor), seen = self.refit(model), self._first, self.frames.seen_stack[:1]
+            others = tuple(effect for effect in model if effect.replacement(seen) is None)
+            if others != model:
+                sensor = self._of_replaced(fit, model, others)
+            elif model != self.given and self.plain.ambiguous > MANY_MISTAKEN:
+                sensor = self._learnt(fit, model, sensor.lost)  # the fits of single pixels say little
+            elif model != self.given:
+                sensor = sensor.refitted(first.maps, fit.maps)
             self.known[model] = Mapped(fit, self._corrected(sensor, model) if model else sensor)
         return self.known[model]
 
-    def _learnt(self, frames: NDArray[np.unsignedinteger], fit: Refit, model: tuple[Effect, ...]) -> Sensor:
-        """Return the sensor that frames and their fit under a model tell.
+    @functools.cached_property
+    def _first(self) -> tuple[Refit, Sensor]:
+        """The fit of the seen frames under the model before the search, and the sensor that both tell."""
+        fit = self.refit(self.given)
+        return fit, self._learnt(fit, self.given)
 
-        What stands in for replaced samples is taken from the frames and, once these have told a sensor, from
-        frames drawn of it: in those that are seen it is itself replaced in part.
+    def _of_replaced(self, fit: Refit, model: tuple[Effect, ...], others: tuple[Effect, ...]) -> Sensor:
+        """Return the sensor under a model that replaces samples, ``others`` without the effects that do so.
+
+        What stands in for them is taken from the frames and, once these have told a sensor, from frames
+        drawn of it: in those that are seen it is itself replaced in part.
         """
-        own, numbers = self.frames.effects(model), self.frames.seen_numbers
-        learnt = functools.partial(learn_sensor, frames, numbers, fit, own, self.plain.ambiguous)
-        sensor = learnt(self.lost)
-        others = tuple(effect for effect in model if effect.replacement(frames[:1]) is None)
-        if others == model:
-            return sensor
-        self.effort.refit(self.plain.maps.usable.size, fit.components, 0.0, ())
-        return learnt(sensor.lost, self._once("before", sensor, others).simulated())
+        lost = self._first[1].lost
+        before = self._once("before", self._learnt(fit, model, lost), others).simulated()
+        return self._learnt(fit, model, lost, before)
+
+    def _learnt(
+        self,
+        fit: Refit,
+        model: tuple[Effect, ...],
+        lost: float | None = None,
+        before: NDArray[np.unsignedinteger] | None = None,
+    ) -> Sensor:
+        """Return the sensor that the seen frames and their fit under a model tell; see `learn_sensor`."""
+        self.effort.learn(self.plain.maps.usable.size, fit.components)
+        frames, numbers = self.own_samples(model), self.frames.seen_numbers
+        effects = self.frames.effects(model)
+        return learn_sensor(frames, numbers, fit, effects, self.plain.ambiguous, lost, before)
 
     def drawn(self, model: tuple[Effect, ...], count: int) -> tuple[Refit, list[Mapping[str, float]]]:
         """Return the fit of a model and the statistics of so many replicates, drawn where they are new.

@@ -282,6 +282,35 @@ class ColumnMemory(Effect):
         return result
 
 
+def test_a_sensor_is_moved_to_another_law_as_the_fits_of_its_pixels_are():
+    """Row noise in half of the columns is in their plain read noise; under its law each pixel has its own."""
+    camera, rng = PlainCamera(0.3, 2.5, 12.0, (20, 20), 1500, SPREAD), np.random.default_rng(5)
+    exposure, step, bias, noise = camera.maps(np.random.default_rng(4))
+    truth = np.stack([np.log(exposure), np.log(step), bias, 2 * np.log(noise * step)], axis=-1)
+    noisy = np.tile(np.arange(20) < 10, (20, 1))
+    frames = camera.frames(4) + np.rint(noisy * 2.5 * rng.standard_normal((1500, 20, 1)))
+    frames, numbers = frames.astype(np.uint16), np.arange(1500)
+    seen = observe(frames, numbers, n_run=1500, block_frames=50)
+    plain = learn_sensor(frames, numbers, Refit(seen.maps, {}, seen.covariance), (), seen.ambiguous)
+    effect = RowNoise(row_noise_dn=2.5, region=Region(columns=((0, 10),)))
+    fit = refit_maps(frames, seen.maps, [effect], seen.covariance)
+    sensor = plain.refitted(seen.maps, fit.maps)
+    assert (sensor.usable == fit.maps.usable).all()
+
+    def off(one, columns):
+        some = one.drawn & columns
+        apart = logs(one.draw(1), some) - truth[some]
+        return np.median(apart, axis=0), 5 * 1.25 * apart.std(axis=0) / np.sqrt(len(apart))
+
+    for columns in (noisy, ~noisy):
+        median, limit = off(sensor, columns)
+        assert (np.abs(median) < limit).all()
+    median, limit = off(plain, noisy)
+    assert median[3] > 2 * limit[3]
+    with pytest.raises(NotFittedError, match="no pixel"):
+        plain.refitted(seen.maps, replace(fit.maps, usable=np.zeros((20, 20), np.bool_)))
+
+
 def test_what_an_effect_without_a_law_adds_is_not_simulated_twice():
     """Its variance is in the fitted read noise; with the effect on top there would be too much of it."""
     camera, effect = PlainCamera(0.25, 1.5, 12.0, (20, 20), 900, SPREAD), ColumnMemory()
@@ -406,7 +435,7 @@ def test_what_stands_in_for_replaced_samples_is_drawn_from_the_model():
     # one stack for what stands in, one whose fits are compared with those of the frames
     assert work.effort.replicates == 2
     seen = work.frames.seen_stack, work.frames.seen_numbers
-    by_seen = learn_sensor(*seen, found.fit, (effect,), observed.plain.ambiguous, work.lost)
+    by_seen = learn_sensor(*seen, found.fit, (effect,), observed.plain.ambiguous, found.sensor.lost)
 
     def off(sensor):
         some = sensor.drawn.copy()
