@@ -17,12 +17,17 @@ import numba
 from numba import _dynfunc
 from numba.core.ccallback import CFunc
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, DefaultPassBuilder, _LowerResult
+from numba.core.compiler import Compiler, DefaultPassBuilder, Flags, _LowerResult
 from numba.core.compiler_machinery import register_pass
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
 
 from pchem_pipeline.base.kernel_cache import TIGHT_MEMORY, KernelCache, values_of_closure
+
+# numba looks most calls up by the options of the caller, and compares them one by one: a tenth of its time
+_HASH = hash(Flags())  # of the names of all options, so the same for all
+Flags.__hash__ = lambda _: _HASH
+Flags.__eq__ = lambda self, other: isinstance(other, Flags) and self._values == other._values
 
 
 def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False, borrows: bool = False) -> Any:
@@ -34,7 +39,8 @@ def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False, 
 
     Args:
         function: of scalars and arrays.
-        inline: put the code of the function into its callers, where they could not be optimised otherwise.
+        inline: have numba put the code into each caller, which takes many times as long: for what returns
+            parts of its arrays to kernels that borrow.
         borrows: all its arrays are its callers': it makes none and returns none. Then references are not
             counted, an atomic operation for each array, each part of one and each call, which takes a fourth
             of the time of loops as short as those of the fit.
@@ -129,7 +135,7 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options)
         self._cache = KernelCache(function)
-        self.callee = CPUDispatcher(
+        self.callee = _Callee(
             function, targetoptions={**options, "no_cpython_wrapper": True}, pipeline_class=_CalleeCompiler
         )
 
@@ -141,6 +147,14 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
     @property
     def _numba_type_(self) -> Any:
         return self.callee._numba_type_
+
+
+class _Callee(CPUDispatcher):  # type: ignore[misc]
+    """A kernel as other kernels see it."""
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Return the signature of a call; numba's own way is to compile anew for each constant."""
+        return super().get_call_template([numba.types.unliteral(each) for each in args], kws)
 
 
 class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]

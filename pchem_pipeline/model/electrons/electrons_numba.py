@@ -109,7 +109,7 @@ def fill_tables(
         placed, codes = place_codes(p, first[p], n, parts, law, satellites, pixel)
         if not known_theta(parameters[p], placed.centre, satellites[p, 1], theta):
             continue
-        cells = cells_of(placed, np.int64(0))
+        cells = cells_of(placed, 0)
         for i in range(n):
             sums[0, i] = sums[1, i] = sums[2, i] = 0.0
             number[at + i] = 0

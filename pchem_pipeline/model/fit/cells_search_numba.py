@@ -95,7 +95,7 @@ _CUT_NOISE_E, _CUT_RATIO = 0.28, 1.2
 _STEPS, _AROUND = 3, 3  # biases per electron, and to either side
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _from_density(pixel: Pixel, warm: bool, near: FloatArray, theta: FloatArray) -> None:
     """Fill ``theta`` from parameters with the whole variance of the read noise.
 
@@ -166,7 +166,7 @@ def _scan_cut(pixel: Pixel, tools: Tools) -> int:
                 trial[0], trial[1 + STEP], trial[1 + SATELLITE] = math.log(exposure), a, 0.0
                 trial[1 + BIAS] = facts[FIRST] + place - a * (middle + around / _STEPS)
                 trial[1 + LOG_VARIANCE] = 2.0 * math.log(max(_CUT_NOISE_E * a, 0.3))
-                used += keep_start(pixel, tools.evaluate, np.bool_(True), tools.scratch)
+                used += keep_start(pixel, tools.evaluate, True, tools.scratch)
         a /= _CUT_RATIO
     return used
 
@@ -176,11 +176,11 @@ def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, out: FloatArray, fo
     """Climb from starts ranked by the cells, where a DN is no small part of an electron."""
     scratch = tools.scratch
     if pixel.facts.shape[0] == 1:
-        used = scan_steps(pixel, tools.evaluate, np.bool_(True), scratch)
+        used = scan_steps(pixel, tools.evaluate, True, scratch)
     else:
-        _, used = fill_starts(np.int64(1), np.bool_(False), pixel, tools.basis, tools.evaluate, scratch)
-        used += add_line_starts(pixel, tools.evaluate, np.bool_(True), np.bool_(True), scratch)
-    found = climb_starts(pixel, tools, np.bool_(False), plus(found, used), best, out)
+        _, used = fill_starts(1, False, pixel, tools.basis, tools.evaluate, scratch)
+        used += add_line_starts(pixel, tools.evaluate, True, True, scratch)
+    found = climb_starts(pixel, tools, False, plus(found, used), best, out)
     return found
 
 
@@ -207,11 +207,11 @@ def _flat_at_two(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) ->
     if abs(1.0 / best[1 + STEP] - 0.5) > NEAR_TWO:
         return False
     combs_of_step(pixel, tools.evaluate, 2.0, tools.scratch)
-    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, np.int64(1 + STEP))
+    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, 1 + STEP)
     return bool(fall < CLEAR_GAP and 2.0 * fall < parabola)
 
 
-@kernel(inline=True)
+@kernel
 def _start_anew(
     pixel: Pixel,
     tools: Tools,
@@ -229,11 +229,11 @@ def _start_anew(
     arrive. Of other pixels the density has scanned all combs, unless their law is another: then those with a
     near rival are started anew, too.
     """
-    n, limits, no = pixel.facts.shape[0], tools.limits, np.bool_(False)
+    n, limits = pixel.facts.shape[0], tools.limits
     place = n + STEP
     if cut and (limits.scan or not best[place] > 0.0 or score > _POOR):
         used = _scan_cut(pixel, tools)
-        found = climb_starts(pixel, tools, no, plus(found, used), best, out)
+        found = climb_starts(pixel, tools, False, plus(found, used), best, out)
     few = not best[place] > FEW_STEP
     astray = few or score > SUSPICIOUS
     rivalled = n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap
@@ -244,16 +244,16 @@ def _start_anew(
         return found
     if abs(1.0 / best[place] - 0.5) > NEAR_TWO:
         used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
-        found = climb_starts(pixel, tools, no, plus(found, used), best, out)
+        found = climb_starts(pixel, tools, False, plus(found, used), best, out)
     elif n == 1:
         for nearer in (1.0, 3.0):
             a = 1.0 / (0.5 - (1.0 / best[place] - 0.5) / nearer)
             used = combs_of_step(pixel, tools.evaluate, a, tools.scratch)
-            found = climb_starts(pixel, tools, np.bool_(False), plus(found, used), best, out)
+            found = climb_starts(pixel, tools, False, plus(found, used), best, out)
     return found
 
 
-@kernel(inline=True)
+@kernel
 def _try_satellites(
     pixel: Pixel, tools: Tools, task: Task, unsure: bool, best: FloatArray, out: FloatArray, found: Found
 ) -> Found:

@@ -122,7 +122,7 @@ class Answers(NamedTuple):
 @kernel
 def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
     """Load the samples of a pixel; return the pixel, which shares the room's arrays."""
-    centre, widest = int(np.int64(0)), 0.0
+    centre, widest = 0, 0.0
     for j in range(given.dark.size):
         first, end = given.places[j], given.places[j + 1]
         own = load(given.counts[index, first:end], given.mask[index, first:end], room.bins[j], room.facts[j])
@@ -134,7 +134,7 @@ def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
     return Pixel(room.bins, room.facts, room.peaks, room.mixtures, centre, 4.0 * widest + 10.0)
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def describe(pixel: Pixel, moments: FloatArray, words: IntArray) -> tuple[float, float]:
     """Fill moments, frames and extreme codes; return the fewest frames and the most occupied bins."""
     lowest, highest, n, least, occupied = 2**62, -(2**62), 0.0, math.inf, 0.0
@@ -173,7 +173,7 @@ def theta_of(parameters: FloatArray, pixel: Pixel, limits: Limits, theta: FloatA
     return True
 
 
-@kernel(inline=True)
+@kernel
 def _write(
     pixel: Pixel,
     theta: FloatArray,
@@ -204,7 +204,7 @@ def _write(
     return regular
 
 
-@kernel(inline=True)
+@kernel
 def _expect_information(
     pixel: Pixel, theta: FloatArray, limits: Limits, evaluate: Any, scratch: Scratch
 ) -> None:
@@ -229,7 +229,7 @@ def _expect_information(
 @kernel
 def make_room(given: Histograms, law: Law) -> Pixel:
     """Return room for the histograms of a pixel."""
-    most = np.int64(0)
+    most = 0
     for j in range(given.dark.size):
         most = max(most, given.places[j + 1] - given.places[j])
     n_peaks = law.peaks.shape[3] * (1 + law.pattern.shape[0])
@@ -248,7 +248,7 @@ def start_tile(given: Histograms, law: Law, basis: FloatArray, parameters: Float
         pixel = load_pixel(given, index, room)
         if pixel.facts[0, OCCUPIED] < 3:
             continue
-        if start_regression(histogram_of(pixel, np.int64(0)), basis, scratch.rows, theta)[0]:
+        if start_regression(histogram_of(pixel, 0), basis, scratch.rows, theta)[0]:
             parameters[index, 0] = math.exp(theta[0])
             parameters[index, 1] = 1.0 / theta[1 + STEP]
             parameters[index, 2] = theta[1 + BIAS] + pixel.centre
