@@ -83,7 +83,7 @@ def back_substitute(lower: FloatArray, start: int, end: int, vector: FloatArray)
     return squared
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _solve_without_satellites(at: FloatArray, share: float, scratch: Scratch, step: FloatArray) -> float:
     """Do as :func:`solve_arrow` where there are no satellites: by L D L', five times faster.
 

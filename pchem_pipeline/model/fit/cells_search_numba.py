@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy import special
@@ -271,65 +272,70 @@ def _try_satellites(
     return Found(loglik, found.runner_up, found.used + count + 1, found.degenerate)
 
 
-def search_cells(
-    pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: FloatArray
-) -> tuple[int, int, int]:
-    """Find the most likely parameters of one pixel with its cells integrated, under any law.
+def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
+    """Make the search; ``satellites``: with what tries free ones."""
 
-    From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
-    exclude them, or where its law was too different to do so. Pixels that the density may have led astray
-    are also started anew. Where the law has free satellites, each amplitude is tried.
+    def search_cells(
+        pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: FloatArray
+    ) -> tuple[int, int, int]:
+        """Find the most likely parameters of one pixel with its cells integrated, under any law.
 
-    Args:
-        pixel: its samples and its law.
-        tools: of the search, with the cells; out: score and information at the maximum in ``at_best``.
-        task: the law, and the fit to start from.
-        best: out, theta at the maximum; its step is 0 where there is none.
-        out: out, a row of results.
+        From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
+        exclude them, or where its law was too different to do so. Pixels that the density may have led astray
+        are also started anew. Where the law has free satellites, each amplitude is tried.
 
-    Returns:
-        Status word, evaluations, degrees of freedom of the goodness of fit.
-    """
-    n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
-    known = task.near[n + STEP] > 0.0
-    gap, score = task.gap if known else math.inf, math.inf
-    best[n + STEP] = 0.0
-    tools.scratch.flags[FIXED, n + SATELLITE] = True
-    out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
-    found = Found(-math.inf, -math.inf, 0, np.bool_(False))
-    at_limits = not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
-    cut = n == 1 and at_limits
-    if known:
-        found = _climb_known(pixel, tools, task.near, best)
-    if best[n + STEP] > 0.0:
-        loglik, runner_up, used = found.loglik, found.runner_up, found.used
-        if cut or gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
-            loglik, runner_up, count = climb_neighbours(pixel, tools, best, loglik)
-            used += count
-            if runner_up > -math.inf and (cut or not limits.scan):
-                gap = math.inf  # that of another law, or of a sample that nothing cuts
-        examine(pixel, tools, best, out)
-        score = score_of(out)
-        found = Found(loglik, runner_up, used + 1, found.degenerate)
-    found = _start_anew(pixel, tools, known, cut, score, gap, best, out, found)
-    if not best[n + STEP] > 0.0:
-        return FIT_NOT_CONVERGED, found.used, 0
-    bias_gap = min(gap, found.loglik - found.runner_up)
-    blurred = math.inf
-    if n == 1 and not (limits.warm or limits.reshapes):
-        blurred = min(found.loglik - null, above_blurred(pixel, tools, best, found.loglik))
-    gap = min(bias_gap, found.loglik - null, blurred)
-    if task.amplitudes.size > 0:
-        found = _try_satellites(pixel, tools, task, gap < CLEAR_GAP, best, out, found)
-    out[LOG_LIKELIHOOD], out[GAP] = found.loglik, gap
-    # the density has told whether there is a gain: it knows no other law than one Gaussian does
-    above_null = math.inf if known else found.loglik - null
-    of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
-    of_gain = of_gain or (n == 1 and limits.scan and _flat_at_two(pixel, tools, best, found.loglik))
-    # of several samples, combs that the limits leave open are not looked for
-    unsure = nats_of_peaks(pixel, best) < SURELY_SEEN or best[n + STEP] < FEW_STEP
-    if n == 1:
-        unsure = bias_gap < limits.gap
-    of_gain = of_gain or (at_limits and unsure)
-    word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
-    return word, found.used, int(out[DEGREES])
+        Args:
+            pixel: its samples and its law.
+            tools: of the search, with the cells; out: score and information at the maximum in ``at_best``.
+            task: the law, and the fit to start from.
+            best: out, theta at the maximum; its step is 0 where there is none.
+            out: out, a row of results.
+
+        Returns:
+            Status word, evaluations, degrees of freedom of the goodness of fit.
+        """
+        n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
+        known = task.near[n + STEP] > 0.0
+        gap, score = task.gap if known else math.inf, math.inf
+        best[n + STEP] = 0.0
+        tools.scratch.flags[FIXED, n + SATELLITE] = True
+        out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
+        found = Found(-math.inf, -math.inf, 0, np.bool_(False))
+        at_limits = not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
+        cut = n == 1 and at_limits
+        if known:
+            found = _climb_known(pixel, tools, task.near, best)
+        if best[n + STEP] > 0.0:
+            loglik, runner_up, used = found.loglik, found.runner_up, found.used
+            if cut or gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
+                loglik, runner_up, count = climb_neighbours(pixel, tools, best, loglik)
+                used += count
+                if runner_up > -math.inf and (cut or not limits.scan):
+                    gap = math.inf  # that of another law, or of a sample that nothing cuts
+            examine(pixel, tools, best, out)
+            score = score_of(out)
+            found = Found(loglik, runner_up, used + 1, found.degenerate)
+        found = _start_anew(pixel, tools, known, cut, score, gap, best, out, found)
+        if not best[n + STEP] > 0.0:
+            return FIT_NOT_CONVERGED, found.used, 0
+        bias_gap = min(gap, found.loglik - found.runner_up)
+        blurred = math.inf
+        if n == 1 and not (limits.warm or limits.reshapes):
+            blurred = min(found.loglik - null, above_blurred(pixel, tools, best, found.loglik))
+        gap = min(bias_gap, found.loglik - null, blurred)
+        if satellites and task.amplitudes.size > 0:
+            found = _try_satellites(pixel, tools, task, gap < CLEAR_GAP, best, out, found)
+        out[LOG_LIKELIHOOD], out[GAP] = found.loglik, gap
+        # the density has told whether there is a gain: it knows no other law than one Gaussian does
+        above_null = math.inf if known else found.loglik - null
+        of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
+        of_gain = of_gain or (n == 1 and limits.scan and _flat_at_two(pixel, tools, best, found.loglik))
+        # of several samples, combs that the limits leave open are not looked for
+        unsure = nats_of_peaks(pixel, best) < SURELY_SEEN or best[n + STEP] < FEW_STEP
+        if n == 1:
+            unsure = bias_gap < limits.gap
+        of_gain = of_gain or (at_limits and unsure)
+        word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
+        return word, found.used, int(out[DEGREES])
+
+    return search_cells

@@ -143,7 +143,7 @@ def min_log_variance(a: float, cells: bool) -> float:
     return max(MIN_LOG_VARIANCE, 2.0 * math.log(MIN_ELECTRON_NOISE * a))
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def floor_in_electrons(a: float, cells: bool) -> bool:
     """Tell whether the lower bound of v is that in e-, which moves with the step a."""
     if cells:
@@ -215,7 +215,7 @@ def find_held(theta: FloatArray, at: FloatArray, fixed: BoolArray, limits: Limit
     held[n + SATELLITE] = fixed[n + SATELLITE] or at_end
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def em_step(pixel: Pixel, theta: FloatArray, at: FloatArray, limits: Limits, out: FloatArray) -> bool:
     """One EM update, eq. (update_eqns), from an evaluation of the density; False where it is not defined.
 
@@ -291,7 +291,7 @@ def _take_step(theta: FloatArray, step: FloatArray, tied: float, limits: Limits,
     return factor
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _tie(theta: FloatArray, rounding: float, out: FloatArray) -> None:
     """Set v so that the read noise in e-, that variance of rounding included, is that of ``theta``."""
     n = theta.size - N_BLOCK + 1
@@ -300,7 +300,7 @@ def _tie(theta: FloatArray, rounding: float, out: FloatArray) -> None:
     out[n + LOG_VARIANCE] = math.log(max(variance, 1e-12))
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def tie_noise(theta: FloatArray, at: FloatArray, rounding: float) -> None:
     """Turn score and information in 1/g at known sigma into those at known ``sigma g``, in place.
 
@@ -324,7 +324,7 @@ def tie_noise(theta: FloatArray, at: FloatArray, rounding: float) -> None:
         block[SCORE, step] += slope * block[SCORE, noise]
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _tie_of(theta: FloatArray, goal: Goal, flags: BoolArray, limits: Limits, rounding: float) -> float:
     """Return the variance of rounding with which sigma moves with 1/g; negative where it does not."""
     noise = theta.size - N_BLOCK + 1 + LOG_VARIANCE
@@ -333,7 +333,7 @@ def _tie_of(theta: FloatArray, goal: Goal, flags: BoolArray, limits: Limits, rou
     return rounding if goal.tied else -1.0
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _end_of(
     theta: FloatArray, known: FloatArray, loglik: float, rise: float, limits: Limits, goal: Goal
 ) -> int:
@@ -349,7 +349,7 @@ def _end_of(
     return _GOING
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _damping_after(risen: float, expected: float, rise: float, share: float) -> float:
     """Return the share of the damping matrix for the step after one that rose by so much."""
     if risen > 0.75 * expected:

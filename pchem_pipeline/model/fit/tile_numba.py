@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -174,37 +175,6 @@ def theta_of(parameters: FloatArray, pixel: Pixel, limits: Limits, theta: FloatA
 
 
 @kernel
-def _write(
-    pixel: Pixel,
-    theta: FloatArray,
-    limits: Limits,
-    scratch: Scratch,
-    parameters: FloatArray,
-    covariance: FloatArray,
-) -> bool:
-    """Fill parameters and covariance at a maximum; tell whether the information is positive definite."""
-    n, at, fixed = pixel.facts.shape[0], scratch.evaluations[AT_BEST], scratch.flags[FIXED]
-    held = fixed.copy()
-    floor = min_log_variance(theta[n + STEP], limits.cells)
-    held[n + LOG_VARIANCE] = theta[n + LOG_VARIANCE] <= floor + 1e-9
-    full = np.empty((n + N_SHARED, n + N_SHARED))
-    regular: bool = invert_arrow(at, theta, held, full)
-    if limits.sandwich and regular:
-        if not limits.cells:
-            fill_squared_scores(pixel, theta, at)
-        enclose(at, theta, full)
-    absolute = theta.copy()
-    absolute[n + BIAS] += pixel.centre
-    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
-    to_natural(absolute, fixed[:n], held, rounding, full, parameters, covariance)
-    if not regular:
-        for row in range(n + 3):
-            for column in range(n + 3):
-                covariance[row, column] = math.nan
-    return regular
-
-
-@kernel
 def _expect_information(
     pixel: Pixel, theta: FloatArray, limits: Limits, evaluate: Any, scratch: Scratch
 ) -> None:
@@ -255,69 +225,108 @@ def start_tile(given: Histograms, law: Law, basis: FloatArray, parameters: Float
             parameters[index, 3] = math.exp(0.5 * theta[1 + LOG_VARIANCE])
 
 
-@kernel
-def fit_tile(
-    given: Histograms,
-    chosen: IntArray,
-    law: Law,
-    starts: Starts,
-    limits: Limits,
-    evaluate: Any,
-    climb: Any,
-    search: Any,
-    basis: FloatArray,
-    answers: Answers,
-) -> None:
-    """Fit pixels; they do not influence each other.
+def _tile_kernel(plain: bool) -> Callable[..., None]:
+    """Make the loop; ``plain``: of single samples and errors from the information, half to compile."""
 
-    Args:
-        given: histograms; codes left out by the tail guard do not count.
-        chosen: pixels to fit.
-        law: of the samples.
-        starts: what is known.
-        limits: bounds and limits.
-        evaluate: the likelihood.
-        climb: the climb on it.
-        search: the search for its maximum.
-        basis: of the regression on the characteristic function.
-        answers: out.
-    """
-    n = given.dark.size
-    room = make_room(given, law)
-    scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
-    tools = Tools(limits, evaluate, climb, basis, scratch)
-    near, best = np.zeros(n + N_SHARED), np.zeros(n + N_SHARED)
-    fixed = scratch.flags[FIXED]
-    fixed[n + SATELLITE] = True
-    for j in range(n):
-        fixed[j] = given.dark[j]
-    for index in chosen:
-        pixel = load_pixel(given, index, room)
-        out, words = answers.out[index], answers.words[index]
-        least, occupied = describe(pixel, answers.moments[index], words)
-        for i in range(out.size):
-            out[i] = math.nan
-        if least == 0.0 or occupied < 3.0:
-            words[STATUS] = NO_DATA if least == 0.0 else TOO_FEW_BINS
-            continue
-        if limits.cells:
-            resolve(law, index, 0.0, pixel)
-        near[n + STEP], gap = 0.0, math.inf
-        if starts.parameters.shape[0] > 0:
-            theta_of(starts.parameters[index], pixel, limits, near)
-            gap = starts.gaps[index]
-        tried = starts.looked[index if starts.looked.size > 1 else 0]
-        amplitudes = starts.amplitudes if tried else starts.amplitudes[:0]
-        task = Task(law, index, amplitudes, near, gap)
-        status, used, words[FREEDOM] = search(pixel, tools, task, best, out)
-        words[EVALUATIONS] += used
-        if best[n + STEP] > 0.0:
-            parameters, covariance = answers.parameters[index], answers.covariance[index]
-            if n > 1 and nats_of_peaks(pixel, best) < SURELY_SEEN:
-                if ripple_by_chance(pixel, tools, best, out[LOG_LIKELIHOOD]):
-                    status |= GAIN_AMBIGUOUS
-                if not limits.sandwich:
-                    _expect_information(pixel, best, limits, evaluate, scratch)
-            if not _write(pixel, best, limits, scratch, parameters, covariance):
-                status |= FIT_NOT_CONVERGED
-        words[STATUS] = status
+    @kernel
+    def _write(
+        pixel: Pixel,
+        theta: FloatArray,
+        limits: Limits,
+        scratch: Scratch,
+        parameters: FloatArray,
+        covariance: FloatArray,
+    ) -> bool:
+        """Fill parameters and covariance at a maximum; tell whether the information is positive definite."""
+        n, at, fixed = pixel.facts.shape[0], scratch.evaluations[AT_BEST], scratch.flags[FIXED]
+        held = fixed.copy()
+        floor = min_log_variance(theta[n + STEP], limits.cells)
+        held[n + LOG_VARIANCE] = theta[n + LOG_VARIANCE] <= floor + 1e-9
+        full = np.empty((n + N_SHARED, n + N_SHARED))
+        regular: bool = invert_arrow(at, theta, held, full)
+        if not plain and limits.sandwich and regular:
+            if not limits.cells:
+                fill_squared_scores(pixel, theta, at)
+            enclose(at, theta, full)
+        absolute = theta.copy()
+        absolute[n + BIAS] += pixel.centre
+        rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
+        to_natural(absolute, fixed[:n], held, rounding, full, parameters, covariance)
+        if not regular:
+            for row in range(n + 3):
+                for column in range(n + 3):
+                    covariance[row, column] = math.nan
+        return regular
+
+    @kernel
+    def fit_tile(
+        given: Histograms,
+        chosen: IntArray,
+        law: Law,
+        starts: Starts,
+        limits: Limits,
+        evaluate: Any,
+        climb: Any,
+        search: Any,
+        basis: FloatArray,
+        answers: Answers,
+    ) -> None:
+        """Fit pixels; they do not influence each other.
+
+        Args:
+            given: histograms; codes left out by the tail guard do not count.
+            chosen: pixels to fit.
+            law: of the samples.
+            starts: what is known.
+            limits: bounds and limits.
+            evaluate: the likelihood.
+            climb: the climb on it.
+            search: the search for its maximum.
+            basis: of the regression on the characteristic function.
+            answers: out.
+        """
+        n = given.dark.size
+        room = make_room(given, law)
+        scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
+        tools = Tools(limits, evaluate, climb, basis, scratch)
+        near, best = np.zeros(n + N_SHARED), np.zeros(n + N_SHARED)
+        fixed = scratch.flags[FIXED]
+        fixed[n + SATELLITE] = True
+        for j in range(n):
+            fixed[j] = given.dark[j]
+        for index in chosen:
+            pixel = load_pixel(given, index, room)
+            out, words = answers.out[index], answers.words[index]
+            least, occupied = describe(pixel, answers.moments[index], words)
+            for i in range(out.size):
+                out[i] = math.nan
+            if least == 0.0 or occupied < 3.0:
+                words[STATUS] = NO_DATA if least == 0.0 else TOO_FEW_BINS
+                continue
+            if limits.cells:
+                resolve(law, index, 0.0, pixel)
+            near[n + STEP], gap = 0.0, math.inf
+            if starts.parameters.shape[0] > 0:
+                theta_of(starts.parameters[index], pixel, limits, near)
+                gap = starts.gaps[index]
+            tried = starts.looked[index if starts.looked.size > 1 else 0]
+            amplitudes = starts.amplitudes if tried else starts.amplitudes[:0]
+            task = Task(law, index, amplitudes, near, gap)
+            status, used, words[FREEDOM] = search(pixel, tools, task, best, out)
+            words[EVALUATIONS] += used
+            if best[n + STEP] > 0.0:
+                parameters, covariance = answers.parameters[index], answers.covariance[index]
+                if not plain and n > 1 and nats_of_peaks(pixel, best) < SURELY_SEEN:
+                    if ripple_by_chance(pixel, tools, best, out[LOG_LIKELIHOOD]):
+                        status |= GAIN_AMBIGUOUS
+                    if not limits.sandwich:
+                        _expect_information(pixel, best, limits, evaluate, scratch)
+                if not _write(pixel, best, limits, scratch, parameters, covariance):
+                    status |= FIT_NOT_CONVERGED
+            words[STATUS] = status
+
+    compiled: Callable[..., None] = fit_tile
+    return compiled
+
+
+fit_tile, fit_plain_tile = _tile_kernel(False), _tile_kernel(True)

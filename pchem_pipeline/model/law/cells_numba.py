@@ -201,7 +201,7 @@ class Component(NamedTuple):
     high: int
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _row(values: FloatArray, index: int) -> int:
     """Return the row of a pixel in an array with one row for all, or one for each."""
     return index if values.shape[1] > 1 else 0
@@ -276,7 +276,7 @@ def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
     set_peaks(law, index, amplitude, pixel)
 
 
-@kernel(inline=True)
+@kernel(views=True)
 def cells_of(pixel: Pixel, j: int) -> Cells:
     """Return one sample as the loops below take it."""
     bins, facts = pixel.bins[j], pixel.facts[j]
@@ -306,7 +306,7 @@ def cells_of(pixel: Pixel, j: int) -> Cells:
     )
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _level(k: float, cells: Cells) -> float:
     """Return the level of k electrons, e-."""
     return cells.level_scale * k * (1.0 + 0.5 * cells.curvature * (k - 1.0)) + cells.level_shift
@@ -336,7 +336,7 @@ def component(k: float, peak: int, theta: FloatArray, cells: Cells, reach: float
     return Component(mean, variance, sd, charge, 0.5 * by_sigma, 2.0 * a * spread, own, low, high)
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _list_numbers(theta: FloatArray, cells: Cells, reach: float, cut: float, numbers: FloatArray) -> int:
     """Fill the electron numbers that reach the cells, with their probabilities; return how many."""
     a, analog2, exposure = theta[_STEP], math.exp(theta[_VARIANCE]), math.exp(theta[_EXPOSURE])
@@ -376,7 +376,7 @@ def _list_numbers(theta: FloatArray, cells: Cells, reach: float, cut: float, num
     return count
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _place_for(part: Component, place: int) -> tuple[int, int]:
     """Return where the edges of a component are kept, and where those of the next one; where only for now."""
     width = part.high - part.low + 1 + SIMD_WIDTH
@@ -400,7 +400,7 @@ def _fill_edges(bins: FloatArray, part: Component, edges: FloatArray, place: int
         edges[row, behind] = edges[row, behind - 1]
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def cell_of(mean: float, cells: Cells, low: int, high: int) -> int:
     """Return the cell that holds a mean, if it is one of these, the end excluded, or one outside."""
     middle = int(min(max(mean - cells.first, low - 1.0), float(high)))
@@ -411,7 +411,7 @@ def cell_of(mean: float, cells: Cells, low: int, high: int) -> int:
     return middle
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _add_component(
     row: FloatArray,
     peak: int,
@@ -526,7 +526,7 @@ def fill_far_enough(
     return count, _REACH[stage]
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _log_mass(cells: Cells, room: FloatArray) -> float:
     """Return the log-likelihood of the masses in the room."""
     total, inside = counting() * 0.0, 1.0
@@ -540,7 +540,7 @@ def _log_mass(cells: Cells, room: FloatArray) -> float:
     return float(simd_sum(total)) - cells.frames * math.log(max(inside, SMALLEST_MASS))
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
     """Return the log-likelihood of the masses in the room; fill score, squared scores and ratios.
 
@@ -582,7 +582,7 @@ def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray)
     return loglik
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _condition(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
     """Take off what all kept codes together give; return the change of the log-likelihood.
 
@@ -616,7 +616,7 @@ def _condition(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArr
     return -n * math.log(inside)
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _hermite_sums(
     cells: Cells, part: Component, room: FloatArray, edges: FloatArray, place: int
 ) -> tuple[float, float, float, float, float]:
@@ -642,7 +642,7 @@ def _hermite_sums(
     return whole, float(simd_sum(s1)), float(simd_sum(s2)), float(simd_sum(s3)), float(simd_sum(s4))
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _subtract_curvature(
     theta: FloatArray,
     cells: Cells,
@@ -703,7 +703,7 @@ def own_theta(pixel: Pixel, j: int, theta: FloatArray, own: FloatArray) -> None:
     own[_SATELLITE] = theta[n + SATELLITE]
 
 
-@kernel(borrows=True)
+@kernel(inline=True, borrows=True)
 def _expect(pixel: Pixel, j: int, cells: Cells, room: FloatArray) -> None:
     """Fill the counts expected of the codes that are not set aside."""
     inside = 1.0

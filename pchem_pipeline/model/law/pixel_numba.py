@@ -293,7 +293,7 @@ def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray,
     return int(low + middle)
 
 
-@kernel(inline=True)
+@kernel(views=True)
 def histogram_of(pixel: Pixel, j: int) -> Histogram:
     """Return one sample's histogram, counted from its own centre."""
     facts = pixel.facts[j]
