@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import operator
 import os
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -24,10 +25,12 @@ from numba.core.typed_passes import NativeLowering
 
 from pchem_pipeline.base.kernel_cache import TIGHT_MEMORY, KernelCache, values_of_closure
 
-# numba looks most calls up by the options of the caller, and compares them one by one: a tenth of its time
+# numba looks most calls up by all options of the caller, and compiles what it has of its own for each
+# variety; only these are passed on to it
+_passed_on = operator.attrgetter("nrt", "fastmath", "error_model")
 _HASH = hash(Flags())  # of the names of all options, so the same for all
 Flags.__hash__ = lambda _: _HASH
-Flags.__eq__ = lambda self, other: isinstance(other, Flags) and self._values == other._values
+Flags.__eq__ = lambda self, other: isinstance(other, Flags) and _passed_on(self) == _passed_on(other)
 
 
 def kernel(
