@@ -48,6 +48,7 @@ from pchem_pipeline.model.fit.starts_numba import (
     combs_of_step,
     fill_starts,
     keep_start,
+    no_starts,
     scan_steps,
 )
 from pchem_pipeline.model.law.pixel_numba import (
@@ -66,7 +67,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     LOG_VARIANCE,
     N_BINS,
     N_FRAMES,
-    N_KEPT,
     N_PEAKS,
     PER_ELECTRON,
     PER_ELECTRON2,
@@ -155,8 +155,7 @@ def _scan_cut(pixel: Pixel, tools: Tools) -> int:
     """
     trial, place, used = tools.scratch.small[HERE], 0, 0
     facts, cumulative = pixel.facts[0], pixel.bins[0, CUMULATIVE]
-    for i in range(N_KEPT):
-        tools.scratch.small[HEIGHTS, i] = -math.inf
+    no_starts(tools.scratch.small[HEIGHTS])
     while cumulative[place + 1] < 0.5 * facts[N_FRAMES]:
         place += 1
     a, least = facts[N_BINS] + 1.0, max(0.25 * math.sqrt(facts[VARIANCE]), LEAST_STEP)

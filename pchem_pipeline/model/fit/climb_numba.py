@@ -143,14 +143,6 @@ def min_log_variance(a: float, cells: bool) -> float:
     return max(MIN_LOG_VARIANCE, 2.0 * math.log(MIN_ELECTRON_NOISE * a))
 
 
-@kernel(inline=True, borrows=True)
-def floor_in_electrons(a: float, cells: bool) -> bool:
-    """Tell whether the lower bound of v is that in e-, which moves with the step a."""
-    if cells:
-        return LEAST_NOISE_E * a > LEAST_NOISE_DN
-    return 2.0 * math.log(MIN_ELECTRON_NOISE * a) > MIN_LOG_VARIANCE
-
-
 @kernel(borrows=True)
 def keep_inside(theta: FloatArray, limits: Limits) -> None:
     """Move ``theta`` to the nearest allowed values."""
@@ -286,18 +278,11 @@ def _take_step(theta: FloatArray, step: FloatArray, tied: float, limits: Limits,
     for i in range(theta.size):
         out[i] = theta[i] + factor * step[i]
     if tied >= 0.0:
-        _tie(theta, tied, out)
+        ratio = out[n + STEP] / a
+        variance = (math.exp(theta[n + LOG_VARIANCE]) + tied) * ratio * ratio - tied
+        out[n + LOG_VARIANCE] = math.log(max(variance, 1e-12))
     keep_inside(out, limits)
     return factor
-
-
-@kernel(inline=True, borrows=True)
-def _tie(theta: FloatArray, rounding: float, out: FloatArray) -> None:
-    """Set v so that the read noise in e-, that variance of rounding included, is that of ``theta``."""
-    n = theta.size - N_BLOCK + 1
-    ratio = out[n + STEP] / theta[n + STEP]
-    variance = (math.exp(theta[n + LOG_VARIANCE]) + rounding) * ratio * ratio - rounding
-    out[n + LOG_VARIANCE] = math.log(max(variance, 1e-12))
 
 
 @kernel(inline=True, borrows=True)
@@ -329,7 +314,11 @@ def _tie_of(theta: FloatArray, goal: Goal, flags: BoolArray, limits: Limits, rou
     """Return the variance of rounding with which sigma moves with 1/g; negative where it does not."""
     noise = theta.size - N_BLOCK + 1 + LOG_VARIANCE
     if flags[HELD, noise] and not flags[FIXED, noise]:  # at its floor, which moves with 1/g
-        return 0.0 if floor_in_electrons(theta[noise - LOG_VARIANCE + STEP], limits.cells) else -1.0
+        a = theta[noise - LOG_VARIANCE + STEP]
+        moves = 2.0 * math.log(MIN_ELECTRON_NOISE * a) > MIN_LOG_VARIANCE
+        if limits.cells:
+            moves = LEAST_NOISE_E * a > LEAST_NOISE_DN
+        return 0.0 if moves else -1.0
     return rounding if goal.tied else -1.0
 
 

@@ -147,16 +147,6 @@ def _beside(direction: float, pixel: Pixel, tools: Tools, theta: FloatArray) -> 
 
 
 @kernel(borrows=True)
-def third_cumulant(histogram: Histogram) -> float:
-    """Return the third cumulant, DN^3, but at least that of a small skewness."""
-    third = 0.0
-    for i in range(histogram.n_bins):
-        third += histogram.weights[i] * (histogram.first + i - histogram.mean) ** 3
-    least = _LEAST_SKEWNESS * histogram.variance * math.sqrt(histogram.variance)
-    return max(third / histogram.n, least)
-
-
-@kernel(borrows=True)
 def _with_cumulants(
     a: float,
     third: float,
@@ -204,8 +194,11 @@ def _from_cumulants(
         Whether there is one, and evaluations.
     """
     scratch, histogram, used = tools.scratch, histogram_of(pixel, 0), 0
-    third = third_cumulant(histogram)
-    m1 = m2 = m3 = 0.0
+    third = m1 = m2 = m3 = 0.0
+    for i in range(histogram.n_bins):
+        third += histogram.weights[i] * (histogram.first + i - histogram.mean) ** 3
+    # the third cumulant, DN^3, but at least that of a small skewness
+    third = max(third / histogram.n, _LEAST_SKEWNESS * histogram.variance * math.sqrt(histogram.variance))
     for side in range(law.pattern.shape[0]):
         shift = law.pattern[side, 0] * amplitude
         m1 += law.pattern[side, 1] * shift

@@ -675,17 +675,6 @@ def plus(found: Found, count: int) -> Found:
 
 
 @kernel(borrows=True)
-def _keep_highest(heights: FloatArray) -> None:
-    """Drop all starts but the highest."""
-    most = heights[0]
-    for i in range(1, N_KEPT):
-        most = max(most, heights[i])
-    for i in range(N_KEPT):
-        if heights[i] < most:
-            heights[i] = -math.inf
-
-
-@kernel(borrows=True)
 def climb_starts(
     pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray
 ) -> Found:
@@ -738,6 +727,7 @@ def search_density(
         Status word, evaluations, degrees of freedom of the goodness of fit.
     """
     n, trial, limits = pixel.facts.shape[0], tools.scratch.small[HERE], tools.limits
+    heights = tools.scratch.small[HEIGHTS]
     null, used = loglik_without_gain(pixel), 0
     best[n + STEP] = 0.0
     if task.near[n + STEP] > 0.0:
@@ -752,7 +742,11 @@ def search_density(
         clear, count = fill_starts(attempt, limits.quick, pixel, tools.basis, tools.evaluate, tools.scratch)
         before = found.loglik
         if clear and attempt == 0:
-            _keep_highest(tools.scratch.small[HEIGHTS])
+            most = -math.inf
+            for i in range(N_KEPT):  # the highest is kept
+                most = max(most, heights[i])
+            for i in range(N_KEPT):
+                heights[i] = heights[i] if heights[i] == most else -math.inf
         found = climb_starts(pixel, tools, clear, plus(found, count), best, out)
         if (n > 1 or attempt == 0) and best[n + STEP] > 0.0:
             poor, least = score_of(out) > SUSPICIOUS, found.loglik - CLEAR_GAP

@@ -15,8 +15,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
@@ -692,17 +690,6 @@ def _subtract_curvature(
             information[3, 3] -= w * (f_mm * mv * mv + 2.0 * f_mq * mv * qv + f_qq * qv * qv + bend)
 
 
-@kernel(borrows=True)
-def own_theta(pixel: Pixel, j: int, theta: FloatArray, own: FloatArray) -> None:
-    """Fill a sample's own parameters from those of its pixel."""
-    n = pixel.facts.shape[0]
-    own[_EXPOSURE] = theta[j] if pixel.facts[j, DARK] == 0.0 else _NO_ELECTRONS
-    own[_STEP] = theta[n + STEP]
-    own[_BIAS] = theta[n + BIAS] - pixel.facts[j, CENTRE]
-    own[_VARIANCE] = theta[n + LOG_VARIANCE]
-    own[_SATELLITE] = theta[n + SATELLITE]
-
-
 @kernel(inline=True, borrows=True)
 def _expect(pixel: Pixel, j: int, cells: Cells, room: FloatArray) -> None:
     """Fill the counts expected of the codes that are not set aside."""
@@ -728,10 +715,12 @@ def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch,
     Returns:
         The log-likelihood, nats.
     """
-    own = scratch.small[OWN]
-    loglik = 0.0
-    for j in range(pixel.facts.shape[0]):
-        own_theta(pixel, j, theta, own)
+    own, n, loglik = scratch.small[OWN], pixel.facts.shape[0], 0.0
+    own[_STEP], own[_VARIANCE] = theta[n + STEP], theta[n + LOG_VARIANCE]
+    own[_SATELLITE] = theta[n + SATELLITE]
+    for j in range(n):
+        own[_EXPOSURE] = theta[j] if pixel.facts[j, DARK] == 0.0 else _NO_ELECTRONS
+        own[_BIAS] = theta[n + BIAS] - pixel.facts[j, CENTRE]
         cells, room = cells_of(pixel, j), scratch.cells[j]
         count, reach = fill_far_enough(own, cells, what, scratch.numbers, scratch.edges, room)
         if what == LOGLIK_ALONE:

@@ -45,12 +45,6 @@ def pixel_scratch(n_bins: int, law: Law) -> tuple[Pixel, Scratch]:
 
 
 @kernel
-def _at(room: Pixel, centre: int) -> Pixel:
-    """Return the pixel counted from a code."""
-    return Pixel(room.bins, room.facts, room.peaks, room.mixtures, centre, 0.0)
-
-
-@kernel
 def known_theta(parameters: FloatArray, centre: int, weight: float, theta: FloatArray) -> bool:
     """Fill a sample's own theta from (H, g, mu, sigma); False unless known, and H that of a pixel."""
     if not (math.isfinite(parameters.sum()) and parameters[0] < _MOST_EXPOSURE):
@@ -104,7 +98,7 @@ def mass_tile(
     for index in range(parameters.shape[0]):
         if not known_theta(parameters[index], first[index], satellites[index, 1], theta):
             continue
-        pixel = _at(room, first[index])
+        pixel = Pixel(room.bins, room.facts, room.peaks, room.mixtures, first[index], 0.0)
         resolve(law, index, satellites[index, 0], pixel)
         cells = cells_of(pixel, 0)
         fill_masses(theta, cells, stage, what, scratch.numbers, scratch.edges, scratch.cells[0])
