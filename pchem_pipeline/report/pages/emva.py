@@ -61,16 +61,21 @@ def emva_tables(data: ReportData) -> list[Table]:
         return []
     if data.mostly_flagged:
         return []
-    rows = tuple(
-        (row.quantity, row.symbol, row.text, row.definition_here, row.where_it_differs)
+    rows = [
+        {
+            "quantity": row.quantity,
+            "symbol": row.symbol,
+            "value": row.text,
+            "definition here": row.definition_here,
+            "difference to EMVA 1288": row.where_it_differs,
+        }
         for row in emva_rows(data.maps, status, data.kind, data.outlier_sigmas)
-    )
+    ]
     return [
         Table(
             "emva1288",
             "Data sheet quantities of EMVA 1288",
             f"Flagged {data.noun}s are excluded. As a file: pchem export {data.typed_run} --format emva",
-            ("quantity", "symbol", "value", "definition here", "difference to EMVA 1288"),
             rows,
             "emva",
         )

@@ -320,6 +320,6 @@ def test_the_section_of_the_report_is_of_the_median_pixel():
     assert section["reached"]["conversion_gain"] == pytest.approx(0.0028, abs=5e-5)
     data = ReportData(title="a run", shape=(2, 2), plan=section)
     [table] = [table for table in result_tables(data) if table.section == "plan"]
-    assert table.rows[0][2] == "0.28 %"
-    assert {len(row) for row in table.rows} == {len(table.head)}
+    assert table.rows[0]["this run's"] == "0.28 %"
+    assert {tuple(row) for row in table.rows} == {table.head}
     assert plan_section({name: np.full((2, 2), np.nan) for name in maps}, 10) is None

@@ -128,9 +128,9 @@ def test_what_is_measured_has_its_numbers_and_no_rivals(base: ReportData) -> Non
     tables = {table.id: table for part in discrepancy_tables(data).values() for table in part}
     assert not [name for name in tables if name.startswith("discrepancy-candidates")]
     row, form = tables["discrepancy-parameters"].rows
-    assert form[:2] == ("empirical_noise: spectrum", "one_over_f")
-    assert row[:2] == ("empirical_noise: noise_dn", "0.784 ± 0.021 DN")
-    assert row[2].endswith("(empirical)")
+    assert (form["parameter"], form["value"]) == ("empirical_noise: spectrum", "one_over_f")
+    assert (row["parameter"], row["value"]) == ("empirical_noise: noise_dn", "0.784 ± 0.021 DN")
+    assert row["effect"].endswith("(empirical)")
     text = Page(rendered(base, data)["discrepancy.html"]).text
     assert "the empirical description has no rivals." in text
 
@@ -442,15 +442,15 @@ def test_a_named_effect_says_why_no_other_one_and_where_it_is() -> None:
     data = discrepancy_data("named", steps=[placed])
     tables = {table.id: table for part in discrepancy_tables(data).values() for table in part}
     rows = tables["discrepancy-rivals"].rows
-    assert [(row[0], row[2], row[3]) for row in rows] == [
+    assert [(row["effect"], row["instead of"], row["log-likelihood lower by"]) for row in rows] == [
         ("periodic_pickup", "row_noise", "16.8"),
         ("interpixel_capacitance", "row_noise", "262"),
     ]
-    assert all(row[4] for row in rows)
+    assert all(row["reason"] for row in rows)
     assert key_facts(data)[0].more[-1] == "in columns 3 to 8"
     unsized = key_facts(discrepancy_data("named", steps=[{**placed, "size": None}]))[0]
     assert (unsized.value, unsized.more[0]) == ("0.3512 ± 0.0041 DN", "row_noise_dn")
-    examined = {row[0]: row[1] for row in tables["discrepancy-examined"].rows}
+    examined = {row["item"]: row["value"] for row in tables["discrepancy-examined"].rows}
     first, last = data.found.examined.rows
     assert examined["rows"] == f"{first} to {last - 1}"  # as in the sentence at the top
 
@@ -463,7 +463,7 @@ def test_a_single_candidate_has_no_share_of_the_probability() -> None:
         for each in discrepancy_tables(discrepancy_data("ambiguous", steps=[alone]))["evidence"]
         if each.id == "discrepancy-candidates-1"
     ]
-    assert table.rows[0][4] == "only candidate"
+    assert table.rows[0]["probability"] == "only candidate"
 
 
 def test_places_of_a_window_are_places_of_the_sensor() -> None:
@@ -475,11 +475,11 @@ def test_places_of_a_window_are_places_of_the_sensor() -> None:
     assert moved.where[1] == found.where[1]
 
 
-def test_unit_tables_have_the_same_width_in_every_row() -> None:
+def test_all_rows_of_a_table_have_the_same_columns() -> None:
     for verdict in VERDICTS:
         for tables in discrepancy_tables(discrepancy_data(verdict)).values():
             for table in tables:
-                assert {len(row) for row in table.rows} == {len(table.head)}, table.id
+                assert {tuple(row) for row in table.rows} == {table.head}, table.id
 
 
 def test_the_report_says_what_was_found_among_its_flags() -> None:

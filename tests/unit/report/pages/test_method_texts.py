@@ -109,7 +109,7 @@ def test_figure_and_table_of_the_report():
     for width in (88.0, 180.0):
         assert figure.draw(Look(width)).axes
     [table] = method_tables(data)
-    assert {len(row) for row in table.rows} == {len(table.head)}
+    assert {tuple(row) for row in table.rows} == {table.head}
     assert " e-" not in table.caption
     assert "0.51 e⁻" in table.caption
     simulated, run = figure.tables

@@ -277,7 +277,7 @@ def test_moments_have_the_digits_of_the_data_that_they_are_compared_with() -> No
     (table,) = [
         each for each in result_tables(replace(data, moments=[*data.moments, part])) if each.id == "moments"
     ]
-    assert [row[1] for row in table.rows] == ["121.340", "251.30", "5.55"]
+    assert [row["from the maps"] for row in table.rows] == ["121.340", "251.30", "5.55"]
 
 
 def test_how_to_cite_has_the_numbers_and_the_papers(page: Page, data: ReportData) -> None:
