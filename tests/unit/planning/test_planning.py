@@ -17,7 +17,7 @@ from pchem_pipeline.planning.targets import TARGET_NAMES, parse_target
 from pchem_pipeline.planning.verify import frames_simulated, verify
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.tables import result_tables
-from pchem_pipeline.stages.report.report import plan_section
+from pchem_pipeline.stages.report.stored import plan_section
 
 GAIN = 1 / 11
 ONE_PERCENT = parse_target("conversion_gain=1%")

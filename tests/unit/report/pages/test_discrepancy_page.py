@@ -490,30 +490,29 @@ def test_the_report_says_what_was_found_among_its_flags() -> None:
 def test_the_page_of_a_run(tmp_path: Path) -> None:
     """From the files of a run: JSON and arrays written, read back, and the same."""
     from pchem_pipeline.base.errors import StoreError
+    from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.stages.identities import discrepancy_state
-    from pchem_pipeline.stages.report.report import verdict_data
     from pchem_pipeline.stages.report.stored import read_run
     from pchem_pipeline.store.run_store import RunStore
 
     store = RunStore.create(tmp_path / "run.zarr")
     SensorInfo("frames", 400, 32, 41, "uint16", 14, None, "copy", {"files": [], "digest": ""}).write(store)
-    assert read_run(store).verdict is None
+    assert read_run(store, RunConfig()).data.discrepancy is None
     assert discrepancy_state(store) is None
     arrays = evidence_arrays(evidence())
     for name, array in arrays.items():
         store.write_array(f"discrepancy/{name}", array)
     store.write_file("discrepancy.json", json.dumps(result("named")).encode())
-    run = read_run(store)
-    assert run.verdict is not None
-    data = verdict_data(run.verdict, run.discrepancy)
+    data = read_run(store, RunConfig()).data.discrepancy
+    assert data is not None
     assert set(data.arrays) == set(arrays)
     np.testing.assert_array_equal(data.arrays["score"], arrays["score"])
     assert data.found.effects == ("row_noise", "bias_drift")
     assert discrepancy_state(store) == "named"
     store.write_file("discrepancy.json", b"[1, 2")
     with pytest.raises(StoreError, match=r"discrepancy.json is damaged .*run pchem discrepancy with --force"):
-        read_run(store)
+        read_run(store, RunConfig())
 
 
 def test_pixels_that_are_not_identified_are_said_beside_a_name() -> None:
@@ -524,7 +523,7 @@ def test_pixels_that_are_not_identified_are_said_beside_a_name() -> None:
 
 
 def test_a_statistic_of_the_report_says_what_its_sign_says() -> None:
-    from pchem_pipeline.stages.report.report import verdict_data
+    from pchem_pipeline.stages.report.stored import verdict_data
 
     found = discrepancy_data("named").found
     names = list(verdict_data(found, {}).statistics)
