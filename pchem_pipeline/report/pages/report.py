@@ -17,7 +17,7 @@ from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.samples import AXES, slope_of
-from pchem_pipeline.report.inspector import embedded, script
+from pchem_pipeline.report.inspector import embedded, script, text_of
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
 from pchem_pipeline.report.pages.emva import emva_tables
 from pchem_pipeline.report.pages.page import DrawAll, Drawn, Finding, Section, draw_here, render_page
@@ -287,21 +287,6 @@ def _discrepancy_page(
     return render_page("discrepancy.html.j2", sections, drawn, title=data.title, about=about)
 
 
-_VERIFICATION = """@article{Hendrickson2023,
-  author  = {Hendrickson, Aaron and Haefner, David P. and Shade, Nicholas R. and Fossum, Eric R.},
-  title   = {Experimental Verification of {PCH-EM} Algorithm for Characterizing {DSERN} Image Sensors},
-  journal = {arXiv preprint arXiv:2302.14654},
-  year    = {2023}
-}"""
-_SEVERAL = """@article{Hendrickson2024,
-  author  = {Hendrickson, Aaron J. and Haefner, David P. and Chan, Stanley H. and Shade, Nicholas R. and
-             Fossum, Eric R.},
-  title   = {{PCH-EM}: A Solution to Information Loss in the Photon Transfer Method},
-  journal = {arXiv preprint arXiv:2403.04498},
-  year    = {2024}
-}"""
-
-
 def citation(data: ReportData) -> dict[str, str]:
     """Return what a paper would say of this run (``text``) and cite (``bibtex``)."""
     versions = data.run.get("versions")
@@ -318,5 +303,5 @@ def citation(data: ReportData) -> dict[str, str]:
   title   = {{pchem\\_pipeline}},
   version = {{{version}}}
 }}"""
-    papers = [_VERIFICATION, *([] if data.samples is None else [_SEVERAL]), software]
-    return {"text": text, "bibtex": "\n\n".join(papers)}
+    papers = text_of("papers.bib").strip().split("\n\n")  # the second one is on several exposures
+    return {"text": text, "bibtex": "\n\n".join([*papers[: 1 if data.samples is None else 2], software])}
