@@ -14,7 +14,7 @@ import numpy as np
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.methods.base import PixelSamples, Sample, methods
-from pchem_pipeline.methods.compare import MethodResult, compare
+from pchem_pipeline.methods.compare import compare
 from pchem_pipeline.methods.photon_transfer import gain_variance
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import (
@@ -62,7 +62,7 @@ def study_point(point: StudyPoint, settings: MethodsSettings) -> dict[str, Any]:
         point: what to simulate.
         settings: of the iterative methods.
     """
-    results: list[MethodResult] = []
+    found: dict[str, dict[str, Any]] = {}
     for number, (needs, exposures) in enumerate(SHARES.items()):
         names = [n for n, m in methods().items() if m.needs == needs and not m.sensor_wide]
         rng = np.random.default_rng([point.seed, number, round(1e6 * point.read_noise_e)])
@@ -74,13 +74,12 @@ def study_point(point: StudyPoint, settings: MethodsSettings) -> dict[str, Any]:
             for share in exposures
         ]
         pixels = PixelSamples(tuple(Sample(one.counts, one.origin) for one in drawn))
-        results += compare(pixels, drawn[0].truth, settings, only=names)
-    order = list(methods())
-    results.sort(key=lambda result: order.index(result.name))
+        results = compare(pixels, drawn[0].truth, settings, only=names)
+        found |= {result.facts["name"]: result.facts for result in results}
     return {
         "read_noise_e": point.read_noise_e,
         "bounds": _gain_bounds(point),
-        "methods": {result.name: result.as_json() for result in results},
+        "methods": {name: found[name] for name in methods() if name in found},
     }
 
 
