@@ -498,13 +498,14 @@ def test_the_page_of_a_run(tmp_path: Path) -> None:
 
     store = RunStore.create(tmp_path / "run.zarr")
     SensorInfo("frames", 400, 32, 41, "uint16", 14, None, "copy", {"files": [], "digest": ""}).write(store)
-    assert read_run(store, RunConfig()).data.discrepancy is None
+    config = RunConfig.model_validate({"input": {"files": ["frames.npy"]}})
+    assert read_run(store, config).data.discrepancy is None
     assert discrepancy_state(store) is None
     arrays = evidence_arrays(evidence())
     for name, array in arrays.items():
         store.write_array(f"discrepancy/{name}", array)
     store.write_file("discrepancy.json", json.dumps(result("named")).encode())
-    data = read_run(store, RunConfig()).data.discrepancy
+    data = read_run(store, config).data.discrepancy
     assert data is not None
     assert set(data.arrays) == set(arrays)
     np.testing.assert_array_equal(data.arrays["score"], arrays["score"])
@@ -512,7 +513,7 @@ def test_the_page_of_a_run(tmp_path: Path) -> None:
     assert discrepancy_state(store) == "named"
     store.write_file("discrepancy.json", b"[1, 2")
     with pytest.raises(StoreError, match=r"discrepancy.json is damaged .*run pchem discrepancy with --force"):
-        read_run(store, RunConfig())
+        read_run(store, config)
 
 
 def test_pixels_that_are_not_identified_are_said_beside_a_name() -> None:
