@@ -16,7 +16,7 @@ import json
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.model.maps.ordered import Ordered
-from pchem_pipeline.report.data import MAP_NAMES, ReportData
+from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.style.palette import shades
 from pchem_pipeline.report.style.ranges import DECADES
-from pchem_pipeline.report.style.wording import symbol, unit_text
+from pchem_pipeline.report.style.wording import unit_text
 
 #: Codes with a meaning of their own, and the last one of the regular range.
 _NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
@@ -262,6 +262,14 @@ class MapEntry:
     same_as: tuple[str, float] | None = None
 
 
+class Notable(NamedTuple):
+    """Why pixels are in the file: in words, which (``y * nx + x``), and the map whose value it is, if one."""
+
+    words: str
+    pixels: tuple[int, ...]
+    path: str = ""
+
+
 @dataclass(frozen=True)
 class PixelSample:
     """Pixels that are in the file in full.
@@ -273,7 +281,7 @@ class PixelSample:
         counts: their histograms.
         deciding: parameters that decide electron numbers, where these are not the fitted ones: (4, n).
         masses: probability of each bin under a model with effects, of as many of the first pixels.
-        reasons: why pixels are here, with their indices, e.g. ``"poorest goodness of fit"``.
+        reasons: why pixels are here, those of the even sample excepted.
     """
 
     index: IntArray
@@ -282,7 +290,7 @@ class PixelSample:
     counts: list[NDArray[np.integer[Any]]]
     deciding: FloatArray | None = None
     masses: list[FloatArray] = field(default_factory=list)
-    reasons: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    reasons: Sequence[Notable] = ()
 
 
 @dataclass(frozen=True)
@@ -414,24 +422,8 @@ def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
             "deciding": sample.deciding is not None,
             "masses": len(sample.masses),
         },
-        "notable": [
-            {"words": words, "pixels": list(where), "path": _shown_value(words)}
-            for words, where in sample.reasons
-        ],
+        "notable": [each._asdict() for each in sample.reasons],
     }
-
-
-def _shown_value(reason: str) -> str:
-    """Return the path of the map whose value makes a pixel notable; empty where it is no value."""
-    if reason == "poorest goodness of fit":
-        return "fit/goodness_p"
-    for name in MAP_NAMES:
-        words = symbol(name)[1]
-        if reason.endswith(f"standard error of the {words}"):
-            return f"maps/{name}_stderr"
-        if reason in (f"largest {words}", f"smallest {words}"):
-            return f"maps/{name}"
-    return ""
 
 
 def map_facts(entry: MapEntry) -> dict[str, Any]:

@@ -132,33 +132,23 @@ def _flag_texts(attributes: Mapping[str, Any], key: str) -> dict[int, str]:
 
 
 class StoredMaps:
-    """Maps of a run, of which some are at hand.
-
-    Attributes:
-        store: the run.
-        loaded: maps that need not be read, by path.
-    """
+    """Maps of a run by their path: those ``loaded`` already, others from its store; the last two are kept."""
 
     def __init__(self, store: RunStore, loaded: Mapping[str, NDArray[Any]] | None = None) -> None:
         self.store, self.loaded = store, loaded or {}
-        self._last: tuple[str, NDArray[Any]] = ("", np.empty(0))
+        self._read = functools.lru_cache(maxsize=2)(store.read)
 
     def has(self, path: str) -> bool:
         """Tell whether there is such a map."""
         return path in self.loaded or self.store.has(path)
 
     def read(self, path: str) -> NDArray[Any]:
-        """Return a map; the last one is kept.
+        """Return a map.
 
         Raises:
             StoreError: it is missing or corrupt.
         """
-        if path in self.loaded:
-            return self.loaded[path]
-        last = self._last  # another thread may put another in its place meanwhile
-        if path != last[0]:
-            last = self._last = path, self.store.read(path)
-        return last[1]
+        return self.loaded[path] if path in self.loaded else self._read(path)
 
 
 def inspector_data(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
@@ -17,7 +17,7 @@ from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
-from pchem_pipeline.report.inspector import InspectorData, PixelSample
+from pchem_pipeline.report.inspector import InspectorData, Notable, PixelSample
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.page import DrawAll, Drawn, draw_figure
 from pchem_pipeline.report.pages.report import render_report
@@ -29,7 +29,6 @@ from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import (
     Chosen,
-    ChosenPixels,
     bin_masses,
     choose_inspected,
     choose_pixels,
@@ -137,13 +136,15 @@ class _Pixels:
 
     Attributes:
         fits: of those that are shown.
-        full: those that the inspector holds in full.
+        index: ``y * nx + x`` of those that the inspector holds in full.
+        reasons: why it does.
         histograms: of the latter.
         masses: of as many of the first of them, under a model with effects.
     """
 
     fits: list[PixelFit]
-    full: ChosenPixels
+    index: IntArray
+    reasons: list[Notable]
     histograms: PixelHistograms
     masses: list[FloatArray]
 
@@ -155,15 +156,15 @@ def _of_pixels(run: StoredRun, asked: Sequence[tuple[int, int]]) -> _Pixels:
     places, bins = [(y, x) for _, y, x in shown], store.array("histogram/counts").shape[2]
     verdict = data.discrepancy
     suspects = [] if verdict is None else [p for place in verdict.found.where for p in place.pixels]
-    full = choose_inspected(data.maps, data.fit, places, suspects, bins=bins)
-    index = np.concatenate([pixel_index(shown, data.shape), full.index])
+    full, reasons = choose_inspected(data.maps, data.fit, places, suspects, bins=bins)
+    index = np.concatenate([pixel_index(shown, data.shape), full])
     histograms = read_histograms(store, index, data.shape)
     drawn, held = slice(0, len(shown)), slice(len(shown), None)
     some = slice(0, len(shown) + 300)  # those with the mass of a model with effects
     masses = bin_masses(run.parameters(index[some]), histograms.of(some), run.model.at(index[some]))
     channel = run.sensor.kind == "histograms"
     fits = pixel_fits(shown, data.maps, data.fit, histograms.of(drawn), masses[drawn], channel=channel)
-    return _Pixels(fits, full, histograms.of(held), masses[held])
+    return _Pixels(fits, full, reasons, histograms.of(held), masses[held])
 
 
 def _shown(run: StoredRun, asked: Sequence[tuple[int, int]]) -> list[Chosen]:
@@ -178,12 +179,12 @@ def _shown(run: StoredRun, asked: Sequence[tuple[int, int]]) -> list[Chosen]:
 
 def _inspector(run: StoredRun, pixels: _Pixels, threads: int) -> InspectorData:
     """Pack maps, and the pixels that are held in full, for the inspector."""
-    data, index, held = run.data, pixels.full.index, pixels.histograms
+    data, index, held = run.data, pixels.index, pixels.histograms
     read = {f"maps/{name}": values for name, values in data.maps.items()}
     read |= {f"fit/{name}": data.fit[name] for name in ("fit_status", "outlier_share") if name in data.fit}
     maps, exact = read_maps(run.store, data.shape, index, read, threads)
     deciding = deciding_parameters(run.parameters(index), run.model.at(index))
-    sample = PixelSample(index, exact, held.origin, held.counts, deciding, pixels.masses, pixels.full.reasons)
+    sample = PixelSample(index, exact, held.origin, held.counts, deciding, pixels.masses, pixels.reasons)
     return inspector_data(run.store.path.name, data.shape, maps, sample)
 
 
