@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,15 @@ CHANNELS = ("charge", "readout")
 
 #: Codes from which their distance is known.
 _FEWEST_CODES = 8
+
+
+def reasons_in(status: NDArray[np.integer[Any]]) -> list[tuple[FitStatus, str, int]]:
+    """Return each reason for caution or failure in status words, gravest first: bit, sentence, pixels.
+
+    A pixel with several reasons counts for each of them.
+    """
+    counts = [(bit, text, int(np.count_nonzero(status & int(bit)))) for bit, text in MEANINGS.items()]
+    return [row for row in counts if row[2]]
 
 
 @dataclass(frozen=True)
@@ -159,7 +168,6 @@ class ReportData:
         camera: name, serial number and temperature of the sensor as the files say; empty where they do not.
         maps: ``name`` and ``name_stderr`` of ``variables.py`` group ``maps`` (y, x); NaN where a fit failed.
         fit: ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... (y, x).
-        status_words: bit of ``fit_status`` to its short sentence, gravest first.
         criteria: limits of the sensor.
         pixels: the shown pixels.
         ensemble: arrays of group ``ensemble``.
@@ -192,9 +200,6 @@ class ReportData:
         samples: the exposures of a run whose input is several samples, or None.
     """
 
-    #: bits of ``fit_status`` for which the parameters are NaN
-    failed_mask: ClassVar[int] = int(FAILED)
-
     title: str
     shape: tuple[int, int]
     kind: str = "unknown"
@@ -203,7 +208,6 @@ class ReportData:
     camera: str = ""
     maps: Mapping[str, FloatArray] = field(default_factory=dict)
     fit: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    status_words: Mapping[int, str] = field(default_factory=lambda: {int(b): t for b, t in MEANINGS.items()})
     criteria: Criteria = field(default_factory=Criteria)
     pixels: Sequence[PixelFit] = ()
     ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -245,27 +249,32 @@ class ReportData:
         return self.shape[0] == 1 and self.shape[1] < FEW_CHANNELS
 
     @cached_property
+    def status(self) -> NDArray[np.integer[Any]]:
+        """Status word of each pixel; without a fit none is fitted; shape ``shape``."""
+        return self.fit.get("fit_status", np.full(self.shape, int(FitStatus.NOT_FITTED)))
+
+    @cached_property
+    def failed(self) -> BoolArray:
+        """Pixels that have a reason for having no value; shape ``shape``."""
+        return np.asarray(self.status & int(FAILED) != 0)
+
+    @cached_property
     def unfitted(self) -> BoolArray:
         """Pixels that no fit has reached yet: neither a value nor a reason; shape ``shape``."""
-        status, gain = self.fit.get("fit_status"), self.maps.get("conversion_gain")
-        if status is None or gain is None:
-            return np.zeros(self.shape, dtype=bool)
-        return np.asarray((status & self.failed_mask == 0) & ~np.isfinite(gain))
+        gain = self.maps.get("conversion_gain")
+        return np.asarray(~self.failed & (np.False_ if gain is None else ~np.isfinite(gain)))
 
     @cached_property
     def flagged(self) -> BoolArray:
         """Pixels with a value that the data leave open by whole electrons, or altogether; shape ``shape``."""
-        return self._with_bits(int(FLAGGED))
+        return self._with_bits(FLAGGED)
 
     def flagged_in(self, name: str) -> BoolArray:
         """Tell which pixels the data leave open in one map: a gain is known where the bias is not."""
-        return self._with_bits(int(FLAGGED & flags_of(name)))
+        return self._with_bits(flags_of(name))
 
-    def _with_bits(self, bits: int) -> BoolArray:
-        status = self.fit.get("fit_status")
-        if status is None:
-            return np.zeros(self.shape, dtype=bool)
-        return np.asarray((status & self.failed_mask == 0) & (status & bits != 0))
+    def _with_bits(self, bits: FitStatus) -> BoolArray:
+        return np.asarray(~self.failed & (self.status & int(bits) != 0))
 
     @cached_property
     def any_flagged(self) -> bool:
@@ -274,9 +283,7 @@ class ReportData:
 
     def flagged_share(self, name: str = "quanta_exposure") -> float:
         """Return the share of flagged pixels among those with a value, in one map; by default all flags."""
-        status = self.fit.get("fit_status")
-        valued = 0 if status is None else int(np.count_nonzero(status & self.failed_mask == 0))
-        return int(np.count_nonzero(self.flagged_in(name))) / max(valued, 1)
+        return int(self.flagged_in(name).sum()) / max(int((~self.failed).sum()), 1)
 
     @property
     def mostly_flagged(self) -> bool:
@@ -286,8 +293,7 @@ class ReportData:
     @property
     def mostly_coarse(self) -> bool:
         """Tell whether rounding, which the fit did not count, biases the estimates of most pixels."""
-        status = self.fit.get("fit_status")
-        return status is not None and bool(np.mean((status & int(FitStatus.COARSE_STEPS)) != 0) > 0.5)
+        return bool(np.mean(self.status & int(FitStatus.COARSE_STEPS) != 0) > 0.5)
 
     @property
     def typed_run(self) -> str:

@@ -23,6 +23,7 @@ from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.style.palette import shades
@@ -408,8 +409,8 @@ def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
         "noun": data.noun,
         "channels": list(data.channel_names),
         "samples": "samples" if data.shape[0] == 1 else "frames",
-        "statusWords": {str(bit): text for bit, text in data.status_words.items()},
-        "failedMask": data.failed_mask,
+        "statusWords": {str(int(bit)): text for bit, text in MEANINGS.items()},
+        "failedMask": int(FAILED),
         "model": data.run.get("model", ""),
         "command": shown.command,
         "keptTo": shown.kept_to,

@@ -56,10 +56,7 @@ class EmvaRow:
 
 def emva_tables(data: ReportData) -> list[Table]:
     """Return the table of the report; of a line of channels or without values there is none."""
-    status = data.fit.get("fit_status")
-    if status is None or data.shape[0] == 1 or not all(data.has_values(name) for name in _NAMES):
-        return []
-    if data.mostly_flagged:
+    if data.shape[0] == 1 or data.mostly_flagged or not all(map(data.has_values, _NAMES)):
         return []
     rows = [
         {
@@ -69,7 +66,7 @@ def emva_tables(data: ReportData) -> list[Table]:
             "definition here": row.definition_here,
             "difference to EMVA 1288": row.where_it_differs,
         }
-        for row in emva_rows(data.maps, status, data.kind, data.outlier_sigmas)
+        for row in emva_rows(data.maps, data.status, data.kind, data.outlier_sigmas)
     ]
     return [
         Table(

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
+from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.maps.maps import summarise
-from pchem_pipeline.report.data import ReportData, Samples
+from pchem_pipeline.report.data import ReportData, Samples, reasons_in
 from pchem_pipeline.report.figures.ensemble import bias_remark
-from pchem_pipeline.report.figures.maps import status_counts
 from pchem_pipeline.report.figures.methods import crossing_text, percent_text
 from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.pages.summary import check_title
@@ -163,7 +163,6 @@ def _channels(data: ReportData) -> Table | None:
 
 
 def _channel_row(data: ReportData, x: int) -> Row:
-    status = np.ravel(data.fit.get("fit_status", np.zeros(data.shape, dtype=np.uint16)))
     label = data.channel_names[x] if x < len(data.channel_names) else ""
     missing = np.full(data.shape, np.nan)
     values = {
@@ -172,8 +171,7 @@ def _channel_row(data: ReportData, x: int) -> Row:
         )
         for name in _known(data)
     }
-    words = "; ".join(text for bit, text in data.status_words.items() if int(status[x]) & bit)
-    return {"channel": f"{x} {label}".strip(), **values, "fit status": words or "good fit"}
+    return {"channel": f"{x} {label}".strip(), **values, "fit status": describe(int(data.status[0, x]))}
 
 
 _ORDER = (
@@ -419,18 +417,14 @@ def _interval_rows(data: ReportData) -> Iterator[Row]:
         yield row
 
 
-def _status(data: ReportData) -> Table | None:
-    status = data.fit.get("fit_status")
-    if status is None:
-        return None
-    unfitted = int(data.unfitted.sum())
+def _status(data: ReportData) -> Table:
+    status, unfitted = data.status, int(data.unfitted.sum())
     good = int((status == 0).sum()) - int((data.unfitted & (status == 0)).sum())
     rows = [("good fit", good, f"{good:,}")]
     if unfitted:
         rows.append(("not fitted yet", unfitted, "none"))
-    kept = status[(status & data.failed_mask) == 0]
-    for bit, text, n in status_counts(status, data.status_words):
-        usable = int(((kept & bit) != 0).sum())
+    for bit, text, n in reasons_in(status):
+        usable = int((~data.failed & (status & int(bit) != 0)).sum())
         rows.append((text, n, f"{usable:,}, with caution" if usable else "none"))
     return Table(
         "failures",

@@ -148,7 +148,6 @@ def test_hostile_metadata_is_shown_not_run(data: ReportData) -> None:
         inputs=[{"name": HOSTILE, "size": 1, "hash": HOSTILE}],
         stages=[{"stage": HOSTILE, "state": HOSTILE, "seconds": 1.0, "notes": [HOSTILE]}],
         missing={"components": HOSTILE},
-        status_words={1 << i: HOSTILE for i in range(16)},
         ensemble={},
     )
     rendered = render_report(odd)
@@ -181,7 +180,7 @@ def test_names_change_nothing_around_them() -> None:
 def test_cautions_are_of_pixels_with_a_value_and_failures_have_reasons() -> None:
     data = report_data((24, 24), failed=0.34)
     status = data.fit["fit_status"].copy()
-    failed = (status & data.failed_mask) != 0
+    failed = data.failed
     status[failed] |= int(FitStatus.BIAS_AMBIGUOUS)
     status[~failed] = 0
     said = flags(replace(data, fit={**data.fit, "fit_status": status}))
