@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from pchem_pipeline.base.units import typeset
 from pchem_pipeline.discrepancy.verdict import (
@@ -374,42 +375,42 @@ DISCREPANCY_PAGE = "discrepancy.html"
 
 #: Changes of a parameter in standard errors of a pixel: below these negligible, and none.
 _IMMATERIAL, _NOT_MOVED = 0.2, 0.01
-#: (id, heading, introduction, what is said where there is nothing to show) of the parts of the page.
-PARTS: tuple[tuple[str, str, str, str], ...] = (
-    (
+#: The parts of the page below the verdict.
+PARTS = (
+    Section(
         "signature",
         "Largest disagreement, before and after",
         "The statistic that the added effect changes most (else the largest disagreement), and all "
         "statistics before and after, in sigma.",
         "",
     ),
-    (
+    Section(
         "where",
         "Where data and model disagree",
         "Effects of light and charge show in the charge channel, effects of the electronics in the readout "
         "residuals. Figures show the training frames, numbers training and test frames.",
         "No data were kept for figures.",
     ),
-    (
+    Section(
         "evidence",
         "Identification of the effect",
         "Log-likelihood of each fitted candidate on test frames, relative to the best; larger is better. A "
         "difference below three standard errors is not decisive.",
         "No candidates were compared: data and model agree within sampling noise.",
     ),
-    (
+    Section(
         "shown",
         "Remaining gap between data and model",
         "Gap on held-out frames, micronats per sample.",
         "No gap was measured.",
     ),
-    (
+    Section(
         "parameters",
         "Parameters of the effect, and changes of the maps",
         "",
         "Nothing was added to the model.",
     ),
-    (
+    Section(
         "limits",
         "Limits of these data",
         "Effects that no number of frames of one constant exposure can show, and the samples examined.",
@@ -439,23 +440,19 @@ def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
         figures: of the verdict.
     """
     tables = discrepancy_tables(data)
-    parts = []
     first = _signature(data.found)
-    described = any(step.verdict == "described" for step in data.found.steps)
-    for id_, title, intro, empty in PARTS:
-        shown = [each for each in figures if each.section == id_ and each.name not in first]
-        if id_ == "signature":
+    words = {"where": {} if data.found.where else {"title": "Data and model side by side"}}
+    if any(step.verdict == "described" for step in data.found.steps):
+        described = "No known effect explains the disagreement; the empirical description has no rivals."
+        words["evidence"] = {"empty": described}
+    parts = []
+    for part in PARTS:
+        shown = [each for each in figures if each.section == part.id and each.name not in first]
+        if part.id == "signature":
             shown = [each for name in first for each in figures if each.name == name]
-        rows = tables.get(id_, [])
-        if id_ == "signature" and not shown:
-            continue  # no disagreement, or no data for figures
-        if id_ == "where" and not data.found.where:
-            title = "Data and model side by side"
-        if id_ == "evidence" and described:
-            empty = "No known effect explains the disagreement; the empirical description has no rivals."
-        missing = () if shown or rows else (empty,)
-        part = f"discrepancy-part-{id_}"
-        parts.append(Section(id=part, title=title, intro=intro, missing=missing, figures=shown, tables=rows))
+        section = part.filled(figures=shown, tables=tables.get(part.id, ()), **words.get(part.id, {}))
+        if section is not None:
+            parts.append(replace(section, id=f"discrepancy-part-{part.id}"))
     return parts
 
 

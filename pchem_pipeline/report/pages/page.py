@@ -8,7 +8,7 @@ import importlib.resources
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -105,16 +105,17 @@ class Finding:
     remarks: Sequence[Flag] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Section:
     """A section of a page: its result, tables, figures, further tables.
 
     Attributes:
         id: anchor in the page.
         title: heading.
+        intro: introduction.
+        empty: sentence where there is nothing to show; empty: the section is left out.
         name: in the table of contents; empty: the title.
         verdict: what came out.
-        intro: introduction.
         missing: sentences on what is not shown, and why.
         first: tables above the figures.
         figures: between these and the others.
@@ -126,9 +127,10 @@ class Section:
 
     id: str
     title: str
+    intro: str = ""
+    empty: str = "Not shown: no data in this run."
     name: str = ""
     verdict: Finding | None = None
-    intro: str = ""
     missing: Sequence[str] = ()
     first: Sequence[Table] = ()
     figures: Sequence[Figure] = ()
@@ -136,6 +138,13 @@ class Section:
     kind: str = ""
     content: Any = None
     folded: bool = False
+
+    def filled(self, **content: Any) -> Section | None:
+        """Return the section with what it shows; without anything it says so, or is None."""
+        found = replace(self, **content)
+        if found.figures or found.tables or found.missing or found.kind:
+            return found
+        return replace(found, missing=(found.empty,)) if found.empty else None
 
 
 @dataclass(frozen=True)

@@ -157,12 +157,11 @@ def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
 
 
 def test_a_new_section_is_one_entry_in_one_list(data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
-    def mine(material: page_report.Material) -> Section:
-        text = f"{material.data.title} & more"
-        return Section(id="mine", title="My <section>", kind="text", content=text)
-
-    monkeypatch.setattr(page_report, "PAGE", (*page_report.PAGE, mine, lambda _: None))
+    mine, empty = Section("mine", "My <section>", kind="text"), Section("without", "content", empty="")
+    monkeypatch.setattr(page_report, "PAGE", (*page_report.PAGE, mine, empty))
+    monkeypatch.setitem(page_report.CONTENT, "text", lambda data: f"{data.title} & more")
     page = page_without_pictures(data)
     assert '<li><a href="#mine">My &lt;section&gt;</a></li>' in page
     assert '<h2 id="mine-heading">My &lt;section&gt;</h2>' in page
     assert "demo sensor &amp; more" in page
+    assert 'id="without"' not in page
