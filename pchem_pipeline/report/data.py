@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
 from pchem_pipeline.report.settings import Criteria
+from pchem_pipeline.report.style.ranges import finite
 
 if TYPE_CHECKING:
     from pchem_pipeline.model.checks.map_parts import Parts
@@ -370,3 +371,27 @@ class ReportData:
             median = median_of(errors, None if key[1] else self.flagged_in(name))
             self._errors[key] = None if np.isnan(median) else median
         return self._errors[key]
+
+
+class TruthErrors(NamedTuple):
+    """Estimates of a map against the truth: medians, root mean square error, (estimate - truth) / error."""
+
+    true_median: float
+    median: float
+    rmse: float
+    pulls: FloatArray
+
+
+def truth_errors(data: ReportData) -> dict[str, TruthErrors]:
+    """Return by map how the estimates of simulated pixels differ from the truth, flagged pixels left out."""
+    found = {}
+    for name in (name for name in data.truth if name in data.maps):
+        known = np.isfinite(data.maps[name]) & ~data.flagged_in(name)
+        if not known.any():
+            continue
+        truth, estimate = (np.asarray(maps[name][known], np.float64) for maps in (data.truth, data.maps))
+        errors = data.maps.get(f"{name}_stderr", np.full(data.shape, np.nan))[known]
+        rmse = float(np.sqrt(np.mean((estimate - truth) ** 2)))
+        pulls = finite((estimate - truth) / errors)
+        found[name] = TruthErrors(float(np.median(truth)), float(np.median(estimate)), rmse, pulls)
+    return found

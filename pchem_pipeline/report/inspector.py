@@ -338,27 +338,17 @@ _GROUPS = {
 }
 
 
-@dataclass(frozen=True)
-class Embedded:
-    """What the page holds for the inspector, ready to stand in it: facts as JSON, data by id, the script."""
+def embedded(data: ReportData) -> dict[str, Any] | None:
+    """Return the inspector's part of the page: ``facts`` as JSON, ``blobs`` of data by id, the ``script``.
 
-    facts: Markup
-    blobs: list[tuple[str, Markup]]
-    script: Markup
-
-
-def embedded(data: ReportData) -> Embedded | None:
-    """Return the inspector's part of the page; None where the run has nothing to inspect."""
+    None where the run has nothing to inspect.
+    """
     if data.inspector is None:
         return None
     shown = data.inspector()
-    parts = [(name, Markup(text)) for name, text in _blobs(shown)]
-    return Embedded(json_for_html(_facts(data, shown)), parts, Markup(script()))
-
-
-def script() -> str:
-    """Return the script of the pixel inspector."""
-    return text_of("inspector.js")
+    blobs = {name: Markup(text) for name, text in _blobs(shown)}
+    script = Markup(text_of("inspector.js"))
+    return {"facts": json_for_html(_facts(data, shown)), "blobs": blobs, "script": script}
 
 
 def text_of(name: str, folder: str = "templates") -> str:

@@ -16,7 +16,7 @@ from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.samples import AXES, slope_of
-from pchem_pipeline.report.inspector import embedded, script, text_of
+from pchem_pipeline.report.inspector import embedded, text_of
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
 from pchem_pipeline.report.pages.emva import emva_tables
 from pchem_pipeline.report.pages.page import DrawAll, Drawn, Finding, Section, draw_here, render_page
@@ -208,7 +208,7 @@ def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, st
         "report.html.j2",
         sections,
         drawn,
-        *([script()] if inspector else []),
+        *([inspector["script"]] if inspector else []),
         title=data.title,
         data=data,
         inspector=inspector,

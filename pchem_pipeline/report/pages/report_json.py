@@ -10,7 +10,7 @@ import numpy as np
 
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
-from pchem_pipeline.report.data import ReportData, reasons_in
+from pchem_pipeline.report.data import ReportData, reasons_in, truth_errors
 from pchem_pipeline.report.figures.samples import middle
 from pchem_pipeline.report.pages.summary import (
     answers,
@@ -154,20 +154,15 @@ def _electron_numbers(data: ReportData) -> dict[str, Any]:
 
 
 def _truth(data: ReportData) -> dict[str, Any]:
-    found = {}
-    for name, truth in data.truth.items():
-        if name not in data.maps:
-            continue
-        error = np.where(data.flagged, np.nan, data.maps[name] - truth)
-        known = finite(error)
-        pull = finite(error / data.maps[f"{name}_stderr"]) if f"{name}_stderr" in data.maps else np.empty(0)
-        found[name] = {
-            "median": float(np.median(truth[np.isfinite(error)])) if known.size else None,
-            "rmse": float(np.sqrt(np.mean(known**2))) if known.size else None,
-            "pull_mean": float(pull.mean()) if pull.size else None,
-            "pull_sd": float(pull.std()) if pull.size else None,
+    return {
+        name: {
+            "median": found.true_median,
+            "rmse": found.rmse,
+            "pull_mean": np.mean(found.pulls) if found.pulls.size else None,
+            "pull_sd": np.std(found.pulls) if found.pulls.size else None,
         }
-    return found
+        for name, found in truth_errors(data).items()
+    }
 
 
 def _discrepancy(data: ReportData) -> dict[str, Any] | None:

@@ -13,7 +13,7 @@ import numpy as np
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.maps.maps import summarise
-from pchem_pipeline.report.data import ReportData, Samples, reasons_in
+from pchem_pipeline.report.data import ReportData, Samples, reasons_in, truth_errors
 from pchem_pipeline.report.figures.ensemble import bias_remark
 from pchem_pipeline.report.figures.methods import crossing_text, percent_text
 from pchem_pipeline.report.figures.samples import AXES, middle
@@ -200,21 +200,13 @@ def _against_truth(data: ReportData) -> Table:
 
 
 def _truth_rows(data: ReportData) -> Iterator[Row]:
-    for name, truth in data.truth.items():
-        if name not in data.maps:
-            continue
-        estimate = np.where(data.flagged_in(name), np.nan, data.maps[name])
-        error = estimate - truth
-        known = finite(error)
-        if known.size == 0:
-            continue
-        pull = finite(error / data.maps[f"{name}_stderr"]) if f"{name}_stderr" in data.maps else np.empty(0)
-        n = pull.size
+    for name, found in truth_errors(data).items():
+        pull, n = found.pulls, found.pulls.size
         yield {
             "parameter": heading(name),
-            "true median": short(float(np.median(truth[np.isfinite(error)])), 4),
-            "estimated median": short(float(np.median(finite(estimate))), 4),
-            "RMSE": short(float(np.sqrt(np.mean(known**2)))),
+            "true median": short(found.true_median, 4),
+            "estimated median": short(found.median, 4),
+            "RMSE": short(found.rmse),
             "mean pull": measured(float(pull.mean()), float(1 / np.sqrt(n))) if n else "not known",
             "sd of pulls": measured(float(pull.std()), float(1 / np.sqrt(2 * n))) if n else "not known",
         }
