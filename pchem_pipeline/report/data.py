@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
+from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
@@ -100,16 +102,21 @@ class DiscrepancyData:
     Attributes:
         found: the verdict.
         arrays: arrays of group ``discrepancy`` by name; any may lack.
-        statistics: name of each statistic, in the order of ``z_before``, to its channel and sentence.
-        titles: tag of an effect to its name in the literature.
-        sources: tag of an effect to where it is described.
     """
 
     found: Verdict
     arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    statistics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    titles: Mapping[str, str] = field(default_factory=dict)
-    sources: Mapping[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def statistics(self) -> dict[str, tuple[str, str]]:
+        """Name of each statistic, in the order of ``z_before``, to its channel and sentence."""
+        signs = dict(zip(STATISTICS, self.arrays.get("z_before", ()), strict=False))
+        return {name: (s.channel, s.says(signs.get(name, 1.0))) for name, s in STATISTICS.items()}
+
+    @cached_property
+    def titles(self) -> dict[str, str]:
+        """Tag of an effect to its name in the literature."""
+        return {tag: effect.title for tag, effect in effect_classes().items() if effect.title}
 
     def title(self, tag: str) -> str:
         """Return the name of an effect in the literature, or its tag."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -20,6 +21,7 @@ from pchem_pipeline.discrepancy.verdict import (
     sigma_text,
 )
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import Finding, KeyFact, Section
@@ -238,6 +240,7 @@ def _how(step: Step, found: Verdict) -> str:
 
 
 def _parameters(data: DiscrepancyData) -> Table:
+    effects = effect_classes()
     return Table(
         "discrepancy-parameters",
         "Parameters of the effects",
@@ -248,7 +251,7 @@ def _parameters(data: DiscrepancyData) -> Table:
                 "parameter": f"{tag}: {name}",
                 "value": value,
                 "effect": f"{data.title(tag)}{place}{_how(step, data.found)}",
-                "source": data.sources.get(tag, ""),
+                "source": effects[tag].source if tag in effects else "",
             }
             for step in data.found.steps
             for tag, place in [(step.likeliest, f", in {step.place}" if step.place else "")]
@@ -638,7 +641,7 @@ def _compared(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
     """State the share of the gap that the next best effect and an unrelated control close instead."""
 
     def short_title(tag: str) -> str:
-        return data.title(tag).partition(" (")[0]  # without synonyms
+        return re.sub(r" \(.*?\)", "", data.title(tag))  # without synonyms
 
     own, name = step.closed, short_title(step.effect or "")
     runner_up, placebo = step.runner_up, step.placebo

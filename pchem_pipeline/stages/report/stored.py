@@ -26,7 +26,6 @@ from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.effects.framework.compose import model_words
-from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.model.maps.ordered import median_of
@@ -166,24 +165,10 @@ def _read_arrays(store: RunStore, searched: bool, threads: int) -> dict[str, dic
 
 
 def verdict_data(found: Verdict, arrays: Arrays) -> DiscrepancyData:
-    """Return what the report shows of a verdict, with the names of effects and statistics.
-
-    Args:
-        found: the verdict.
-        arrays: group ``discrepancy`` of the store.
-    """
-    effects = effect_classes()
-    # those of a search with other statistics are in another order: what its JSON tells is left
+    """Return a verdict with its arrays, but vectors that a search of other statistics has in another order."""
     vectors = ("z_before", "z_after")  # a number for each statistic
-    arrays = {n: array for n, array in arrays.items() if n not in vectors or len(array) == len(STATISTICS)}
-    signs = dict(zip(STATISTICS, arrays.get("z_before", ()), strict=False))
-    return DiscrepancyData(
-        found=found,
-        arrays=arrays,
-        statistics={name: (s.channel, s.says(signs.get(name, 1.0))) for name, s in STATISTICS.items()},
-        titles={tag: effect.title for tag, effect in effects.items() if effect.title},
-        sources={tag: effect.source for tag, effect in effects.items() if effect.source},
-    )
+    known = {n: array for n, array in arrays.items() if n not in vectors or len(array) == len(STATISTICS)}
+    return DiscrepancyData(found, known)
 
 
 def plan_section(maps: Arrays, n_frames: int | None) -> dict[str, Any] | None:
