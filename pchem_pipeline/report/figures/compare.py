@@ -155,12 +155,9 @@ def _limit(known: FloatArray, least: float) -> float:
 
 
 def ensembles_chart(tables: Sequence[DataTable]) -> Chart:
-    """Return the chart of the ensemble histograms of runs over each other, raw and NUCed (fig:ensemble_plot).
+    """Return the chart of :func:`ensemble_tables`: runs over each other, raw and NUCed (fig:ensemble_plot).
 
     The strip below each shows the difference to the first run in standard errors of counting.
-
-    Args:
-        tables: of :func:`ensemble_tables`.
     """
     titles = {half.part: half.title for half in HALVES}
     stacks = tuple(_one_half(table, unit_text(table.units["signal"]), titles[table.part]) for table in tables)

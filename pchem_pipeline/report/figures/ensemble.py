@@ -148,12 +148,7 @@ def case_name(constant: Sequence[str]) -> str:
 
 
 def ensemble_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, ...]:
-    """Return data and predictions of the ensemble, raw and after correction; either may lack.
-
-    Args:
-        arrays: group ``ensemble`` of the store: ``dn``, ``counts``, ``density``, ``epcd_exact``, ... and
-            ``electrons``, ``nuced_counts``, ``nuced_density``, ``nuced_exact``, ...
-    """
+    """Return data and predictions of the group ``ensemble``, raw and after correction; either may lack."""
     tables = []
     for part, axis, data, model, unit, *_ in HALVES:
         if axis not in arrays or f"{data}density" not in arrays:
@@ -190,15 +185,11 @@ def _held(case: str) -> str:
 def ensemble_chart(
     tables: Sequence[DataTable], rmse: Mapping[str, float], n_frames: int | None = None
 ) -> Chart:
-    """Return the chart of the ensemble histogram with the three EPCDs, raw and NUCed (fig:ensemble_plot).
+    """Return the chart of :func:`ensemble_tables`: data, the three EPCDs, differences (fig:ensemble_plot).
 
-    The strip below each shows data minus prediction; its gray band is two standard deviations of the
-    sampling noise of the data. On a page, a panel at the right shows all values on a logarithmic axis.
-
-    Args:
-        tables: of :func:`ensemble_tables`.
-        rmse: RMSE of each prediction under its name, and ``noise_floor``, ``nuced_noise_floor``.
-        n_frames: frames in the histogram, for the legend.
+    The strip below each shows data minus prediction over two standard deviations of the sampling noise. On a
+    page, a panel at the right shows all values on a logarithmic axis. The legend has the RMSE of each
+    prediction, and ``noise_floor``, ``nuced_noise_floor``.
     """
     halves = [_Drawn(table, rmse, n_frames) for table in tables if table["counts"].sum() > 0]
     stacks = tuple(stack for half in halves for stack in (_bulk_stack(half), _tail_stack(half)))
@@ -292,10 +283,8 @@ def _tail_stack(half: _Drawn) -> Stack:
 def electrons_chart(table: DataTable) -> Chart:
     """Return the chart of estimated electron numbers against the predicted mass (eq. K_ensemble_pmf).
 
-    Args:
-        table: electron numbers ``k``, their share ``electron_mass`` among the estimates, the mass
-            ``electron_pmf`` predicted from the map of H; where known the mass ``electron_pmf_map`` that the
-            estimator itself should show, and ``electron_counts`` for the sampling noise in the strip.
+    The table has ``k``, ``electron_mass`` and ``electron_pmf``; where they are known ``electron_pmf_map``, which
+    the estimator itself should show, and ``electron_counts``.
     """
     # the last number with a mass that can be seen, at least 1
     seen = np.flatnonzero(np.nan_to_num(np.maximum(table["electron_mass"], table["electron_pmf"])) > 1e-3)
@@ -342,12 +331,7 @@ _CASES: tuple[tuple[str, Dash], ...] = (
 
 
 def components_chart(table: DataTable, highlight: Sequence[str] = ()) -> Chart:
-    """Return the chart of the width of the EPCD's components against the electron number (Appendix B).
-
-    Args:
-        table: of :func:`component_table`.
-        highlight: cases drawn in colour, at most six; the others are gray.
-    """
+    """Return the chart of :func:`component_table` (Appendix B): at most six cases in colour, others gray."""
     chosen = dict(zip(map(_held, highlight), _CASES, strict=False))
     k = table["k"]
     gray, lines = [], []

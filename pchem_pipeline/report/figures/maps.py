@@ -163,12 +163,12 @@ def goodness_figures(data: ReportData) -> Iterator[Figure]:
 def map_tables(
     values: NDArray[Any], name: str, stderr: NDArray[Any] | None, known: Ordered
 ) -> tuple[DataTable, ...]:
-    """Return a map with its standard errors, and its histogram where one is drawn.
+    """Return a map (y, x) with its standard errors, and the histogram of its known values where one is drawn.
 
     Args:
-        values: map (y, x), NaN where there is no value.
-        name: name of the map in the store, e.g. ``"dark_current"``.
-        stderr: standard errors (y, x).
+        values: NaN where there is no value.
+        name: in the store, e.g. ``"dark_current"``.
+        stderr: of the values; None: not known.
         known: the values in their order.
     """
     unit = stored_unit(name)
@@ -188,14 +188,9 @@ def _histogram_table(known: Ordered, name: str, most: int) -> DataTable:
 
 
 def map_chart(tables: Sequence[DataTable], name: str, known: Ordered) -> Chart:
-    """Return the histogram of a map on top and the map below (Appendix C; fig:iD_map to fig:sigmaR_map).
+    """Return the chart of :func:`map_tables`: the histogram, the map below (Appendix C; fig:iD_map ...).
 
     A sensor of one row or column (ready-made histograms) is drawn as points with error bars.
-
-    Args:
-        tables: of :func:`map_tables`.
-        name: name of the map in the store.
-        known: the values in their order.
     """
     full = tables[0][name]
     sign, words, unit = symbol(name)
@@ -265,12 +260,8 @@ def status_chart(
 ) -> Chart:
     """Return where fits failed or deserve caution, with a legend of sentences.
 
-    A pixel with several bits has the colour of the first of them in ``rows``; the legend counts every bit.
-
-    Args:
-        status: status words (y, x).
-        rows: of :func:`reasons_in`.
-        unfitted: pixels that no fit has reached yet (y, x).
+    A pixel with several bits has the colour of the first of them in the rows of :func:`reasons_in`; every bit
+    counts in the legend. Pixels that no fit has reached yet have a colour of their own.
     """
     last = len(_STATUS_COLOURS) - 1
     missing = None if unfitted is None or not unfitted.any() else unfitted & (status == 0)

@@ -165,7 +165,7 @@ def _read_arrays(store: RunStore, searched: bool, threads: int) -> dict[str, dic
 
 
 def verdict_data(found: Verdict, arrays: Arrays) -> DiscrepancyData:
-    """Return a verdict with its arrays, but vectors that a search of other statistics has in another order."""
+    """Return a verdict with its arrays, but vectors of a search of other statistics, in another order."""
     vectors = ("z_before", "z_after")  # a number for each statistic
     known = {n: array for n, array in arrays.items() if n not in vectors or len(array) == len(STATISTICS)}
     return DiscrepancyData(found, known)
