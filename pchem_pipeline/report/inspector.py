@@ -131,14 +131,9 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
         scale: from :func:`choose_scale`.
     """
     flat = np.asarray(values).ravel()
-    codes = np.empty(flat.size, "<u2")
-    bars = _empty_bars(flat, scale)
-    for start in range(0, flat.size, AT_ONCE):
-        part = slice(start, start + AT_ONCE)
-        place = _places(flat[part], scale)
-        if bars is not None:
-            _count(place, bars)
-        codes[part] = _codes(place, flat[part])
+    place = _places(flat, scale)
+    bars = None if flat.dtype.kind in "iub" else _bars(place)
+    codes = _codes(place, flat).astype("<u2")
     outside = (codes == _BELOW) | (codes == _ABOVE)
     if scale.log:  # zeros, which may be many, need no place in the list
         outside &= flat != 0
@@ -172,33 +167,29 @@ def _codes(place: FloatArray, values: NDArray[Any]) -> FloatArray:
     return place
 
 
-def _empty_bars(flat: NDArray[Any], scale: Scale) -> Bars | None:
-    """Return bars over the bulk of a map, empty; None where codes are narrow enough to be bars.
+def _bars(place: FloatArray) -> Bars | None:
+    """Return the histogram over the bulk of a map; None where codes are narrow enough to be bars.
 
     The axis is that of the script: from the 1st to the 99th percentile and 0.3 of it beyond, where there are
-    values.
+    values; those beyond it are in no bar.
+
+    Args:
+        place: of each value on the scale, in steps, shape (n,).
     """
-    if flat.dtype.kind in "iub":
+    known = Ordered.of(some_of(place))
+    if known.size < 2:
         return None
-    place = Ordered.of(_places(some_of(flat), scale))
-    if place.size < 2:
-        return None
-    low, high = place.quantiles([0.01, 0.99])
+    low, high = known.quantiles([0.01, 0.99])
     margin = 0.3 * (high - low)
-    ends = max(low - margin, place.values[0], 0.0), min(high + margin, place.values[-1])
+    ends = max(low - margin, known.values[0], 0.0), min(high + margin, known.values[-1])
     first, last = np.rint(ends).astype(int)
-    wanted = np.clip(2.0 * np.cbrt(flat.size), _FEWEST_BARS, _MOST_BARS)
+    wanted = np.clip(2.0 * np.cbrt(place.size), _FEWEST_BARS, _MOST_BARS)
     parts = round(float(wanted) / max(int(last - first) + 1, 1))
     if parts < 2 or not high > low:
         return None
-    return Bars(int(first) + _FIRST, parts, np.zeros((int(last - first) + 1) * parts, np.int64))
-
-
-def _count(place: FloatArray, bars: Bars) -> None:
-    """Add the values at some places to their bars; those beyond the axis are in none."""
-    bar = (place - (bars.first - _FIRST - 0.5)) * bars.parts
-    inside = bar[(bar >= 0.0) & (bar < bars.counts.size)]
-    bars.counts[:] += np.bincount(inside.astype(np.int64), minlength=bars.counts.size)
+    n, bar = int(last - first + 1) * parts, (place - (first - 0.5)) * parts
+    inside = bar[(bar >= 0.0) & (bar < n)].astype(np.int64)
+    return Bars(int(first) + _FIRST, parts, np.bincount(inside, minlength=n))
 
 
 def varints(values: NDArray[Any]) -> bytes:

@@ -448,8 +448,8 @@ def _has(data: DiscrepancyData, *names: str) -> bool:
 def code_table(arrays: Mapping[str, NDArray[Any]]) -> DataTable:
     """Return the counts of the codes and their residuals, (observed - expected) / sqrt(expected).
 
-    They are made of ``code_dn``, ``code_observed``, ``code_expected``, and ``code_extended`` where effects were
-    named, from the first to the last code where a count is seen or expected.
+    They are made of ``code_dn``, ``code_observed``, ``code_expected``, and ``code_extended`` where effects
+    were named, from the first to the last code where a count is seen or expected.
     """
     dn, observed, expected = (
         np.asarray(arrays[f"code_{name}"], dtype=np.float64) for name in ("dn", "observed", "expected")

@@ -283,8 +283,8 @@ def _tail_stack(half: _Drawn) -> Stack:
 def electrons_chart(table: DataTable) -> Chart:
     """Return the chart of estimated electron numbers against the predicted mass (eq. K_ensemble_pmf).
 
-    The table has ``k``, ``electron_mass`` and ``electron_pmf``; where they are known ``electron_pmf_map``, which
-    the estimator itself should show, and ``electron_counts``.
+    The table has ``k``, ``electron_mass`` and ``electron_pmf``; where they are known ``electron_pmf_map``,
+    which the estimator itself should show, and ``electron_counts``.
     """
     # the last number with a mass that can be seen, at least 1
     seen = np.flatnonzero(np.nan_to_num(np.maximum(table["electron_mass"], table["electron_pmf"])) > 1e-3)

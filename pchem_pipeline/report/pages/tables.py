@@ -21,6 +21,7 @@ from pchem_pipeline.report.pages.summary import check_title
 from pchem_pipeline.report.pages.summary import size_text as check_size
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
+    MAPS,
     count,
     heading,
     measured,
@@ -109,7 +110,7 @@ def _parameters(data: ReportData) -> Table:
 
 def _known(data: ReportData) -> list[str]:
     """Return the maps that have values, in the order of the tables."""
-    return [name for name in _ORDER if data.has_values(name)]
+    return [name for name in MAPS if data.has_values(name)]
 
 
 def _parameter_row(data: ReportData, name: str) -> Row:
@@ -172,21 +173,6 @@ def _channel_row(data: ReportData, x: int) -> Row:
         for name in _known(data)
     }
     return {"channel": f"{x} {label}".strip(), **values, "fit status": describe(int(data.status[0, x]))}
-
-
-_ORDER = (
-    "quanta_exposure",
-    "charge_rate",
-    "dark_current",
-    "charge_per_level",
-    "spurious_charge",
-    "dark_signal",
-    "conversion_gain",
-    "bias",
-    "read_noise_dn",
-    "read_noise_e",
-    "analog_read_noise_e",
-)
 
 
 def _against_truth(data: ReportData) -> Table:
@@ -388,7 +374,7 @@ def _noise_shares(data: ReportData, names: tuple[str, ...]) -> dict[str, float]:
 
 
 def _interval_rows(data: ReportData) -> Iterator[Row]:
-    shares = _noise_shares(data, _ORDER)
+    shares = _noise_shares(data, MAPS)
     for name in _known(data):
         error = data.pixel_error(name, with_flagged=True)
         if error is None:
