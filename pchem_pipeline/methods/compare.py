@@ -174,12 +174,12 @@ def pixel_bounds(samples: Sequence[Sample], reference: FloatArray) -> FloatArray
         frames.append(moments.n_frames)
     noise = reference[:, 1] * reference[:, 3]
     pixels = zip(np.stack(exposures, 1), noise, reference[:, 1], np.stack(frames, 1), strict=True)
-    rows = [_bound(tuple(map(float, h)), float(s), float(g), tuple(map(float, n))) for h, s, g, n in pixels]
+    rows = [bounds(tuple(map(float, h)), float(s), float(g), tuple(map(float, n))) for h, s, g, n in pixels]
     return np.array(rows).reshape(-1, 4)
 
 
 @functools.lru_cache(maxsize=1 << 16)
-def _bound(exposures: tuple[float, ...], noise: float, gain: float, frames: tuple[float, ...]) -> FloatArray:
+def bounds(exposures: tuple[float, ...], noise: float, gain: float, frames: tuple[float, ...]) -> FloatArray:
     """Return the bound of (H of the first sample, g, mu, s_e), relative, the bias in e-."""
     if not (
         np.isfinite([*exposures, noise]).all() and exposures[0] > 0 and noise > 0 and min(exposures) >= 0

@@ -14,14 +14,9 @@ import numpy as np
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.methods.base import PixelSamples, Sample, methods
-from pchem_pipeline.methods.compare import compare
+from pchem_pipeline.methods.compare import bounds, compare
 from pchem_pipeline.methods.photon_transfer import gain_variance
 from pchem_pipeline.methods.settings import MethodsSettings
-from pchem_pipeline.model.errors.expected_information import (
-    expected_information,
-    inverse_information,
-    shared_information,
-)
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 
 #: Exposures of the samples in units of H, by what a method needs; frames are shared evenly.
@@ -85,11 +80,10 @@ def study_point(point: StudyPoint, settings: MethodsSettings) -> dict[str, Any]:
 
 def _gain_bounds(point: StudyPoint) -> dict[str, float | None]:
     """Return the smallest relative errors of g: one sample, dark and bright, and photon transfer's own."""
-    exposure, noise, n = point.quanta_exposure, point.read_noise_e, float(point.n_frames)
-    gain = point.conversion_gain
-    one = inverse_information(expected_information(exposure, noise, gain) * n)[1, 1]
-    two = shared_information(exposure, noise, gain) + shared_information(0.0, noise, gain)
-    both = inverse_information(two * (n / 2))[0, 0]
-    transfer = gain_variance(exposure, 0.0, noise, n / 2, n / 2)
+    exposure, noise = point.quanta_exposure, point.read_noise_e
+    gain, n = point.conversion_gain, point.n_frames
+    one = bounds((exposure,), noise, gain, (n,))[1]
+    both = bounds((exposure, 0.0), noise, gain, (n / 2, n / 2))[1]
+    transfer = np.sqrt(gain_variance(exposure, 0.0, noise, n / 2, n / 2))
     found = {"one sample": one, "a dark and a bright sample": both, "photon_transfer": transfer}
-    return {name: plain(np.sqrt(value)) for name, value in found.items()}
+    return {name: plain(value) for name, value in found.items()}

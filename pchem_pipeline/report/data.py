@@ -284,11 +284,6 @@ class ReportData:
     def _with_bits(self, bits: FitStatus) -> BoolArray:
         return np.asarray(~self.failed & (self.status & int(bits) != 0))
 
-    @cached_property
-    def any_flagged(self) -> bool:
-        """Whether a pixel is flagged."""
-        return bool(self.flagged.any())
-
     def flagged_share(self, name: str = "quanta_exposure") -> float:
         """Return the share of flagged pixels among those with a value, in one map; by default all flags."""
         return int(self.flagged_in(name).sum()) / max(int((~self.failed).sum()), 1)
@@ -354,7 +349,7 @@ class ReportData:
         """
         if (name, with_flagged) not in self._summaries:
             self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
-            if self.any_flagged:
+            if self.flagged.any():
                 known = Ordered.of(self.maps[name], self.flagged_in(name))
                 self._summaries[name, False] = self._summarised(known)
         return self._summaries[name, with_flagged]
@@ -373,7 +368,7 @@ class ReportData:
         errors = self.maps.get(f"{name}_stderr")
         if errors is None:
             return None
-        key = name, with_flagged or not self.any_flagged
+        key = name, with_flagged or not bool(self.flagged.any())
         if key not in self._errors:
             median = median_of(errors, None if key[1] else self.flagged_in(name))
             self._errors[key] = None if np.isnan(median) else median

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,8 +161,7 @@ def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
     return f"{LINE_WORDS[line]}: {' and '.join(found) or 'not known'}"
 
 
-@dataclass(frozen=True)
-class PixelMap:
+class PixelMap(NamedTuple):
     """A statistic of every pixel in sigma, with its overall significance.
 
     Attributes:

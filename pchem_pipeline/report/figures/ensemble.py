@@ -29,7 +29,7 @@ from pchem_pipeline.report.figures.pixels import shown_bins
 from pchem_pipeline.report.style.wording import power_of_ten, scientific, short
 
 #: Suffix of a prediction to (name in the legend, hue, line style).
-_PREDICTIONS: dict[str, tuple[str, str, Dash]] = {
+PREDICTIONS: dict[str, tuple[str, str, Dash]] = {
     "independent": ("independent parameters", "vermilion", ":"),
     "dependent": ("dependent parameters", "blue", "--"),
     "exact": ("exact mean over pixels", "ink", "-"),
@@ -154,7 +154,7 @@ def ensemble_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, ...]
         if axis not in arrays or f"{data}density" not in arrays:
             continue
         columns = {axis: arrays[axis], "counts": arrays[f"{data}counts"]}
-        names = (f"{data}density", *(f"{model}{each}" for each in (*_PREDICTIONS, "stderr")))
+        names = (f"{data}density", *(f"{model}{each}" for each in (*PREDICTIONS, "stderr")))
         columns |= {name: arrays[name] for name in names if name in arrays}
         tables.append(DataTable(columns, dict.fromkeys(names, f"1/{unit}") | {axis: unit}, part))
     return tuple(tables)
@@ -206,10 +206,10 @@ class _Drawn:
         self.step = float(np.median(np.diff(self.x))) if self.x.size > 1 else 1.0
         self.counts = table["counts"].astype(np.float64)
         self.density = table[f"{data}density"].astype(np.float64)
-        self.models = {each: table[model + each] for each in _PREDICTIONS if model + each in table}
+        self.models = {each: table[model + each] for each in PREDICTIONS if model + each in table}
         self.floor = rmse.get(f"{data}noise_floor")
         self.label = f"{words}, {n_frames:,} frames" if n_frames else words
-        self.rmse = {each: rmse[model + each] for each in _PREDICTIONS if model + each in rmse}
+        self.rmse = {each: rmse[model + each] for each in PREDICTIONS if model + each in rmse}
 
     def bars(self, where: slice, **style: Any) -> Steps:
         """Return the data as gray bars."""
@@ -221,7 +221,7 @@ class _Drawn:
         """Return a line for each prediction."""
         found = []
         for suffix, each in values.items():
-            words, hue, dash = _PREDICTIONS[suffix]
+            words, hue, dash = PREDICTIONS[suffix]
             label = f"{words}, RMSE {scientific(self.rmse[suffix])}" if suffix in self.rmse else words
             found.append(Line(self.x[where], each, colour=hue, dash=dash, label=label, **style))
         return found

@@ -136,17 +136,14 @@ def _density(pixel: PixelFit, dn: IntArray) -> FloatArray:
 
 def has_fit(parameters: Mapping[str, float]) -> bool:
     """Tell whether the four parameters of the PCD are all known and describe a density."""
-    values = [parameters.get(name, float("nan")) for name in PARAMETERS]
+    values = _theta(parameters)
     return bool(np.all(np.isfinite(values))) and values[1] > 0 and values[3] > 0 and values[0] >= 0
 
 
 def _theta(parameters: Mapping[str, float]) -> tuple[float, float, float, float]:
-    return (
-        parameters["quanta_exposure"],
-        parameters["conversion_gain"],
-        parameters["bias"],
-        parameters["read_noise_dn"],
-    )
+    """Return (H, g, mu, sigma); NaN where one is not known."""
+    exposure, gain, bias, sigma = (parameters.get(name, float("nan")) for name in PARAMETERS)
+    return exposure, gain, bias, sigma
 
 
 def _bars(counts: NDArray[Any], origin: int, where: slice) -> Steps:

@@ -13,7 +13,7 @@ from pchem_pipeline.report.figures.compare import difference_figures, ensembles_
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, draw_here, render_page
 from pchem_pipeline.report.pages.summary import Flag, Level
-from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
+from pchem_pipeline.report.pages.tables import RMSES, Table
 from pchem_pipeline.report.style.wording import (
     count,
     cut,
@@ -235,7 +235,8 @@ def run_table(found: Comparison) -> Table:
         medians = [run.summary.get(name, (math.nan, math.nan))[:2] for run in runs]
         rows[f"{heading(name)}, median"] = [measured(*median, symbol(name)[2]) for median in medians]
     for name in dict.fromkeys(each for run in runs for each in run.rmse):
-        rows[f"RMSE, {rmse_words(name)} ({rmse_unit(name)})"] = [
+        words, unit = RMSES.get(name, (name, "1/DN"))
+        rows[f"RMSE, {words} ({unit})"] = [
             scientific(run.rmse[name]) if name in run.rmse else "not known" for run in runs
         ]
     titles = [run.title for run in runs]

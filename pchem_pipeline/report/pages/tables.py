@@ -14,7 +14,7 @@ from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.maps.maps import summarise
 from pchem_pipeline.report.data import ReportData, Samples, reasons_in, truth_errors
-from pchem_pipeline.report.figures.ensemble import bias_remark
+from pchem_pipeline.report.figures.ensemble import HALVES, PREDICTIONS, bias_remark
 from pchem_pipeline.report.figures.methods import crossing_text, percent_text
 from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.pages.summary import check_title
@@ -134,7 +134,7 @@ def _left_out(data: ReportData) -> str:
 def _flagged(data: ReportData) -> Table:
     """Return what flagged pixels read; their errors are no errors and are not shown."""
     rows = []
-    for name in _known(data) if data.any_flagged else ():
+    for name in _known(data) if data.flagged.any() else ():
         flagged = data.flagged_in(name)
         if not flagged.any():
             continue
@@ -198,37 +198,24 @@ def _truth_rows(data: ReportData) -> Iterator[Row]:
         }
 
 
-#: Predictions of the ensemble, and the sampling noise beside them, in words.
-_RMSE = {
-    "epcd_exact": "raw, exact mean over pixels",
-    "epcd_dependent": "raw, dependent parameters",
-    "epcd_independent": "raw, independent parameters",
-    "noise_floor": "raw, sampling noise alone",
-    "nuced_exact": "NUCed, exact mean over pixels",
-    "nuced_dependent": "NUCed, dependent parameters",
-    "nuced_independent": "NUCed, independent parameters",
-    "nuced_noise_floor": "NUCed, sampling noise alone",
+#: RMSE of each prediction of the ensemble, and of the sampling noise beside them, to words and unit.
+RMSES = {
+    name: (f"{half.words.removesuffix(' data')}, {words}", f"1/{unit_text(half.unit)}")
+    for half in HALVES
+    for name, words in (
+        *((f"{half.model}{each}", words) for each, (words, *_) in reversed(PREDICTIONS.items())),
+        (f"{half.data}noise_floor", "sampling noise alone"),
+    )
 }
-
-
-def rmse_words(name: str) -> str:
-    """Return what a prediction of the ensemble is called, or the sampling noise beside it."""
-    return _RMSE.get(name, name.replace("_", " "))
-
-
-def rmse_unit(name: str) -> str:
-    """Return the unit of the densities of an ensemble, raw or after correction."""
-    return "1/e⁻" if name.startswith("nuced") else "1/DN"
 
 
 def _rmse(data: ReportData) -> Table:
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     rows = []
-    for name, words in _RMSE.items():
+    for name, (words, unit) in RMSES.items():
         if rmse.get(name) is None or name.endswith("noise_floor"):
             continue
         floor = rmse.get("nuced_noise_floor" if name.startswith("nuced") else "noise_floor")
-        unit = rmse_unit(name)
         rows.append(
             {
                 "prediction": words,
@@ -356,34 +343,19 @@ def _intervals(data: ReportData) -> Table:
     )
 
 
-def _noise_shares(data: ReportData, names: tuple[str, ...]) -> dict[str, float]:
-    """Return, by map, the part of its variance over the pixels that the errors of the estimates make.
-
-    Both are robust: the median squared standard error over ``(1.4826 MAD)^2``. Maps that do not exist or have
-    fewer than 8 values are left out.
-    """
-    found = {}
-    for name in names:
-        error = data.pixel_error(name, with_flagged=True)
-        if error is None or not data.has_values(name):
-            continue
-        summary = data.summary(name, with_flagged=True)
-        if summary.n_valid >= 8 and summary.robust_sd > 0:
-            found[name] = float(error**2 / summary.robust_sd**2)
-    return found
-
-
 def _interval_rows(data: ReportData) -> Iterator[Row]:
-    shares = _noise_shares(data, MAPS)
     for name in _known(data):
-        error = data.pixel_error(name, with_flagged=True)
+        error, summary = data.pixel_error(name, with_flagged=True), data.summary(name, with_flagged=True)
         if error is None:
             continue
+        # both robust: the median squared error over (1.4826 MAD)^2
+        known = summary.n_valid >= 8 and summary.robust_sd > 0
+        noise = percent(min(error**2 / summary.robust_sd**2, 1.0), 1.0) if known else "not known"
         row = {
             "quantity": heading(name),
             f"error per {data.noun}": short(error, 3),
-            "relative error": percent(error, abs(data.summary(name, with_flagged=True).median)),
-            "noise in the map": percent(min(shares[name], 1.0), 1.0) if name in shares else "not known",
+            "relative error": percent(error, abs(summary.median)),
+            "noise in the map": noise,
         }
         if data.intervals:
             ends = ["", ""]
