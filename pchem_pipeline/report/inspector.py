@@ -34,8 +34,6 @@ from pchem_pipeline.report.style.wording import unit_text
 _NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
 #: Quantiles between which a value is surely inside the range; the range is three times wider on each side.
 _TAIL = 1e-3
-#: Values that are worked on at a time.
-AT_ONCE = 1 << 17
 #: Step of logarithmic maps: 2.3 %.
 _LOG_STEP = 0.01
 #: Bars of a map's histogram, at least and at most.
