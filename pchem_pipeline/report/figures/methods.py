@@ -133,7 +133,7 @@ def _study(study: Sequence[Mapping[str, Any]], letter: str) -> Stack:
         words = Words(crossing, 0.02, f" {crossing:.2f} e⁻", "left", colour="faint")
         marks += [Level(crossing, "x", colour="#999999", width=0.7, dash=":"), words]
     ticks = ((0.1, "0.1"), (1.0, "1"), (10.0, "10"), (100.0, "100"))
-    y = Axis("rms error of the gain (%)", _RANGE[0], 40 * _RANGE[1], log=True, ticks=ticks)
+    y = Axis("rms error of the gain (%)", _RANGE[0], 150 * _RANGE[1], log=True, ticks=ticks)
     panel = Panel(y, tuple(marks), legend="upper left", columns=2)
     title = f"{letter}simulated pixels, as many frames for each"
     return Stack((panel,), Axis("read noise (e⁻)"), title, height_mm=86.0)

@@ -95,6 +95,12 @@ def emva_rows(
     gain, exposure = maps["conversion_gain"], stored["quanta_exposure"]
     is_hot = hot_pixels(exposure, stored["quanta_exposure_stderr"], ~kept, outlier_sigmas)
     hot = int(is_hot.sum()) / max(int(np.isfinite(exposure).sum()), 1)
+    unknown: tuple[float | None, float | None] = (None, None)
+    response, current = unknown, unknown
+    if kind == "light":
+        response = _relative_spread(maps["quanta_exposure"], errors["quanta_exposure"])
+    if kind == "dark" and "dark_current" in stored and kept.any():
+        current = _mean(stored["dark_current"][kept])
     rows = [
         EmvaRow(
             "overall system gain", "K", *_mean(1.0 / gain), "DN/e-", "mean over the pixels of 1/g",
@@ -110,13 +116,23 @@ def emva_rows(
             "root mean square over the pixels of sigma, quantisation included", "as above",
         ),
         _dsnu(maps, errors, kind),
-        _prnu(maps, errors, kind),
+        EmvaRow(
+            "photo response non-uniformity", "PRNU_1288 (similar)", *response, "%",
+            "standard deviation of H between the pixels over its mean, corrected for errors (input.kind: "
+            "light)",
+            "EMVA: at half saturation, dark subtracted, trends of the illumination filtered out; not done "
+            "here",
+        ),
         EmvaRow(
             "non-uniformity of the gain", "", *_relative_spread(gain, errors["conversion_gain"]), "%",
             "standard deviation of g between the pixels over its mean, corrected for their errors",
             "not in EMVA: K is one number for the sensor; PRNU combines gain and sensitivity",
         ),
-        _dark_current(stored.get("dark_current"), kept, kind),
+        EmvaRow(
+            "dark current from mean", "mu_I.mean", *current, "e-/px/s",
+            "mean over the pixels of H / integration time (input.kind: dark), or of its slope",
+            "EMVA: slope of the mean dark signal over six or more exposure times",
+        ),
         EmvaRow(
             "hot pixels", "", 100.0 * hot if kept.any() else np.nan, None, "%",
             f"pixels whose H is above the median by more than {outlier_sigmas:g} robust standard deviations",
@@ -194,26 +210,3 @@ def _dsnu(maps: _Kept, errors: _Kept, kind: str) -> EmvaRow:
             "EMVA: from dark frames, dark current included; here the bias alone (input.kind is not dark)"
         )
     return EmvaRow("dark signal non-uniformity", "DSNU_1288", value, error, "e-", words, differs)
-
-
-def _prnu(maps: _Kept, errors: _Kept, kind: str) -> EmvaRow:
-    value, error = None, None
-    if kind == "light":
-        value, error = _relative_spread(maps["quanta_exposure"], errors["quanta_exposure"])
-    return EmvaRow(
-        "photo response non-uniformity", "PRNU_1288 (similar)", value, error, "%",
-        "standard deviation of H between the pixels over its mean, corrected for errors (input.kind: light)",
-        "EMVA: at half saturation, dark subtracted, trends of the illumination filtered out; not done here",
-    )  # fmt: skip
-
-
-def _dark_current(found: NDArray[Any] | None, kept: BoolArray, kind: str) -> EmvaRow:
-    value: float | None = None
-    error: float | None = None
-    if kind == "dark" and found is not None and kept.any():
-        value, error = _mean(found[kept])
-    return EmvaRow(
-        "dark current from mean", "mu_I.mean", value, error, "e-/px/s",
-        "mean over the pixels of H / integration time (input.kind: dark), or of its slope",
-        "EMVA: slope of the mean dark signal over six or more exposure times",
-    )  # fmt: skip
