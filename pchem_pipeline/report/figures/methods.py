@@ -109,7 +109,7 @@ def _methods_chart(result: Mapping[str, Any]) -> Chart:
     letters = ("(a) ", "(b) ") if study and known else ("", "")
     stacks = [_study(study, letters[0])] if study else []
     stacks += [_run(known, letters[1])] if known else []
-    return Chart(tuple(stacks), (1.5, 1.0) if len(stacks) > 1 else (1.0,), empty="nothing to compare")
+    return Chart(tuple(stacks), (2.3, 1.0) if len(stacks) > 1 else (1.0,), empty="nothing to compare")
 
 
 def _study(study: Sequence[Mapping[str, Any]], letter: str) -> Stack:
