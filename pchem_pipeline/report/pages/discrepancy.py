@@ -11,7 +11,6 @@ from pchem_pipeline.base.units import typeset
 from pchem_pipeline.discrepancy.verdict import (
     CONVINCING_PLACEBO,
     RARE,
-    Candidate,
     GapChange,
     Place,
     Step,
@@ -55,15 +54,6 @@ def probability_text(p: float) -> str:
     if not math.isfinite(p):
         return ""
     return "< 0.001" if p < 0.001 else "> 0.999" if p > 0.999 else f"{p:.3f}"
-
-
-def parameter_texts(candidate: Candidate) -> list[tuple[str, str]]:
-    """Format the given fields of a candidate, numbers to three digits."""
-    return [
-        (name, f"{value:.3g}" if isinstance(value, int | float) else str(value))
-        for name, value in candidate.parameters.items()
-        if value is not None and not isinstance(value, list | dict)
-    ]
 
 
 def parameter_name(name: str) -> str:
@@ -142,6 +132,11 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     # an empirical description has no competitors
     for candidate in step.candidates[: 0 if step.verdict == "described" else _MOST_CANDIDATES]:
         behind = candidate.score - best
+        given = {
+            name: f"{value:.3g}" if isinstance(value, int | float) else str(value)
+            for name, value in candidate.parameters.items()
+            if value is not None and not isinstance(value, list | dict)
+        }
         rows.append(
             {
                 "effect": candidate.effect,
@@ -149,7 +144,7 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
                 "log-likelihood": measured(candidate.score, candidate.stderr),
                 "difference": short(behind) if -math.inf < behind < 0 else "best" if behind == 0 else "",
                 "probability": probability_text(candidate.probability) if several else "only candidate",
-                "parameters": ", ".join(f"{name} {value}" for name, value in parameter_texts(candidate)),
+                "parameters": ", ".join(f"{name} {value}" for name, value in given.items()),
             }
         )
     if step.effect:
