@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
@@ -17,7 +16,7 @@ from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
-from pchem_pipeline.report.inspector import InspectorData, Notable, PixelSample
+from pchem_pipeline.report.inspector import InspectorData, PixelSample
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE
 from pchem_pipeline.report.pages.page import DrawAll, Drawn, draw_figure
 from pchem_pipeline.report.pages.report import render_report
@@ -35,7 +34,7 @@ from pchem_pipeline.stages.report.pixels import (
     pixel_fits,
     pixel_index,
 )
-from pchem_pipeline.stages.report.stored import PixelHistograms, StoredRun, read_histograms, read_run
+from pchem_pipeline.stages.report.stored import StoredRun, read_histograms, read_run
 from pchem_pipeline.stages.table import pipeline
 from pchem_pipeline.store.run_store import RunStore
 
@@ -123,34 +122,13 @@ def gather(
     pixels = hand(functools.partial(_of_pixels, run, config.report.pixels))
     sums = read_sums(store)
     stability = hand(functools.partial(stability_figures, sums))
-    inspector = hand(lambda: _inspector(run, pixels(), max(1, threads - 1)))
+    inspector = hand(lambda: _inspector(run, pixels()[1], max(1, threads - 1)))
     look = run_quick_look(run, sums)
-    return replace(
-        run.data, pixels=pixels().fits, inspector=inspector, quick_look=look, stability=stability()
-    )
+    return replace(run.data, pixels=pixels()[0], inspector=inspector, quick_look=look, stability=stability())
 
 
-@dataclass(frozen=True)
-class _Pixels:
-    """Single pixels of the report.
-
-    Attributes:
-        fits: of those that are shown.
-        index: ``y * nx + x`` of those that the inspector holds in full.
-        reasons: why it does.
-        histograms: of the latter.
-        masses: of as many of the first of them, under a model with effects.
-    """
-
-    fits: list[PixelFit]
-    index: IntArray
-    reasons: list[Notable]
-    histograms: PixelHistograms
-    masses: list[FloatArray]
-
-
-def _of_pixels(run: StoredRun, asked: Sequence[tuple[int, int]]) -> _Pixels:
-    """Choose pixels, those asked for among them, and read their histograms."""
+def _of_pixels(run: StoredRun, asked: Sequence[tuple[int, int]]) -> tuple[list[PixelFit], PixelSample]:
+    """Return the fits of the pixels that are shown, and those that the inspector holds, without maps."""
     data, store = run.data, run.store
     shown = _shown(run, asked)
     places, bins = [(y, x) for _, y, x in shown], store.array("histogram/counts").shape[2]
@@ -164,7 +142,8 @@ def _of_pixels(run: StoredRun, asked: Sequence[tuple[int, int]]) -> _Pixels:
     masses = bin_masses(run.parameters(index[some]), histograms.of(some), run.model.at(index[some]))
     channel = run.sensor.kind == "histograms"
     fits = pixel_fits(shown, data.maps, data.fit, histograms.of(drawn), masses[drawn], channel=channel)
-    return _Pixels(fits, full, reasons, histograms.of(held), masses[held])
+    deciding, kept = deciding_parameters(run.parameters(full), run.model.at(full)), histograms.of(held)
+    return fits, PixelSample(full, {}, kept.origin, kept.counts, deciding, masses[held], reasons)
 
 
 def _shown(run: StoredRun, asked: Sequence[tuple[int, int]]) -> list[Chosen]:
@@ -177,15 +156,13 @@ def _shown(run: StoredRun, asked: Sequence[tuple[int, int]]) -> list[Chosen]:
     return choose_pixels(data.maps["read_noise_e"], data.maps["quanta_exposure"], data.fit["fit_status"])
 
 
-def _inspector(run: StoredRun, pixels: _Pixels, threads: int) -> InspectorData:
-    """Pack maps, and the pixels that are held in full, for the inspector."""
-    data, index, held = run.data, pixels.index, pixels.histograms
+def _inspector(run: StoredRun, sample: PixelSample, threads: int) -> InspectorData:
+    """Pack maps for the inspector, and add their values to the pixels that are held in full."""
+    data = run.data
     read = {f"maps/{name}": values for name, values in data.maps.items()}
     read |= {f"fit/{name}": data.fit[name] for name in ("fit_status", "outlier_share") if name in data.fit}
-    maps, exact = read_maps(run.store, data.shape, index, read, threads)
-    deciding = deciding_parameters(run.parameters(index), run.model.at(index))
-    sample = PixelSample(index, exact, held.origin, held.counts, deciding, pixels.masses, pixels.reasons)
-    return inspector_data(run.store.path.name, data.shape, maps, sample)
+    maps, exact = read_maps(run.store, data.shape, sample.index, read, threads)
+    return inspector_data(run.store.path.name, data.shape, maps, replace(sample, exact=exact))
 
 
 def _stage_rows(context: StageContext) -> list[dict[str, Any]]:
