@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -225,20 +226,19 @@ def history_figures(rows: Sequence[HistoryRow], labelled: bool) -> Iterator[Figu
         ordered = by_date = False
     at = places - (places.min() if by_date else 0.0) if ordered else np.arange(len(rows), dtype=np.float64)
     axis = "days since the first" if by_date else "label" if ordered else "run"
-    columns: dict[str, object] = {
-        "run": [row.run.name for row in rows],
-        "label": [row.label for row in rows],
-        axis: at,
+    heads = ("run", "label") if by_date else ("name", "text")
+    columns: dict[str, Any] = {
+        heads[0]: [row.run.name for row in rows],
+        heads[1]: [row.label for row in rows],
     }
-    if axis in ("run", "label"):
-        columns = {"name": columns["run"], "text": columns["label"], axis: at}
+    columns[axis] = at
     units = {}
     for name in shown:
         for part, key in enumerate(("median", "standard error", "scatter")):
             heading = f"{name} {key}"
             columns[heading] = [row.run.summary[name][part] for row in rows]
             units[heading] = symbol(name)[2].replace("e⁻", "e-")
-    table = DataTable(columns, units)  # type: ignore[arg-type]
+    table = DataTable(columns, units)
     first, last = rows[0], rows[-1]
     words = "; ".join(
         f"{symbol(name)[1]} from {short(first.run.summary[name][0])} to {short(last.run.summary[name][0])} "

@@ -18,6 +18,7 @@ from pchem_pipeline.report.charts.chart import (
     Dash,
     Level,
     Line,
+    Mark,
     Panel,
     Points,
     Stack,
@@ -293,21 +294,19 @@ def electrons_chart(table: DataTable) -> Chart:
     power = _power([mass - pmf])
     scale = 10.0**-power
     estimated = Bars(k, np.zeros(k.size), mass, colour="bars", label="estimated electron numbers")
-    above: list[Bars | Points] = [
-        estimated,
-        Points(k, pmf, colour="ink", size=3.2, label=r"predicted mass $p_{K_e}$"),
-    ]
-    below: list[Bars | Points | Level] = []
+    predicted = r"predicted mass $p_{K_e}$"
+    above: list[Mark] = [estimated, Points(k, pmf, colour="ink", size=3.2, label=predicted)]
+    below: list[Mark] = []
     if "electron_counts" in table and table["electron_counts"].sum() > 0:
         noise = 2.0 * scale * np.sqrt(mass / float(table["electron_counts"].sum()))
         below.append(Bars(k, -noise, noise, colour="band"))
     rest = scale * (mass - pmf)
-    below.append(Points(k, rest, colour="ink", size=3.0, label=above[1].label, listed=False))
+    below.append(Points(k, rest, colour="ink", size=3.0, label=predicted, listed=False))
     if "electron_pmf_map" in table:
         expected, words = table["electron_pmf_map"][: last + 1], "expected share"
-        cross = {"colour": "vermilion", "mark": "x", "size": 4.0, "label": words}
-        above.append(Points(k, expected, **cross))  # type: ignore[arg-type]
-        below.append(Points(k, scale * (mass - expected), listed=False, **cross))  # type: ignore[arg-type]
+        cross: dict[str, Any] = {"colour": "vermilion", "mark": "x", "size": 4.0, "label": words}
+        above.append(Points(k, expected, **cross))
+        below.append(Points(k, scale * (mass - expected), listed=False, **cross))
     below.append(Level(0.0, colour="ink", width=0.5))
     y = Axis("probability", 0.0, 1.1 * max(float(np.nanmax(mass, initial=0.0)), 1e-12))
     panels = (
