@@ -111,6 +111,7 @@ def test_runs_in_their_order_are_told_by_label_or_letter(
         for letter, label in zip("AB", labels, strict=True)
     ]
     (figure,) = history_figures(rows, labelled=True)
+    assert figure.tables[0]["name"].tolist() == ["r.zarr", "r.zarr"]
     axis = figure.draw(Look()).axes[-1].xaxis
     assert list(zip(axis.get_ticklocs(), [t.get_text() for t in axis.get_ticklabels()], strict=True)) == ticks
 
