@@ -251,15 +251,10 @@ def _drawn(look: Look, chart: Chart) -> Drawing:
     ]
     keys = _keys(chart, look)
     lines = sum(1 + text.count("\n") for text in keys)
-    height_mm = (sum(heights) or 40.0) + (5.0 + _LINE_MM * lines if keys else 0.0)
+    height_mm = sum(heights) + (5.0 + _LINE_MM * lines if keys else 0.0)
     drawing = Drawing(figsize=(inches(look.width_mm), inches(height_mm)), layout="constrained")
     drawing.look = look
     FigureCanvasAgg(drawing)  # a canvas of its own
-    if not rows:
-        axes = drawing.add_subplot()
-        axes.text(0.5, 0.5, chart.empty, ha="center", va="center", transform=axes.transAxes)
-        axes.set_axis_off()
-        return drawing
     widths = chart.widths if columns > 1 else (1.0,)
     grid = drawing.add_gridspec(len(rows), columns, height_ratios=heights, width_ratios=widths)
     handles: dict[str, Handle] = {}

@@ -84,11 +84,11 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
 def ensembles_figures(runs: Sequence[RunFacts]) -> Iterator[Figure]:
     """Return the ensembles of runs over each other, where at least two have one."""
     runs = [run for run in runs if "density" in run.ensemble]
-    if len(runs) < 2:
+    tables = ensemble_tables(runs)
+    if len(runs) < 2 or not tables:
         return
     highest = (run.ensemble["dn"][int(np.argmax(run.ensemble["density"]))] for run in runs)
     peaks = ", ".join(f"{run.title}: {int(dn)} DN" for run, dn in zip(runs, highest, strict=True))
-    tables = ensemble_tables(runs)
     yield Figure(
         "ensembles",
         "",
@@ -162,7 +162,7 @@ def ensembles_chart(tables: Sequence[DataTable]) -> Chart:
     """
     titles = {half.part: half.title for half in HALVES}
     stacks = tuple(_one_half(table, unit_text(table.units["signal"]), titles[table.part]) for table in tables)
-    return Chart(stacks, empty="no ensemble histograms")
+    return Chart(stacks)
 
 
 def _one_half(table: DataTable, unit: str, title: str) -> Stack:

@@ -152,7 +152,7 @@ def ensemble_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, ...]
     """Return data and predictions of the group ``ensemble``, raw and after correction; either may lack."""
     tables = []
     for part, axis, data, model, unit, *_ in HALVES:
-        if axis not in arrays or f"{data}density" not in arrays:
+        if axis not in arrays or f"{data}density" not in arrays or not np.sum(arrays[f"{data}counts"]):
             continue
         columns = {axis: arrays[axis], "counts": arrays[f"{data}counts"]}
         names = (f"{data}density", *(f"{model}{each}" for each in (*PREDICTIONS, "stderr")))
@@ -192,9 +192,9 @@ def ensemble_chart(
     page, a panel at the right shows all values on a logarithmic axis. The legend has the RMSE of each
     prediction, and ``noise_floor``, ``nuced_noise_floor``.
     """
-    halves = [_Drawn(table, rmse, n_frames) for table in tables if table["counts"].sum() > 0]
+    halves = [_Drawn(table, rmse, n_frames) for table in tables]
     stacks = tuple(stack for half in halves for stack in (_bulk_stack(half), _tail_stack(half)))
-    return Chart(stacks, (2.4, 1.0), empty="no ensemble histogram")
+    return Chart(stacks, (2.4, 1.0))
 
 
 class _Drawn:

@@ -210,10 +210,8 @@ def _half(arrays: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     "change",
     [
-        lambda a: {},
         lambda a: _half(a, "dn", "counts", "density"),
         lambda a: _half(a, "electrons", "nuced_counts", "nuced_density", "nuced_exact"),
-        lambda a: {**_half(a, "dn", "counts", "density", "epcd_exact"), "counts": np.zeros_like(a["counts"])},
         lambda a: {"dn": np.array([100]), "counts": np.array([7]), "density": np.array([1.0])},
     ],
 )
@@ -221,6 +219,11 @@ def test_ensemble_with_parts_missing(
     arrays: dict[str, np.ndarray], change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]
 ) -> None:
     drawn(draw_chart(LOOK, ensemble_chart(ensemble_tables(change(arrays)), {})))
+
+
+def test_without_samples_there_is_no_ensemble(arrays: dict[str, np.ndarray]) -> None:
+    half = _half(arrays, "dn", "counts", "density", "epcd_exact")
+    assert ensemble_tables({}) == ensemble_tables({**half, "counts": np.zeros_like(half["counts"])}) == ()
 
 
 def test_electron_numbers(arrays: dict[str, np.ndarray]) -> None:
