@@ -544,7 +544,6 @@ def test_names_in_all_scripts_are_shown_not_run_and_keep_the_page_as_wide_as_the
     store = make_run(
         tmp_path, (1, len(NAMES)) if channels else (12, 16), failed=0.0 if channels else 0.3, n_frames=60,
         title=" ".join((HOSTILE, *NAMES)), camera=" ".join(NAMES), run={"store": HOSTILE, "model": NAMES[4]},
-        status_words=dict.fromkeys(map(int, MEANINGS), HOSTILE),
         inputs=[{"name": name, "size": 1, "hash": "0" * 32} for name in NAMES],
         channel_names=NAMES if channels else (),
     )  # fmt: skip

@@ -17,7 +17,7 @@ from pchem_pipeline.planning.targets import TARGET_NAMES, parse_target
 from pchem_pipeline.planning.verify import frames_simulated, verify
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.tables import result_tables
-from pchem_pipeline.stages.report.report import plan_section
+from pchem_pipeline.stages.report.stored import plan_section
 
 GAIN = 1 / 11
 ONE_PERCENT = parse_target("conversion_gain=1%")
@@ -320,6 +320,6 @@ def test_the_section_of_the_report_is_of_the_median_pixel():
     assert section["reached"]["conversion_gain"] == pytest.approx(0.0028, abs=5e-5)
     data = ReportData(title="a run", shape=(2, 2), plan=section)
     [table] = [table for table in result_tables(data) if table.section == "plan"]
-    assert table.rows[0][2] == "0.28 %"
-    assert {len(row) for row in table.rows} == {len(table.head)}
+    assert table.rows[0]["this run's"] == "0.28 %"
+    assert {tuple(row) for row in table.rows} == {table.head}
     assert plan_section({name: np.full((2, 2), np.nan) for name in maps}, 10) is None

@@ -30,7 +30,6 @@ from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
 from pchem_pipeline.stages.ensemble.ensemble import on_axis
 from pchem_pipeline.stages.fit.fit import code_sums
-from pchem_pipeline.stages.report.report import report_data
 from pchem_pipeline.stages.report.stored import read_run
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.records import StageRecord
@@ -159,7 +158,7 @@ def test_dark_current_is_of_the_dark_alone(prepared: Path, tmp_path: Path, kind:
     assert context.store.has(f"maps/{wanted}")
     assert not context.store.has(f"maps/{other}")
     assert wanted in context.store.attributes("maps")["summary"]
-    data = report_data(read_run(context.store), context.config, [])
+    data = read_run(context.store, context.config).data
     words = wanted.replace("_", " ")
     assert words in sentence(data)
     assert [number.label for number in key_numbers(data) if number.name == wanted] == [words]

@@ -114,26 +114,26 @@ def test_the_charge_rate_costs_nothing(store: RunStore, data: ReportData) -> Non
 
 
 def test_a_small_sensor_is_there_whole(data: ReportData) -> None:
-    chosen = choose_inspected(data.maps, data.fit, [(3, 4)], everything=4096, most=100)
-    assert chosen.index[0] == 3 * 16 + 4
-    assert sorted(chosen.index.tolist()) == list(range(12 * 16))
+    index, _ = choose_inspected(data.maps, data.fit, [(3, 4)], everything=4096, most=100)
+    assert index[0] == 3 * 16 + 4
+    assert sorted(index.tolist()) == list(range(12 * 16))
 
 
 def test_of_wide_histograms_fewer_pixels_are_there() -> None:
     data = report_data((60, 60))
-    assert choose_inspected(data.maps, data.fit, [], bins=2048).index.size == 3600
-    assert choose_inspected(data.maps, data.fit, [], bins=16384).index.size == 512
+    assert choose_inspected(data.maps, data.fit, [], bins=2048)[0].size == 3600
+    assert choose_inspected(data.maps, data.fit, [], bins=16384)[0].size == 512
 
 
 def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
     data = report_data((100, 120), failed=0.01)
     p = np.array(data.fit["goodness_p"])
     p[40, 50] = 1e-12
-    chosen = choose_inspected(
+    index, found = choose_inspected(
         data.maps, {**data.fit, "goodness_p": p}, [(1, 2)], [(5, 6)], everything=4096, most=1500
     )
-    reasons = dict(chosen.reasons)
-    assert chosen.index.size == np.unique(chosen.index).size == 1500
+    reasons = {each.words: each.pixels for each in found}
+    assert index.size == np.unique(index).size == 1500
     assert reasons["shown in the report"] == (1 * 120 + 2,)
     assert reasons["from the search for missing effects"] == (5 * 120 + 6,)
     assert reasons["poorest goodness of fit"][0] == 40 * 120 + 50
@@ -142,12 +142,13 @@ def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
     status = data.fit["fit_status"].ravel()
     for bit, words in MEANINGS.items():
         where = set(np.flatnonzero(status & int(bit)).tolist())
-        found = reasons.get(words, ())
-        assert set(found) <= where
-        assert len(found) == min(len(where), 40)
-    assert {i for _, where in chosen.reasons for i in where} <= set(chosen.index.tolist())
+        flagged = reasons.get(words, ())
+        assert set(flagged) <= where
+        assert len(flagged) == min(len(where), 40)
+    assert {i for where in reasons.values() for i in where} <= set(index.tolist())
+    assert {each.path for each in found if "bias" in each.words} >= {"maps/bias", "maps/bias_stderr"}
     # every tenth of the rows and columns has its share of the sample
-    for line, n in ((chosen.index // 120, 100), (chosen.index % 120, 120)):
+    for line, n in ((index // 120, 100), (index % 120, 120)):
         parts = np.histogram(line, bins=10, range=(0, n))[0]
         assert parts.min() > 100
 
@@ -156,12 +157,11 @@ def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
 
 
 def test_a_new_section_is_one_entry_in_one_list(data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
-    def mine(material: page_report.Material) -> Section:
-        text = f"{material.data.title} & more"
-        return Section(id="mine", title="My <section>", kind="text", content=text)
-
-    monkeypatch.setattr(page_report, "PAGE", (*page_report.PAGE, mine, lambda _: None))
+    mine, empty = Section("mine", "My <section>", kind="text"), Section("without", "content", empty="")
+    monkeypatch.setattr(page_report, "PAGE", (*page_report.PAGE, mine, empty))
+    monkeypatch.setitem(page_report.CONTENT, "text", lambda data: f"{data.title} & more")
     page = page_without_pictures(data)
     assert '<li><a href="#mine">My &lt;section&gt;</a></li>' in page
     assert '<h2 id="mine-heading">My &lt;section&gt;</h2>' in page
     assert "demo sensor &amp; more" in page
+    assert 'id="without"' not in page
