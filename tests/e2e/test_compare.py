@@ -215,12 +215,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
     assert "-20 C" in page
     for each in ({"labels": ["one"]}, {"rate": 0.0}):
         with pytest.raises(ConfigError, match="--"):
-            comparison_of(
-                [shell.folder / "a.zarr", shell.folder / "b.zarr"],
-                1e-12,
-                Reporter("off"),
-                **each,
-            )
+            comparison_of([shell.folder / "a.zarr", shell.folder / "b.zarr"], 1e-12, Reporter("off"), **each)
 
 
 def test_the_history_has_date_and_temperature_of_the_files(shell, copies, finished):

@@ -1,18 +1,16 @@
 """The stage simulate: every format holds the same frames, resuming, and what it refuses to overwrite."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.stage import Options
-from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
@@ -31,7 +29,7 @@ SIMULATE: dict[str, Any] = {
 }
 
 
-def prepare(folder: Path, *, backend: str = "serial", **changes: Any) -> Target:
+def prepare(folder, *, backend="serial", **changes):
     content = {
         "run": {"tile": 8},
         "simulate": {**SIMULATE, **changes},
@@ -42,19 +40,19 @@ def prepare(folder: Path, *, backend: str = "serial", **changes: Any) -> Target:
     return find_run(path)
 
 
-def simulated(target: Target, **options: Any) -> str:
+def simulated(target, **options):
     command = Command(options=Options(**options), quiet=True)
     return run_stages(target, ["simulate"], command)[0].state
 
 
-def frames_of(target: Target) -> NDArray[Any]:
+def frames_of(target):
     with open_frames(target.config.input, target.base_dir) as reader:
         frames = np.empty(reader.shape, reader.dtype)
         reader.read_into(frames, 0, reader.shape[0])
     return frames
 
 
-def expected(target: Target) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+def expected(target):
     settings = target.config.simulate
     assert settings is not None
     return simulate_block(draw_truth(settings), settings, (0, settings.n_frames))
@@ -115,7 +113,7 @@ def test_a_failed_run_goes_on_where_it_was(tmp_path, monkeypatch):
     target = prepare(tmp_path, frames_per_file=4)
     real, written = stage.write_frames, []
 
-    def failing(format: str, path: Path, *args: Any, **kwargs: Any) -> Any:
+    def failing(format, path, *args, **kwargs):
         if path.stem == "frames_00004" and len(written) < 10:
             raise PchEmError("the cable fell out")
         written.append(path.name)

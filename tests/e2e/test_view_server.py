@@ -23,10 +23,10 @@ from pchem_pipeline.store.run_store import RunStore
 class Client:
     """Asks the server, with any header."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port):
         self.port = port
 
-    def ask(self, method: str, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    def ask(self, method, path, **headers):
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
         names = {name.replace("_", "-"): value for name, value in headers.items()}
         connection.request(method, path, headers=names)
@@ -35,7 +35,7 @@ class Client:
         connection.close()
         return found
 
-    def json(self, path: str) -> dict:
+    def json(self, path):
         status, _, content = self.ask("GET", path)
         assert status == 200, content
         return json.loads(content)
@@ -53,7 +53,7 @@ def client(finished):
     thread.join()
 
 
-def digest(folder) -> str:
+def digest(folder):
     found = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
         if path.is_file():

@@ -20,10 +20,10 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 CASES = [(2.0, 11.0, 0.3), (0.15, 9.0, 0.25), (7.0, 13.0, 0.4), (1.0, 10.0, 0.48)]
 
 
-def _minimise(counts: np.ndarray, x: np.ndarray, start: np.ndarray) -> Minuit:
+def _minimise(counts, x, start):
     k = np.arange(60)
 
-    def cost(h: float, a: float, mu: float, sigma: float) -> float:
+    def cost(h, a, mu, sigma):
         log_terms = k * np.log(h) - h - gammaln(k + 1) - 0.5 * ((x[:, None] - mu - k * a) / sigma) ** 2
         top = log_terms.max(axis=1)
         log_density = top + np.log(np.exp(log_terms - top[:, None]).sum(axis=1))
@@ -40,7 +40,7 @@ def _minimise(counts: np.ndarray, x: np.ndarray, start: np.ndarray) -> Minuit:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_maximum_and_standard_errors_match_iminuit(case: tuple[float, float, float]) -> None:
+def test_maximum_and_standard_errors_match_iminuit(case):
     pixel = draw(np.random.default_rng(21), *case)
     result = fit_histograms(pixel.counts, pixel.origin, settings=FitSettings(tolerance=1e-12))
     occupied = np.flatnonzero(pixel.counts[0])
@@ -65,7 +65,7 @@ def test_maximum_and_standard_errors_match_iminuit(case: tuple[float, float, flo
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_no_point_nearby_is_likelier_by_the_reference(case: tuple[float, float, float]) -> None:
+def test_no_point_nearby_is_likelier_by_the_reference(case):
     pixel = draw(np.random.default_rng(22), *case, n_frames=4000)
     result = fit_histograms(pixel.counts, pixel.origin)
     x = samples(pixel.counts[0], int(pixel.origin[0]))
@@ -90,7 +90,7 @@ def test_no_point_nearby_is_likelier_by_the_reference(case: tuple[float, float, 
         (2.0, 7.0, 1.0, 0.0, 3.0),
     ],
 )
-def test_log_density_matches_many_digits(x: float, h: float, g: float, mu: float, sigma: float) -> None:
+def test_log_density_matches_many_digits(x, h, g, mu, sigma):
     with mpmath.workdps(50):
         terms = [
             mpmath.exp(-mpmath.mpf(h)) * mpmath.mpf(h) ** k / mpmath.factorial(k)
@@ -101,7 +101,7 @@ def test_log_density_matches_many_digits(x: float, h: float, g: float, mu: float
     assert float(log_pcd(x, h, g, mu, sigma)) == pytest.approx(expected, rel=2e-14)
 
 
-def test_mass_of_one_pixel_to_forty_digits() -> None:
+def test_mass_of_one_pixel_to_forty_digits():
     h, g, mu, sigma = 2.3, 0.11, 98.7, 2.9
     pixels = UsablePixels(*(np.array([v]) for v in (h, g, mu, sigma)))
     found = weighted_mass(pixels, DnAxis(80, 120), np.ones(1))
@@ -118,7 +118,7 @@ def test_mass_of_one_pixel_to_forty_digits() -> None:
             assert independent[i] == pytest.approx(float(expected), abs=2e-15)
 
 
-def test_error_rate_without_rounding_is_the_bit_error_rate() -> None:
+def test_error_rate_without_rounding_is_the_bit_error_rate():
     # a fine ADC (1000 DN per electron) and s_e = 0.3: the error is that of the continuous thresholds
     h, s_e = 1.5, 0.3
     pixels = UsablePixels(*(np.array([v]) for v in (h, 1e-3, 50.0, s_e * 1e3)))

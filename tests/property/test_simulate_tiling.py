@@ -2,7 +2,6 @@
 
 import itertools
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 from hypothesis import given, settings
@@ -22,7 +21,7 @@ MEMORY = {"tag": "analog_memory", "memory": 0.3}  # of the frame before
 LEAK = {"tag": "interpixel_capacitance", "coupling": 0.1}  # of the rows above and below
 
 
-def make(*effects: dict[str, Any]) -> SimulateSettings:
+def make(*effects):
     return SimulateSettings(shape=SHAPE, n_frames=N_FRAMES, seed=8, effects=effects)
 
 
@@ -47,7 +46,7 @@ TRUTH = {name: draw_truth(sensor) for name, sensor in SENSORS.items()}
 WHOLE = {name: simulate_block(TRUTH[name], sensor, (0, N_FRAMES)) for name, sensor in SENSORS.items()}
 
 
-def cuts(n: int) -> st.SearchStrategy[list[int]]:
+def cuts(n):
     return st.sets(st.integers(1, n - 1)).map(lambda inner: [0, *sorted(inner), n])
 
 

@@ -7,7 +7,6 @@ have caught the error that it guards against.
 import numpy as np
 import pytest
 from helpers.plain_law import joint_mass
-from numpy.typing import NDArray
 from scipy import stats
 
 from pchem_pipeline.simulate.chain import simulate_block
@@ -19,7 +18,7 @@ FALSE_ALARM = 6e-7
 N = 1 << 20
 
 
-def chi_square_p(dn: NDArray[np.uint16], h: float, g: float, mu: float, sigma: float) -> float:
+def chi_square_p(dn, h, g, mu, sigma):
     """Probability of a larger chi-square against the exact mass, bins of fewer than 20 expected merged."""
     top = int(mu + (h + 12 * np.sqrt(h) + 20) / g)
     fitted = np.sqrt((sigma / g) ** 2 + 1 / 12)
@@ -31,7 +30,7 @@ def chi_square_p(dn: NDArray[np.uint16], h: float, g: float, mu: float, sigma: f
     return float(stats.chi2.sf(((o - e) ** 2 / e).sum(), full.sum()))
 
 
-def identical_pixels(shape: tuple[int, int], h: float, g: float, mu: float, sigma: float) -> TruthMaps:
+def identical_pixels(shape, h, g, mu, sigma):
     return TruthMaps(*(np.full(shape, v) for v in (h, g, mu, sigma)), defect=np.zeros(shape, np.uint8))
 
 

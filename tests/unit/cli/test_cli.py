@@ -218,17 +218,17 @@ def test_simulated_frames_lie_on_this_machine():
         ({"width": "88 px"}, "--width '88 px': write a length such as 88mm"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted, words: str) -> None:
+def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted, words):
     with pytest.raises(ConfigError, match=words):
         figures_of_run(Path("nowhere.zarr"), Path("out"), **wanted)
 
 
 @pytest.mark.parametrize("option", ["--only", "--format"])
-def test_a_list_of_nothing_does_not_mean_all(option: str) -> None:
+def test_a_list_of_nothing_does_not_mean_all(option):
     with pytest.raises(ConfigError, match=f"{option}: ' ,' is no name"):
         invoke("figures", "run.zarr", option, " ,")
 
 
-def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
+def test_a_folder_without_a_run_is_told(tmp_path):
     with pytest.raises(StoreError, match="there is no run at"):
         figures_of_run(tmp_path, tmp_path / "out")

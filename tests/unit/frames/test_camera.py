@@ -3,8 +3,6 @@
 import itertools
 import json
 import struct
-from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -33,13 +31,13 @@ STACK = np.random.default_rng(5).integers(0, 4096, (5, 6, 7)).astype(np.uint16)
 TAKEN = 1_769_860_800.0  # 2026-01-31T12:00:00 UTC
 
 
-def facts(path: Path, **settings: object) -> CameraFacts:
+def facts(path, **settings):
     with opened(path, **settings) as frames:
         np.testing.assert_array_equal(frames.read(), STACK)
         return frames.camera
 
 
-def test_fits(tmp_path: Path) -> None:
+def test_fits(tmp_path):
     image = fits.PrimaryHDU(STACK)
     image.header["INSTRUME"], image.header["SERIALNO"] = "qCMOS X", 1234
     image.header["CCD-TEMP"], image.header["DATE-OBS"] = -19.5, "2026-01-31T12:00:00"
@@ -52,7 +50,7 @@ def test_fits(tmp_path: Path) -> None:
     assert (found.temperature, found.taken) == (pytest.approx(-20.0), TAKEN)
 
 
-def test_tiff_tags_and_records(tmp_path: Path) -> None:
+def test_tiff_tags_and_records(tmp_path):
     texts = {271: "Maker", 272: "Model 7", 306: "2026:01:31 12:00:00"}
     tags = [(number, "s", 0, text, True) for number, text in texts.items()]
     tifffile.imwrite(tmp_path / "tags.tif", STACK, photometric="minisblack", extratags=tags, metadata=None)
@@ -67,7 +65,7 @@ def test_tiff_tags_and_records(tmp_path: Path) -> None:
     assert facts(tmp_path / "m.tif") == CameraFacts("Andor", None, -60.0, None)
 
 
-def test_ome_tiff(tmp_path: Path) -> None:
+def test_ome_tiff(tmp_path):
     path = tmp_path / "a.ome.tif"
     tifffile.imwrite(path, STACK, metadata={"axes": "TYX", "AcquisitionDate": "2026-01-31T12:00:00"})
     text = tifffile.tiffcomment(path)
@@ -80,7 +78,7 @@ def test_ome_tiff(tmp_path: Path) -> None:
     assert (found.name, found.serial, found.temperature, found.taken) == ("A & B", "9", -10.0, TAKEN)
 
 
-def test_hdf5_and_zarr(tmp_path: Path) -> None:
+def test_hdf5_and_zarr(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         group = file.create_group("entry/detector")
         group["frames"] = STACK
@@ -95,7 +93,7 @@ def test_hdf5_and_zarr(tmp_path: Path) -> None:
     assert facts(tmp_path / "a.zarr") == CameraFacts("Z", None, 12.5, TAKEN)
 
 
-def test_a_free_text_is_no_camera(tmp_path: Path) -> None:
+def test_a_free_text_is_no_camera(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["frames"] = STACK
         file["frames"].attrs["description"] = "dark frames of Monday"
@@ -103,7 +101,7 @@ def test_a_free_text_is_no_camera(tmp_path: Path) -> None:
     assert facts(tmp_path / "a.h5") == CameraFacts()
 
 
-def test_ser_and_raw(tmp_path: Path) -> None:
+def test_ser_and_raw(tmp_path):
     ser.write_frames(tmp_path / "a.ser", iter([STACK]), StackFacts(STACK.shape, STACK.dtype, bit_depth=12))
     head = bytearray((tmp_path / "a.ser").read_bytes())
     head[82:122] = b"Planetary cam".ljust(40, b"\0")
@@ -116,7 +114,7 @@ def test_ser_and_raw(tmp_path: Path) -> None:
     assert facts(tmp_path / "a.raw", format="raw") == CameraFacts("R", None, -5.0, None)
 
 
-def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
+def test_several_files_share_what_they_state_alike(tmp_path):
     for i, temperature in enumerate((-20.0, -20.4, -17.0)):
         image = fits.PrimaryHDU(STACK[i])
         image.header["INSTRUME"], image.header["CCD-TEMP"] = "C", temperature
@@ -131,7 +129,7 @@ def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
     assert shared_facts([CameraFacts(temperature=1.0), CameraFacts()])[0].temperature is None
 
 
-def test_files_of_two_cameras_are_no_stack(tmp_path: Path) -> None:
+def test_files_of_two_cameras_are_no_stack(tmp_path):
     for i, serial in enumerate(("A1", "A1", "B2", "B2")):
         image = fits.PrimaryHDU(STACK[i])
         image.header["SERIALNO"] = serial
@@ -159,11 +157,11 @@ def test_files_of_two_cameras_are_no_stack(tmp_path: Path) -> None:
         ("warm", "C", None),
     ],
 )
-def test_a_temperature_is_one_of_a_sensor_or_none(value: object, unit: str, found: float | None) -> None:
+def test_a_temperature_is_one_of_a_sensor_or_none(value, unit, found):
     assert celsius(value, unit) == (None if found is None else pytest.approx(found))
 
 
-def test_names_of_a_megabyte_in_every_format(tmp_path: Path) -> None:
+def test_names_of_a_megabyte_in_every_format(tmp_path):
     text = "日本語 кир עברית \u202e\x1b[31m<script>" * 35_000
     image = fits.PrimaryHDU(STACK)
     image.header["INSTRUME"] = "Z" * 100_000
@@ -185,7 +183,7 @@ def test_names_of_a_megabyte_in_every_format(tmp_path: Path) -> None:
         assert found.name.isprintable()
 
 
-def test_xml_that_stands_for_a_billion_letters_is_not_read(tmp_path: Path) -> None:
+def test_xml_that_stands_for_a_billion_letters_is_not_read(tmp_path):
     names = "abcdefghij"
     more = "".join(f'<!ENTITY {b} "{f"&{a};" * 10}">' for a, b in itertools.pairwise(names))
     xml = f'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "{"a" * 10}">{more}]><OME><Image Name="&j;"/></OME>'
@@ -193,7 +191,7 @@ def test_xml_that_stands_for_a_billion_letters_is_not_read(tmp_path: Path) -> No
     assert facts(tmp_path / "a.tif") == CameraFacts()
 
 
-def test_hostile_texts_become_one_short_line() -> None:
+def test_hostile_texts_become_one_short_line():
     assert text_of(b"a\x1b[31m\n<b>\0rest") == "a [31m <b>"
     assert text_of("x" * 1_000_000) == "x" * 80
     assert (text_of(b"\0\0"), text_of(None), text_of(True)) == (None, None, None)
@@ -249,13 +247,13 @@ def test_hostile_texts_become_one_short_line() -> None:
         (2, "exposure time (hours)", 7200.0),
     ],
 )
-def test_durations(value: Any, unit: Any, seconds: float | None) -> None:
+def test_durations(value, unit, seconds):
     comment = unit if isinstance(unit, str) and " " in unit else ""
     found = duration_of("exposure", value, None if comment else unit, comment=comment)
     assert (found and found.seconds) == (None if seconds is None else pytest.approx(seconds))
 
 
-def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) -> None:
+def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path):
     image = fits.PrimaryHDU(STACK)
     cards = {"plain": {}, "unit": {"TIMEUNIT": "ms"}, "doubt": {"TIMEUNIT": "ms"}}
     for name, more in cards.items():
@@ -283,7 +281,7 @@ def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) ->
             assert "--integration-time" not in stack.time_words or right is None
 
 
-def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path: Path) -> None:
+def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path):
     cards = {
         "apart": ({"EXPTIME": (0.1, "[s]"), "EXPOSURE": (0.2, "[s]")}, None),
         "alike": ({"EXPTIME": (0.0333, "[s]"), "EXPOSURE": (33.3333, "[ms]")}, 0.0333),
@@ -310,11 +308,11 @@ def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path: 
     ("value", "bits"),
     [(12, 12), (np.int16(16), 16), (0, None), (33, None), (12.0, None), ("12", None), (True, None)],
 )
-def test_bits(value: Any, bits: int | None) -> None:
+def test_bits(value, bits):
     assert bits_of(value) == bits
 
 
-def test_every_format_with_attributes_takes_the_same_names(tmp_path: Path) -> None:
+def test_every_format_with_attributes_takes_the_same_names(tmp_path):
     """HDF5 as a program that stores each number as an array of one; zarr with the unit beside."""
     frames = np.ones((2, 3, 4), np.uint16)
     with h5py.File(tmp_path / "a.h5", "w") as file:

@@ -1,13 +1,10 @@
 """Ready-made histograms: layouts, refusals, and the measured SiPM spectra."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.histogram_files import HistogramInput, is_histogram_input, read_histograms
+from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.settings import InputSettings
 
 DN = np.array([100, 101, 102, 104])
@@ -15,7 +12,7 @@ COUNTS = np.array([3, 0, 7, 2])
 WANTED = [3, 0, 7, 0, 2]
 
 
-def read(folder: Path, *files: str, **settings: Any) -> HistogramInput:
+def read(folder, *files, **settings):
     return read_histograms(InputSettings(files=files, format="histogram", **settings), folder)
 
 
@@ -33,7 +30,7 @@ def read(folder: Path, *files: str, **settings: Any) -> HistogramInput:
         "DN,count,\n100,3,\n102,7,\n104,2,\n",
     ],
 )
-def test_csv(tmp_path: Path, text: str) -> None:
+def test_csv(tmp_path, text):
     (tmp_path / "a.csv").write_text(text, encoding="utf-8")
     found = read(tmp_path, "a.csv")
     assert found.counts.shape == (1, 1, 5)
@@ -45,7 +42,7 @@ def test_csv(tmp_path: Path, text: str) -> None:
     assert any("are taken as 0" in note for note in found.notes)
 
 
-def test_several_columns_are_several_channels(tmp_path: Path) -> None:
+def test_several_columns_are_several_channels(tmp_path):
     (tmp_path / "a.csv").write_text("DN,left,right\n10,1,0\n11,2,0\n12,0,5\n")
     found = read(tmp_path, "a.csv")
     assert found.names == ("a:left", "a:right")
@@ -54,7 +51,7 @@ def test_several_columns_are_several_channels(tmp_path: Path) -> None:
     assert found.notes == ()
 
 
-def test_numpy_files(tmp_path: Path) -> None:
+def test_numpy_files(tmp_path):
     np.save(tmp_path / "columns.npy", np.stack([DN, COUNTS], axis=1))
     np.save(tmp_path / "line.npy", np.array(WANTED, np.uint64))
     np.save(tmp_path / "channels.npy", np.array([WANTED, [0, 0, 0, 0, 9]]))
@@ -71,7 +68,7 @@ def test_numpy_files(tmp_path: Path) -> None:
     assert two.names == ("two:0", "two:1")
 
 
-def test_several_files_and_large_counts(tmp_path: Path) -> None:
+def test_several_files_and_large_counts(tmp_path):
     (tmp_path / "c2.csv").write_text("0,1\n1,2\n")
     (tmp_path / "c10.csv").write_text(f"-5,{2**40}\n-4,1\n-3,1\n")
     found = read(tmp_path, "c*.csv")
@@ -102,7 +99,7 @@ def test_several_files_and_large_counts(tmp_path: Path) -> None:
         ("1,1e300\n2,1\n", "too large to be exact"),
     ],
 )
-def test_refusals(tmp_path: Path, text: str, words: str) -> None:
+def test_refusals(tmp_path, text, words):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError, match=words) as caught:
         read(tmp_path, "a.csv")
@@ -111,8 +108,8 @@ def test_refusals(tmp_path: Path, text: str, words: str) -> None:
     assert caught.value.exit_code == 4
 
 
-def test_refusals_of_numpy_files(tmp_path: Path) -> None:
-    def refused(words: str, name: str) -> None:
+def test_refusals_of_numpy_files(tmp_path):
+    def refused(words, name):
         with pytest.raises(InputError, match=words):
             read(tmp_path, name)
 
@@ -138,7 +135,7 @@ def test_refusals_of_numpy_files(tmp_path: Path) -> None:
     refused("give histograms as", "x.dat")
 
 
-def test_all_bad_files_in_one_message(tmp_path: Path) -> None:
+def test_all_bad_files_in_one_message(tmp_path):
     (tmp_path / "a.csv").write_text("1,2\n2,3\n")
     (tmp_path / "b.csv").write_text("1,-2\n")
     (tmp_path / "c.csv").write_text("")
@@ -153,11 +150,11 @@ def test_all_bad_files_in_one_message(tmp_path: Path) -> None:
         read(tmp_path)
 
 
-def test_what_is_a_histogram_input(tmp_path: Path) -> None:
+def test_what_is_a_histogram_input(tmp_path):
     (tmp_path / "a.csv").write_text("1,2\n2,3\n")
     np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), np.uint8))
 
-    def kind(*files: str, format: str = "auto") -> bool:
+    def kind(*files, format="auto"):
         return is_histogram_input(InputSettings(files=files, format=format), tmp_path)
 
     assert kind("a.csv")
@@ -170,7 +167,7 @@ def test_what_is_a_histogram_input(tmp_path: Path) -> None:
         kind("a.csv", "a.npy")
 
 
-def test_tables_that_are_none(tmp_path: Path) -> None:
+def test_tables_that_are_none(tmp_path):
     wide = "DN," + ",".join(f"c{i}" for i in range(1000))
     cases = {
         "cell": ("DN,count\n1," + "9" * 131_073, "no table of numbers"),

@@ -242,10 +242,7 @@ def test_the_joint_fit_confirms_a_split():
 
 def test_the_command_in_words_and_files(tmp_path):
     request = PlanRequest(
-        read_noise_e=0.3,
-        quanta_exposure=2.0,
-        targets=("conversion_gain=1%",),
-        json=tmp_path / "plan.json",
+        read_noise_e=0.3, quanta_exposure=2.0, targets=("conversion_gain=1%",), json=tmp_path / "plan.json"
     )
     text = make_plan(request)
     content = json.loads((tmp_path / "plan.json").read_text())

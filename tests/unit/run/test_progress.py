@@ -22,13 +22,13 @@ from pchem_pipeline.run.progress import (
 from pchem_pipeline.store.run_store import RunStore
 
 
-def test_rate_and_remaining_time_are_means_of_this_run() -> None:
+def test_rate_and_remaining_time_are_means_of_this_run():
     pace = paced("fit", "tile", done=30, total=64, new=10, seconds=5.0)
     assert (pace["rate"], pace["remaining"]) == (2.0, 17.0)
     assert paced("fit", "tile", done=20, total=64, new=0, seconds=0.1)["remaining"] is None
 
 
-def test_json_lines_tell_the_pace(tmp_path: Path) -> None:
+def test_json_lines_tell_the_pace(tmp_path):
     reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
     with reporter.progress("fit", 4, "tile", done=1) as advance:
         for _ in range(3):
@@ -44,7 +44,7 @@ def test_json_lines_tell_the_pace(tmp_path: Path) -> None:
     assert last["rate"] > 100
 
 
-def test_a_bar_moves_within_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bar_moves_within_a_unit(tmp_path, monkeypatch):
     clock = iter(range(1000))
     monkeypatch.setattr("pchem_pipeline.run.progress.time.monotonic", lambda: 2.0 * next(clock))
     reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
@@ -57,7 +57,7 @@ def test_a_bar_moves_within_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert events[1]["remaining"] > 0
 
 
-def test_the_time_of_compiling_is_no_part_of_the_rate(tmp_path: Path) -> None:
+def test_the_time_of_compiling_is_no_part_of_the_rate(tmp_path):
     reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
     with reporter.compilation("fit"), reporter.progress("fit", 1000, "tile") as advance:
         heard(("one", None), ("one", 1e4))
@@ -68,9 +68,7 @@ def test_the_time_of_compiling_is_no_part_of_the_rate(tmp_path: Path) -> None:
     assert [each["rate"] for each in events if each["event"] == "progress"][-1] == pytest.approx(1e6)
 
 
-def test_phases_are_named_and_named_again_where_nothing_else_is_heard(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_phases_are_named_and_named_again_where_nothing_else_is_heard(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pchem_pipeline.run.progress._SILENCE", 0.5)
     run = RunStore.create(tmp_path / "run.zarr")
     store = run.path
@@ -92,7 +90,7 @@ def test_phases_are_named_and_named_again_where_nothing_else_is_heard(
     assert [event["event"] for event in events[:3]] == ["phase", "phase", "still"]
 
 
-def test_a_bar_shows_rate_and_remaining_time(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bar_shows_rate_and_remaining_time(capsys):
     reporter = Reporter("on")
     with reporter.progress("fit", 3, "tile") as advance:
         advance()
@@ -101,7 +99,7 @@ def test_a_bar_shows_rate_and_remaining_time(capsys: pytest.CaptureFixture[str])
     assert "0/3 [00:00<?, ? tile/s]" in shown
 
 
-def test_others_see_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
+def test_others_see_how_far_it_is_until_it_ends(tmp_path):
     run = RunStore.create(tmp_path / "run.zarr")
     store = run.path
     assert read_progress(store) is None
@@ -119,7 +117,7 @@ def test_others_see_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
     assert [path.name for path in (store / ".pchem").iterdir()] == ["lock"]
 
 
-def test_what_a_killed_process_left_counts_as_nothing(tmp_path: Path) -> None:
+def test_what_a_killed_process_left_counts_as_nothing(tmp_path):
     """The lock decides, not a number of a process, which another one may have by now."""
     store = RunStore.create(tmp_path / "run.zarr")
     place = store.path / ".pchem" / "progress.json"
@@ -134,7 +132,7 @@ def test_what_a_killed_process_left_counts_as_nothing(tmp_path: Path) -> None:
             assert read_progress(store.path) is None
 
 
-def test_what_is_wrong_or_moves_the_cursor_does_not_get_through(tmp_path: Path) -> None:
+def test_what_is_wrong_or_moves_the_cursor_does_not_get_through(tmp_path):
     store = RunStore.create(tmp_path / "run.zarr")
     content = {
         "stage": "fit\x1b[2J\x07: now",
@@ -157,7 +155,7 @@ def test_what_is_wrong_or_moves_the_cursor_does_not_get_through(tmp_path: Path) 
     ]
 
 
-def test_a_folder_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_stops_nothing(tmp_path):
     (tmp_path / "file").touch()
     ProgressFile(tmp_path / "file").show({"stage": "fit"})
     ProgressFile(tmp_path / "file").remove()

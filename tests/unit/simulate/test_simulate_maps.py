@@ -19,7 +19,7 @@ PLAIN = {
 }
 
 
-def settings(shape=(12, 10), seed=1, **parameters) -> SimulateSettings:
+def settings(shape=(12, 10), seed=1, **parameters):
     return SimulateSettings(shape=shape, seed=seed, parameters={**PLAIN, **parameters})
 
 

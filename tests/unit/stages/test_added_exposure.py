@@ -1,7 +1,5 @@
 """Exposure beside H: how effects give it, how it is put together, and how the store keeps it."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -25,7 +23,7 @@ MAPS = PixelMaps(*(np.full((6, 8), v) for v in (1.5, 0.1, 100.0, 3.0)), np.ones(
 GHOST = Persistence(peak_e=0.5, decay_frames=300.0, slow_decay_frames=2000.0, radius=0.3)
 
 
-def test_ghost_has_the_moments_of_its_course() -> None:
+def test_ghost_has_the_moments_of_its_course():
     numbers = np.arange(1000)
     frames = np.zeros((0, 6, 8), np.uint16)
     added = GHOST.added_exposure(frames, numbers, MAPS)
@@ -39,7 +37,7 @@ def test_ghost_has_the_moments_of_its_course() -> None:
     assert Persistence(peak_e=0.0, decay_frames=300.0).added_exposure(frames, numbers, MAPS) is None
 
 
-def test_effects_add_up_and_the_others_add_nothing() -> None:
+def test_effects_add_up_and_the_others_add_nothing():
     one = AddedExposure(np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[0.7, 1.0], [0.3, 0.0]]))
     two = AddedExposure(np.array([[0.1, 0.2], [0.4, 0.6]]), np.array([[0.5, 0.5], [0.5, 0.5]]))
     both = one.combined_with(two)
@@ -57,9 +55,9 @@ def test_effects_add_up_and_the_others_add_nothing() -> None:
     assert added_exposures([RowNoise(row_noise_dn=1.0)], frames, np.arange(1000), MAPS) is None
 
 
-def test_an_effect_that_fails_is_named() -> None:
+def test_an_effect_that_fails_is_named():
     class Broken(RowNoise):
-        def added_exposure(self, *_: object) -> AddedExposure | None:
+        def added_exposure(self, *_):
             raise ZeroDivisionError("oh")
 
     frames = np.zeros((2, 6, 8), np.uint16)
@@ -67,9 +65,7 @@ def test_an_effect_that_fails_is_named() -> None:
         added_exposures([Broken(row_noise_dn=1.0)], frames, np.arange(2), MAPS)
 
 
-def test_a_version_of_the_model_gives_it_back_and_models_with_the_same_effect_take_it_over(
-    tmp_path: Path,
-) -> None:
+def test_a_version_of_the_model_gives_it_back_and_models_with_the_same_effect_take_it_over(tmp_path):
     store = RunStore.create(tmp_path / "run.zarr")
     store.create_array("histogram/origin", (8, 9), chunks=(8, 9))
     blinking, noise = DarkCurrentRts(fraction=0.1), RowNoise(row_noise_dn=1.0)

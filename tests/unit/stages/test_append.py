@@ -1,7 +1,5 @@
 """Frames appended to a finished run: what all frames together give, without reading the old ones."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers.commands import arrays_of
@@ -13,7 +11,7 @@ from pchem_pipeline.compute import memory
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.stage import Options
-from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.fit.fit import kept_fit
 from pchem_pipeline.store.run_store import RunStore
@@ -29,12 +27,12 @@ def frames():
     return stack
 
 
-def write(folder: Path, frames, cuts) -> None:
+def write(folder, frames, cuts):
     for number, part in enumerate(np.split(frames, cuts)):
         np.save(folder / f"f{number}.npy", part)
 
 
-def target(folder: Path, store: str, files: tuple[str, ...] = ("f*.npy",), **sections) -> Target:
+def target(folder, store, files=("f*.npy",), **sections):
     content = {"run": {"store": store, "tile": 32}, "input": {"files": list(files), "mode": "reference"}}
     content |= {"histogram": {"window_frames": 64, "block_frames": 96}, "compute": {"workers": 2}}
     for name, values in sections.items():

@@ -127,7 +127,7 @@ def test_several_processes_that_make_the_same_store_at_once_have_it_all(tmp_path
 def test_a_folder_that_another_process_makes_meanwhile_is_no_stranger(tmp_path, monkeypatch):
     asked, is_dir = [], Path.is_dir
 
-    def meanwhile(path: Path) -> bool:
+    def meanwhile(path):
         found = is_dir(path)
         if path.name == "run.zarr" and not found:
             asked.append(path)

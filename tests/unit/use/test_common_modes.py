@@ -178,7 +178,7 @@ class Stranger(RowNoise):
 
     says: ClassVar[SharedOffset] = SharedOffset("column", 4.0)
 
-    def shared_offset(self) -> SharedOffset:
+    def shared_offset(self):
         return self.says
 
 

@@ -1,6 +1,6 @@
 """From effects to the law of the pixels, and what the fit of a tile makes of it."""
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
@@ -27,28 +27,28 @@ class Broken(Effect):
     tag: Literal["broken"] = "broken"
     plane: ClassVar[Plane] = Plane.ANALOG
 
-    def apply(self, values: Any, context: Any) -> Any:
+    def apply(self, values, context):
         return values
 
-    def sample_law(self, model: SampleLaw, maps: Any) -> SampleLaw:
+    def sample_law(self, model, maps):
         raise IndexError("list index out of range")
 
 
 class Wide(Broken):
     """Variance in e-^2 that grows with the pixel's own exposure."""
 
-    tag: Literal["wide"] = "wide"  # type: ignore[assignment]
+    tag: Literal["wide"] = "wide"
 
-    def sample_law(self, model: SampleLaw, maps: Any) -> SampleLaw:
+    def sample_law(self, model, maps):
         return model.with_variance(e2=0.01 * np.nan_to_num(maps.quanta_exposure))
 
 
-def maps_of(*exposures: float):
+def maps_of(*exposures):
     h = np.array(exposures)
     return pixel_maps([h, h * 0 + 0.1, h * 0 + 100, h * 0 + 2.5], np.ones(h.size, bool))
 
 
-def test_effects_add_up_in_their_order() -> None:
+def test_effects_add_up_in_their_order():
     maps = maps_of(1.0, np.nan, 3.0)
     assert maps.usable.tolist() == [True, False, True]
     assert np.isnan(maps.bias).tolist() == [False, True, False]
@@ -60,7 +60,7 @@ def test_effects_add_up_in_their_order() -> None:
     assert model_words([]) == "PCD"
 
 
-def test_new_effects_stand_where_the_signal_comes_to_them() -> None:
+def test_new_effects_stand_where_the_signal_comes_to_them():
     limit, clamp, steps = Clipping(high=260), BlackClamp(follow=0.4), AdcInl(inl_lsb=1.0, period_dn=64.0)
     rows, repeated = RowNoise(row_noise_dn=0.5), RepeatedFrames(probability=0.1)
     chain = rows, clamp, steps, limit, repeated
@@ -70,14 +70,14 @@ def test_new_effects_stand_where_the_signal_comes_to_them() -> None:
     assert along_chain((limit, clamp), (repeated, rows)) == (rows, limit, clamp, repeated)
 
 
-def test_an_effect_that_raises_is_named() -> None:
+def test_an_effect_that_raises_is_named():
     with pytest.raises(
         ConfigError, match=r"model\.effects: broken \(test_effects_compose\).*IndexError.*remove it"
     ):
         sample_law([RowNoise(row_noise_dn=0.5), Broken()], maps_of(1.0))
 
 
-def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
+def test_tile_without_effects_is_the_plain_fit_and_with_them_not():
     pixels = draw(np.random.default_rng(6), [0.5, 2.0, 1.0, 4.0], 11.0, 0.3)
     histogram = {
         "counts": pixels.counts.reshape(2, 2, -1),
@@ -105,7 +105,7 @@ def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
     assert np.isnan(extended["satellite_amplitude_e"]).all()
 
 
-def test_the_nearest_pcd_has_the_whole_width_of_the_peaks() -> None:
+def test_the_nearest_pcd_has_the_whole_width_of_the_peaks():
     columns = [
         np.array([2.0, np.nan]),
         np.array([0.1, np.nan]),

@@ -1,7 +1,6 @@
 """Properties of every effect: described, neutral at no strength, the same frames in any division."""
 
 import itertools
-from typing import Any
 
 import numpy as np
 import pytest
@@ -104,7 +103,7 @@ EVERY: list[Effect] = [
 SCALED = [effect for effect in EVERY if effect.strength and getattr(effect, effect.strength)]
 
 
-def frames(*effects: Effect, shape: Any = SHAPE, n: int = N_FRAMES, **part: Any) -> Any:
+def frames(*effects, shape=SHAPE, n=N_FRAMES, **part):
     """Return frames and electron numbers of a sensor with effects."""
     return simulated(a_sensor(shape), *effects, n_frames=n, seed=8, **part)
 

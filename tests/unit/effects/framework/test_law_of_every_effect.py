@@ -68,7 +68,7 @@ def test_the_law_is_that_of_the_samples(effect):
     sigma = np.sqrt((NOISE_E / GAIN) ** 2 + 1 / 12)
     maps = PixelMaps.known([np.array([v]) for v in (EXPOSURE, GAIN, BIAS, sigma)], np.ones(1, bool))
 
-    def misfit(model: SampleLaw) -> float:
+    def misfit(model):
         expected = sample_mass(model, maps, CODES)[0] * inside.size
         some = expected > 10
         chi2 = ((seen - expected)[some] ** 2 / expected[some]).sum()

@@ -1,7 +1,5 @@
 """Curves of voltage and code: forward models, and what the estimator makes of an independent camera."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from helpers.small_sensors import context_of, seen
@@ -12,13 +10,13 @@ from pchem_pipeline.effects.operators.curve import AdcDnl, AdcInl, Clipping, Gai
 from pchem_pipeline.effects.operators.replace import RepeatedFrames
 
 
-def coded(effect: AdcDnl | AdcInl, values: Any, **kwargs: Any) -> Any:
+def coded(effect, values, **kwargs):
     values = np.asarray(values, float).reshape(-1, 1, 1)
     context = context_of((1, 1), len(values), **kwargs)
     return np.rint(effect.apply(values, context)).astype(int).ravel()
 
 
-def edges_of(effect: AdcDnl | AdcInl, first: int, last: int, **kwargs: Any) -> Any:
+def edges_of(effect, first, last, **kwargs):
     """Return where codes first + 1 .. last begin."""
     fine = np.arange(first - 0.5, last + 0.5, 1e-3) + 5e-4
     codes = coded(effect, fine, **kwargs)

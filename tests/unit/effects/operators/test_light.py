@@ -167,7 +167,7 @@ def test_bursts_so_bright_that_they_mislead_the_fits_keep_their_form(seed):
     assert found.radius == pytest.approx(0.2, rel=0.1)
 
 
-def test_a_spot_that_no_cell_shows_is_no_guess() -> None:
+def test_a_spot_that_no_cell_shows_is_no_guess():
     rng = np.random.default_rng(5)
     lost = np.full((4, 4), 0.01)
     lost[:2] = np.inf  # no usable pixel in the upper half

@@ -1,13 +1,10 @@
 """Samples replaced by others: forward models, laws, and estimators."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.discrepancy.observe.misplaced import own_lines
-from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted
 from pchem_pipeline.effects.operators.offsets import RowNoise
@@ -28,7 +25,7 @@ from pchem_pipeline.simulate.settings import SimulateSettings
 N_FRAMES, SMALL = 14, (6, 5)
 
 
-def frames_of(*effects: Effect) -> Any:
+def frames_of(*effects):
     sensor = SimulateSettings(shape=SMALL, n_frames=N_FRAMES, seed=8, effects=effects)
     return simulate_block(drawn_truth(SMALL), sensor, (0, N_FRAMES))[0]
 

@@ -1,7 +1,5 @@
 """FITS: facts of its headers, what must be chosen, what is reported and what is refused."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -16,7 +14,7 @@ STACK = np.random.default_rng(12).integers(0, 65536, (5, 18, 23)).astype(np.uint
 
 @pytest.mark.parametrize("keyword", ["EXPTIME", "EXPOSURE", "TELAPSE"])
 @pytest.mark.parametrize("extension", [False, True])
-def test_facts_are_taken_from_the_header(tmp_path: Path, keyword: str, extension: bool) -> None:
+def test_facts_are_taken_from_the_header(tmp_path, keyword, extension):
     primary = fits.PrimaryHDU() if extension else fits.PrimaryHDU(STACK)
     primary.header[keyword] = 4.87
     primary.header["BITDEPTH"] = 16
@@ -27,7 +25,7 @@ def test_facts_are_taken_from_the_header(tmp_path: Path, keyword: str, extension
     assert reader.bit_depth == 16
 
 
-def test_values_that_may_be_no_samples_are_reported(tmp_path: Path) -> None:
+def test_values_that_may_be_no_samples_are_reported(tmp_path):
     for i in range(3):
         unit = fits.PrimaryHDU(STACK[i : i + 3])
         unit.header["BLANK"] = -32768
@@ -40,7 +38,7 @@ def test_values_that_may_be_no_samples_are_reported(tmp_path: Path) -> None:
         ]
 
 
-def test_compression_that_loses_is_reported(tmp_path: Path) -> None:
+def test_compression_that_loses_is_reported(tmp_path):
     path = tmp_path / "a.fits"
     for scale, notes in ((0, 0), (4, 1)):
         unit = fits.CompImageHDU(
@@ -52,7 +50,7 @@ def test_compression_that_loses_is_reported(tmp_path: Path) -> None:
         assert np.array_equal(reader.read(), STACK) == (scale == 0)
 
 
-def test_unsigned_plio_is_refused(tmp_path: Path) -> None:
+def test_unsigned_plio_is_refused(tmp_path):
     """The format's own library writes it, shifted by an offset that astropy does not take back."""
     path = tmp_path / "a.fits"
     fits.CompImageHDU((STACK & 0xFFF).astype(np.int16), compression_type="PLIO_1").writeto(path)
@@ -62,7 +60,7 @@ def test_unsigned_plio_is_refused(tmp_path: Path) -> None:
     refused("unsigned samples compressed by PLIO", path)
 
 
-def test_several_images_must_be_chosen_from(tmp_path: Path) -> None:
+def test_several_images_must_be_chosen_from(tmp_path):
     path = tmp_path / "two.fits"
     units = [fits.PrimaryHDU(), fits.ImageHDU(STACK, name="DARK"), fits.ImageHDU(STACK + 1, name="FLAT")]
     fits.HDUList(units).writeto(path)
@@ -72,7 +70,7 @@ def test_several_images_must_be_chosen_from(tmp_path: Path) -> None:
     refused("with this name: none", path, dataset="BIAS")
 
 
-def test_scaled(tmp_path: Path) -> None:
+def test_scaled(tmp_path):
     path = tmp_path / "f.fits"
     scaled = fits.PrimaryHDU(STACK.astype(np.int16))
     scaled.header["BSCALE"], scaled.header["BZERO"] = 0.5, 10.0
@@ -80,7 +78,7 @@ def test_scaled(tmp_path: Path) -> None:
     refused(r"scaled data \(BSCALE 0.5", path)
 
 
-def test_no_image(tmp_path: Path) -> None:
+def test_no_image(tmp_path):
     path = tmp_path / "table.fits"
     fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU(np.zeros(3, [("a", "i4")]))]).writeto(path)
     refused("no image", path)

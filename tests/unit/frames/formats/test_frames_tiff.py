@@ -1,7 +1,6 @@
 """TIFF: stacks as cameras write them, facts of its tags, what is reported and what is refused."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from pchem_pipeline.frames.settings import InputSettings
 STACK = np.random.default_rng(11).integers(0, 4096, (6, 21, 34)).astype(np.uint16)
 
 
-def test_twelve_bits_packed(tmp_path: Path) -> None:
+def test_twelve_bits_packed(tmp_path):
     """Bits packed without gaps, as machine-vision recorders write them: two samples in three bytes."""
     path = tmp_path / "packed.tif"
     columns = 34
@@ -43,7 +42,7 @@ def test_twelve_bits_packed(tmp_path: Path) -> None:
     np.testing.assert_array_equal(reader.read(0, 1, 5, 9), STACK[:1, 5:9])
 
 
-def test_imagej_stack_with_one_directory(tmp_path: Path) -> None:
+def test_imagej_stack_with_one_directory(tmp_path):
     """ImageJ writes stacks above 4 GB with one directory, the number of images in its description."""
     path = tmp_path / "big_imagej.tif"
     description = f"ImageJ=1.53t\nimages={len(STACK)}\nframes={len(STACK)}\nhyperstack=true\n"
@@ -58,7 +57,7 @@ def test_imagej_stack_with_one_directory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(path), STACK)
 
 
-def test_metamorph_stack_with_one_directory(tmp_path: Path) -> None:
+def test_metamorph_stack_with_one_directory(tmp_path):
     """MetaMorph writes one directory, and counts the planes behind it by a tag of its own."""
     path = tmp_path / "a.stk"
     n = len(STACK)
@@ -70,13 +69,13 @@ def test_metamorph_stack_with_one_directory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(path), STACK)
 
 
-def test_volumes_are_refused(tmp_path: Path) -> None:
+def test_volumes_are_refused(tmp_path):
     path = tmp_path / "volume.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", volumetric=True, tile=(2, 16, 16))
     refused("pages of 6 x 21 x 34 uint16 are volumes", path)
 
 
-def test_pages_are_frames_although_metadata_tell_several_series(tmp_path: Path) -> None:
+def test_pages_are_frames_although_metadata_tell_several_series(tmp_path):
     path = tmp_path / "series.tif"
     with tifffile.TiffWriter(path) as writer:
         for block in (STACK[:2], STACK[2:3], STACK[3:]):
@@ -86,7 +85,7 @@ def test_pages_are_frames_although_metadata_tell_several_series(tmp_path: Path) 
     np.testing.assert_array_equal(read(path), STACK)
 
 
-def test_pages_coded_differently(tmp_path: Path) -> None:
+def test_pages_coded_differently(tmp_path):
     path = tmp_path / "mixed.tif"
     codings: list[dict[str, Any]] = [
         {"compression": "zlib", "rowsperstrip": 5}, {}, {"compression": "lzw"}, {"tile": (16, 16)},
@@ -99,7 +98,7 @@ def test_pages_coded_differently(tmp_path: Path) -> None:
     np.testing.assert_array_equal(reader.read(0, 6, 7, 18), STACK[:, 7:18])
 
 
-def test_previews_are_left_out_and_reported(tmp_path: Path) -> None:
+def test_previews_are_left_out_and_reported(tmp_path):
     path = tmp_path / "preview.tif"
     with tifffile.TiffWriter(path) as writer:
         for frame in STACK:
@@ -110,7 +109,7 @@ def test_previews_are_left_out_and_reported(tmp_path: Path) -> None:
     assert "1 reduced page" in reader.report.message()
 
 
-def test_facts_are_taken_from_the_file(tmp_path: Path) -> None:
+def test_facts_are_taken_from_the_file(tmp_path):
     exif = tmp_path / "exif.tif"
     tifffile.imwrite(exif, STACK, photometric="minisblack", extratags=[(33434, "2I", 1, (487, 100), True)])
     assert TiffReader.open(exif, InputSettings()).integration_time == pytest.approx(4.87)
@@ -132,14 +131,14 @@ def test_facts_are_taken_from_the_file(tmp_path: Path) -> None:
     assert TiffReader.open(plain, InputSettings()).bit_depth is None
 
 
-def test_exposure_in_the_exif_directory(tmp_path: Path) -> None:
+def test_exposure_in_the_exif_directory(tmp_path):
     tags = ImageFileDirectory_v2()
     tags[34665] = {33434: IFDRational(487, 100)}
     Image.fromarray(STACK[0]).save(tmp_path / "a.tif", tiffinfo=tags)
     assert TiffReader.open(tmp_path / "a.tif", InputSettings()).integration_time == pytest.approx(4.87)
 
 
-def test_channels_beside_frames_are_refused(tmp_path: Path) -> None:
+def test_channels_beside_frames_are_refused(tmp_path):
     """Frames of two channels in turn are no samples of one law; frames called channels are frames."""
     imagej, ome = tmp_path / "imagej.tif", tmp_path / "a.ome.tif"
     mixed = STACK.reshape(3, 2, *STACK.shape[1:])
@@ -156,7 +155,7 @@ def test_channels_beside_frames_are_refused(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(ome), STACK[:3])  # the other channel lies in another file
 
 
-def test_strips_that_were_never_written(tmp_path: Path) -> None:
+def test_strips_that_were_never_written(tmp_path):
     """GDAL leaves empty strips out: offset 0 and 0 bytes, where other bytes of the file must not be read."""
     path = tmp_path / "sparse.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", metadata=None)
@@ -171,7 +170,7 @@ def test_strips_that_were_never_written(tmp_path: Path) -> None:
     assert "1 of 6 strips or tiles was not written; read as the fill value" in reader.notes[0]
 
 
-def test_page_without_its_strips(tmp_path: Path) -> None:
+def test_page_without_its_strips(tmp_path):
     path = tmp_path / "unfinished.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", metadata=None, rowsperstrip=8, compression="lzw")
     with tifffile.TiffFile(path) as file:
@@ -182,13 +181,13 @@ def test_page_without_its_strips(tmp_path: Path) -> None:
     refused(r"unfinished\.tif: page 1 has 0 strips or tiles and 3 sizes", path)
 
 
-def test_compressed_planes_are_refused(tmp_path: Path) -> None:
+def test_compressed_planes_are_refused(tmp_path):
     path = tmp_path / "planes.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", planarconfig="separate", compression="zlib")
     refused("one page of 6 compressed planes; write one frame per page", path)
 
 
-def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path: Path) -> None:
+def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path):
     lossy = [Image.fromarray((frame >> 4).astype(np.uint8)) for frame in STACK]
     lossy[0].save(tmp_path / "jpeg.tif", save_all=True, append_images=lossy[1:], compression="jpeg")
     tifffile.imwrite(tmp_path / "white.tif", STACK, photometric="miniswhite")
@@ -198,7 +197,7 @@ def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path: Pat
         assert said in TiffReader.open(tmp_path / f"{name}.tif", InputSettings()).notes[0]
 
 
-def test_colour_is_refused(tmp_path: Path) -> None:
+def test_colour_is_refused(tmp_path):
     path = tmp_path / "rgb.tif"
     rgb = np.zeros((2, 8, 9, 3), np.uint8)
     tifffile.imwrite(path, rgb, photometric="rgb")
@@ -209,7 +208,7 @@ def test_colour_is_refused(tmp_path: Path) -> None:
     refused("PALETTE", path)
 
 
-def test_pages_of_another_shape_or_type(tmp_path: Path) -> None:
+def test_pages_of_another_shape_or_type(tmp_path):
     path = tmp_path / "odd.tif"
     for odd in (STACK[0, :5], STACK[0].astype(np.uint8)):
         with tifffile.TiffWriter(path) as writer:
@@ -218,7 +217,7 @@ def test_pages_of_another_shape_or_type(tmp_path: Path) -> None:
         refused(r"odd\.tif: page 2 is .* page 0 is 21 x 34 uint16", path)
 
 
-def test_damaged_strip_is_named(tmp_path: Path) -> None:
+def test_damaged_strip_is_named(tmp_path):
     path = tmp_path / "broken.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", compression="zlib")
     with tifffile.TiffFile(path) as file:

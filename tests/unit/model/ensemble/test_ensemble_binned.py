@@ -23,7 +23,7 @@ from pchem_pipeline.model.law.parameters import UsablePixels
 K = np.arange(150)
 
 
-def make_pixels(n: int, seed: int = 1) -> UsablePixels:
+def make_pixels(n, seed=1):
     rng = np.random.default_rng(seed)
     z = rng.standard_normal(n)
     g = 0.1 * np.exp(0.05 * z)
@@ -33,11 +33,11 @@ def make_pixels(n: int, seed: int = 1) -> UsablePixels:
     )
 
 
-def pcd(dn: np.ndarray, h: float, g: float, mu: float, variance: float) -> np.ndarray:
+def pcd(dn, h, g, mu, variance):
     return joint_mass(dn, h, g, mu, np.sqrt(variance), K.size).sum(axis=0)
 
 
-def test_cells_are_those_of_numpy() -> None:
+def test_cells_are_those_of_numpy():
     pixels = make_pixels(400)
     columns = (pixels.quanta_exposure, pixels.conversion_gain, pixels.bias)
     cells = joint_cells(columns, HistogramChoice(5, "full", "centre"))
@@ -58,17 +58,17 @@ def test_cells_are_those_of_numpy() -> None:
         assert found[key] == pytest.approx(count)
 
 
-def test_mean_representative_keeps_the_mean_of_the_map() -> None:
+def test_mean_representative_keeps_the_mean_of_the_map():
     pixels = make_pixels(400)
     hot = pixels.quanta_exposure.copy()
     hot[:3] = 500.0
     for span in ("central", "full"):
-        cells = joint_cells((hot, pixels.bias), HistogramChoice(6, span, "mean"))  # type: ignore[arg-type]
+        cells = joint_cells((hot, pixels.bias), HistogramChoice(6, span, "mean"))
         np.testing.assert_allclose(cells.values @ cells.share, [hot.mean(), pixels.bias.mean()], rtol=1e-12)
         assert cells.share.sum() == pytest.approx(1.0, abs=1e-12)
 
 
-def test_hot_pixels_do_not_widen_the_bins() -> None:
+def test_hot_pixels_do_not_widen_the_bins():
     pixels = make_pixels(1000)
     hot = pixels.quanta_exposure.copy()
     hot[:3] = 5000.0
@@ -79,16 +79,16 @@ def test_hot_pixels_do_not_widen_the_bins() -> None:
     assert central.values.max() == pytest.approx(5000.0)  # beyond the bins: mean of the occupants
 
 
-def test_a_constant_map_is_one_cell() -> None:
+def test_a_constant_map_is_one_cell():
     cells = joint_cells((np.full(9, 2.5),), HistogramChoice(4, "central", "centre"))
     np.testing.assert_allclose(cells.values, [[2.5]])
     np.testing.assert_allclose(cells.share, [1.0])
 
 
 @pytest.mark.parametrize("representative", ["mean", "centre"])
-def test_dependent_is_the_sum_over_cells(representative: str) -> None:
+def test_dependent_is_the_sum_over_cells(representative):
     pixels, dn = make_pixels(60), DnAxis(50, 250)
-    choice = HistogramChoice(3, "central", representative)  # type: ignore[arg-type]
+    choice = HistogramChoice(3, "central", representative)
     h, g, mu, sigma = pixels.maps
     cells = joint_cells((h, g, mu, sigma**2), choice)
     expected = sum(w * pcd(dn.dn, *v) for w, v in zip(cells.share, cells.values.T, strict=True))
@@ -96,9 +96,9 @@ def test_dependent_is_the_sum_over_cells(representative: str) -> None:
 
 
 @pytest.mark.parametrize("representative", ["mean", "centre"])
-def test_independent_is_the_sum_over_all_products(representative: str) -> None:
+def test_independent_is_the_sum_over_all_products(representative):
     pixels, dn = make_pixels(60), DnAxis(50, 250)
-    choice = HistogramChoice(3, "central", representative)  # type: ignore[arg-type]
+    choice = HistogramChoice(3, "central", representative)
     h, g, mu, sigma = pixels.maps
     marginals = [joint_cells((column,), choice) for column in (h, g, mu, sigma**2)]
     expected = np.zeros(dn.size)
@@ -108,7 +108,7 @@ def test_independent_is_the_sum_over_all_products(representative: str) -> None:
     np.testing.assert_allclose(epcd_independent(pixels, dn, choice), expected, rtol=1e-9, atol=2e-15)
 
 
-def test_independent_integrates_narrow_noise_over_the_cell() -> None:
+def test_independent_integrates_narrow_noise_over_the_cell():
     pixels = UsablePixels(np.array([2.0]), np.array([0.5]), np.array([10.3]), np.array([0.6]))
     dn = DnAxis(0, 60)
     density = epcd_independent(pixels, dn, HistogramChoice(2))
@@ -116,7 +116,7 @@ def test_independent_integrates_narrow_noise_over_the_cell() -> None:
     assert density.sum() == pytest.approx(1.0, abs=1e-12)
 
 
-def test_independent_on_a_short_axis_is_a_cut_of_the_long_one() -> None:
+def test_independent_on_a_short_axis_is_a_cut_of_the_long_one():
     pixels = make_pixels(60)
     long, short = DnAxis(0, 500), DnAxis(110, 20)
     choice = HistogramChoice(8)
@@ -125,12 +125,12 @@ def test_independent_on_a_short_axis_is_a_cut_of_the_long_one() -> None:
     )
 
 
-def test_nuced_is_the_sum_of_bin_means() -> None:
+def test_nuced_is_the_sum_of_bin_means():
     pixels, axis = make_pixels(60), NucedAxis(0.25, -8, 60)
     choice = HistogramChoice(3)
     low, high = (np.arange(60) - 8.5) * 0.25, (np.arange(60) - 7.5) * 0.25
 
-    def bin_mean(h: float, variance: float) -> np.ndarray:
+    def bin_mean(h, variance):
         sd = np.sqrt(variance)
         cells = norm.cdf(high, K[:, None], sd) - norm.cdf(low, K[:, None], sd)
         return np.asarray(poisson.pmf(K, h) @ cells / 0.25)
@@ -148,7 +148,7 @@ def test_nuced_is_the_sum_of_bin_means() -> None:
     np.testing.assert_allclose(nuced_independent(pixels, axis, choice), expected, rtol=1e-9, atol=1e-13)
 
 
-def test_binned_electron_mass() -> None:
+def test_binned_electron_mass():
     exposure = make_pixels(500).quanta_exposure
     choice = HistogramChoice(10, "full", "centre")
     counts, edges = np.histogram(exposure, bins=10)
@@ -157,7 +157,7 @@ def test_binned_electron_mass() -> None:
     np.testing.assert_allclose(electron_pmf_binned(exposure, 20, choice), expected, rtol=1e-10)
 
 
-def test_exposures_far_from_each_other_are_inverted_apart() -> None:
+def test_exposures_far_from_each_other_are_inverted_apart():
     """One hot and one very quiet pixel; the product of the four histograms is summed cell by cell."""
     rng = np.random.default_rng(3)
     n = 40
@@ -177,7 +177,7 @@ def test_exposures_far_from_each_other_are_inverted_apart() -> None:
     np.testing.assert_allclose(epcd_independent(pixels, dn, choice), expected, atol=1e-13)
 
 
-def test_what_is_beyond_the_limits_of_the_codes_is_at_these() -> None:
+def test_what_is_beyond_the_limits_of_the_codes_is_at_these():
     pixels = UsablePixels(*np.outer((1.0, 0.1, 2.0, 3.0), np.ones(30)))
     choice, dn = HistogramChoice(bins=4), DnAxis(0, 16)
     wide = epcd_dependent(pixels, DnAxis(-60, 300), choice)

@@ -21,7 +21,7 @@ from pchem_pipeline.model.law.parameters import UsablePixels, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
-def make_pixels(n: int, seed: int = 1, gain: float = 0.1) -> UsablePixels:
+def make_pixels(n, seed=1, gain=0.1):
     rng = np.random.default_rng(seed)
     g = gain * np.exp(0.05 * rng.standard_normal(n))
     return UsablePixels(
@@ -32,7 +32,7 @@ def make_pixels(n: int, seed: int = 1, gain: float = 0.1) -> UsablePixels:
     )
 
 
-def test_weighted_mass_is_that_of_the_formula() -> None:
+def test_weighted_mass_is_that_of_the_formula():
     # the last one is narrow, at an integer + 0.3: its density at the integers does not add up to 1
     wide = make_pixels(30)
     last = (0.0, 1.5), (0.1, 0.5), (100.2, 70.3), (3.0, 0.6)
@@ -44,14 +44,14 @@ def test_weighted_mass_is_that_of_the_formula() -> None:
     np.testing.assert_allclose(part, (share @ rows)[50:70], rtol=1e-10, atol=1e-13)
 
 
-def test_a_hot_pixel_keeps_its_mass() -> None:
+def test_a_hot_pixel_keeps_its_mass():
     pixels = UsablePixels(np.array([3000.0]), np.array([0.1]), np.array([100.0]), np.array([3.0]))
     density = weighted_mass(pixels, DnAxis(0, 60_000), np.ones(1))
     assert density.sum() == pytest.approx(1.0, abs=1e-10)
     assert density @ np.arange(60_000) == pytest.approx(100.0 + 30_000.0, rel=1e-10)
 
 
-def test_poisson_sums_are_those_of_all_pixels() -> None:
+def test_poisson_sums_are_those_of_all_pixels():
     exposure = np.array([0.4, 2e5, 0.0, 700.0, 1e-9, 8.0, 41.0])
     columns = np.random.default_rng(2).random((7, 2))
     found = poisson_sums(exposure, columns, 210_000)
@@ -59,7 +59,7 @@ def test_poisson_sums_are_those_of_all_pixels() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-20)
 
 
-def test_tally_is_that_of_the_samples() -> None:
+def test_tally_is_that_of_the_samples():
     rng = np.random.default_rng(3)
     pixels, dn, axis = make_pixels(12), DnAxis(90, 40), NucedAxis(0.11, -3, 30)
     samples = rng.integers(80, 150, size=(12, 500))
@@ -76,7 +76,7 @@ def test_tally_is_that_of_the_samples() -> None:
     assert result.nuced_sum_square == pytest.approx((values**2).sum(), rel=1e-12)
 
 
-def test_axis_is_not_stretched_by_one_strange_gain() -> None:
+def test_axis_is_not_stretched_by_one_strange_gain():
     pixels = make_pixels(1000)
     strange = UsablePixels(
         pixels.quanta_exposure,
@@ -93,7 +93,7 @@ def test_axis_is_not_stretched_by_one_strange_gain() -> None:
     assert nuced_axis(pixels, DnAxis(60, 200), width=0.25).width == 0.25
 
 
-def test_electron_mass_is_the_mean_of_poisson_masses() -> None:
+def test_electron_mass_is_the_mean_of_poisson_masses():
     exposure = np.array([0.0, 0.3, 2.0, 60.0])
     expected = poisson.pmf(np.arange(30), exposure[:, None]).mean(axis=0)
     np.testing.assert_allclose(electron_pmf(exposure, 30), expected, rtol=1e-11, atol=1e-17)
@@ -102,7 +102,7 @@ def test_electron_mass_is_the_mean_of_poisson_masses() -> None:
     np.testing.assert_allclose(electron_pmf(exposure, 30, share), expected, rtol=1e-11, atol=1e-17)
 
 
-def test_parameters_must_be_usable() -> None:
+def test_parameters_must_be_usable():
     good = np.ones(3)
     with pytest.raises(ValueError, match="usable"):
         UsablePixels(good, good, good, np.array([1.0, np.nan, 1.0]))
@@ -118,7 +118,7 @@ def test_parameters_must_be_usable() -> None:
 
 
 @pytest.mark.parametrize(("place", "value"), [(0, 1e9), (1, 1e-12), (1, 1e9), (2, -1e300), (3, 1e12)])
-def test_absurd_parameters_are_not_usable(place: int, value: float) -> None:
+def test_absurd_parameters_are_not_usable(place, value):
     # a runaway fit must neither fill the memory nor overflow an index
     columns = [np.array([v, v]) for v in (2.0, 0.1, 100.0, 3.0)]
     columns[place][1] = value
@@ -126,7 +126,7 @@ def test_absurd_parameters_are_not_usable(place: int, value: float) -> None:
 
 
 @pytest.mark.parametrize("law", [SampleLaw(), SampleLaw().with_noise([0.5, 0.5], shift_e=[0.0, 0.5])])
-def test_masses_are_sorted_onto_both_axes(law: SampleLaw) -> None:
+def test_masses_are_sorted_onto_both_axes(law):
     pixels, dn = make_pixels(8), DnAxis(40, 220)
     axis = NucedAxis(0.1, -100, 400)
     known = KnownPixels(pixels, law)

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 from helpers.drawn_pixels import draw
-from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit import search_numba
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import (
     FAILED,
@@ -21,32 +19,30 @@ from pchem_pipeline.model.fit.status import (
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 
 
-def fit_one(counts: NDArray[np.generic], origin: int = 100, **options: object) -> FitResult:
-    return fit_histograms(np.asarray(counts, np.uint32)[None], np.array([origin]), **options)  # type: ignore[arg-type]
+def fit_one(counts, origin=100, **options):
+    return fit_histograms(np.asarray(counts, np.uint32)[None], np.array([origin]), **options)
 
 
-def drawn(
-    exposure: float, step: float, noise: float, seed: int = 1, n_frames: int = 17_750, **options: object
-) -> FitResult:
+def drawn(exposure, step, noise, seed=1, n_frames=17_750, **options):
     pixel = draw(np.random.default_rng(seed), exposure, step, noise, n_frames=n_frames)
-    return fit_histograms(pixel.counts, pixel.origin, **options)  # type: ignore[arg-type]
+    return fit_histograms(pixel.counts, pixel.origin, **options)
 
 
-def word(result: FitResult) -> FitStatus:
+def word(result):
     return FitStatus(int(result.fit_status[0]))
 
 
-def histogram_of(values: NDArray[np.floating], size: int = 400) -> NDArray[np.int64]:
+def histogram_of(values, size=400):
     return np.bincount(np.rint(values).astype(int), minlength=size)
 
 
-def test_no_data() -> None:
+def test_no_data():
     assert word(fit_one(np.zeros(50))) == FitStatus.NO_DATA
     assert word(fit_one(np.zeros(0))) == FitStatus.NO_DATA
     assert word(fit_one(np.zeros(50), adc_limits=(100, 149))) == FitStatus.NO_DATA
 
 
-def test_fewer_than_three_bins() -> None:
+def test_fewer_than_three_bins():
     counts = np.zeros(50)
     counts[7] = 1000
     assert word(fit_one(counts)) == FitStatus.TOO_FEW_BINS
@@ -55,7 +51,7 @@ def test_fewer_than_three_bins() -> None:
     assert np.isnan(fit_one(counts).bias[0])
 
 
-def test_not_converged_holds_nan() -> None:
+def test_not_converged_holds_nan():
     settings = FitSettings(algorithm="em", em_max_iterations=20, likelihood="density")
     result = drawn(2.0, 11.0, 0.4, settings=settings)
     assert word(result) & FitStatus.NOT_CONVERGED
@@ -63,20 +59,20 @@ def test_not_converged_holds_nan() -> None:
     assert np.isnan(result.covariance).all()
 
 
-def test_gain_not_identified_without_electrons() -> None:
+def test_gain_not_identified_without_electrons():
     rng = np.random.default_rng(3)
     for sigma in (2.0, 3.0, 5.0):
         assert word(fit_one(histogram_of(rng.normal(60, sigma, 17_750)))) & FitStatus.GAIN_NOT_IDENTIFIED
 
 
-def test_exposure_at_its_lower_bound() -> None:
+def test_exposure_at_its_lower_bound():
     result = drawn(0.03, 11.0, 0.2, settings=FitSettings(minimum_quanta_exposure=0.1))
     assert word(result) & FitStatus.EXPOSURE_AT_BOUND
     assert np.isnan(result.conversion_gain[0])
     assert not word(drawn(0.03, 11.0, 0.2)) & FitStatus.EXPOSURE_AT_BOUND
 
 
-def test_bias_ambiguous() -> None:
+def test_bias_ambiguous():
     result = drawn(40.0, 11.0, 0.35)
     assert word(result) & FitStatus.BIAS_AMBIGUOUS
     assert result.likelihood_gap[0] < 5
@@ -85,7 +81,7 @@ def test_bias_ambiguous() -> None:
     assert not word(strict) & FitStatus.BIAS_AMBIGUOUS
 
 
-def test_a_rival_is_of_bias_where_peaks_are_resolved_and_of_gain_where_they_overlap() -> None:
+def test_a_rival_is_of_bias_where_peaks_are_resolved_and_of_gain_where_they_overlap():
     resolved, overlapping = drawn(20.0, 11.0, 0.15, n_frames=500), drawn(20.0, 11.0, 0.4, n_frames=500)
     assert word(resolved) & FLAGGED == FitStatus.BIAS_AMBIGUOUS
     assert word(overlapping) & FitStatus.GAIN_AMBIGUOUS
@@ -95,7 +91,7 @@ def test_a_rival_is_of_bias_where_peaks_are_resolved_and_of_gain_where_they_over
     assert not with_rivals_named(0 * words, dark=True).any()
 
 
-def test_flags_name_what_they_concern() -> None:
+def test_flags_name_what_they_concern():
     for name in ("quanta_exposure", "bias", "dark_current"):
         assert flags_of(name) == FLAGGED
     for name in ("conversion_gain", "read_noise_dn", "read_noise_e", "analog_read_noise_e"):
@@ -103,7 +99,7 @@ def test_flags_name_what_they_concern() -> None:
     assert [int(FitStatus.BIAS_AMBIGUOUS), int(FitStatus.WEAKLY_IDENTIFIED)] == [32, 2048]  # in old files
 
 
-def test_bias_frames_make_it_the_gain_that_is_ambiguous() -> None:
+def test_bias_frames_make_it_the_gain_that_is_ambiguous():
     rng = np.random.default_rng(4)
     shown = draw_histograms(rng, np.full(60, 8.0), 0.09, 100.0 + rng.random(60), 0.7, 400)
     dark = draw_histograms(rng, 0.0, shown.truth[:, 1], shown.truth[:, 2], 0.7, 400)
@@ -115,7 +111,7 @@ def test_bias_frames_make_it_the_gain_that_is_ambiguous() -> None:
     assert not np.any(fit.fit_status & int(FitStatus.BIAS_AMBIGUOUS))
 
 
-def test_not_informative() -> None:
+def test_not_informative():
     result = drawn(1.0, 11.0, 0.6)
     assert word(result) & FitStatus.NOT_INFORMATIVE
     assert np.isfinite(result.conversion_gain[0])
@@ -125,7 +121,7 @@ def test_not_informative() -> None:
     )
 
 
-def test_adc_limits() -> None:
+def test_adc_limits():
     pixel = draw(np.random.default_rng(1), 2.0, 11.0, 0.3)
     seen = pixel.origin[0] + np.flatnonzero(pixel.counts[0])
     low, high = int(seen[0]), int(seen[-1])
@@ -135,7 +131,7 @@ def test_adc_limits() -> None:
         assert bool(word(result) & FitStatus.ADC_LIMIT) is expected
 
 
-def test_outside_the_window() -> None:
+def test_outside_the_window():
     pixel = draw(np.random.default_rng(1), 2.0, 11.0, 0.3)
     for name in ("under", "over"):
         result = fit_histograms(pixel.counts, pixel.origin, **{name: np.array([3])})
@@ -152,7 +148,7 @@ def test_outside_the_window() -> None:
     assert word(nothing) == FitStatus.OK
 
 
-def test_poor_fit_of_a_telegraph_pixel() -> None:
+def test_poor_fit_of_a_telegraph_pixel():
     rng = np.random.default_rng(5)
     values = rng.normal(50, 3, 17_750) + 30.0 * (rng.random(17_750) < 0.5)
     result = fit_one(histogram_of(values))
@@ -160,7 +156,7 @@ def test_poor_fit_of_a_telegraph_pixel() -> None:
     assert result.goodness_p[0] < 1e-6
 
 
-def test_coarse_steps() -> None:
+def test_coarse_steps():
     density = FitSettings(likelihood="density")
     assert word(drawn(2.0, 2.2, 0.35, settings=density)) & FitStatus.COARSE_STEPS
     assert not word(drawn(2.0, 4.0, 0.3, settings=density)) & FitStatus.COARSE_STEPS
@@ -168,7 +164,7 @@ def test_coarse_steps() -> None:
         assert not word(drawn(2.0, 2.2, 0.25, n_frames=n_frames)) & FitStatus.COARSE_STEPS
 
 
-def test_every_word_has_a_sentence_and_the_loops_agree_on_the_bits() -> None:
+def test_every_word_has_a_sentence_and_the_loops_agree_on_the_bits():
     assert set(MEANINGS) == set(FitStatus)
     everything = int(sum(FitStatus))
     assert describe(everything).count(";") >= len(MEANINGS) - 1
@@ -179,7 +175,7 @@ def test_every_word_has_a_sentence_and_the_loops_agree_on_the_bits() -> None:
         assert getattr(search_numba, name) == FitStatus[names.get(name, name)]
 
 
-def degenerate_pixels() -> dict[str, NDArray[np.generic]]:
+def degenerate_pixels():
     rng = np.random.default_rng(0)
     pixel = draw(rng, 2.0, 11.0, 0.3)
     values = pixel.origin[0] + np.repeat(np.arange(pixel.counts.shape[1]), pixel.counts[0])
@@ -208,9 +204,9 @@ def degenerate_pixels() -> dict[str, NDArray[np.generic]]:
 
 
 @pytest.mark.timeout(60)
-def test_degenerate_pixels_end_with_a_word_or_an_answer() -> None:
+def test_degenerate_pixels_end_with_a_word_or_an_answer():
     for algorithm in ("newton", "em"):
-        settings = FitSettings(algorithm=algorithm, em_max_iterations=200)  # type: ignore[arg-type]
+        settings = FitSettings(algorithm=algorithm, em_max_iterations=200)
         for name, counts in degenerate_pixels().items():
             result = fit_one(counts, settings=settings)
             failed = bool(word(result) & FAILED)

@@ -4,7 +4,6 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.operators.noise import NoiseSkew
@@ -20,9 +19,7 @@ COMB = [
 ]  # fmt: skip
 
 
-def drawn(
-    rng: np.random.Generator, truth: NDArray[np.float64], n_frames: int, per_electron: float = 0.0
-) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+def drawn(rng, truth, n_frames, per_electron=0.0):
     """Return histograms of pixels with (H, g, mu, analog read noise in DN), and DN of bin 0."""
     h, g, mu, sigma = (column[:, None] for column in truth.T)
     k = rng.poisson(h, (truth.shape[0], n_frames))
@@ -34,7 +31,7 @@ def drawn(
     return np.array(counts, np.uint16), origin
 
 
-def test_a_comb_that_fits_whole_numbers_is_no_answer() -> None:
+def test_a_comb_that_fits_whole_numbers_is_no_answer():
     # 2 DN per electron: peaks as narrow as a DN, at whole numbers, are 0.14 nats likelier than the truth, but
     # their width says nothing of the read noise
     counts = np.array([COMB], np.uint16)
@@ -44,7 +41,7 @@ def test_a_comb_that_fits_whole_numbers_is_no_answer() -> None:
     assert np.isfinite(found.covariance[0]).all()
 
 
-def test_read_noise_at_its_floor_converges() -> None:
+def test_read_noise_at_its_floor_converges():
     # the law has more noise than the pixels: nothing is left for their own, and its floor is in e-, so it
     # moves with the gain
     rng = np.random.default_rng(1)
@@ -54,7 +51,7 @@ def test_read_noise_at_its_floor_converges() -> None:
     assert np.count_nonzero(found.fit_status & int(FitStatus.NOT_CONVERGED)) <= 1
 
 
-def test_an_ambiguous_pixel_gets_the_likeliest_gain_of_the_law() -> None:
+def test_an_ambiguous_pixel_gets_the_likeliest_gain_of_the_law():
     # where the peaks are not resolved, the density and the law rank the maxima differently
     rng = np.random.default_rng(2)
     n, extra = 150, 0.09**2
@@ -78,7 +75,7 @@ def test_an_ambiguous_pixel_gets_the_likeliest_gain_of_the_law() -> None:
     assert (both & lower).sum() <= 8  # 14 by the maxima of the density alone, one by 17 nats
 
 
-def test_a_misfit_of_the_model_calls_for_no_other_starts() -> None:
+def test_a_misfit_of_the_model_calls_for_no_other_starts():
     # noise that grows with the signal: the fit is poor, the peaks are resolved, and no other gain is likelier
     rng = np.random.default_rng(3)
     n = 60
@@ -99,7 +96,7 @@ def test_a_misfit_of_the_model_calls_for_no_other_starts() -> None:
         assert not (again.log_likelihood[poor] > found.log_likelihood[poor] + 1e-6).any()
 
 
-def test_of_two_maxima_on_one_comb_the_higher_one_is_kept() -> None:
+def test_of_two_maxima_on_one_comb_the_higher_one_is_kept():
     # three exposures and a bias: two gains 4 % apart give the same bias and nearly the same brightest mean;
     # the one that is climbed to first is 0.055 nats lower
     rng = np.random.default_rng(9)
@@ -119,7 +116,7 @@ def test_of_two_maxima_on_one_comb_the_higher_one_is_kept() -> None:
 
 
 @pytest.mark.timeout(120)
-def test_steps_out_of_bounds_end_a_climb() -> None:
+def test_steps_out_of_bounds_end_a_climb():
     # a gain that moves from frame to frame, under a law that cannot follow it: all noise is a one-sided tail
     rng = np.random.default_rng(4)
     n, frames = 300, 990
@@ -141,7 +138,7 @@ MOST_EVALUATIONS = 1.5
 
 
 @pytest.fixture(scope="module")
-def histograms() -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+def histograms():
     """Pixels whose frames come five times each: no law of single frames fits them."""
     rng = np.random.default_rng(90210)
     values = []
@@ -156,9 +153,7 @@ def histograms() -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
     return np.array(counts, np.uint16), first
 
 
-def test_a_misfit_without_outliers_has_the_fit_of_all_samples_and_costs_little_more(
-    histograms: tuple[NDArray[np.uint16], NDArray[np.int64]],
-) -> None:
+def test_a_misfit_without_outliers_has_the_fit_of_all_samples_and_costs_little_more(histograms):
     counts, origin = histograms
     guarded = fit_histograms(counts, origin)
     plain = fit_histograms(counts, origin, settings=FitSettings(tail_guard=0.0))
@@ -175,9 +170,7 @@ def test_a_misfit_without_outliers_has_the_fit_of_all_samples_and_costs_little_m
     assert guarded.n_iterations[whole & poor].min() > plain.n_iterations[whole & poor].min()
 
 
-def test_outliers_of_a_misfit_are_still_left_out(
-    histograms: tuple[NDArray[np.uint16], NDArray[np.int64]],
-) -> None:
+def test_outliers_of_a_misfit_are_still_left_out(histograms):
     counts, origin = histograms
     struck = np.concatenate([counts, np.zeros((counts.shape[0], 400), np.uint16)], axis=1)
     struck[:, -20] = 3

@@ -2,12 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
-    BlockSums,
-    CovarianceMaps,
     SummaryAccumulator,
     block_starts,
     frame_statistics,
@@ -15,21 +12,19 @@ from pchem_pipeline.model.histogram.summaries import (
 )
 
 
-def noise(seed: int, shape: tuple[int, int, int], dtype: type = np.uint16) -> NDArray[np.unsignedinteger]:
+def noise(seed, shape, dtype=np.uint16):
     rng = np.random.default_rng(seed)
     return np.rint(rng.normal(100, 6, shape[1:]) + rng.normal(0, 12, shape)).astype(dtype)
 
 
-def summarise(
-    frames: NDArray, block: int, cuts: tuple[int, ...] = ()
-) -> tuple[list[BlockSums], CovarianceMaps]:
+def summarise(frames, block, cuts=()):
     accumulator = SummaryAccumulator(frames.shape[1:], block)
     blocks = [done for part in np.split(frames, cuts) for done in accumulator.add(part)]
     last, maps = accumulator.finish()
     return blocks + last, maps
 
 
-def reference(frames: NDArray, block: int) -> tuple[NDArray, NDArray, NDArray]:
+def reference(frames, block):
     """Covariances straight from their definition, in float64."""
     x = frames.astype(np.float64)
     n_frames, ny, nx = x.shape

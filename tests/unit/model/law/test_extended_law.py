@@ -21,7 +21,7 @@ CODES = range(70, 220)
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_mass_is_the_docstring_term_by_term(name: str) -> None:
+def test_mass_is_the_docstring_term_by_term(name):
     model = LAWS[name]
     got = sample_mass(model, list(np.transpose(PIXELS)), list(CODES))
     for pixel, row in zip(PIXELS, got, strict=True):
@@ -33,7 +33,7 @@ def test_mass_is_the_docstring_term_by_term(name: str) -> None:
         np.testing.assert_allclose(row[close], expected[close], rtol=1e-11)
 
 
-def test_an_exposure_beyond_all_pixels_is_not_known() -> None:
+def test_an_exposure_beyond_all_pixels_is_not_known():
     """The search went on for an hour, electron number by electron number, and heard no signal."""
     maps = [
         np.array([2.0, 6.5e13]),
@@ -46,7 +46,7 @@ def test_an_exposure_beyond_all_pixels_is_not_known() -> None:
     assert np.isfinite(value).tolist() == [True, False]
 
 
-def test_parts_that_differ_from_pixel_to_pixel_are_those_of_their_pixel() -> None:
+def test_parts_that_differ_from_pixel_to_pixel_are_those_of_their_pixel():
     laws = [LAWS["levels"], SampleLaw().with_variance(e2=0.04, dn2=0.2), LAWS["skew"]]
     laws[1] = laws[1].with_added_exposure([[0.0, 0.8]], [[0.6, 0.4]])
     both = SampleLaw().with_levels(scale=[0.98, 1, 1], shift_e=[0.2, 0, 0], curvature=0.0)
@@ -67,7 +67,7 @@ def test_parts_that_differ_from_pixel_to_pixel_are_those_of_their_pixel() -> Non
     np.testing.assert_array_equal(part, got[[2, 0]])
 
 
-def test_neutral_law_is_the_pcd_and_codes_may_differ_by_pixel() -> None:
+def test_neutral_law_is_the_pcd_and_codes_may_differ_by_pixel():
     columns = list(np.transpose(PIXELS))
     exposure, gain, bias, sigma = columns
     codes = np.array([60, 70, 80])[:, None] + np.arange(90)
@@ -78,7 +78,7 @@ def test_neutral_law_is_the_pcd_and_codes_may_differ_by_pixel() -> None:
     assert not any(model.neutral for name, model in LAWS.items() if name != "neutral")
 
 
-def test_clipped_codes_hold_all_that_lies_beyond() -> None:
+def test_clipped_codes_hold_all_that_lies_beyond():
     columns = [np.array([2.0]), np.array([1 / 12]), np.array([100.0]), np.array([3.0])]
     plain = sample_mass(SampleLaw(), columns, np.arange(50, 600))[0]
     clipped = sample_mass(SampleLaw().with_clip(97, 130), columns, np.arange(90, 140))[0]
@@ -97,7 +97,7 @@ def test_clipped_codes_hold_all_that_lies_beyond() -> None:
     assert (tighter.clip_low, tighter.clip_high) == (97, 120)
 
 
-def test_outliers_are_spread_evenly_and_weigh_nothing_else() -> None:
+def test_outliers_are_spread_evenly_and_weigh_nothing_else():
     columns = [np.array([2.0]), np.array([1 / 12]), np.array([100.0]), np.array([3.0])]
     plain = sample_mass(SampleLaw(), columns, np.arange(70, 200))
     with_some = sample_mass(SampleLaw().with_outliers(1e-3, 1000), columns, np.arange(70, 200))
@@ -107,7 +107,7 @@ def test_outliers_are_spread_evenly_and_weigh_nothing_else() -> None:
 @pytest.mark.parametrize("law", ["poisson", "negative_binomial", "borel", "trapped", "lost"])
 @pytest.mark.parametrize("satellite", [0.0, 1.3])
 @pytest.mark.parametrize("aside", [False, True])
-def test_score_and_information_are_the_derivatives(law: str, satellite: float, aside: bool) -> None:
+def test_score_and_information_are_the_derivatives(law, satellite, aside):
     model = EVERYTHING.with_counts(law, 0.06).with_clip(92, 158).with_outliers(1e-3, 4096)
     counts = np.zeros(90, np.uint32)
     counts[2:69] = np.arange(67) % 7 * 9 + 1
@@ -145,7 +145,7 @@ def test_score_and_information_are_the_derivatives(law: str, satellite: float, a
 @pytest.mark.parametrize(
     ("law", "dispersion"), [(0, 0.0), (1, 0.3), (1, 1e-4), (1, 0.0), (2, 0.2), (3, 0.2), (3, 0.0)]
 )
-def test_electron_number_law_sums_to_one_with_the_right_mean_and_slopes(law: int, dispersion: float) -> None:
+def test_electron_number_law_sums_to_one_with_the_right_mean_and_slopes(law, dispersion):
     # 0.6 e- of the mean are added, and do not grow with H
     mixtures = np.array([[0.25, 0.75, 0.0], [1.6, 0.8, 0.0], [0.4, 0.6, 0.0], [0.0, 1.0, 0.0]])
     k = np.arange(400)
@@ -170,7 +170,7 @@ def test_electron_number_law_sums_to_one_with_the_right_mean_and_slopes(law: int
         np.testing.assert_allclose(plain, compiled, rtol=1e-13)
 
 
-def test_what_is_lost_of_electrons_is_what_chance_takes() -> None:
+def test_what_is_lost_of_electrons_is_what_chance_takes():
     chance, exposure = 0.08, 2.4
     n = np.arange(80)
     before, gone = poisson.pmf(n, exposure), np.minimum(chance * np.maximum(n - 1, 0), 0.99)
@@ -194,7 +194,7 @@ def test_what_is_lost_of_electrons_is_what_chance_takes() -> None:
     assert _one_law(LOST, 0.0, 3.0, exposure) == _one_law(0, 0.0, 3.0, exposure)
 
 
-def test_threshold_of_free_satellites_grows_with_the_number_of_trials() -> None:
+def test_threshold_of_free_satellites_grows_with_the_number_of_trials():
     one = SampleLaw().with_free_satellites([1.0])
     eight = SampleLaw().with_free_satellites(range(1, 9))
     # half of the chi-square mass: a normal deviate exceeds sqrt(2 rise) with the probability of a trial
@@ -202,7 +202,7 @@ def test_threshold_of_free_satellites_grows_with_the_number_of_trials() -> None:
     assert norm.sf(np.sqrt(2 * satellite_threshold(eight))) == pytest.approx(1e-4 / 8, rel=1e-6)
 
 
-def test_laws_that_do_not_fit_the_pixels_are_refused() -> None:
+def test_laws_that_do_not_fit_the_pixels_are_refused():
     columns = list(np.transpose(PIXELS))
     with pytest.raises(ValueError, match="extra_variance_e2 has 2 rows for 3 pixels"):
         sample_mass(SampleLaw().with_variance(e2=[0.1, 0.2]), columns, [1, 2])
@@ -214,14 +214,14 @@ def test_laws_that_do_not_fit_the_pixels_are_refused() -> None:
         sample_mass(SampleLaw(), columns, [1, 3])
 
 
-def test_edges_of_several_effects_add_up() -> None:
+def test_edges_of_several_effects_add_up():
     model = SampleLaw().with_edges(10, [0.1, 0.2]).with_edges(8, [0.3, 0.3, 0.3])
     assert model.edge_first == 8
     np.testing.assert_allclose(model.edge_shift, [0.3, 0.3, 0.4, 0.2])
 
 
 @pytest.mark.parametrize("name", LAWS)
-def test_a_parabola_is_made_of_masses_and_slopes(name: str) -> None:
+def test_a_parabola_is_made_of_masses_and_slopes(name):
     """With a sample so far out that the first look at the masses does not reach it."""
     model, maps = LAWS[name], list(np.transpose(PIXELS))
     origin, n_codes = np.full(3, CODES[0]), len(CODES)
@@ -269,7 +269,7 @@ CASES = [
 
 
 @pytest.mark.parametrize("theta", CASES)
-def test_density_has_the_moments_of_its_cumulants(theta: tuple[float, float, float, float]) -> None:
+def test_density_has_the_moments_of_its_cumulants(theta):
     exposure, gain, bias, sigma = theta
     mean, variance = bias + exposure / gain, sigma**2 + exposure / gain**2
     third, fourth = exposure / gain**3, exposure / gain**4
@@ -283,23 +283,23 @@ def test_density_has_the_moments_of_its_cumulants(theta: tuple[float, float, flo
     assert weight @ d**4 - 3 * (weight @ d**2) ** 2 == pytest.approx(fourth, rel=1e-6, abs=1e-6 * variance**2)
 
 
-def test_without_electrons_it_is_a_gaussian() -> None:
+def test_without_electrons_it_is_a_gaussian():
     x = np.linspace(-30, 30, 13)
     np.testing.assert_allclose(log_pcd(x, 0.0, 0.1, 1.0, 2.5), norm.logpdf(x, 1.0, 2.5), rtol=1e-14)
 
 
-def test_far_tails_do_not_underflow() -> None:
+def test_far_tails_do_not_underflow():
     assert log_pcd(-1000.0, 2.0, 0.1, 0.0, 3.0) == pytest.approx(norm.logpdf(-1000, 0, 3) - 2.0, rel=1e-12)
     assert np.isfinite(log_pcd(1e5, 2.0, 0.1, 0.0, 3.0))
 
 
-def test_bad_parameters_give_nan_not_an_error() -> None:
+def test_bad_parameters_give_nan_not_an_error():
     assert np.isnan(
         log_pcd(0.0, [-1.0, 1.0, 1.0, np.nan], [0.1, 0.0, 0.1, 0.1], 0.0, [3.0, 3.0, -1.0, 3.0])
     ).all()
 
 
-def test_mass_is_the_integral_of_the_density() -> None:
+def test_mass_is_the_integral_of_the_density():
     fine = np.linspace(-0.5, 0.5, 2001)
     x = np.arange(80, 150)
     sigma = 0.3 / 0.09
@@ -307,7 +307,7 @@ def test_mass_is_the_integral_of_the_density() -> None:
     np.testing.assert_allclose(pcd_mass(x, 1.5, 0.09, 100.2, 0.3), integral, atol=1e-9)
 
 
-def test_mass_without_noise_is_shared_by_the_cells_beside_and_of_no_parameters_is_nan() -> None:
+def test_mass_without_noise_is_shared_by_the_cells_beside_and_of_no_parameters_is_nan():
     """A comb of 2 DN per electron that begins half-way between 0 and 1 DN."""
     np.testing.assert_allclose(
         pcd_mass([0, 1, 2, 3], 1.0, 0.5, 0.5, 0.0), np.exp(-1) * np.array([0.5, 0.5, 0.5, 0.5]), rtol=1e-12

@@ -32,12 +32,12 @@ PARAMETERS = {
 }
 
 
-def make_covariance() -> np.ndarray:
+def make_covariance():
     root = np.random.default_rng(1).standard_normal((1, 2, 4, 4)) * np.array([0.01, 1e-3, 0.1, 0.02])[:, None]
     return np.asarray(root @ np.swapaxes(root, -1, -2))
 
 
-def numeric_stderr(function: object, covariance: np.ndarray, at: np.ndarray) -> float:
+def numeric_stderr(function, covariance, at):
     """Delta method with derivatives by central differences."""
     slopes = []
     for i in range(4):
@@ -45,7 +45,7 @@ def numeric_stderr(function: object, covariance: np.ndarray, at: np.ndarray) -> 
         up, down = at.copy(), at.copy()
         up[i] += step
         down[i] -= step
-        slopes.append((function(*up) - function(*down)) / (2 * step))  # type: ignore[operator]
+        slopes.append((function(*up) - function(*down)) / (2 * step))
     return float(np.sqrt(np.array(slopes) @ covariance @ np.array(slopes)))
 
 
@@ -57,7 +57,7 @@ FUNCTIONS = {
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_derived_maps_and_their_errors(name: str) -> None:
+def test_derived_maps_and_their_errors(name):
     covariance = make_covariance()
     maps = derived_maps(PARAMETERS, covariance, 4.87)
     for x in range(2):
@@ -67,7 +67,7 @@ def test_derived_maps_and_their_errors(name: str) -> None:
         assert maps[f"{name}_stderr"][0, x] == pytest.approx(expected, rel=1e-6)
 
 
-def test_noise_below_rounding_has_no_analog_part() -> None:
+def test_noise_below_rounding_has_no_analog_part():
     below = {**PARAMETERS, "read_noise_dn": np.array([[0.28, np.nan]])}
     maps = derived_maps(below, make_covariance(), None)
     assert np.isnan(maps["analog_read_noise_e"]).all()
@@ -77,9 +77,7 @@ def test_noise_below_rounding_has_no_analog_part() -> None:
 
 
 @pytest.mark.parametrize(("exposure", "noise", "n_frames"), [(8.0, 0.15, 1000), (80.0, 0.25, 2000)])
-def test_the_error_of_h_holds_the_chance_of_being_electrons_off(
-    exposure: float, noise: float, n_frames: int
-) -> None:
+def test_the_error_of_h_holds_the_chance_of_being_electrons_off(exposure, noise, n_frames):
     rng = np.random.default_rng(3)
     drawn = draw_histograms(rng, np.full(120, exposure), 0.09, 100 + rng.random(120), noise, n_frames)
     fit = fit_histograms(drawn.counts, drawn.origin)
@@ -105,7 +103,7 @@ def test_the_error_of_h_holds_the_chance_of_being_electrons_off(
         np.testing.assert_array_equal(np.isnan(cut[name]), ambiguous)
 
 
-def test_no_chance_of_being_off_where_the_gap_is_large() -> None:
+def test_no_chance_of_being_off_where_the_gap_is_large():
     exposure, gap = np.array([2.0, 2.0, np.nan, 0.0, 8.0]), np.array([40.0, 3.0, np.nan, 1.0, 2.0])
     m, probability = electron_shifts(exposure, gap, 1000)
     np.testing.assert_allclose(probability.sum(axis=1), 1.0)
@@ -119,7 +117,7 @@ def test_no_chance_of_being_off_where_the_gap_is_large() -> None:
     assert others[m == -1] == pytest.approx(np.exp(2.0 - 1000 / 128))
 
 
-def test_hot_pixels_are_far_above_the_unflagged_ones() -> None:
+def test_hot_pixels_are_far_above_the_unflagged_ones():
     values = np.array([1.0, 1.1, 0.9, 1.0, 1.2, 50.0, 60.0, np.nan])
     flagged = np.array([0, 0, 0, 0, 0, 0, 1, 0], bool)
     stderr = np.array([0.1, 0.1, 0.1, 0.1, np.nan, 3.0, 3.0, np.nan])
@@ -129,7 +127,7 @@ def test_hot_pixels_are_far_above_the_unflagged_ones() -> None:
     assert not hot_pixels(values, stderr, np.ones(8, bool), 6.0).any()
 
 
-def test_quality_follows_the_status() -> None:
+def test_quality_follows_the_status():
     status = np.array([0, int(FitStatus.BIAS_AMBIGUOUS), int(FitStatus.NO_DATA), 0], dtype=np.uint16)
     gain = np.array([0.1, 0.1, np.nan, np.nan])
     np.testing.assert_array_equal(quality_map(status, gain), [GOOD, CAUTION, NO_VALUE, NO_VALUE])
@@ -138,7 +136,7 @@ def test_quality_follows_the_status() -> None:
             assert quality_map(np.array([int(bit)]), np.array([0.1]))[0] == NO_VALUE
 
 
-def test_every_reason_is_counted() -> None:
+def test_every_reason_is_counted():
     status = np.array([[0, 32, 32 | 512], [1, 0, 0]], dtype=np.uint16)
     counts = status_counts(status)
     assert counts["ok"] == 3
@@ -149,7 +147,7 @@ def test_every_reason_is_counted() -> None:
     assert len(counts) == 1 + len(FitStatus)
 
 
-def test_a_handful_of_hot_pixels_does_not_move_the_summary() -> None:
+def test_a_handful_of_hot_pixels_does_not_move_the_summary():
     rng = np.random.default_rng(4)
     values = 0.3 + 0.02 * rng.standard_normal((100, 100))
     clean = summarise(values)
@@ -165,7 +163,7 @@ def test_a_handful_of_hot_pixels_does_not_move_the_summary() -> None:
     assert found.percentiles[99.0] == pytest.approx(clean.percentiles[99.0], rel=0.01)
 
 
-def test_summary_of_nothing_and_of_one_value() -> None:
+def test_summary_of_nothing_and_of_one_value():
     nothing = summarise(np.full((2, 2), np.nan))
     assert nothing.n_missing == 4
     assert np.isnan(nothing.median)
@@ -175,20 +173,20 @@ def test_summary_of_nothing_and_of_one_value() -> None:
     assert one.n_high == 0
 
 
-def test_median_error_of_a_normal_map() -> None:
+def test_median_error_of_a_normal_map():
     values = np.random.default_rng(5).standard_normal(40_000)
     # the distance of two order statistics 200 ranks apart scatters by 1/sqrt(200) of itself
     expected = np.sqrt(np.pi / 2) / 200
     assert summarise(values).median_stderr == pytest.approx(expected, rel=5 / np.sqrt(200))
 
 
-def displayed(values: np.ndarray, n: int = 1000) -> np.ndarray:
+def displayed(values, n=1000):
     """The level of each value, to 1 / n."""
     edges = display_edges(Ordered.of(values), np.arange(1, n) / n)
     return np.searchsorted(edges, values, side="right") / n
 
 
-def test_a_display_has_the_beta_shape() -> None:
+def test_a_display_has_the_beta_shape():
     values = np.random.default_rng(6).lognormal(0, 2, size=(40, 50))
     rank = (values.ravel().argsort().argsort() + 0.5) / values.size
     level = beta(2, 2).ppf(rank)
@@ -197,7 +195,7 @@ def test_a_display_has_the_beta_shape() -> None:
     np.testing.assert_allclose(displayed(-values).ravel(), 1 - level, atol=1.001e-3)
 
 
-def test_settings_refuse_nonsense() -> None:
+def test_settings_refuse_nonsense():
     with pytest.raises(ValueError, match="at least one frame"):
         EnsembleSettings(frames=0)
     assert EnsembleSettings(frames="all").frames == "all"

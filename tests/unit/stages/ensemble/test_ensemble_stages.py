@@ -3,8 +3,6 @@
 import csv
 import re
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from helpers.pickled_tasks import PickledTasks
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.base.variables import PARAMETERS, variables_of
 from pchem_pipeline.commands.export import export_run
-from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
+from pchem_pipeline.compute.executor import SerialExecutor, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
@@ -41,16 +39,7 @@ HISTOGRAM = ("counts", "origin", "under", "over")
 FAILED_PIXEL = (3, 5)
 
 
-def make_context(
-    folder: Path,
-    *,
-    tile: int = 16,
-    executor: Executor | None = None,
-    options: Options | None = None,
-    store: str = "run.zarr",
-    input: dict[str, object] | None = None,
-    **ensemble: object,
-) -> StageContext:
+def make_context(folder, *, tile=16, executor=None, options=None, store="run.zarr", input=None, **ensemble):
     config = RunConfig.model_validate(
         {
             "run": {"tile": tile, "store": store},
@@ -63,7 +52,7 @@ def make_context(
     return StageContext(config, folder, place, executor or SerialExecutor(), options=options or Options())
 
 
-def write_fit(context: StageContext, *, tiles: list[str] | None = None, failed: bool = True) -> None:
+def write_fit(context, *, tiles=None, failed=True):
     """What the fit stage leaves behind, with the truth as its estimate."""
     status = np.zeros(context.sensor.shape, dtype=np.uint16)
     if failed:
@@ -73,7 +62,7 @@ def write_fit(context: StageContext, *, tiles: list[str] | None = None, failed: 
 
 
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def prepared(tmp_path_factory):
     """A run up to the histograms, at tiles of 16."""
     folder = tmp_path_factory.mktemp("sensor")
     context = make_context(folder)
@@ -82,12 +71,12 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def fresh_copy(prepared: Path, folder: Path) -> None:
+def fresh_copy(prepared, folder):
     shutil.copytree(prepared, folder, dirs_exist_ok=True)
 
 
 @pytest.fixture(scope="module")
-def finished(prepared: Path, tmp_path_factory: pytest.TempPathFactory) -> StageContext:
+def finished(prepared, tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     fresh_copy(prepared, folder)
     context = make_context(folder, frames=250)
@@ -97,11 +86,11 @@ def finished(prepared: Path, tmp_path_factory: pytest.TempPathFactory) -> StageC
     return context
 
 
-def ensemble_of(store: RunStore) -> dict[str, np.ndarray]:
+def ensemble_of(store):
     return {v.name: store.read(v.path) for v in variables_of("ensemble") if store.has(v.path)}
 
 
-def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+def assert_same(found, expected):
     for name, values in expected.items():
         if values.dtype.kind == "f":
             # far tails of a curve are sums of numbers below rounding; residuals are small differences
@@ -111,7 +100,7 @@ def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -
             np.testing.assert_array_equal(found[name], values, err_msg=name)
 
 
-def test_maps_are_the_fit_and_what_follows(finished: StageContext) -> None:
+def test_maps_are_the_fit_and_what_follows(finished):
     store = finished.store
     truth = {name: store.read(f"truth/{name}") for name in PARAMETERS}
     for name in PARAMETERS:
@@ -130,7 +119,7 @@ def test_maps_are_the_fit_and_what_follows(finished: StageContext) -> None:
     assert store.array("maps/charge_rate").attrs["units"] == "e-/px/s"
 
 
-def test_no_integration_time_means_no_charge_rate(prepared: Path, tmp_path: Path) -> None:
+def test_no_integration_time_means_no_charge_rate(prepared, tmp_path):
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path)
     write_fit(context)
@@ -145,7 +134,7 @@ def test_no_integration_time_means_no_charge_rate(prepared: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("kind", ["dark", "light", "unknown"])
-def test_dark_current_is_of_the_dark_alone(prepared: Path, tmp_path: Path, kind: str) -> None:
+def test_dark_current_is_of_the_dark_alone(prepared, tmp_path, kind):
     fresh_copy(prepared, tmp_path)
     write_fit(make_context(tmp_path))
     execute("maps", make_context(tmp_path))
@@ -165,7 +154,7 @@ def test_dark_current_is_of_the_dark_alone(prepared: Path, tmp_path: Path, kind:
     assert [number.label for number in key_numbers(data) if number.name == wanted] == [words]
 
 
-def test_ensemble_is_that_of_the_chosen_frames(finished: StageContext) -> None:
+def test_ensemble_is_that_of_the_chosen_frames(finished):
     frames = np.load(finished.base_dir / "frames" / "frames.npy")
     use = np.ones((NY, NX), dtype=bool)
     use[FAILED_PIXEL] = False
@@ -184,7 +173,7 @@ def test_ensemble_is_that_of_the_chosen_frames(finished: StageContext) -> None:
     assert found["nuced_density"].sum() * step == pytest.approx(1.0, abs=1e-3)
 
 
-def test_copies_and_empty_frames_are_in_no_ensemble(prepared: Path, tmp_path: Path) -> None:
+def test_copies_and_empty_frames_are_in_no_ensemble(prepared, tmp_path):
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path, frames=250)
     write_fit(context)
@@ -199,7 +188,7 @@ def test_copies_and_empty_frames_are_in_no_ensemble(prepared: Path, tmp_path: Pa
     assert (facts["n_frames"], facts["n_frames_all"]) == (149, FRAMES - 102)
 
 
-def test_the_true_parameters_predict_to_the_noise(finished: StageContext) -> None:
+def test_the_true_parameters_predict_to_the_noise(finished):
     facts = finished.store.attributes("ensemble")
     error = facts["rmse"]
     # the mean square has some tens of independent terms: its root scatters by about a tenth
@@ -213,7 +202,7 @@ def test_the_true_parameters_predict_to_the_noise(finished: StageContext) -> Non
     assert facts["component_cases"] == [list(case) for case in COMPONENT_CASES]
 
 
-def test_error_rate_against_the_truth(finished: StageContext) -> None:
+def test_error_rate_against_the_truth(finished):
     store = finished.store
     facts = store.attributes("ensemble")
     true = store.read("truth/electron_number")
@@ -228,7 +217,7 @@ def test_error_rate_against_the_truth(finished: StageContext) -> None:
     assert facts["least_error_rate"] == pytest.approx(facts["expected_error_rate"])
 
 
-def test_error_rate_of_a_fit_that_is_off(prepared: Path, tmp_path: Path) -> None:
+def test_error_rate_of_a_fit_that_is_off(prepared, tmp_path):
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path)
     write_fit(context, failed=False)
@@ -243,7 +232,7 @@ def test_error_rate_of_a_fit_that_is_off(prepared: Path, tmp_path: Path) -> None
     assert facts["least_error_rate"] == pytest.approx(facts["expected_error_rate"], rel=0.02)
 
 
-def test_electron_stack(finished: StageContext) -> None:
+def test_electron_stack(finished):
     frames = np.load(finished.base_dir / "frames" / "frames.npy")
     maps = [finished.store.read(f"fit/{name}") for name in PARAMETERS]
     found = finished.store.read("electrons/electron_number")
@@ -267,9 +256,7 @@ def test_electron_stack(finished: StageContext) -> None:
     [(64, make_executor(ComputeSettings(backend="threads", workers=3))), (32, PickledTasks())],
     ids=["threads", "pickled"],
 )
-def test_result_depends_on_neither_tile_nor_backend(
-    finished: StageContext, tmp_path: Path, tile: int, executor: Executor
-) -> None:
+def test_result_depends_on_neither_tile_nor_backend(finished, tmp_path, tile, executor):
     shutil.copytree(finished.base_dir / "frames", tmp_path / "frames")
     context = make_context(tmp_path, tile=tile, executor=executor, frames=250)
     for stage in ("simulate", "ingest", "histogram"):
@@ -282,9 +269,7 @@ def test_result_depends_on_neither_tile_nor_backend(
         np.testing.assert_array_equal(context.store.read(name), finished.store.read(name))
 
 
-def test_tiles_that_the_fit_finishes_later_are_added(
-    finished: StageContext, prepared: Path, tmp_path: Path
-) -> None:
+def test_tiles_that_the_fit_finishes_later_are_added(finished, prepared, tmp_path):
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path, frames=250)
     write_fit(context, tiles=["0.0", "0.1", "0.2"])
@@ -299,9 +284,7 @@ def test_tiles_that_the_fit_finishes_later_are_added(
     assert_same(ensemble_of(again.store), ensemble_of(finished.store))
 
 
-def test_samples_that_the_fit_counted_need_no_histograms(
-    finished: StageContext, prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_samples_that_the_fit_counted_need_no_histograms(finished, prepared, tmp_path, monkeypatch):
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path, frames=250)
     write_fit(context)
@@ -312,7 +295,7 @@ def test_samples_that_the_fit_counted_need_no_histograms(
         store.records.mark("fit", "truth", tile.key, {"codes": code_sums(read, list(fit.values()))})
     plain_read = RunStore.read
 
-    def read_little(self: RunStore, name: str, *region: Any) -> Any:
+    def read_little(self, name, *region):
         assert name != "histogram/counts"
         return plain_read(self, name, *region)
 
@@ -324,7 +307,7 @@ def test_samples_that_the_fit_counted_need_no_histograms(
     assert found["samples_beyond_dn_all_frames"] == expected["samples_beyond_dn_all_frames"]
 
 
-def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis() -> None:
+def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis():
     counts = np.arange(12, dtype=np.uint16).reshape(1, 3, 4)
     origin = np.array([[100, 100, 102]], np.int32)
     outside = {"under": np.array([[1, 10, 100]], np.uint32), "over": np.array([[0, 1, 0]], np.uint32)}
@@ -336,7 +319,7 @@ def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis()
     assert beyond == 101 + 1 + 11
 
 
-def test_all_frames_need_no_frames(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_frames_need_no_frames(prepared, tmp_path, monkeypatch):
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path, frames="all")
     write_fit(context)
@@ -351,7 +334,7 @@ def test_all_frames_need_no_frames(prepared: Path, tmp_path: Path, monkeypatch: 
     assert "truth" in facts["missing"]
 
 
-def test_region_and_range_of_frames_find_their_truth(finished: StageContext, tmp_path: Path) -> None:
+def test_region_and_range_of_frames_find_their_truth(finished, tmp_path):
     shutil.copytree(finished.base_dir / "frames", tmp_path / "frames")
     crop = {"roi": [8, 32, 4, 48], "frame_range": [20, 300]}
     context = make_context(tmp_path, input=crop, frames=150, first_frame=10)
@@ -365,7 +348,7 @@ def test_region_and_range_of_frames_find_their_truth(finished: StageContext, tmp
     assert abs(facts["error_rate"] - facts["expected_error_rate"]) < 5 * facts["error_rate_stderr"]
 
 
-def test_frames_that_do_not_exist(prepared: Path, tmp_path: Path) -> None:
+def test_frames_that_do_not_exist(prepared, tmp_path):
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path, first_frame=1000)
     write_fit(context)
@@ -373,7 +356,7 @@ def test_frames_that_do_not_exist(prepared: Path, tmp_path: Path) -> None:
         execute("ensemble", context)
 
 
-def test_no_pixel_with_a_value(prepared: Path, tmp_path: Path) -> None:
+def test_no_pixel_with_a_value(prepared, tmp_path):
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path)
     write_fit(context)
@@ -386,7 +369,7 @@ def test_no_pixel_with_a_value(prepared: Path, tmp_path: Path) -> None:
     assert execute("ensemble", context) == state
 
 
-def test_no_pixel_with_a_value_so_far(prepared: Path, tmp_path: Path) -> None:
+def test_no_pixel_with_a_value_so_far(prepared, tmp_path):
     """Tiles that the fit is not finished are no reason to call the ensemble done."""
     fresh_copy(prepared, tmp_path)
     context = make_context(tmp_path)
@@ -404,7 +387,7 @@ def test_no_pixel_with_a_value_so_far(prepared: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("n_samples", [(20_000, 20_000), (5_000, 80_000)])
-def test_ready_made_histograms(tmp_path: Path, n_samples: tuple[int, int]) -> None:
+def test_ready_made_histograms(tmp_path, n_samples):
     rng = np.random.default_rng(8)
     truth = np.array([[0.8, 0.1, 100.0, 3.0], [2.5, 0.1, 104.0, 3.2]])
     counts = np.zeros((2, 250), dtype=np.int64)
@@ -438,7 +421,7 @@ def test_ready_made_histograms(tmp_path: Path, n_samples: tuple[int, int]) -> No
         execute("electrons", context)
 
 
-def test_export(finished: StageContext, tmp_path: Path) -> None:
+def test_export(finished, tmp_path):
     from astropy.io import fits
     from tifffile import imread
 
@@ -463,7 +446,7 @@ def test_export(finished: StageContext, tmp_path: Path) -> None:
         assert {row["fit_status"]: row["pixels"] for row in csv.DictReader(file)}["poor_fit"] == "1"
 
 
-def test_export_says_what_is_wrong(finished: StageContext, tmp_path: Path) -> None:
+def test_export_says_what_is_wrong(finished, tmp_path):
     run = finished.store.path
     finished.store.write_config(dump_config(finished.config))
     with pytest.raises(ConfigError, match="xlsx cannot be written; choose from fits, tiff, npz, csv"):

@@ -1,8 +1,5 @@
 """The stage fit: a tile, tiles of several samples, and the sensor as a whole."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -20,7 +17,7 @@ from pchem_pipeline.store.run_store import RunStore
 WEAK = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED))
 
 
-def sensor(folder: Path, noise: float, steps: float, n_frames: int, tile: int) -> StageContext:
+def sensor(folder, noise, steps, n_frames, tile):
     """A run up to its fit: H = 2, equal pixels."""
     values = {"quanta_exposure": 2.0, "dn_per_electron": steps, "analog_read_noise_e": noise}
     constant = {name: {"kind": "constant", "value": value} for name, value in values.items()}
@@ -33,7 +30,7 @@ def sensor(folder: Path, noise: float, steps: float, n_frames: int, tile: int) -
     return fitted(folder, "simulate", run={"tile": tile, "store": f"run{tile}.zarr"}, simulate=simulate)
 
 
-def fitted(folder: Path, *before: str, **sections: dict[str, Any]) -> StageContext:
+def fitted(folder, *before, **sections):
     """A run up to its fit, and what comes before it."""
     config = RunConfig.model_validate(sections)
     store = RunStore.create(folder / config.run.store)
@@ -43,7 +40,7 @@ def fitted(folder: Path, *before: str, **sections: dict[str, Any]) -> StageConte
     return context
 
 
-def test_words_given_in_common_depend_on_no_tiling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_words_given_in_common_depend_on_no_tiling(tmp_path, monkeypatch):
     contexts = [sensor(tmp_path, 0.48, 7.0, 2000, tile) for tile in (8, 64)]
     words = [context.store.read("fit/fit_status") for context in contexts]
     np.testing.assert_array_equal(*words)
@@ -63,16 +60,14 @@ def test_words_given_in_common_depend_on_no_tiling(tmp_path: Path, monkeypatch: 
     np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0] & ~WEAK)
 
 
-def test_a_good_sensor_keeps_its_words(tmp_path: Path) -> None:
+def test_a_good_sensor_keeps_its_words(tmp_path):
     words = sensor(tmp_path, 0.3, 7.0, 4000, 64).store.read("fit/fit_status")
     assert not (words & WEAK).any()
     assert (words == 0).mean() > 0.95
 
 
 @pytest.mark.parametrize(("low", "high"), [(0, 200), (90, 255)])
-def test_samples_cut_off_at_a_code_that_no_file_states_are_censored(
-    tmp_path: Path, low: int, high: int
-) -> None:
+def test_samples_cut_off_at_a_code_that_no_file_states_are_censored(tmp_path, low, high):
     """A fifth of the samples at 200 DN, in 16 bits: the gain came out twelve times too large."""
     rng = np.random.default_rng(3)
     electrons = rng.poisson(1.5, (1500, 12, 14)) + 0.3 * rng.standard_normal((1500, 12, 14))

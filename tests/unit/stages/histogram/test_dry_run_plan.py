@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ print(json.dumps([peak_rss_bytes(), *[state.state for state in states]]))
 def camera(tmp_path):
     """Write a raw file of some frames of 256 x 256 pixels, repeated; return its YAML."""
 
-    def write(n_frames: int, **sections: object) -> Path:
+    def write(n_frames, **sections):
         rng = np.random.default_rng(5)
         shape = (32, 256, 256)
         block = np.rint(100 + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype("<u2")
@@ -56,7 +55,7 @@ def camera(tmp_path):
     return write
 
 
-def _run(path: Path) -> list:
+def _run(path):
     outcome = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(path)], capture_output=True, text=True, timeout=300
     )

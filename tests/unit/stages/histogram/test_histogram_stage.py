@@ -1,14 +1,11 @@
 """The histogram stage on a store: exact arrays, whatever the tiles, the memory and the workers."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers.pickled_tasks import PickledTasks
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import StoreError
-from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
+from pchem_pipeline.compute.executor import SerialExecutor, make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.histogram.count import histogram_frames
@@ -24,7 +21,7 @@ FRAMES, NY, NX = 300, 150, 40
 
 
 @pytest.fixture(scope="module")
-def frames() -> NDArray[np.uint16]:
+def frames():
     rng = np.random.default_rng(30)
     bias = rng.normal(100, 6, (NY, NX))
     shape = (FRAMES, NY, NX)
@@ -34,7 +31,7 @@ def frames() -> NDArray[np.uint16]:
     return dn
 
 
-def ingest(store: RunStore, info: SensorInfo, frames: NDArray[np.uint16] | None) -> None:
+def ingest(store, info, frames):
     """What the ingest stage leaves behind."""
     info.write(store)
     if frames is not None:
@@ -44,16 +41,7 @@ def ingest(store: RunStore, info: SensorInfo, frames: NDArray[np.uint16] | None)
     store.records.mark("ingest", "abc", "all", {})
 
 
-def make_context(
-    folder: Path,
-    frames: NDArray[np.uint16],
-    *,
-    mode: str = "reference",
-    executor: Executor | None = None,
-    options: Options | None = None,
-    tile: int = 64,
-    **settings: object,
-) -> StageContext:
+def make_context(folder, frames, *, mode="reference", executor=None, options=None, tile=64, **settings):
     folder.mkdir(exist_ok=True)
     source = folder / "frames.npy"
     if not source.exists():
@@ -72,7 +60,7 @@ def make_context(
     return StageContext(config, folder, store, executor or SerialExecutor(), options=options or Options())
 
 
-def contents(store: RunStore) -> dict[str, NDArray]:
+def contents(store):
     names = [
         *(f"histogram/{name}" for name in ("counts", *arrays.MAPS)),
         *(f"summary/{name}" for name in arrays.COVARIANCES),
@@ -83,13 +71,13 @@ def contents(store: RunStore) -> dict[str, NDArray]:
 
 
 @pytest.fixture(scope="module")
-def expected(tmp_path_factory: pytest.TempPathFactory, frames: NDArray[np.uint16]) -> dict[str, NDArray]:
+def expected(tmp_path_factory, frames):
     context = make_context(tmp_path_factory.mktemp("expected"), frames)
     assert execute("histogram", context).state == "complete"
     return contents(context.store)
 
 
-def assert_equal(found: dict[str, NDArray], expected: dict[str, NDArray]) -> None:
+def assert_equal(found, expected):
     for name, values in expected.items():
         np.testing.assert_array_equal(found[name], values, err_msg=name)
 
@@ -177,7 +165,7 @@ def test_a_failed_band_leaves_the_others_and_resumes(tmp_path, frames, expected,
     assert any("2 pixels have samples outside" in note for note in again.notes)
 
 
-def _single_bands(context: StageContext) -> list[histogram.Band]:
+def _single_bands(context):
     from pchem_pipeline.stages.bands import plan_bands
 
     return plan_bands(context.tiles(), {t.key for t in context.tiles()}, 1, 1)

@@ -3,7 +3,6 @@
 import json
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 import tifffile
 from astropy.io import fits
 from helpers.commands import arrays_of
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import make_executor
@@ -27,7 +25,7 @@ FRAMES, NY, NX = 300, 150, 40
 
 
 @pytest.fixture(scope="module")
-def frames() -> NDArray[np.uint16]:
+def frames():
     rng = np.random.default_rng(31)
     shape = (FRAMES, NY, NX)
     bias = rng.normal(100, 6, shape[1:])
@@ -36,11 +34,11 @@ def frames() -> NDArray[np.uint16]:
     return dn
 
 
-def _npy(folder: Path, frames: NDArray[np.uint16]) -> None:
+def _npy(folder, frames):
     np.save(folder / "a.npy", frames)
 
 
-def _raw(folder: Path, frames: NDArray[np.uint16]) -> None:
+def _raw(folder, frames):
     """Big-endian raw frames, left-justified, behind a header, with padding, in two files."""
     for name, part in (("a.raw", frames[:140]), ("b.raw", frames[140:])):
         padded = b"".join((frame << 2).astype(">u2").tobytes() + b"-" * 10 for frame in part)
@@ -50,20 +48,20 @@ def _raw(folder: Path, frames: NDArray[np.uint16]) -> None:
         (folder / f"{name}.json").write_text(json.dumps(facts))
 
 
-def _tiff(folder: Path, frames: NDArray[np.uint16]) -> None:
+def _tiff(folder, frames):
     for i, part in enumerate(np.array_split(frames, 5)):
         tifffile.imwrite(folder / f"f{i}.tif", part, photometric="minisblack")
 
 
-def _zlib(folder: Path, frames: NDArray[np.uint16]) -> None:
+def _zlib(folder, frames):
     tifffile.imwrite(folder / "f.tif", frames, photometric="minisblack", compression="zlib", rowsperstrip=50)
 
 
-def _fits(folder: Path, frames: NDArray[np.uint16]) -> None:
+def _fits(folder, frames):
     fits.PrimaryHDU(frames).writeto(folder / "f.fits")
 
 
-def _hdf5(folder: Path, frames: NDArray[np.uint16]) -> None:
+def _hdf5(folder, frames):
     with h5py.File(folder / "f.h5", "w") as file:
         file.create_dataset("frames", data=frames, chunks=(10, NY, NX), compression="gzip")
 
@@ -73,7 +71,7 @@ WRITERS = {"npy": _npy, "raw": _raw, "tiff": _tiff, "zlib": _zlib, "fits": _fits
 SUFFIXES = (".npy", ".raw", ".tif", ".fits", ".h5")
 
 
-def make_context(folder: Path, store: str, *, workers: int = 2, **sections: dict[str, Any]) -> StageContext:
+def make_context(folder, store, *, workers=2, **sections):
     files = sorted(str(path) for path in folder.iterdir() if path.suffix in SUFFIXES)
     content = {name: dict(values) for name, values in sections.items()}
     content["input"] = {"files": files, "mode": "reference", **content.get("input", {})}
@@ -83,17 +81,17 @@ def make_context(folder: Path, store: str, *, workers: int = 2, **sections: dict
     return StageContext(config, folder, RunStore.create(folder / store), make_executor(config.compute))
 
 
-def run_both(context: StageContext) -> StageContext:
+def run_both(context):
     assert execute("ingest", context).state == "complete"
     assert execute("histogram", context).state == "complete"
     return context
 
 
-def contents(context: StageContext) -> dict[str, NDArray[Any]]:
+def contents(context):
     return arrays_of(context.store.path, ("frames", "histogram", "summary"))
 
 
-def compare(folder: Path, **sections: dict[str, Any]) -> tuple[StageContext, StageContext]:
+def compare(folder, **sections):
     """Run both ways and compare everything that they leave."""
     apart = run_both(make_context(folder, "apart.zarr", **sections))
     once = make_context(folder, "once.zarr", **sections)
@@ -138,7 +136,7 @@ def test_settings_change_nothing_in_that(tmp_path, frames, monkeypatch, name, se
     compare(tmp_path, **sections)
 
 
-def _bytes_read() -> int:
+def _bytes_read():
     facts = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
     return int(facts["rchar"])
 

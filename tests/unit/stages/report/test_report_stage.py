@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from pchem_pipeline.store.run_store import RunStore
 NY, NX, FRAMES = 16, 24, 200
 
 
-def make_context(folder: Path, settings: dict[str, object] | None = None, **run: object) -> StageContext:
+def make_context(folder, settings=None, **run):
     config = RunConfig.model_validate(
         {
             "run": {"tile": 8, **run},
@@ -39,7 +38,7 @@ def make_context(folder: Path, settings: dict[str, object] | None = None, **run:
 
 
 @pytest.fixture(scope="module")
-def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def base(tmp_path_factory):
     """A run up to the ensemble; 3 pixels failed."""
     folder = tmp_path_factory.mktemp("base")
     context = make_context(folder)
@@ -55,12 +54,12 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def folder(base: Path, tmp_path: Path) -> Path:
+def folder(base, tmp_path):
     shutil.copytree(base, tmp_path / "run")
     return tmp_path / "run"
 
 
-def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
+def test_a_run_gets_page_numbers_and_figures(folder):
     context = make_context(folder, title="My <sensor>")
     assert execute("report", context).state == "complete"
     store = folder / "run.zarr"
@@ -86,7 +85,7 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     assert status(STAGES["report"], context).state == "complete"
 
 
-def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder: Path) -> None:
+def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder):
     context = make_context(folder, {"pixels": [[2, 1], [15, 23]]})
     data = gather(context.store, context.config, [])
     assert [(pixel.y, pixel.x) for pixel in data.pixels] == [(2, 1), (15, 23)]
@@ -96,7 +95,7 @@ def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder: Path) -> None:
         execute("report", make_context(folder, {"pixels": [[16, 0]]}))
 
 
-def test_a_report_is_the_same_whoever_works_on_it(folder: Path) -> None:
+def test_a_report_is_the_same_whoever_works_on_it(folder):
     context = make_context(folder)
     context.store.write_config(dump_config(context.config))
     pages = []
@@ -110,7 +109,7 @@ def test_a_report_is_the_same_whoever_works_on_it(folder: Path) -> None:
     assert len(set(pages)) == 1  # without pytest's comparison
 
 
-def test_a_histogram_is_that_of_its_pixel(folder: Path) -> None:
+def test_a_histogram_is_that_of_its_pixel(folder):
     context = make_context(folder)
     pixel = gather(context.store, context.config, []).pixels[0]
     frames = np.load(next(folder.rglob("*.npy")))[:, pixel.y, pixel.x]
@@ -118,7 +117,7 @@ def test_a_histogram_is_that_of_its_pixel(folder: Path) -> None:
     np.testing.assert_array_equal(shown, np.sort(frames))
 
 
-def test_what_a_run_lacks_is_said(folder: Path) -> None:
+def test_what_a_run_lacks_is_said(folder):
     context = make_context(folder)
     context.store.delete("ensemble")
     for name in ("maps/charge_rate", "maps/charge_rate_stderr"):
@@ -128,7 +127,7 @@ def test_what_a_run_lacks_is_said(folder: Path) -> None:
     assert "input.integration_time" in data.missing["charge_rate"]
 
 
-def test_pixels_of_unfinished_tiles_are_not_called_good(folder: Path) -> None:
+def test_pixels_of_unfinished_tiles_are_not_called_good(folder):
     context = make_context(folder)
     for name in ("maps/conversion_gain", "maps/read_noise_e"):
         values = context.store.read(name)
@@ -141,10 +140,8 @@ def test_pixels_of_unfinished_tiles_are_not_called_good(folder: Path) -> None:
     assert (counted["n_unfitted"], counted["n_failed"]) == (64, 3 + 64)
 
 
-def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(figure: object) -> None:
+def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(folder, monkeypatch):
+    def fail(figure):
         raise MemoryError("no room to draw")
 
     monkeypatch.setattr("pchem_pipeline.stages.report.report.draw_figure", fail)
@@ -154,7 +151,7 @@ def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
     assert not (folder / "run.zarr" / "report.html").exists()
 
 
-def test_the_good_pixel_nearest_to_a_corner_of_all_good_ones_is_chosen() -> None:
+def test_the_good_pixel_nearest_to_a_corner_of_all_good_ones_is_chosen():
     rng = np.random.default_rng(2)
     noise = rng.standard_normal((80, 70))
     exposure = np.exp(
@@ -174,7 +171,7 @@ def test_the_good_pixel_nearest_to_a_corner_of_all_good_ones_is_chosen() -> None
         assert distance[(y - 20) * 70 + x] == pytest.approx(distance.min())
 
 
-def test_few_or_no_pixels_to_choose_from() -> None:
+def test_few_or_no_pixels_to_choose_from():
     nan, one = np.full((2, 2), np.nan), np.array([[0.3, np.nan], [0.2, np.nan]])
     words = np.array([[2, 2], [8, 2]], dtype=np.uint16)
     assert choose_pixels(nan, nan, words) == [("no fit", 0, 0), ("no fit", 1, 0)]
