@@ -40,3 +40,16 @@ def samples(counts: ArrayLike, origin: int) -> NDArray[np.float64]:
     """Return the raw sample of a histogram, sorted."""
     values = np.asarray(counts)
     return np.repeat(origin + np.arange(values.size), values).astype(float)
+
+
+def codes(rng, shape, exposure, step, noise_e, bias=100.3):
+    """Return whole DN of samples by plain numpy: ``bias + step (electrons + noise)``, rounded; noise in e-."""
+    electrons = rng.poisson(exposure, shape) + noise_e * rng.standard_normal(shape)
+    return np.rint(bias + step * electrons).astype(np.int64)
+
+
+def histograms(dn):
+    """Return the histograms (pixel, bin) of whole DN (pixel, frame), and the DN of bin 0, one for all."""
+    low, width = dn.min(), int(np.ptp(dn)) + 1
+    counts = np.stack([np.bincount(row - low, minlength=width) for row in dn])
+    return counts.astype(np.uint32), np.full(len(dn), low)

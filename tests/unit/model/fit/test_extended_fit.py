@@ -1,5 +1,6 @@
 """The fit under an extended law: at the maximum, with the right errors, and what it does with odd pixels."""
 
+from helpers.drawn_pixels import codes, histograms
 import dataclasses
 import functools
 
@@ -212,10 +213,8 @@ def test_free_satellites_are_found_where_they_are_and_nowhere_else():
 def test_a_law_without_limits_is_cut_where_the_adc_cuts():
     """A third of the samples at 0 DN, and noise that a row shares: as the PCD, whose read noise has it in."""
     rng = np.random.default_rng(3)
-    samples = 10.0 * (rng.poisson(1.0, (12, 3000)) + 0.34 * rng.standard_normal((12, 3000))) - 3.0
-    samples = np.rint(samples).astype(np.int64).clip(0, 4095)
-    counts = np.stack([np.bincount(row, minlength=200) for row in samples]).astype(np.uint32)
-    fit = functools.partial(fit_histograms, counts, np.zeros(12, np.int32), adc_limits=(0, 4095))
+    samples = codes(rng, (12, 3000), 1.0, 10.0, 0.34, bias=-3.0).clip(0, 4095)
+    fit = functools.partial(fit_histograms, *histograms(samples), adc_limits=(0, 4095))
     plain, shared = fit(), fit(law=SampleLaw(extra_variance_dn2=np.array([4.0])))
     np.testing.assert_allclose(shared.log_likelihood, plain.log_likelihood, atol=1e-3)
     np.testing.assert_allclose(shared.bias, plain.bias, atol=1e-2)

@@ -1,5 +1,6 @@
 """The joint fit against dense algebra, finite differences, plain numpy EM, iminuit and the single fit."""
 
+from helpers.drawn_pixels import codes, histograms
 from typing import NamedTuple
 
 import numpy as np
@@ -26,15 +27,12 @@ def draw_series(rng, exposures, noise_e, n_pixels, *, step=10.0, bias=100.3, n_f
     counts, origins = [], []
     for exposure in exposures:
         if exposure > 0:
-            drawn = draw(rng, np.full(n_pixels, exposure), step, noise_e, bias, n_frames)
-            counts.append(drawn.counts)
-            origins.append(drawn.origin)
-            continue
-        sd = np.sqrt((noise_e * step) ** 2 - 1 / 12)
-        codes = np.rint(bias + sd * rng.standard_normal((n_pixels, n_frames))).astype(np.int64)
-        low, width = codes.min(), int(np.ptp(codes)) + 1
-        counts.append(np.stack([np.bincount(row - low, minlength=width) for row in codes]).astype(np.uint32))
-        origins.append(np.full(n_pixels, low))
+            drawn = draw(rng, np.full(n_pixels, exposure), step, noise_e, bias, n_frames)[:2]
+        else:
+            analog = np.sqrt(noise_e**2 - 1 / (12 * step**2))
+            drawn = histograms(codes(rng, (n_pixels, n_frames), 0.0, step, analog, bias))
+        counts.append(drawn[0])
+        origins.append(drawn[1])
     return Drawn(counts, origins, [exposure == 0 for exposure in exposures])
 
 
