@@ -1,11 +1,10 @@
 """The joint fit against dense algebra, finite differences, plain numpy EM, iminuit and the single fit."""
 
-from helpers.drawn_pixels import codes, histograms
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers.drawn_pixels import draw
+from helpers.drawn_pixels import codes, draw, histograms
 
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
@@ -66,14 +65,6 @@ def test_plain_em_ends_at_the_same_maximum():
     np.testing.assert_allclose(em.quanta_exposure[:, :2], newton.quanta_exposure[:, :2], rtol=1e-4)
     for name in ("conversion_gain", "bias", "read_noise_dn"):
         np.testing.assert_allclose(getattr(em, name), getattr(newton, name), rtol=1e-4)
-
-
-def test_a_pixel_does_not_depend_on_the_others():
-    series = draw_series(np.random.default_rng(4), [0.6, 2.5], 0.5, 4)
-    together = fit_histograms(series.counts, series.origins)
-    alone = fit_histograms([c[2:3] for c in series.counts], [o[2:3] for o in series.origins])
-    assert together.conversion_gain[2] == alone.conversion_gain[0]
-    np.testing.assert_array_equal(together.covariance[2], alone.covariance[0])
 
 
 def test_words_say_why_a_pixel_has_no_value():

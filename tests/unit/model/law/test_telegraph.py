@@ -29,11 +29,6 @@ def drawn(rng, exposure):
     return np.rint(dn).astype(np.uint16)
 
 
-def blocks(n, length, gap):
-    """Frame numbers in blocks with gaps between them."""
-    return np.asarray((np.arange(n // length)[:, None] * (length + gap) + np.arange(length)).ravel())
-
-
 def pixel_with_mean(samples):
     """The pixel with the exposure that a plain fit finds, the mean one."""
     return np.array([(samples.mean() - PIXEL[2]) * PIXEL[1], *PIXEL[1:]])
@@ -79,7 +74,7 @@ def test_likelihood_and_states_are_those_of_the_matrices(n_processes):
 
 @pytest.mark.parametrize("gap", [0, 200])
 def test_blinking_pixels_are_found_with_their_lower_exposure(gap):
-    frames = blocks(3000, 100, gap)
+    frames = (np.arange(30)[:, None] * (100 + gap) + np.arange(100)).ravel()
     pulls, shares = [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
