@@ -52,21 +52,21 @@ def test_thresholds_are_where_the_largest_membership_changes(case):
     np.testing.assert_array_equal(np.searchsorted(table, x), membership_argmax(x, *case))
 
 
-def test_pixels_without_parameters_have_no_number():
-    frames = np.full((2, 1, 3), 130, dtype=np.uint16)
-    maps = [np.array([[v, v, v]]) for v in (2.0, 0.1, 100.0, 3.0)]
-    maps[1][0, 1] = np.nan
-    maps[0][0, 2] = np.inf
-    np.testing.assert_array_equal(converted(frames, known(*maps))[:, 0], [[3, NO_NUMBER, NO_NUMBER]] * 2)
-
-
-def test_no_exposure_means_no_electrons_and_huge_numbers_are_cut():
-    one = np.ones((1, 2))
-    frames = np.array([[[100, 5000]]], dtype=np.uint16)
-    np.testing.assert_array_equal(converted(frames, known(0 * one, 0.1 * one, 50 * one, 3 * one)), [[[0, 0]]])
-    frames = np.array([[[100, 65535]]], dtype=np.uint16)
-    large = converted(frames, known(1000 * one, 2.0 * one, 50 * one, 0.1 * one))
-    assert large[0, 0, 1] == LARGEST_NUMBER
+@pytest.mark.parametrize(
+    ("pixel", "dn", "numbers"),
+    [
+        ((2.0, 0.1, 100.0, 3.0), [130], [3]),
+        ((2.0, np.nan, 100.0, 3.0), [130], [NO_NUMBER]),
+        ((np.inf, 0.1, 100.0, 3.0), [130], [NO_NUMBER]),
+        ((0.0, 0.1, 50.0, 3.0), [100, 5000], [0, 0]),
+        ((1000.0, 2.0, 50.0, 0.1), [65535], [LARGEST_NUMBER]),
+        ((1.0, 0.125, 101.0, 3.0), [105, 106], [0, 1]),  # 105 is half-way at H = 1: the smaller number
+    ],
+)
+def test_numbers_of_odd_pixels_and_samples(pixel, dn, numbers):
+    maps = [np.full((1, 1), value) for value in pixel]
+    found = converted(np.array(dn, np.uint16)[:, None, None], known(*maps))
+    np.testing.assert_array_equal(found.ravel(), numbers)
 
 
 def test_codes_beyond_the_table_have_no_number():
@@ -76,13 +76,6 @@ def test_codes_beyond_the_table_have_no_number():
     tables = number_tables(low, high, pixels.exposure, pixels)
     frames = np.array([89, 90, 130, 131], np.uint16)[:, None, None]
     np.testing.assert_array_equal(tables.convert(frames).number.ravel(), [NO_NUMBER, 0, 3, NO_NUMBER])
-
-
-def test_a_tie_goes_to_the_smaller_number():
-    # H = 1: the boundary between 0 and 1 is exactly half-way, mu + 1/(2 g) = 105
-    frames = np.array([[[105, 106]]], dtype=np.uint16)
-    maps = [np.full((1, 2), v) for v in (1.0, 0.125, 101.0, 3.0)]
-    np.testing.assert_array_equal(converted(frames, known(*maps)), [[[0, 1]]])
 
 
 def test_histograms_and_frames_give_the_same_numbers():

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.drawn_pixels import unlike_pixels
 from scipy.stats import poisson
 
 from pchem_pipeline.model.ensemble.components import (
@@ -18,19 +19,6 @@ from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
-def make_pixels(n, seed=2):
-    """All four parameters vary and depend on one another."""
-    rng = np.random.default_rng(seed)
-    z = rng.standard_normal((4, n))
-    g = 0.1 * np.exp(0.1 * z[0])
-    return UsablePixels(
-        2.0 * np.exp(0.4 * z[1] + 0.2 * z[0]),
-        g,
-        100.0 + 4.0 * z[2] + 2.0 * z[0],
-        3.0 * np.exp(0.1 * z[3] - 0.1 * z[1]),
-    )
-
-
 def brute_width(h, g, mu, s2, k):
     """E and Var of E | K_e = k as the appendix writes them."""
     weight = np.exp(-h) * h**k
@@ -40,7 +28,7 @@ def brute_width(h, g, mu, s2, k):
 
 
 def test_every_case_is_that_of_maps_held_constant():
-    pixels = make_pixels(500)
+    pixels = unlike_pixels(500)
     result = component_widths(pixels, 12)
     h, g, mu, sigma = pixels.maps
     for row, case in enumerate(COMPONENT_CASES):
@@ -57,7 +45,7 @@ def test_every_case_is_that_of_maps_held_constant():
 
 
 def test_only_the_paper_s_five_cases_do_not_depend_on_k():
-    variance = component_widths(make_pixels(2000), 10).variance
+    variance = component_widths(unlike_pixels(2000), 10).variance
     constant = {
         case for case, row in zip(COMPONENT_CASES, variance, strict=True) if np.ptp(row) < 1e-9 * row[0]
     }
@@ -70,25 +58,19 @@ def test_only_the_paper_s_five_cases_do_not_depend_on_k():
     }
 
 
-def test_widths_survive_hot_pixels_and_many_electrons():
-    pixels = UsablePixels(
-        np.array([0.0, 2.0, 900.0]), np.array([0.1, 0.2, 0.1]), np.array([90.0, 100.0, 110.0]), np.ones(3)
-    )
-    result = component_widths(pixels, 1500)
+def test_widths_survive_hot_pixels_many_electrons_and_none():
+    columns = [0.0, 2.0, 900.0], [0.1, 0.2, 0.1], [90.0, 100.0, 110.0], [1.0, 1.0, 1.0]
+    result = component_widths(UsablePixels(*np.array(columns)), 1500)
     assert np.isfinite(result.variance).all()
     assert result.mean[0] == pytest.approx((90 + np.exp(-2) * 100) / (1 + np.exp(-2)))
     assert result.mean[1400] == pytest.approx(110 + 1400 / 0.1)
-
-
-def test_no_electrons_means_one_component():
-    ones = np.ones(3)
-    result = component_widths(UsablePixels(0 * ones, 0.1 * ones, 100 * ones, 3 * ones), 2)
-    assert result.variance[0, 0] == pytest.approx(9.0)
-    assert np.isnan(result.mean[1])
+    none = component_widths(UsablePixels(*np.outer((0.0, 0.1, 100.0, 3.0), np.ones(3))), 2)
+    assert none.variance[0, 0] == pytest.approx(9.0)
+    assert np.isnan(none.mean[1])
 
 
 def test_moments_are_those_of_the_mixture():
-    pixels = make_pixels(300)
+    pixels = unlike_pixels(300)
     h, g, mu, sigma = pixels.maps
     k = np.arange(120)
     weight = poisson.pmf(k, h[:, None]) / 300
@@ -108,7 +90,7 @@ def test_moments_are_those_of_the_mixture():
 
 
 def test_pixels_whose_bias_may_be_an_electron_off_do_not_count():
-    pixels, doubtful = make_pixels(300), np.arange(300) < 60
+    pixels, doubtful = unlike_pixels(300), np.arange(300) < 60
     h, g, mu, sigma = pixels.maps
     wrong = UsablePixels(h + doubtful, g, mu - doubtful / g, sigma)
     weight = bias_weight(np.where(doubtful, 0.0, np.inf))
@@ -143,7 +125,7 @@ def test_moment_errors_of_equal_poisson_pixels():
 
 
 def test_moment_errors_are_those_of_repeated_captures():
-    pixels, rng, n = make_pixels(600), np.random.default_rng(14), 400
+    pixels, rng, n = unlike_pixels(600), np.random.default_rng(14), 400
     h, g, mu, sigma = pixels.maps
     moments = []
     for _ in range(n):

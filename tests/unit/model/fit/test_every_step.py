@@ -1,13 +1,11 @@
 """The search finds the comb of any step: dark and clean pixels, few DN per electron, samples at a limit."""
 
-from helpers.drawn_pixels import codes, histograms
 import numpy as np
 import pytest
+from helpers.drawn_pixels import codes, histograms
 
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of
-
-
 
 
 def fitted(dn, **options):

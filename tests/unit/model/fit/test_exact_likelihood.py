@@ -1,10 +1,9 @@
 """The exact quantised likelihood of one sample: where it is used, and what rounding does without it."""
 
-from helpers.drawn_pixels import codes, histograms
 import numpy as np
 import pytest
 from helpers.bounds import cramer_rao
-from helpers.drawn_pixels import draw
+from helpers.drawn_pixels import codes, draw, histograms
 from helpers.plain_law import pcd_mass
 from scipy.optimize import minimize
 
@@ -21,8 +20,6 @@ from pchem_pipeline.store.run_store import RunStore
 
 EXACT, DENSITY = FitSettings(likelihood="exact"), FitSettings(likelihood="density")
 AUTO = FitSettings()
-
-
 
 
 def test_the_predicted_bias_is_where_the_density_goes_on_the_exact_masses():

@@ -1,11 +1,11 @@
 """The fit under an extended law: at the maximum, with the right errors, and what it does with odd pixels."""
 
-from helpers.drawn_pixels import codes, histograms
 import dataclasses
 import functools
 
 import numpy as np
 import pytest
+from helpers.drawn_pixels import codes, histograms
 from helpers.extended_reference import LAWS
 from scipy.optimize import root
 
