@@ -6,20 +6,19 @@ import shutil
 import numpy as np
 import pytest
 import tifffile
+from helpers.stage_runs import stage_context
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.compute.executor import SerialExecutor, make_executor
+from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
-from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run import input as run_input
 from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.input import open_source
-from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
-from pchem_pipeline.run.stage import Options, StageContext, open_store
+from pchem_pipeline.run.stage import Options, open_store
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.table import STAGES
@@ -43,16 +42,7 @@ def write_stack(folder, parts=4):
 
 
 def make_context(folder, *, executor=None, options=None, stop=None, **settings):
-    given = {"files": ["cam"], **settings}
-    return StageContext(
-        RunConfig.model_validate({"input": given}),
-        folder,
-        RunStore.create(folder / "run.zarr"),
-        executor or SerialExecutor(),
-        Reporter("off", quiet=True),
-        stop or StopRequest(),
-        options=options or Options(),
-    )
+    return stage_context(folder, executor, options, stop, input={"files": ["cam"], **settings})
 
 
 def run(context):

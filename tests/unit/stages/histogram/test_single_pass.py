@@ -10,16 +10,15 @@ import pytest
 import tifffile
 from astropy.io import fits
 from helpers.commands import arrays_of
+from helpers.drawn_pixels import codes
+from helpers.stage_runs import completed, stage_context
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import make_executor
-from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
-from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.bands import cut_rows
 from pchem_pipeline.stages.histogram import memory, single_pass
-from pchem_pipeline.store.run_store import RunStore
 
 FRAMES, NY, NX = 300, 150, 40
 
@@ -27,9 +26,7 @@ FRAMES, NY, NX = 300, 150, 40
 @pytest.fixture(scope="module")
 def frames():
     rng = np.random.default_rng(31)
-    shape = (FRAMES, NY, NX)
-    bias = rng.normal(100, 6, shape[1:])
-    dn = np.rint(bias + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype(np.uint16)
+    dn = codes(rng, (FRAMES, NY, NX), 1.5, 11, 0.3, rng.normal(100, 6, (NY, NX))).astype(np.uint16)
     dn[200:, 7, 7] += 900  # a pixel that outgrows its window after the first block
     return dn
 
@@ -73,18 +70,14 @@ SUFFIXES = (".npy", ".raw", ".tif", ".fits", ".h5")
 
 def make_context(folder, store, *, workers=2, **sections):
     files = sorted(str(path) for path in folder.iterdir() if path.suffix in SUFFIXES)
-    content = {name: dict(values) for name, values in sections.items()}
-    content["input"] = {"files": files, "mode": "reference", **content.get("input", {})}
-    content["histogram"] = {"block_frames": 96, "window_frames": 64, **content.get("histogram", {})}
-    content["compute"] = {"workers": workers, **content.get("compute", {})}
-    config = RunConfig.model_validate(content)
-    return StageContext(config, folder, RunStore.create(folder / store), make_executor(config.compute))
+    content = {"input": {"files": files, "mode": "reference"}, "compute": {"workers": workers}}
+    content |= {"histogram": {"block_frames": 96, "window_frames": 64}, "run": {"store": store}}
+    content = {name: values | sections.get(name, {}) for name, values in content.items()}
+    return stage_context(folder, make_executor(ComputeSettings(**content["compute"])), **content)
 
 
 def run_both(context):
-    assert execute("ingest", context).state == "complete"
-    assert execute("histogram", context).state == "complete"
-    return context
+    return completed(context, "ingest", "histogram")
 
 
 def contents(context):

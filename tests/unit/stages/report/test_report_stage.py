@@ -6,51 +6,38 @@ import shutil
 import numpy as np
 import pytest
 from helpers.inspector_material import page_without_pictures
+from helpers.stage_runs import completed, stage_context
 from helpers.written_fit import write_fit
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.compute.executor import beside
 from pchem_pipeline.config.load import dump_config
-from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.run.fingerprint import status
-from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.report.pixels import choose_pixels
 from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.stages.table import STAGES
-from pchem_pipeline.store.run_store import RunStore
 
 NY, NX, FRAMES = 16, 24, 200
 
 
 def make_context(folder, settings=None, **run):
-    config = RunConfig.model_validate(
-        {
-            "run": {"tile": 8, **run},
-            "simulate": {"shape": [NY, NX], "n_frames": FRAMES, "format": "npy"},
-            "report": settings or {},
-        }
-    )
-    return StageContext(config, folder, RunStore.create(folder / "run.zarr"))
+    simulate = {"shape": [NY, NX], "n_frames": FRAMES, "format": "npy"}
+    return stage_context(folder, run={"tile": 8, **run}, simulate=simulate, report=settings or {})
 
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory):
     """A run up to the ensemble; 3 pixels failed."""
-    folder = tmp_path_factory.mktemp("base")
-    context = make_context(folder)
-    for name in ("simulate", "ingest", "histogram"):
-        assert execute(name, context).state == "complete"
+    context = completed(make_context(tmp_path_factory.mktemp("base")), "simulate", "ingest", "histogram")
     status_map = np.zeros((NY, NX), dtype=np.uint16)
     status_map[2, :3] = int(FitStatus.TOO_FEW_BINS)
     status_map[5, 5] = int(FitStatus.POOR_FIT)
     write_fit(context, status_map, status_map == int(FitStatus.TOO_FEW_BINS))
-    for name in ("maps", "ensemble"):
-        assert execute(name, context).state == "complete"
-    return folder
+    return completed(context, "maps", "ensemble").base_dir
 
 
 @pytest.fixture
@@ -60,8 +47,7 @@ def folder(base, tmp_path):
 
 
 def test_a_run_gets_page_numbers_and_figures(folder):
-    context = make_context(folder, title="My <sensor>")
-    assert execute("report", context).state == "complete"
+    context = completed(make_context(folder, title="My <sensor>"), "report")
     store = folder / "run.zarr"
     numbers = json.loads((store / "report.json").read_text())
     median = float(np.nanmedian(context.store.read("maps/read_noise_e")))
@@ -69,14 +55,8 @@ def test_a_run_gets_page_numbers_and_figures(folder):
     assert numbers["ensemble"]["rmse"] == pytest.approx(context.store.attributes("ensemble")["rmse"])
     assert numbers["fit_status"]["n_failed"] == 3
     assert numbers["fit_status"]["reasons"]["poor_fit"]["pixels"] == 1
-    assert [row["stage"] for row in numbers["stages"]] == [
-        "simulate",
-        "ingest",
-        "histogram",
-        "fit",
-        "maps",
-        "ensemble",
-    ]
+    stages = ["simulate", "ingest", "histogram", "fit", "maps", "ensemble"]
+    assert [row["stage"] for row in numbers["stages"]] == stages
     assert numbers["inputs"][0]["name"].endswith(".npy")
     assert len(numbers["moments"]) >= 4
     html = (store / "report.html").read_text(encoding="utf-8")
