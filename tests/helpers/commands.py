@@ -25,6 +25,25 @@ input: {files: [frames/*.tif], integration_time: 4.87, bit_depth: 14}
 """
 
 
+LISTING = """
+import sys
+from pchem_pipeline.cli import app
+try:
+    app.main(sys.argv[1:])
+except SystemExit as end:
+    assert end.code in (0, None), end.code
+print(' '.join(sorted({name.partition('.')[0] for name in sys.modules})))
+"""
+
+
+def imported_by(*arguments) -> set[str]:
+    """Run a command in a process of its own, which must succeed; return the libraries that it imported."""
+    command = [sys.executable, "-c", LISTING, *map(str, arguments)]
+    outcome = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert outcome.returncode == 0, outcome.stderr
+    return set(outcome.stdout.splitlines()[-1].split())
+
+
 @dataclass
 class Result:
     """What a finished command left."""
@@ -97,6 +116,13 @@ class Shell:
                 code = end.code
         open_store.cache_clear()  # as a process of its own forgets them
         return Result(code or 0, stdout.getvalue(), stderr.getvalue())
+
+    def refused(self, code: int, *arguments) -> str:
+        """Run the command, which must end with this code; return what it says last, in one line."""
+        result = self(*arguments)
+        assert result.code == code, result.stderr
+        assert "Traceback" not in result.stderr
+        return result.last
 
     def ok(self, *arguments) -> Result:
         """Run the command, which must succeed."""
