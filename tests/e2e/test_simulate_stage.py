@@ -85,28 +85,23 @@ def test_integration_time_and_bit_depth_travel_with_the_files(tmp_path):
         assert (reader.integration_time, reader.bit_depth) == (2.5, 12)
 
 
-def test_processes_give_the_same_frames(tmp_path):
-    target = prepare(tmp_path, backend="processes", frames_per_file=12)
+@pytest.mark.parametrize(
+    ("backend", "limits", "n_files"),
+    [
+        ("processes", {}, 2),
+        ("threads", {"_BUDGET": 1, "_CHUNK": 3 * 4 * 9 * 11}, 1),  # small blocks
+        ("serial", {"_MOST_UNITS": 4}, 23),  # many files share few units
+    ],
+)
+def test_blocks_units_and_processes_give_the_same_frames(tmp_path, monkeypatch, backend, limits, n_files):
+    for name, value in limits.items():
+        monkeypatch.setattr(stage, name, value)
+    target = prepare(tmp_path, backend=backend, frames_per_file=-(-23 // n_files))
     assert simulated(target) == "complete"
-    np.testing.assert_array_equal(frames_of(target), expected(target)[0])
-
-
-def test_small_blocks_give_the_same_frames(tmp_path, monkeypatch):
-    monkeypatch.setattr(stage, "_BUDGET", 1)
-    monkeypatch.setattr(stage, "_CHUNK", 3 * 4 * 9 * 11)
-    target = prepare(tmp_path, backend="threads")
-    simulated(target)
     dn, electrons = expected(target)
     np.testing.assert_array_equal(frames_of(target), dn)
     np.testing.assert_array_equal(RunStore.open(target.store).read("truth/electron_number"), electrons[:10])
-
-
-def test_many_files_share_few_units(tmp_path, monkeypatch):
-    monkeypatch.setattr(stage, "_MOST_UNITS", 4)
-    target = prepare(tmp_path, frames_per_file=1)
-    simulated(target)
-    np.testing.assert_array_equal(frames_of(target), expected(target)[0])
-    assert len(list((tmp_path / "frames").glob("*.raw"))) == 23
+    assert len(list((tmp_path / "frames").glob("*.raw"))) == n_files
 
 
 def test_a_failed_run_goes_on_where_it_was(tmp_path, monkeypatch):

@@ -3,8 +3,7 @@
 import mpmath
 import numpy as np
 import pytest
-from helpers.drawn_pixels import draw, samples
-from helpers.reference_pchem import Theta, log_likelihood
+from helpers.drawn_pixels import draw
 from iminuit import Minuit
 from scipy.special import gammaln
 
@@ -53,31 +52,12 @@ def test_maximum_and_standard_errors_match_iminuit(case):
     slope = np.array([1, -1 / a**2, 1, 1])
     covariance = np.array(minuit.covariance) * np.outer(slope, slope)
     error = np.sqrt(np.diag(covariance))
-    ours = np.array(
-        [result.quanta_exposure[0], result.conversion_gain[0], result.bias[0], result.read_noise_dn[0]]
-    )
-    np.testing.assert_allclose((ours - [h, 1 / a, mu, sigma]) / error, 0, atol=2e-3)
+    np.testing.assert_allclose((result.columns[0] - [h, 1 / a, mu, sigma]) / error, 0, atol=2e-3)
     np.testing.assert_allclose(
         result.covariance[0] / np.outer(error, error), covariance / np.outer(error, error), atol=5e-3
     )
     assert result.log_likelihood[0] == pytest.approx(-minuit.fval, abs=1e-5)
     assert result.log_likelihood[0] >= -minuit.fval - 1e-7  # never below the other program's maximum
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_no_point_nearby_is_likelier_by_the_reference(case):
-    pixel = draw(np.random.default_rng(22), *case, n_frames=4000)
-    result = fit_histograms(pixel.counts, pixel.origin)
-    x = samples(pixel.counts[0], int(pixel.origin[0]))
-    best = np.array(
-        [result.quanta_exposure[0], result.conversion_gain[0], result.bias[0], result.read_noise_dn[0]]
-    )
-    top = log_likelihood(x, Theta(*best))
-    assert result.log_likelihood[0] == pytest.approx(top, rel=1e-12)
-    root = np.linalg.cholesky(result.covariance[0])
-    for direction in np.vstack([root.T, -root.T]):
-        # half a standard error off costs 1/8 nat, up to the cubic term
-        assert top - log_likelihood(x, Theta(*(best + 0.1 * direction))) == pytest.approx(0.005, rel=0.25)
 
 
 @pytest.mark.parametrize(

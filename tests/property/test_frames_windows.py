@@ -4,7 +4,6 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -54,22 +53,3 @@ def test_windows_of_what_we_write(data, stack, format):
             format, Path(folder) / "in" / "a", iter([stack]), stack.shape, stack.dtype, frames_per_file=parts
         )
         check(data, Path(folder) / "in", stack, format=format)
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    data=st.data(),
-    stack=stacks(),
-    compression=st.sampled_from([None, "zlib", "lzw"]),
-    byteorder=st.sampled_from("<>"),
-    rows=st.one_of(st.none(), st.integers(1, 12)),
-    bigtiff=st.booleans(),
-)
-def test_windows_of_tiff(data, stack, compression, byteorder, rows, bigtiff):
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.tif"
-        with tifffile.TiffWriter(path, byteorder=byteorder, bigtiff=bigtiff) as writer:
-            for frame in stack:
-                options = {"compression": compression, "rowsperstrip": rows, "metadata": None}
-                writer.write(frame, photometric="minisblack", **options)
-        check(data, path, stack)

@@ -5,13 +5,13 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pytest
+from helpers.small_sensors import a_uniform_sensor
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 NOTHING = [
     {"tag": "exposure_drift", "drift": 0.0},
@@ -42,10 +42,7 @@ def sensor(**changes):
 
 
 def constant_truth(shape=(6, 7), *, exposure=2.0, gain=0.1, bias=100.0, noise=0.3):
-    return TruthMaps(
-        *(np.full(shape, float(value)) for value in (exposure, gain, bias, noise)),
-        defect=np.zeros(shape, np.uint8),
-    )
+    return a_uniform_sensor(shape, float(exposure), gain, float(bias), noise)
 
 
 def test_long_tables_of_hot_pixels_are_searched_right():

@@ -248,30 +248,6 @@ def test_the_weights_of_exposures_may_differ_by_pixel_where_the_exposures_do_not
         np.testing.assert_array_equal(sample_mass(one, maps, codes)[row], both[row])
 
 
-CASES = [
-    (0.05, 0.1, 50.2, 3.0),
-    (2.0, 0.09, 100.0, 3.4),
-    (15.0, 0.07, -20.0, 6.0),
-    (3.0, 1.0, 0.0, 2.5),
-    (80.0, 0.1, 7.0, 2.0),
-]
-
-
-@pytest.mark.parametrize("theta", CASES)
-def test_density_has_the_moments_of_its_cumulants(theta):
-    exposure, gain, bias, sigma = theta
-    mean, variance = bias + exposure / gain, sigma**2 + exposure / gain**2
-    third, fourth = exposure / gain**3, exposure / gain**4
-    x = np.linspace(mean - 14 * np.sqrt(variance), mean + 40 * np.sqrt(variance), 200_001)
-    weight = pcd(x, *theta) * (x[1] - x[0])
-    d = x - (weight @ x)
-    assert weight.sum() == pytest.approx(1, abs=1e-10)
-    assert weight @ x == pytest.approx(mean, rel=1e-10)
-    assert weight @ d**2 == pytest.approx(variance, rel=1e-9)
-    assert weight @ d**3 == pytest.approx(third, rel=1e-7)
-    assert weight @ d**4 - 3 * (weight @ d**2) ** 2 == pytest.approx(fourth, rel=1e-6, abs=1e-6 * variance**2)
-
-
 def test_the_density_where_there_is_little_to_say():
     x = np.linspace(-30, 30, 13)
     np.testing.assert_allclose(log_pcd(x, 0.0, 0.1, 1.0, 2.5), norm.logpdf(x, 1.0, 2.5), rtol=1e-14)
