@@ -7,11 +7,11 @@ import json
 import shutil
 import signal
 import socket
-import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.commands import served
 from helpers.packed_maps import unpack_map
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
@@ -43,14 +43,9 @@ class Client:
 
 @pytest.fixture(scope="module")
 def client(finished):
-    server, address = make_server(finished)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    assert address == f"http://127.0.0.1:{server.server_port}/"
-    yield Client(server.server_port)
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with served(finished) as (server, address):
+        assert address == f"http://127.0.0.1:{server.server_port}/"
+        yield Client(server.server_port)
 
 
 def digest(folder):

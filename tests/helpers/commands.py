@@ -5,15 +5,18 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
 
 from pchem_pipeline.cli.app import main
+from pchem_pipeline.commands.view import make_server
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
 
@@ -129,6 +132,20 @@ class Shell:
         result = self(*arguments)
         assert result.code == 0, result.stderr
         return result
+
+
+@contextmanager
+def served(path) -> Iterator[tuple[ThreadingHTTPServer, str]]:
+    """Serve the page of a run meanwhile: the server, and its address."""
+    server, address = make_server(path)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield server, address
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
 
 
 def arrays_of(path, groups=("frames", "histogram", "summary", "fit", "maps", "ensemble")):
