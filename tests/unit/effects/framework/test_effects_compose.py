@@ -79,16 +79,12 @@ def test_an_effect_that_raises_is_named():
 
 def test_tile_without_effects_is_the_plain_fit_and_with_them_not():
     pixels = draw(np.random.default_rng(6), [0.5, 2.0, 1.0, 4.0], 11.0, 0.3)
-    histogram = {
+    histogram = {name: np.zeros((2, 2), np.uint32) for name in ("under", "over")}
+    histogram |= {
         "counts": pixels.counts.reshape(2, 2, -1),
-        "origin": pixels.origin.reshape(2, 2).astype(np.int32),
-        "under": np.zeros((2, 2), np.uint32),
-        "over": np.zeros((2, 2), np.uint32),
+        "origin": pixels.origin.reshape(2, 2).astype("i4"),
     }
     plain = fit_tile([histogram], TileFit())["fit"]
-    again = fit_tile([histogram], TileFit())["fit"]
-    for name, values in plain.items():
-        np.testing.assert_array_equal(again[name], values)
     trap = RtsNoise(fraction=0.1, amplitude_e=1.5, probability=0.2)
     extended = fit_tile([histogram], TileFit(effects=[RowNoise(row_noise_dn=1.0), trap]))["fit"]
     ends = {path for name in INTERVALS for path in interval_names(name)}  # only where they are asked for
@@ -106,12 +102,7 @@ def test_tile_without_effects_is_the_plain_fit_and_with_them_not():
 
 
 def test_the_nearest_pcd_has_the_whole_width_of_the_peaks():
-    columns = [
-        np.array([2.0, np.nan]),
-        np.array([0.1, np.nan]),
-        np.array([100.0, np.nan]),
-        np.array([2.5, np.nan]),
-    ]
+    columns = [np.array([value, np.nan]) for value in (2.0, 0.1, 100.0, 2.5)]
     model = SampleLaw().with_variance(dn2=1.0, e2=0.01, per_electron=0.005, per_electron2=0.001)
     model = model.with_levels(scale=0.98, shift_e=0.1, curvature=0.02).with_noise(
         [0.5, 0.5], shift_dn=[-1.0, 2.0]
@@ -130,12 +121,7 @@ def test_the_nearest_pcd_has_the_whole_width_of_the_peaks():
 def test_of_very_many_electrons_of_which_nearly_all_are_lost_the_few_are_left():
     """The chance that none is lost is 0 in doubles, which is no reason for a warning."""
     electrons, rng = np.full(2000, 900), np.random.default_rng(4)
-    left = regrouped(
-        electrons,
-        rng.random(2000),
-        1.0,
-        lambda index: (0.9, 0.0),
-        lambda u, index: np.zeros(u.size, np.int64),
-    )
+    none = lambda u, index: np.zeros(u.size, np.int64)  # noqa: E731
+    left = regrouped(electrons, rng.random(2000), 1.0, lambda index: (0.9, 0.0), none)
     assert abs(left.mean() - 90.0) < 4.0 * np.sqrt(900 * 0.09 / 2000)
     assert left.var() == pytest.approx(81.0, rel=4.0 * np.sqrt(2.0 / 2000))
