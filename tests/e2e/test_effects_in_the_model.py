@@ -25,20 +25,10 @@ EFFECTS: list[dict[str, Any]] = [
 QUIET = Command(quiet=True)
 
 
-def configured(folder, effects, tile=8):
-    content = {
-        "run": {"tile": tile},
-        "simulate": {
-            "shape": [16, 20],
-            "n_frames": 3000,
-            "seed": 3,
-            "format": "npy",
-            "effects": EFFECTS,
-            "truth_frames": 500,
-        },
-        "model": {"effects": effects},
-        "compute": {"backend": "serial"},
-    }
+def configured(folder, effects):
+    simulate = {"shape": [16, 20], "n_frames": 3000, "seed": 3, "format": "npy", "truth_frames": 500}
+    content = {"run": {"tile": 8}, "simulate": {**simulate, "effects": EFFECTS}}
+    content |= {"model": {"effects": effects}, "compute": {"backend": "serial"}}
     path = folder / "run.yaml"
     path.write_text(dump_config(RunConfig.model_validate(content)), encoding="utf-8")
     return path

@@ -268,7 +268,6 @@ def test_typed_ends_select_the_right_pixels(tab, store):
     bias = as_shown(store, "maps/bias")
     step = packed_map(StoredMaps(store), "maps/bias").scale.step
     found = re.search(r"Median bias ([\d.]+) DN, of all ([\d.]+)", tab.text("#inspector-selection"))
-    assert found is not None
     for text, values in ((found[1], bias[inside]), (found[2], bias[np.isfinite(bias)])):
         assert float(text) == pytest.approx(np.median(values), abs=step + 0.5)
     assert selected(tab) == inside.sum()
@@ -595,7 +594,6 @@ def test_the_server_shows_every_pixel_and_every_map(open_tab, store):
         assert f"Gray: {counts.sum():,} frames." in tab.text("#inspector-caption")
         tab.show("fit/log_likelihood")
         words = re.search(r"median (\d+) nat", tab.text("#inspector-histogram-words"))
-        assert words is not None
         assert int(words[1]) == pytest.approx(NX * NY / 2, rel=0.013)
         assert any("/api/map?path=fit%2Flog_likelihood" in each for each in tab.asked)
     page.write_text(text)

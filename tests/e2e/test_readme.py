@@ -47,7 +47,6 @@ def test_the_commands_in_readme_work(shell, frames):
     assert result.returncode == 0, result.stderr
     assert (shell.folder / "run.zarr" / "report.html").exists()
     shown = re.search(r"<!-- output of: (pchem status .*?) -->\n```\n(.*?)```", DOCS, re.S)
-    assert shown is not None
     assert shell.ok(*shown[1].split()[1:]).stdout == shown[2]
 
 

@@ -54,7 +54,6 @@ def frames_of(target):
 
 def expected(target):
     settings = target.config.simulate
-    assert settings is not None
     return simulate_block(draw_truth(settings), settings, (0, settings.n_frames))
 
 

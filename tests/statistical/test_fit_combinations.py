@@ -84,7 +84,6 @@ def test_each_pair_has_the_right_pulls_and_covers_the_truth(told):
     assert (np.abs(pulls.std(axis=0) - 1) < 5 / np.sqrt(2 * n) + 0.02).all()
     if "profile" in told:
         ends = found.intervals
-        assert ends is not None
         inside = (ends[good, :-1, 0] <= whole[good]) & (whole[good] <= ends[good, :-1, 1])
         np.testing.assert_allclose(inside.mean(axis=0), 0.6827, atol=5 * np.sqrt(0.22 / n))
     if "guard" in told:
@@ -118,7 +117,6 @@ def test_iminuit_finds_the_same_maximum_errors_and_intervals(case):
     found = fit_histograms(
         counts, origins, law=[LAW] * len(counts), settings=settings, start=plain, excluding=excluding
     )
-    assert found.intervals is not None
     for pixel in range(2):
         place = (np.arange(FIRST, FIRST + N_CODES) - plain.bias[pixel]) * plain.conversion_gain[pixel]
         aside = np.array([any(low <= v < high for low, high in excluding) for v in place])

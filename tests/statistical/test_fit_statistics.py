@@ -54,14 +54,10 @@ def test_a_gap_below_thirty_is_that_to_the_polished_neighbour():
     result = fit_histograms(pixels.counts, pixels.origin)
     best = result.columns[0]
     a = 1 / best[1]
-    runners = [
-        em_trace(
-            pixels.counts[0], int(pixels.origin[0]), (best[0] + d, best[1], best[2] - d * a, best[3]), 6000
-        )
-        for d in (-1, 1)
-    ]
+    starts = [(best[0] + d, best[1], best[2] - d * a, best[3]) for d in (-1, 1)]
+    paths = [em_trace(pixels.counts[0], int(pixels.origin[0]), start, 6000) for start in starts]
     assert 0 < result.likelihood_gap[0] < 30
-    heights = [runner.log_likelihood[-1] for runner in runners]
+    heights = [path.log_likelihood[-1] for path in paths]
     assert result.log_likelihood[0] - max(heights) == pytest.approx(result.likelihood_gap[0], abs=1e-3)
 
 

@@ -23,6 +23,14 @@ def file(tmp_path):
     return path
 
 
+def ingested(place, config=None):
+    """Leave a store whose frames are ingested, with the settings of a run."""
+    store = RunStore.create(place)
+    if config is not None:
+        store.write_config(dump_config(config))
+    store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -74,8 +82,7 @@ def test_options_can_be_corrected_until_a_stage_is_finished(tmp_path, file):
     store.write_config(dump_config(target.config))
     again, _ = begun(find_or_start, [file], place, {"bit_depth": 14})
     assert load_config(tmp_path / "run.yaml") == again.config
-    store.write_config(dump_config(again.config))
-    store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+    ingested(place, again.config)
     with pytest.raises(ConfigError, match=r"exists with other settings.*'.*/run\.yaml'|run\.yaml"):
         find_or_start([file], place, {"bit_depth": 12})
 
@@ -92,9 +99,7 @@ def test_a_folder_of_files_is_one_pattern_wherever_the_store_is(tmp_path, monkey
         target, _ = begun(find_or_start, files, Path("new/run.zarr"), {})
         assert target.config.input.files == ("../frames 1/*.tif",)
     (tmp_path / "frames 1" / "f.tif").touch()
-    store = RunStore.create(target.store)
-    store.write_config(dump_config(target.config))
-    store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+    ingested(target.store, target.config)
     with pytest.raises(ConfigError, match=r"input\.files .* in the file, .* here") as refused:
         find_or_start(files, Path("new/run.zarr"), {})
     assert len(str(refused.value)) < 700  # twice the path of the test
@@ -116,7 +121,7 @@ def test_the_same_command_goes_on_with_a_yaml_that_says_more(tmp_path, file, mon
     monkeypatch.chdir(tmp_path)
     place = tmp_path / "run.zarr"
     begun(find_or_start, [file], place, {"bit_depth": 12}, (0, 8, 8, 16))
-    RunStore.create(place).records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+    ingested(place)
     path = tmp_path / "run.yaml"
     effects = "effects: [{tag: row_noise, row_noise_dn: 1.0}]  # named"
     edited = path.read_text().replace("effects: []", effects).replace("tail_guard: 0.001", "tail_guard: 0")

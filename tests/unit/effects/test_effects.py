@@ -144,10 +144,8 @@ def test_parameters_at_a_limit_are_told_and_defaults_are_not():
 
 def test_limits_that_are_values_like_others_are_not_told():
     """Half a cycle per row is a frequency; a missing code is one of no width."""
-    pickup = registry.effect_class("periodic_pickup").model_validate(
-        {"amplitude_dn": 0.3, "cycles_per_row": 0.5}
-    )
-    assert pickup.at_limits() == {}
+    kind = registry.effect_class("periodic_pickup")
+    assert kind(amplitude_dn=0.3, cycles_per_row=0.5).at_limits() == {}
     every = [kind for kind in registry.effect_classes().values() if kind.may_be_at_bound]
     assert every
     assert all(set(kind.may_be_at_bound) <= set(kind.model_fields) for kind in every)

@@ -108,37 +108,34 @@ def test_refusals(tmp_path, text, words):
     assert caught.value.exit_code == 4
 
 
-def test_refusals_of_numpy_files(tmp_path):
-    def refused(words, name):
-        with pytest.raises(InputError, match=words):
-            read(tmp_path, name)
-
-    np.save(tmp_path / "o.npy", np.array([{1: 2}], dtype=object), allow_pickle=True)
-    refused("pickles are never opened", "o.npy")
-    np.save(tmp_path / "d.npy", np.zeros((2, 3, 4)))
-    refused(r"an array of shape \(2, 3, 4\)", "d.npy")
-    np.save(tmp_path / "t.npy", np.array(["a", "b"]))
-    refused("numbers are needed", "t.npy")
-    np.savez(tmp_path / "n.npz", dn=DN, count=COUNTS)
-    refused("needs arrays dn and counts, has count, dn", "n.npz")
-    np.savez(tmp_path / "s.npz", dn=DN, counts=COUNTS[:2])
-    refused("do not match", "s.npz")
-    np.savez(tmp_path / "b.npz", dn=DN, counts=COUNTS)
-    data = (tmp_path / "b.npz").read_bytes()
-    (tmp_path / "b.npz").write_bytes(data[: len(data) // 2])
-    refused(r"b\.npz: ", "b.npz")
-    (tmp_path / "e.npy").write_bytes(b"")
-    refused(r"e\.npy: ", "e.npy")
-    (tmp_path / "x.csv").write_bytes(b"\xff\xfe\x00\x01")
-    refused("not a text file", "x.csv")
-    (tmp_path / "x.dat").write_text("1,2")
-    refused("give histograms as", "x.dat")
+@pytest.mark.parametrize(
+    ("name", "arrays", "words"),
+    [
+        ("o.npy", np.array([{1: 2}], dtype=object), "pickles are never opened"),
+        ("d.npy", np.zeros((2, 3, 4)), r"an array of shape \(2, 3, 4\)"),
+        ("t.npy", np.array(["a", "b"]), "numbers are needed"),
+        ("n.npz", {"dn": DN, "count": COUNTS}, "needs arrays dn and counts, has count, dn"),
+        ("s.npz", {"dn": DN, "counts": COUNTS[:2]}, "do not match"),
+        ("e.npy", b"", r"e\.npy: "),
+        ("b.npz", b"PK\x03\x04\x14\0\0\0", r"b\.npz: "),
+        ("x.csv", b"\xff\xfe\x00\x01", "not a text file"),
+        ("x.dat", b"1,2", "give histograms as"),
+    ],
+)
+def test_refusals_of_other_files(tmp_path, name, arrays, words):
+    if isinstance(arrays, bytes):
+        (tmp_path / name).write_bytes(arrays)
+    elif isinstance(arrays, dict):
+        np.savez(tmp_path / name, **arrays)
+    else:
+        np.save(tmp_path / name, arrays, allow_pickle=True)
+    with pytest.raises(InputError, match=words):
+        read(tmp_path, name)
 
 
 def test_all_bad_files_in_one_message(tmp_path):
-    (tmp_path / "a.csv").write_text("1,2\n2,3\n")
-    (tmp_path / "b.csv").write_text("1,-2\n")
-    (tmp_path / "c.csv").write_text("")
+    for name, text in (("a", "1,2\n2,3\n"), ("b", "1,-2\n"), ("c", "")):
+        (tmp_path / f"{name}.csv").write_text(text)
     with pytest.raises(InputError, match=r"b\.csv: negative.*c\.csv: no hist.*input\.on_bad_file: skip"):
         read(tmp_path, "*.csv")
     found = read(tmp_path, "*.csv", on_bad_file="skip")
@@ -150,21 +147,23 @@ def test_all_bad_files_in_one_message(tmp_path):
         read(tmp_path)
 
 
-def test_what_is_a_histogram_input(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "format", "expected"),
+    [
+        ("a.csv", "auto", True),
+        ("*.csv", "auto", True),
+        ("a.csv", "raw", False),
+        ("a.npy", "auto", False),
+        ("a.npy", "histogram", True),
+        (".", "auto", False),
+    ],
+)
+def test_what_is_a_histogram_input(tmp_path, name, format, expected):
     (tmp_path / "a.csv").write_text("1,2\n2,3\n")
     np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), np.uint8))
-
-    def kind(*files, format="auto"):
-        return is_histogram_input(InputSettings(files=files, format=format), tmp_path)
-
-    assert kind("a.csv")
-    assert kind("*.csv")
-    assert not kind("a.npy")
-    assert kind("a.npy", format="histogram")
-    assert not kind("a.csv", format="raw")
-    assert not kind(".")
+    assert is_histogram_input(InputSettings(files=(name,), format=format), tmp_path) == expected
     with pytest.raises(InputError, match="mixed"):
-        kind("a.csv", "a.npy")
+        is_histogram_input(InputSettings(files=("a.csv", "a.npy")), tmp_path)
 
 
 def test_tables_that_are_none(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 import tifffile
 import zarr
 from astropy.io import fits
-from helpers.camera_files import not_opened, opened, write_hdf5
+from helpers.camera_files import not_opened, opened, write_fits, write_hdf5
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
@@ -155,9 +155,7 @@ def test_left_justified_values_above_the_bit_depth_say_their_shift(tmp_path, shi
 
 def test_files_that_contradict_each_other(tmp_path):
     for i, time in enumerate((1.5, 1.5, 2.0)):
-        hdu = fits.PrimaryHDU(STACK[i])
-        hdu.header["EXPTIME"] = time
-        hdu.writeto(tmp_path / f"f{i}.fits")
+        write_fits(tmp_path / f"f{i}.fits", STACK[i], EXPTIME=time)
     not_opened(r"different integration_time: 1\.5 in f0\.fits, 2\.0 in f2\.fits", tmp_path / "*.fits")
     assert opened(tmp_path / "*.fits", integration_time=3.0).integration_time == 3.0
     fits.PrimaryHDU(STACK[2]).writeto(tmp_path / "f2.fits", overwrite=True)
@@ -346,9 +344,7 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path):
 
 def test_fits_adds_what_its_header_says(tmp_path):
     stack = np.random.default_rng(4).integers(0, 4096, (9, 6, 8)).astype(np.uint16)
-    image = fits.PrimaryHDU((stack.astype(np.int32) - 1000).astype(np.int16))
-    image.header["BZERO"] = 1000
-    image.writeto(tmp_path / "a.fits")
+    write_fits(tmp_path / "a.fits", (stack.astype(np.int32) - 1000).astype(np.int16), BZERO=1000)
     with opened(tmp_path / "a.fits") as frames:
         np.testing.assert_array_equal(frames.read(), stack)
 

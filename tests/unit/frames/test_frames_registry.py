@@ -102,15 +102,21 @@ def test_plug_in_is_not_loaded_without_need(tmp_path, monkeypatch):
         open_frames(InputSettings(files=("a.npy",), format="broken"), tmp_path)
 
 
-def test_doubles_are_refused(monkeypatch):
-    plug_in(monkeypatch, ("tiff", "other.package:Tiff"))
-    with pytest.raises(ConfigError, match=r"named 'tiff': pchem_pipeline itself and other\.package:Tiff"):
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        ([("tiff", "other.package:Tiff")], "'tiff': pchem_pipeline itself and other.package:Tiff"),
+        ([("sif", "one.package:Sif"), ("sif", "two.package:Sif")], "'sif': one.package:Sif and two.package"),
+        ([("sif", "one.package:Sif")] * 2, ""),  # one that is listed twice is no double
+    ],
+)
+def test_doubles_are_refused(monkeypatch, points, words):
+    plug_in(monkeypatch, *points)
+    if not words:
+        assert registry.reader_names()[-1] == "sif"
+        return
+    with pytest.raises(ConfigError, match=f"named {words}"):
         registry.reader_names()
-    plug_in(monkeypatch, ("sif", "one.package:Sif"), ("sif", "two.package:Sif"))
-    with pytest.raises(ConfigError, match=r"named 'sif': one\.package:Sif and two\.package:Sif"):
-        registry.reader_class("sif")
-    plug_in(monkeypatch, ("sif", "one.package:Sif"), ("sif", "one.package:Sif"))
-    assert registry.reader_names()[-1] == "sif"
 
 
 @pytest.mark.parametrize(("name", "cls"), [("noreader", "NoReader"), ("othername", "TextReader")])

@@ -56,20 +56,16 @@ def test_zarr(tmp_path, codec):
         read(path)
 
 
-def test_zstd_of_many_frames(tmp_path):
+def test_zarr_of_many_frames_and_compressed_twice(tmp_path):
+    gzip_, zstd = ({"name": name, "configuration": {}} for name in ("gzip", "zstd"))
     path, coder = tmp_path / "a.zarr", numcodecs.Zstd()
-    coded = {"name": "zstd", "configuration": {}}
-    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded)
+    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=zstd)
     (path / "c/1/0/0").write_bytes(coder.encode(bytes(8)) + coder.encode(bytes(BOMB)))
     with refused_at_once(r"unpacks to more than"):
         read(path)
-
-
-def test_zarr_compressed_twice(tmp_path):
-    coded = [{"name": "gzip", "configuration": {}}, {"name": "zstd", "configuration": {}}]
-    zarr.create_array(tmp_path / "a.zarr", data=STACK, chunks=(20, 16, 16), compressors=coded)
+    zarr.create_array(tmp_path / "b.zarr", data=STACK, chunks=(20, 16, 16), compressors=[gzip_, zstd])
     with refused_at_once(r"compressed twice, by \w+ and \w+; write it again with one of them"):
-        read(tmp_path / "a.zarr")
+        read(tmp_path / "b.zarr")
 
 
 @pytest.mark.parametrize("place", ["start", "end"])
@@ -228,13 +224,18 @@ def test_a_codec_that_may_run_code(tmp_path, content):
     assert not (tmp_path / "trace").exists()
 
 
+def linked_out(path):
+    """Move a file or folder out of its store, and leave a link to it."""
+    moved = next(each for each in path.parents if each.suffix == ".zarr").with_name("elsewhere")
+    path.rename(moved)
+    path.symlink_to(moved)
+
+
 @pytest.mark.parametrize("link", ["c", "c/0/0/0"])
 def test_a_link_out_of_the_store(tmp_path, link):
     path = tmp_path / "a.zarr"
     zarr.create_array(path, data=frames(), chunks=(6, 8, 9))
-    moved = tmp_path / "elsewhere"
-    (path / link).rename(moved)
-    (path / link).symlink_to(moved)
+    linked_out(path / link)
     refused(f"{link} is a link out of the store; copy its files into the store", path)
 
 
@@ -278,9 +279,7 @@ def test_a_run_with_a_link_out_of_it(tmp_path, link):
     store = RunStore.create(path)
     store.write_array("fit/bias", np.ones((8, 8)))
     store.write_file("report.json", b"{}")
-    moved = tmp_path / "elsewhere"
-    (path / link).rename(moved)
-    (path / link).symlink_to(moved)
+    linked_out(path / link)
     _refuse_links.cache_clear()  # the links of a store are looked at once in a process
     for writable in (False, True):
         with pytest.raises(StoreError, match=f"run.zarr: {link} is a link out of the store"):

@@ -82,7 +82,6 @@ def test_a_verdict_makes_a_version_with_its_arrays_and_the_same_effects_without_
     found = keep_in_force(store, found)
     assert (found.number, found.source, found.parent, found.closed_fraction) == (3, "verdict", 1, 0.97)
     kept = read_added_exposure(store, found)
-    assert kept is not None
     np.testing.assert_array_equal(kept.exposure_e, exposure)
     assert read_added_exposure(store, plain) is None
     # both are the same section of the YAML: the one in force stays
@@ -111,7 +110,6 @@ def test_an_effect_of_a_package_that_is_gone_is_told_and_other_versions_can_be_u
     put(store, settings(ROW))
     place = store.path / "model/0002.json"
     changed = read_record(place)
-    assert changed is not None
     write_record(place, json.loads(json.dumps(changed).replace("row_noise", "their_effect")))
     assert put(store, settings()) == 1
     with pytest.raises(ConfigError, match=r"model 2 of the run: .*their_effect"):
@@ -167,7 +165,6 @@ def verdict(path, *effects, closed=0.9):
     )
     store.write_file(VERDICT_FILE, found.to_json().encode())
     ingested = store.records.read("ingest")
-    assert ingested is not None
     found = RunConfig.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
     content = {
         "stage": "discrepancy",

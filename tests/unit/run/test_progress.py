@@ -28,6 +28,10 @@ def test_rate_and_remaining_time_are_means_of_this_run():
     assert paced("fit", "tile", done=20, total=64, new=0, seconds=0.1)["remaining"] is None
 
 
+def logged(folder):
+    return [json.loads(line) for line in (folder / "run.log").read_text().splitlines()]
+
+
 def test_json_lines_tell_the_pace(tmp_path):
     reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
     with reporter.progress("fit", 4, "tile", done=1) as advance:
@@ -36,7 +40,7 @@ def test_json_lines_tell_the_pace(tmp_path):
     with reporter.progress("report", 1, hidden=True) as advance:
         advance()
     reporter.close()
-    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    events = logged(tmp_path)
     assert {event["stage"] for event in events} == {"fit"}
     first, last = events[0], events[-1]
     assert (first["done"], first["rate"], first["remaining"]) == (1, None, None)
@@ -52,7 +56,7 @@ def test_a_bar_moves_within_a_unit(tmp_path, monkeypatch):
         assert list(parts_told("abc")) == ["a", "b", "c"]
     assert list(parts_told("abc")) == ["a", "b", "c"]  # nobody listens
     reporter.close()
-    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    events = logged(tmp_path)
     assert [event["done"] for event in events] == [0, 0.33, 0.67, 1]
     assert events[1]["remaining"] > 0
 
@@ -64,7 +68,7 @@ def test_the_time_of_compiling_is_no_part_of_the_rate(tmp_path):
         for _ in range(1000):
             advance()
     reporter.close()
-    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    events = logged(tmp_path)
     assert [each["rate"] for each in events if each["event"] == "progress"][-1] == pytest.approx(1e6)
 
 
@@ -78,7 +82,6 @@ def test_phases_are_named_and_named_again_where_nothing_else_is_heard(tmp_path, 
         tell("comparing candidates")
         time.sleep(2.3)
         seen = read_progress(store)
-        assert seen is not None
         assert seen["stage"] == "discrepancy: comparing candidates"
     reporter.close()
     lines = capsys.readouterr().err.splitlines()
@@ -86,7 +89,7 @@ def test_phases_are_named_and_named_again_where_nothing_else_is_heard(tmp_path, 
     assert lines[2:]
     assert all(line.startswith("discrepancy: comparing candidates, ") for line in lines[2:])
     assert lines[-1].endswith(" s so far")
-    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    events = logged(tmp_path)
     assert [event["event"] for event in events[:3]] == ["phase", "phase", "still"]
 
 
@@ -108,7 +111,6 @@ def test_others_see_how_far_it_is_until_it_ends(tmp_path):
         advance()
         advance()
         seen = read_progress(store)
-        assert seen is not None
         assert (seen["stage"], seen["done"], seen["total"], seen["pid"]) == ("fit", 2, 2, os.getpid())
     ProgressFile(store).remove()  # not its own file
     assert (store / ".pchem" / "progress.json").exists()
@@ -134,25 +136,15 @@ def test_what_a_killed_process_left_counts_as_nothing(tmp_path):
 
 def test_what_is_wrong_or_moves_the_cursor_does_not_get_through(tmp_path):
     store = RunStore.create(tmp_path / "run.zarr")
-    content = {
-        "stage": "fit\x1b[2J\x07: now",
-        "unit": ["tile"],
-        "done": "5",
-        "total": None,
-        "rate": float("nan"),
-        "remaining": -3,
-        "elapsed": 1e300,
-        "more": 1,
-    }
+    content = {"stage": "fit\x1b[2J\x07: now", "unit": ["tile"], "done": "5", "total": None, "more": 1}
+    content |= {"rate": float("nan"), "remaining": -3, "elapsed": 1e300}
     with store.locked():
         (store.path / ".pchem" / "progress.json").write_text(json.dumps(content))
         seen = read_progress(store.path)
-    assert seen is not None
     assert seen.keys() == {"stage"}
     assert seen["stage"].isprintable()
-    assert rows([StageState("fit", "partial")], {"stage": "fit: now", "rate": 2.0}) == [
-        "fit         running (now)"
-    ]
+    told = rows([StageState("fit", "partial")], {"stage": "fit: now", "rate": 2.0})
+    assert told == ["fit         running (now)"]
 
 
 def test_a_folder_that_cannot_be_written_stops_nothing(tmp_path):

@@ -151,7 +151,6 @@ def test_second_process_finds_the_run_locked_and_a_killed_one_frees_it(store):
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(store.path)], stdout=subprocess.PIPE, text=True
     )
-    assert process.stdout is not None
     assert process.stdout.readline() == "locked\n"
     with pytest.raises(LockedError, match="another pchem process"), store.locked():
         pass

@@ -71,9 +71,8 @@ def test_new_effects_stand_where_the_signal_comes_to_them():
 
 
 def test_an_effect_that_raises_is_named():
-    with pytest.raises(
-        ConfigError, match=r"model\.effects: broken \(test_effects_compose\).*IndexError.*remove it"
-    ):
+    words = r"model\.effects: broken \(test_effects_compose\).*IndexError.*remove it"
+    with pytest.raises(ConfigError, match=words):
         sample_law([RowNoise(row_noise_dn=0.5), Broken()], maps_of(1.0))
 
 

@@ -31,12 +31,7 @@ EFFECTS = [
     make("adc_dnl", dnl_lsb=1.0, pattern="edges", first_code=108, edges=(1.0, 0.0, 0.5, -0.5)),
     make("adc_inl", inl_lsb=1.0, period_dn=37.0, phase=1.0),
     make(
-        "adc_inl",
-        inl_lsb=1.0,
-        form="curve",
-        first_dn=90.0,
-        spacing_dn=9.0,
-        curve=(0.0, 1.0, -0.5, 0.2, 0.8, 0.0),
+        "adc_inl", inl_lsb=1.0, form="curve", first_dn=90.0, spacing_dn=9.0, curve=(0, 1, -0.5, 0.2, 0.8, 0)
     ),
     make("clipping", low=98, high=141),
     make("gain_stitch", gain_change=0.05, level_dn=121.3),

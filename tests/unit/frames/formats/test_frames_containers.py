@@ -7,12 +7,12 @@ import h5py
 import numpy as np
 import pytest
 import zarr
+from helpers import layouts
 from helpers.camera_files import opened, read, refused, write_hdf5
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.hdf5 import Hdf5Reader
 from pchem_pipeline.frames.formats.omezarr import ZarrReader
-from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 
 STACK = np.random.default_rng(13).integers(0, 65536, (7, 19, 22)).astype(np.uint16)
@@ -20,13 +20,11 @@ WINDOWS = [(0, 1, 0, 19), (6, 7, 18, 19), (2, 7, 3, 11), (0, 7, 0, 19)]
 
 
 def check_windows(path, stack, **settings):
-    reader = open_frames(InputSettings(files=(str(path),), **settings), path.parent)
-    assert reader.shape == stack.shape
-    assert reader.dtype == stack.dtype.newbyteorder("=")
-    again = pickle.loads(pickle.dumps(reader))
-    for t0, t1, y0, y1 in WINDOWS:
-        np.testing.assert_array_equal(reader.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
-        np.testing.assert_array_equal(again.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
+    reader = opened(path, **settings)
+    assert (reader.shape, reader.dtype) == (stack.shape, stack.dtype.newbyteorder("="))
+    for each in (reader, pickle.loads(pickle.dumps(reader))):
+        for t0, t1, y0, y1 in WINDOWS:
+            np.testing.assert_array_equal(each.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
 
 
 @pytest.mark.parametrize(
@@ -193,8 +191,7 @@ def test_hdf5_virtual_dataset_of_what_it_must_not_have(tmp_path, case):
 
 
 def test_hdf5_where_files_cannot_be_locked(tmp_path, monkeypatch):
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("frames", data=STACK, compression="gzip")
+    layouts.hdf5(tmp_path / "a.h5", STACK, compression="gzip")
     usual = h5py.File
     wrong = OSError("unable to lock file, errno = 38, error message = 'Function not implemented'")
 
@@ -211,8 +208,7 @@ def test_hdf5_where_files_cannot_be_locked(tmp_path, monkeypatch):
 
 def test_hdf5_filter_that_is_not_installed(tmp_path):
     path = tmp_path / "a.h5"
-    with h5py.File(path, "w") as file:
-        file.create_dataset("frames", data=STACK, chunks=(1, 19, 22), compression="gzip")
+    layouts.hdf5(path, STACK, chunks=(1, 19, 22), compression="gzip")
     data = bytearray(path.read_bytes())
     place = data.index(b"deflate\0") - 8
     assert data[place : place + 2] == b"\1\0"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from astropy.io import fits
-from helpers.camera_files import read, refused
+from helpers.camera_files import read, refused, write_fits
 
 from pchem_pipeline.frames.formats.fits import FitsReader
 from pchem_pipeline.frames.open import open_frames
@@ -27,9 +27,7 @@ def test_facts_are_taken_from_the_header(tmp_path, keyword, extension):
 
 def test_values_that_may_be_no_samples_are_reported(tmp_path):
     for i in range(3):
-        unit = fits.PrimaryHDU(STACK[i : i + 3])
-        unit.header["BLANK"] = -32768
-        unit.writeto(tmp_path / f"f{i}.fits")
+        write_fits(tmp_path / f"f{i}.fits", STACK[i : i + 3], BLANK=-32768)
     with open_frames(InputSettings(files=(str(tmp_path),)), tmp_path) as reader:
         assert reader.report.notes == [
             "f0.fits and 2 more: BLANK = -32768 marks pixels without a value; read as stored",
@@ -70,15 +68,9 @@ def test_several_images_must_be_chosen_from(tmp_path):
     refused("with this name: none", path, dataset="BIAS")
 
 
-def test_scaled(tmp_path):
-    path = tmp_path / "f.fits"
-    scaled = fits.PrimaryHDU(STACK.astype(np.int16))
-    scaled.header["BSCALE"], scaled.header["BZERO"] = 0.5, 10.0
-    scaled.writeto(path)
-    refused(r"scaled data \(BSCALE 0.5", path)
-
-
-def test_no_image(tmp_path):
+def test_scaled_values_and_no_image_are_refused(tmp_path):
+    scaled = write_fits(tmp_path / "f.fits", STACK.astype(np.int16), BSCALE=0.5, BZERO=10.0)
+    refused(r"scaled data \(BSCALE 0.5", scaled)
     path = tmp_path / "table.fits"
     fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU(np.zeros(3, [("a", "i4")]))]).writeto(path)
     refused("no image", path)

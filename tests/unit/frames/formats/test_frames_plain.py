@@ -103,25 +103,25 @@ def test_raw_with_more_frames_than_stated(tmp_path):
     assert "has 5 frames; the first 3 are used" in reader.report.message()
 
 
-def test_npy_refusals(tmp_path):
+@pytest.mark.parametrize(
+    ("array", "words"),
+    [
+        (np.array([[{"a": 1}, None]] * 2), "object array"),
+        (STACK.astype(np.complex64), "floating-point"),
+        (STACK.astype(bool), "samples of type bool"),
+        (STACK.astype(np.uint64), "samples of type uint64"),
+        (np.zeros(3, np.uint8), r"needed: \(frames"),
+        (np.zeros((2, 1, 6, 5, 3), np.uint8), "2 axes before rows and columns"),
+        (np.zeros((1, 6, 5, 3), np.uint8), "looks like colour"),
+        (np.asfortranarray(STACK), "Fortran order"),
+        (STACK, "input.dtype is uint8"),
+        (np.zeros((3, 4), np.dtype([("a", "u1"), ("b", "u2")])), "objects instead of numbers"),
+    ],
+)
+def test_npy_refusals(tmp_path, array, words):
     path = tmp_path / "a.npy"
-
-    def refused(array, words, **settings):
-        np.save(path, array)
-        with pytest.raises(InputError, match=words) as caught:
-            read(path, **settings)
-        assert str(caught.value).startswith(str(path))
-
-    refused(np.array([[{"a": 1}, None]] * 2), "object array")
-    refused(STACK.astype(np.complex64), "floating-point")
-    refused(STACK.astype(bool), "samples of type bool")
-    refused(STACK.astype(np.uint64), "samples of type uint64")
-    refused(np.zeros(3, np.uint8), r"needed: \(frames")
-    refused(np.zeros((2, 1, 6, 5, 3), np.uint8), "2 axes before rows and columns")
-    refused(np.zeros((1, 6, 5, 3), np.uint8), "looks like colour")
-    refused(np.asfortranarray(STACK), "Fortran order")
-    refused(STACK, "input.dtype is uint8", dtype="uint8")
-    refused(np.zeros((3, 4), np.dtype([("a", "u1"), ("b", "u2")])), "objects instead of numbers")
+    np.save(path, array)
+    refused(f"^{path}.*{words}", path, **({"dtype": "uint8"} if array is STACK else {}))
 
 
 def test_npy_never_opens_a_pickle(tmp_path):
@@ -169,22 +169,23 @@ def test_ser_times(tmp_path):
     path = tmp_path / "a.ser"
     path.write_bytes(ser_bytes(STACK, 16, times=True))
     times = SerReader.open(path, InputSettings()).timestamps
-    assert times is not None
     np.testing.assert_allclose(np.diff(times), 0.5, atol=1e-6)
     assert np.datetime64(int(times[0]), "s").astype(str).startswith("2019-07-2")
     both = opened(tmp_path / "a.ser", frame_range=(2, 5))
-    assert both.timestamps is not None
     np.testing.assert_array_equal(both.timestamps, times[2:5])
 
 
-def test_ser_refusals(tmp_path):
-    path = tmp_path / "a.ser"
-    for data, words in [
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
         (ser_bytes(STACK, 16, colour=8), r"colour video \(Bayer, ColorID 8\)"),
         (ser_bytes(STACK, 16, colour=100), r"colour video \(RGB"),
         (ser_bytes(STACK, 33), "damaged header"),
         (ser_bytes(STACK, 16)[:100], "truncated, or not SER"),
         (ser_bytes(STACK, 16)[:-1], r"truncated: 5 frames need 1608 bytes, the file has 1607 \(4 compl"),
-    ]:
-        path.write_bytes(data)
-        refused(words, path)
+    ],
+    ids=range(5),
+)
+def test_ser_refusals(tmp_path, data, words):
+    (tmp_path / "a.ser").write_bytes(data)
+    refused(words, tmp_path / "a.ser")

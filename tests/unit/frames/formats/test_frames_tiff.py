@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from helpers import layouts
 from helpers.camera_files import opened, read, refused
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
@@ -100,35 +101,31 @@ def test_pages_coded_differently(tmp_path):
 
 def test_previews_are_left_out_and_reported(tmp_path):
     path = tmp_path / "preview.tif"
-    with tifffile.TiffWriter(path) as writer:
-        for frame in STACK:
-            writer.write(frame, photometric="minisblack", metadata=None)
-        writer.write(STACK[0, ::2, ::2], photometric="minisblack", metadata=None, subfiletype=1)
-    reader = opened(tmp_path / "preview.tif")
+    layouts.tiff_pages(path, STACK)
+    tifffile.imwrite(path, STACK[0, ::2, ::2], append=True, metadata=None, subfiletype=1)
+    reader = opened(path)
     np.testing.assert_array_equal(reader.read(), STACK)
     assert "1 reduced page" in reader.report.message()
 
 
-def test_facts_are_taken_from_the_file(tmp_path):
-    exif = tmp_path / "exif.tif"
-    tifffile.imwrite(exif, STACK, photometric="minisblack", extratags=[(33434, "2I", 1, (487, 100), True)])
-    assert TiffReader.open(exif, InputSettings()).integration_time == pytest.approx(4.87)
-    ome = tmp_path / "a.ome.tif"
-    plane = {"ExposureTime": [4870.0] * 6, "ExposureTimeUnit": ["ms"] * 6}
-    tifffile.imwrite(ome, STACK, metadata={"axes": "TYX", "Plane": plane, "SignificantBits": 12})
-    reader = TiffReader.open(ome, InputSettings())
-    assert reader.integration_time == pytest.approx(4.87)
-    assert reader.bit_depth == 12
-    manager = tmp_path / "mm.tif"
-    record = json.dumps({"Exposure-ms": 12.5}).encode()
-    tifffile.imwrite(
-        manager, STACK, photometric="minisblack", extratags=[(51123, "s", len(record) + 1, record, True)]
-    )
-    assert TiffReader.open(manager, InputSettings()).integration_time == pytest.approx(0.0125)
-    plain = tmp_path / "plain.tif"
-    tifffile.imwrite(plain, STACK, photometric="minisblack")
-    assert TiffReader.open(plain, InputSettings()).integration_time is None
-    assert TiffReader.open(plain, InputSettings()).bit_depth is None
+RECORD = json.dumps({"Exposure-ms": 12.5}).encode()
+PLANE = {"ExposureTime": [4870.0] * 6, "ExposureTimeUnit": ["ms"] * 6}
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "seconds", "bits"),
+    [
+        ("exif.tif", {"extratags": [(33434, "2I", 1, (487, 100), True)]}, 4.87, None),
+        ("a.ome.tif", {"metadata": {"axes": "TYX", "Plane": PLANE, "SignificantBits": 12}}, 4.87, 12),
+        ("mm.tif", {"extratags": [(51123, "s", len(RECORD) + 1, RECORD, True)]}, 0.0125, None),
+        ("plain.tif", {}, None, None),
+    ],
+)
+def test_facts_are_taken_from_the_file(tmp_path, name, options, seconds, bits):
+    layouts.tiff(tmp_path / name, STACK, **options)
+    reader = TiffReader.open(tmp_path / name, InputSettings())
+    assert reader.integration_time == (None if seconds is None else pytest.approx(seconds))
+    assert reader.bit_depth == bits
 
 
 def test_exposure_in_the_exif_directory(tmp_path):
@@ -211,9 +208,8 @@ def test_colour_is_refused(tmp_path):
 def test_pages_of_another_shape_or_type(tmp_path):
     path = tmp_path / "odd.tif"
     for odd in (STACK[0, :5], STACK[0].astype(np.uint8)):
-        with tifffile.TiffWriter(path) as writer:
-            for frame in (STACK[0], STACK[1], odd):
-                writer.write(frame, photometric="minisblack", metadata=None)
+        layouts.tiff_pages(path, STACK[:2])
+        tifffile.imwrite(path, odd, append=True, metadata=None)
         refused(r"odd\.tif: page 2 is .* page 0 is 21 x 34 uint16", path)
 
 

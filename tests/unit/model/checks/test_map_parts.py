@@ -8,12 +8,9 @@ from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere, r
 from pchem_pipeline.model.checks.map_parts import map_parts
 
 
-def taps(rng, shape=(48, 64)):
-    return np.where(np.arange(shape[1]) < 32, 0.100, 0.115) * (1 + 0.02 * rng.standard_normal(shape))
-
-
 def test_two_taps_are_found_along_columns_and_rows():
-    values = taps(np.random.default_rng(1))
+    noise = np.random.default_rng(1).standard_normal((48, 64))
+    values = np.where(np.arange(64) < 32, 0.100, 0.115) * (1 + 0.02 * noise)
     values[::7, 3] = np.nan
     (found,) = map_parts(values)
     assert found.boxes == ((0, 48, 0, 32), (0, 48, 32, 64))
@@ -57,13 +54,8 @@ def test_maps_of_one_part_give_nothing():
         noise = rng.standard_normal(y.shape)
         vignetted = 10.0 * np.exp(-((x - 0.2) ** 2) - y**2) + 0.1 * noise
         gaps = np.where(rng.random(y.shape) < 0.2, np.nan, noise)
-        for values in (
-            noise,
-            vignetted,
-            rng.exponential(size=y.shape),
-            noise + rng.standard_normal(56),
-            gaps,
-        ):
+        skewed, columns = rng.exponential(size=y.shape), noise + rng.standard_normal(56)
+        for values in (noise, vignetted, skewed, columns, gaps):
             assert map_parts(values) == [], i
     assert map_parts(np.full((8, 8), 2.0)) == []
     assert map_parts(np.full((8, 8), np.nan)) == []

@@ -18,8 +18,7 @@ GOOD = np.ones(SHAPE, dtype=bool)
 
 
 def test_integers_are_equal_or_not():
-    a = np.array([[0, 5], [7, 65535]], dtype=np.uint16)
-    b = np.array([[1, 5], [7, 0]], dtype=np.uint16)
+    a, b = np.array([[[0, 5], [7, 65535]], [[1, 5], [7, 0]]], dtype=np.uint16)
     assert compare_blocks(a, a, scale=1, tolerance=0.5) == BlockDifference(4, 0, 0, 0.0)
     # unsigned differences do not wrap round
     assert compare_blocks(a, b, scale=65535, tolerance=0.5) == BlockDifference(4, 2, 2, 65535.0)

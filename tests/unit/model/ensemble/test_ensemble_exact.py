@@ -68,12 +68,8 @@ def test_tally_is_that_of_the_samples():
 
 def test_axis_is_not_stretched_by_one_strange_gain():
     pixels = unlike_pixels(1000)
-    strange = UsablePixels(
-        pixels.quanta_exposure,
-        np.where(np.arange(1000) == 7, 50.0, pixels.conversion_gain),
-        pixels.bias,
-        pixels.read_noise_dn,
-    )
+    h, g, mu, sigma = pixels.maps
+    strange = UsablePixels(h, np.where(np.arange(1000) == 7, 50.0, g), mu, sigma)
     axis, usual = nuced_axis(strange, DnAxis(60, 200)), nuced_axis(pixels, DnAxis(60, 200))
     assert axis.size < 1.2 * usual.size
     assert usual.width == pytest.approx(0.1, rel=0.01)

@@ -69,13 +69,8 @@ def prepare(case, seed=4):
     counts, origin, truth = draw(np.random.default_rng(seed), *case, n_frames=N)
     pixel, scratch, centre = one_sample(counts[0])
     scratch.rows[:] = np.nan  # what was in memory before must not matter
-    h, g, mu, sigma = truth[0]
-    return (
-        Sample(pixel, scratch),
-        float(origin[0] + centre),
-        samples(counts[0], int(origin[0])),
-        Theta(1.04 * h, 0.985 * g, mu - 0.3, 1.05 * sigma),
-    )
+    theta = Theta(*(truth[0] * [1.04, 0.985, 1.0, 1.05] - [0, 0, 0.3, 0]))
+    return Sample(pixel, scratch), float(origin[0] + centre), samples(counts[0], int(origin[0])), theta
 
 
 def internal(theta, centre):

@@ -53,15 +53,8 @@ def test_one_sample_is_the_single_fit(settings):
 
 def test_plain_em_ends_at_the_same_maximum():
     series = draw_series(np.random.default_rng(8), [0.8, 3.0, 0.0], 0.25, 3)
-    newton, em = (
-        fit_histograms(
-            series.counts,
-            series.origins,
-            dark=series.dark,
-            settings=FitSettings(algorithm=each, likelihood="density"),
-        )
-        for each in ("newton", "em")
-    )
+    settings = [FitSettings(algorithm=each, likelihood="density") for each in ("newton", "em")]
+    newton, em = (fit_histograms(*series[:2], dark=series.dark, settings=each) for each in settings)
     np.testing.assert_allclose(em.quanta_exposure[:, :2], newton.quanta_exposure[:, :2], rtol=1e-4)
     for name in ("conversion_gain", "bias", "read_noise_dn"):
         np.testing.assert_allclose(getattr(em, name), getattr(newton, name), rtol=1e-4)

@@ -34,18 +34,13 @@ def fitted(case, seed=3):
 def intervals(pixel, level):
     settings = FitSettings(intervals="profile", interval_level=level)
     found = fit_histograms(pixel.counts, pixel.origin, settings=settings).intervals
-    assert found is not None
     return found
-
-
-def occupied(pixel):
-    codes = np.flatnonzero(pixel.counts[0])
-    return (pixel.origin[0] + codes).astype(float), pixel.counts[0, codes].astype(float)
 
 
 def minuit(pixel, at, cost):
     """Return the profile limits of iminuit, below and above its maximum, of a law's parameters."""
-    x, c = occupied(pixel)
+    codes = np.flatnonzero(pixel.counts[0])
+    x, c = (pixel.origin[0] + codes).astype(float), pixel.counts[0, codes]
     found = Minuit(lambda *theta: -float(c @ log_pcd(x, *cost(*theta))), *at, name=("h", "g", "mu", "s"))
     found.errordef = Minuit.LIKELIHOOD
     found.tol = 1e-4

@@ -81,7 +81,6 @@ def test_blinking_pixels_are_found_with_their_lower_exposure(gap):
         up = course(rng, frames, SHARE, TAU)
         samples = drawn(rng, PIXEL[0] + STEP * up)
         found = find_telegraph(samples, frames, pixel_with_mean(samples))
-        assert found is not None
         assert found.weight.sum() == pytest.approx(1.0)
         steady = pixel_with_mean(samples)[0] - found.added @ found.weight
         # of a pixel whose states are known: the mean of its frames with the lower exposure
@@ -100,7 +99,6 @@ def test_two_defects_of_one_pixel_are_told_apart():
     high = course(rng, frames, 0.3, 40.0)
     samples = drawn(rng, PIXEL[0] + 0.8 * low + 1.7 * high)
     found = find_telegraph(samples, frames, pixel_with_mean(samples))
-    assert found is not None
     assert found.step.size == 2
     np.testing.assert_allclose(np.sort(found.step), [0.8, 1.7], atol=0.25)
     np.testing.assert_allclose(found.added, added_of(found.step))
@@ -127,7 +125,6 @@ def test_effect_gives_levels_to_the_pixels_that_blink_and_none_to_the_others():
     maps = PixelMaps(mean, *(np.full((4, 5), v) for v in PIXEL[1:]), usable)
     effect = DarkCurrentRts(fraction=0.05)
     added = effect.added_exposure(frames, np.arange(2000), maps)
-    assert added is not None
     where = (added.exposure_e > 0).any(axis=0)
     assert np.argwhere(where).tolist() == [[2, 3]]
     np.testing.assert_allclose(added.weight.sum(axis=0), 1.0)

@@ -135,13 +135,9 @@ def test_quality_follows_the_status():
 
 
 def test_every_reason_is_counted():
-    status = np.array([[0, 32, 32 | 512], [1, 0, 0]], dtype=np.uint16)
-    counts = status_counts(status)
-    assert counts["ok"] == 3
-    assert counts["bias_ambiguous"] == 2
-    assert counts["poor_fit"] == 1
-    assert counts["no_data"] == 1
-    assert sum(counts.values()) == 7
+    counts = status_counts(np.array([[0, 32, 32 | 512], [1, 0, 0]], dtype=np.uint16))
+    seen = {name: number for name, number in counts.items() if number}
+    assert seen == {"ok": 3, "bias_ambiguous": 2, "poor_fit": 1, "no_data": 1}
     assert len(counts) == 1 + len(FitStatus)
 
 
@@ -270,17 +266,13 @@ def test_every_number_is_that_of_numpy_to_the_bit(values):
     edges = np.linspace(np.quantile(values, 0.1) - 1e-9, values.max(), 9)
     np.testing.assert_array_equal(found.histogram(edges), np.histogram(values, edges)[0])
     middle = values[values.size // 2]
-    assert (found.n_below(middle), found.n_above(middle)) == (
-        (values < middle).sum(),
-        (values > middle).sum(),
-    )
-    np.testing.assert_array_equal(
-        found.within(0.0, middle).values, np.sort(values[(values >= 0.0) & (values <= middle)])
-    )
+    below, above = (values < middle).sum(), (values > middle).sum()
+    assert (found.n_below(middle), found.n_above(middle)) == (below, above)
+    inside = np.sort(values[(values >= 0.0) & (values <= middle)])
+    np.testing.assert_array_equal(found.within(0.0, middle).values, inside)
     _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-    np.testing.assert_array_equal(
-        found.shares(values), ((np.cumsum(counts) - 0.5 * counts) / values.size)[inverse]
-    )
+    shares = (np.cumsum(counts) - 0.5 * counts) / values.size
+    np.testing.assert_array_equal(found.shares(values), shares[inverse])
 
 
 def test_what_has_no_value_or_is_left_out_is_counted_and_the_map_stays():

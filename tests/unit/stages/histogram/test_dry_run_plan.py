@@ -145,13 +145,27 @@ def test_bands_are_sound(ny, tile, most, workers, together, data):
             assert (band.y0 <= t.y0 < t.y1 <= band.y1) == (t.key in band.keys)
 
 
-def test_memory_and_workers_decide_the_height():
-    tiles = tile_grid((512, 512), 64)
+@pytest.mark.parametrize(
+    ("most", "workers", "rows_per_read", "n_bands"),
+    [
+        (10_000, 1, 1, 1),
+        (10_000, 2, 1, 2),
+        (130, 2, 1, 4),
+        (1, 2, 1, 8),
+        # rows that are decoded together stay together
+        (10_000, 8, 128, 4),
+        (10_000, 8, 512, 1),
+        (10_000, 2, 500, 1),
+        # odd strips: each worker keeps its band, at the price of a few strips decoded twice
+        (10_000, 4, 27, 4),
+        # unless memory forbids
+        (64, 8, 512, 8),
+    ],
+)
+def test_memory_workers_and_strips_decide_the_height(most, workers, rows_per_read, n_bands):
+    tiles = tile_grid((512, 128), 64)
     everything = {tile.key for tile in tiles}
-    assert len(plan_bands(tiles, everything, 10_000, 1)) == 1
-    assert len(plan_bands(tiles, everything, 10_000, 2)) == 2
-    assert len(plan_bands(tiles, everything, 130, 2)) == 4
-    assert len(plan_bands(tiles, everything, 1, 2)) == 8
+    assert len(plan_bands(tiles, everything, most, workers, rows_per_read=rows_per_read)) == n_bands
 
 
 def test_only_pending_rows_are_joined():
@@ -159,18 +173,6 @@ def test_only_pending_rows_are_joined():
     bands = plan_bands(tiles, {"2.0", "3.1", "4.0"}, 10_000, 1)
     assert [(band.y0, band.y1) for band in bands if "2.0" in band.keys] == [(128, 320)]
     assert len(bands) == 6
-
-
-def test_rows_that_are_decoded_together_stay_together():
-    tiles = tile_grid((512, 128), 64)
-    everything = {tile.key for tile in tiles}
-    assert len(plan_bands(tiles, everything, 10_000, 8, rows_per_read=128)) == 4
-    assert len(plan_bands(tiles, everything, 10_000, 8, rows_per_read=512)) == 1
-    # odd strips: each worker keeps its band, at the price of a few strips decoded twice
-    assert len(plan_bands(tiles, everything, 10_000, 4, rows_per_read=27)) == 4
-    assert len(plan_bands(tiles, everything, 10_000, 2, rows_per_read=500)) == 1
-    # unless memory forbids
-    assert len(plan_bands(tiles, everything, 64, 8, rows_per_read=512)) == 8
 
 
 def test_row_sums_of_tall_sensors_are_read_in_smaller_pieces():

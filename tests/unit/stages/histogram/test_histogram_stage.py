@@ -144,7 +144,8 @@ def test_a_failed_band_leaves_the_others_and_resumes(tmp_path, frames, expected,
         return real(source, rows, step, threads=threads)
 
     monkeypatch.setattr(histogram, "FrameStream", breaks)
-    monkeypatch.setattr(histogram, "plan_bands", lambda *a: [*_single_bands(context)])
+    single = plan_bands(context.tiles(), {t.key for t in context.tiles()}, 1, 1)
+    monkeypatch.setattr(histogram, "plan_bands", lambda *a: single)
     state = execute("histogram", context)
     assert state.state == "failed"
     assert "odd rows" in state.why
@@ -153,10 +154,6 @@ def test_a_failed_band_leaves_the_others_and_resumes(tmp_path, frames, expected,
     completed(again, "histogram")
     assert_equal(contents(again.store), expected)
     assert any("2 pixels have samples outside" in note for note in again.notes)
-
-
-def _single_bands(context):
-    return plan_bands(context.tiles(), {t.key for t in context.tiles()}, 1, 1)
 
 
 def test_band_memory_does_not_make_it_stale(tmp_path, frames):
