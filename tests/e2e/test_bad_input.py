@@ -75,7 +75,7 @@ def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell):
     assert "again" not in result.stderr
     assert "warning: no pixel has a value, so there is no ensemble" in result.stderr
     assert (shell.folder / "run.zarr" / "report.html").exists()
-    assert {line.split()[1] for line in shell.ok("status", "run.yaml").stdout.splitlines()} == {"complete"}
+    assert {words.split()[0] for words in shell.states("run.yaml").values()} == {"complete"}
 
 
 def test_input_that_is_refused_costs_a_finished_run_nothing(shell):
@@ -216,6 +216,5 @@ def test_a_region_beyond_the_sensor_is_one_line(shell, command, finished):
 
 
 def test_usage_errors_are_exit_code_2(shell):
-    assert shell("fit").code == 2
-    assert shell("fit", "run.zarr", "--workers", "0").code == 2
-    assert shell.alone()("no-such-command").code == 2
+    for command in (("fit",), ("fit", "run.zarr", "--workers", "0"), ("no-such-command",)):
+        assert shell(*command).code == 2

@@ -1,5 +1,6 @@
 """The charts of a report in a real browser: Debian's Chromium, headless, driven by Playwright."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -48,27 +49,9 @@ def names(data):
 
 
 @pytest.fixture
-def open_page(browser, page_url):
-    """Open the report; it must say nothing and ask nobody, which is checked at the end of each test."""
-    said: list[str] = []
-    contexts = []
-
-    def open_(width=1200, **options):
-        context = browser.new_context(viewport={"width": width, "height": 900}, **options)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on(
-            "request", lambda request: request.url.startswith(("file:", "data:")) or said.append(request.url)
-        )
-        page.goto(page_url)
-        return page
-
-    yield open_
-    assert said == []
-    for context in contexts:
-        context.close()
+def report(open_page, page_url):
+    """Open the report, with options of the browser."""
+    return functools.partial(open_page, page_url)
 
 
 def chart(page, name):
@@ -96,8 +79,8 @@ def drag(page, over, start, end):
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1200, "light"), (1200, "dark"), (400, "light")])
-def test_every_chart_is_drawn(open_page, names, width, scheme):
-    page = open_page(width, color_scheme=scheme)
+def test_every_chart_is_drawn(report, names, width, scheme):
+    page = report(width, color_scheme=scheme)
     assert names["discrepancy"]
     for file, name in [(file, name) for file, shown in names.items() for name in shown]:
         if not page.url.endswith(f"{file}.html"):
@@ -115,8 +98,8 @@ def test_every_chart_is_drawn(open_page, names, width, scheme):
     assert page.evaluate("() => document.scrollingElement.scrollWidth") <= width
 
 
-def test_a_drag_zooms_and_a_double_click_goes_back(open_page):
-    page = open_page()
+def test_a_drag_zooms_and_a_double_click_goes_back(report):
+    page = report()
     figure = chart(page, "ensemble")
     top, strip = (figure.locator("canvas").nth(i) for i in (0, 1))
     before = [each.evaluate(SHOWN) for each in (top, strip)]
@@ -131,8 +114,8 @@ def test_a_drag_zooms_and_a_double_click_goes_back(open_page):
     assert [each.evaluate(SHOWN) for each in (top, strip)] == before
 
 
-def test_the_legend_has_values_and_hides_what_it_names(open_page, data):
-    page = open_page()
+def test_the_legend_has_values_and_hides_what_it_names(report, data):
+    page = report()
     figure = chart(page, "electron_numbers")
     button = figure.get_by_role("button", name="estimated electron numbers")
     box = figure.locator(".u-over").nth(0).bounding_box()
@@ -158,8 +141,8 @@ def test_the_legend_has_values_and_hides_what_it_names(open_page, data):
     assert (button.get_attribute("aria-pressed"), canvas.evaluate(SHOWN)) == ("true", before)
 
 
-def test_keys_read_values_and_zoom(open_page):
-    page = open_page()
+def test_keys_read_values_and_zoom(report):
+    page = report()
     figure = chart(page, "frame_means")
     panel, canvas = figure.locator(".panel").nth(0), figure.locator("canvas").nth(0)
     before = canvas.evaluate(SHOWN)
@@ -175,20 +158,20 @@ def test_keys_read_values_and_zoom(open_page):
     assert canvas.evaluate(SHOWN) == before
 
 
-def test_paper_and_readers_without_scripts_get_the_plain_picture(open_page):
-    page = open_page()
+def test_paper_and_readers_without_scripts_get_the_plain_picture(report):
+    page = report()
     figure = chart(page, "ensemble")
     page.emulate_media(media="print")
     assert figure.locator("img").is_visible()
     assert not figure.locator(".chart").is_visible()
-    page = open_page(java_script_enabled=False)
+    page = report(java_script_enabled=False)
     image = page.locator("#figure-ensemble img")
     assert image.is_visible()
     assert image.bounding_box()["height"] > 200
 
 
-def test_a_chart_follows_the_width_of_the_window(open_page):
-    page = open_page()
+def test_a_chart_follows_the_width_of_the_window(report):
+    page = report()
     figure = chart(page, "pixel_fits")
     wide = figure.locator("canvas").nth(0).bounding_box()["width"]
     page.set_viewport_size({"width": 420, "height": 900})
@@ -199,8 +182,8 @@ def test_a_chart_follows_the_width_of_the_window(open_page):
     assert page.evaluate("() => document.scrollingElement.scrollWidth") <= 420
 
 
-def test_a_picture_is_saved_from_the_page(open_page, tmp_path):
-    page = open_page()
+def test_a_picture_is_saved_from_the_page(report, tmp_path):
+    page = report()
     figure = chart(page, "ensemble")
     with page.expect_download() as download:
         figure.get_by_role("button", name="Save ensemble as SVG").click()

@@ -127,6 +127,10 @@ class Shell:
         assert "Traceback" not in result.stderr
         return result.last
 
+    def states(self, run) -> dict[str, str]:
+        """Return what ``pchem status`` says of each stage."""
+        return dict(line.split(maxsplit=1) for line in self.ok("status", run).stdout.splitlines())
+
     def ok(self, *arguments) -> Result:
         """Run the command, which must succeed."""
         result = self(*arguments)
@@ -159,14 +163,19 @@ def arrays_of(path, groups=("frames", "histogram", "summary", "fit", "maps", "en
     return found
 
 
-def assert_same_results(one, other, *, rtol=0.0, groups=("histogram", "summary", "fit", "maps", "ensemble")):
-    """Integers must be equal, floats to ``rtol`` (0: to the bit)."""
-    left, right = arrays_of(one, groups), arrays_of(other, groups)
-    assert left.keys() == right.keys()
-    assert len(left) > 40
-    for name, array in left.items():
-        if rtol and array.dtype.kind == "f":
-            scale = np.nanmax(np.abs(array), initial=0.0)
-            np.testing.assert_allclose(array, right[name], rtol=rtol, atol=rtol * scale, err_msg=name)
+def assert_equal_arrays(found, expected, *, rtol=0.0):
+    """Arrays by name: integers must be equal, floats to ``rtol`` of the largest (0: to the bit)."""
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        if rtol and values.dtype.kind == "f":
+            scale = np.nanmax(np.abs(values), initial=0.0)
+            np.testing.assert_allclose(found[name], values, rtol=rtol, atol=rtol * scale, err_msg=name)
         else:
-            np.testing.assert_array_equal(array, right[name], err_msg=name)
+            np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def assert_same_results(one, other, *, rtol=0.0, groups=("histogram", "summary", "fit", "maps", "ensemble")):
+    """Compare the arrays of two runs."""
+    found, expected = arrays_of(one, groups), arrays_of(other, groups)
+    assert len(found) > 5
+    assert_equal_arrays(found, expected, rtol=rtol)

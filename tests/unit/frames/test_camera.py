@@ -205,10 +205,11 @@ WORDS = {
     ),
     None: (
         "exposure time in ticks", "exposure time in clock cycles", "exposure time [ms/10]",
-        "exposure time, ticks", "[lines] exposure time", "[s] exposure time in ms", "exposure in units of 10 us",
-        "exposure in tenths of seconds", "tenths of a second",
-        "exposure time, tenths of a second", "exposure time (tenths of a second)", "exposure of half seconds", "exposure time, deci-seconds",
-        "exposure time, deciseconds", "1/s", "frames per second",
+        "exposure time, ticks", "[lines] exposure time", "[s] exposure time in ms",
+        "exposure in units of 10 us", "exposure in tenths of seconds", "tenths of a second",
+        "exposure time, tenths of a second", "exposure time (tenths of a second)",
+        "exposure of half seconds", "exposure time, deci-seconds", "exposure time, deciseconds",
+        "1/s", "frames per second",
     ),
 }  # fmt: skip
 

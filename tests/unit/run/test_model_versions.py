@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers.commands import arrays_of
+from helpers.commands import arrays_of, assert_equal_arrays
 from helpers.discrepancy_material import verdict_of
 from typer.testing import CliRunner
 
@@ -221,14 +221,12 @@ def test_a_verdict_is_put_in_force_and_taken_back(run):
     # through the store, too, whose copy of the YAML goes with it
     assert find_run(run.parent / "run.zarr").config.model == settings()
     run_stages(find_run(run), DONE, QUIET)
-    for name, values in arrays_of(run.parent / "run.zarr", ("fit", "maps")).items():
-        np.testing.assert_array_equal(values, before[name], err_msg=name)
+    assert_equal_arrays(arrays_of(run.parent / "run.zarr", ("fit", "maps")), before)
     assert "is already in use" in use_model(find_run(run), 1)
     use_model(find_run(run.parent / "run.zarr"), 2)
     assert load_config(run).model == settings(ROW)
     run_stages(find_run(run), DONE, QUIET)
-    for name, values in arrays_of(run.parent / "run.zarr", ("fit", "maps")).items():
-        np.testing.assert_array_equal(values, after[name], err_msg=name)
+    assert_equal_arrays(arrays_of(run.parent / "run.zarr", ("fit", "maps")), after)
     assert [version.number for version in model_versions(RunStore.open(run.parent / "run.zarr"))] == [1, 2]
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.commands import arrays_of
+from helpers.commands import arrays_of, assert_equal_arrays, assert_same_results
 from helpers.small_stacks import small_stack
 
 from pchem_pipeline.base.errors import InputError, StoreError
@@ -62,10 +62,7 @@ def test_the_result_is_that_of_all_frames(tmp_path, monkeypatch, frames, cuts, m
     assert append_frames(extended, QUIET) == []
     whole = target(tmp_path, "whole.zarr", **sections)
     run_stages(whole, ["ingest", "histogram"], QUIET)
-    expected, found = (arrays_of(tmp_path / name, GROUPS) for name in ("whole.zarr", "run.zarr"))
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    assert_same_results(tmp_path / "run.zarr", tmp_path / "whole.zarr", groups=GROUPS)
     one, other = (RunStore.open(tmp_path / name) for name in ("whole.zarr", "run.zarr"))
     assert one.attributes("frames") == other.attributes("frames")
     for stage in ("ingest", "histogram"):
@@ -79,9 +76,7 @@ def test_odd_frames_among_old_and_new_ones_are_in_no_sum(tmp_path, frames):
     odd[[250, 500]] += 300
     append_frames(begun(tmp_path, odd, 301), QUIET)
     run_stages(target(tmp_path, "whole.zarr"), ["ingest", "histogram"], QUIET)
-    expected, found = (arrays_of(tmp_path / name, ("summary",)) for name in ("whole.zarr", "run.zarr"))
-    for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    assert_same_results(tmp_path / "run.zarr", tmp_path / "whole.zarr", groups=("summary",))
     for name in ("whole.zarr", "run.zarr"):
         store = RunStore.open(tmp_path / name)
         assert store.attributes("summary")["left_out"] == [40, 41, 250, 500, 610]
@@ -216,8 +211,5 @@ def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, monkeypatch, frames
         assert [state.why for state in run_status(run) if state.stage == "fit"] == ["the run has no input"]
     assert [state.state for state in append_frames(run, QUIET)] == ["complete", "complete"]
     assert append_frames(run, QUIET) == []
-    found = arrays_of(tmp_path / "run.zarr", GROUPS)
-    assert found.keys() == of_all_frames.keys()
-    for name, values in of_all_frames.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    assert_equal_arrays(arrays_of(tmp_path / "run.zarr", GROUPS), of_all_frames)
     assert kept_fit(tmp_path / "run.zarr", (slice(None), slice(None))) is not None

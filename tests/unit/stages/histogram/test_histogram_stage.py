@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.commands import assert_equal_arrays as assert_equal
 from helpers.drawn_pixels import codes
 from helpers.pickled_tasks import PickledTasks
 from helpers.stage_runs import completed, stage_context
@@ -67,11 +68,6 @@ def contents(store):
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory, frames):
     return contents(completed(make_context(tmp_path_factory.mktemp("expected"), frames), "histogram").store)
-
-
-def assert_equal(found, expected):
-    for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
 
 
 def test_arrays_are_right(frames, expected):

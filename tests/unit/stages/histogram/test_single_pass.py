@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers import layouts
-from helpers.commands import arrays_of
+from helpers.commands import arrays_of, assert_equal_arrays
 from helpers.drawn_pixels import codes
 from helpers.stage_runs import completed, stage_context
 
@@ -69,10 +69,6 @@ def run_both(context):
     return completed(context, "ingest", "histogram")
 
 
-def contents(context):
-    return arrays_of(context.store.path, ("frames", "histogram", "summary"))
-
-
 def compare(folder, **sections):
     """Run both ways and compare everything that they leave."""
     apart = run_both(make_context(folder, "apart.zarr", **sections))
@@ -80,10 +76,10 @@ def compare(folder, **sections):
     single_pass.count_in_one_pass(once)
     assert set(once.prepared) == {"ingest", "histogram"}
     run_both(once)
-    expected, found = contents(apart), contents(once)
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    groups = ("frames", "histogram", "summary")
+    expected, found = (arrays_of(context.store.path, groups) for context in (apart, once))
+    assert_equal_arrays(found, expected)
+    for name in expected:
         assert once.store.array(name).chunks == apart.store.array(name).chunks
     assert once.sensor == apart.sensor
     for stage in ("ingest", "histogram"):
