@@ -14,8 +14,9 @@ from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+from typer.testing import CliRunner
 
-from pchem_pipeline.cli.app import main
+from pchem_pipeline.cli.app import app, main
 from pchem_pipeline.commands.view import make_server
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
@@ -45,6 +46,11 @@ def imported_by(*arguments) -> set[str]:
     outcome = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert outcome.returncode == 0, outcome.stderr
     return set(outcome.stdout.splitlines()[-1].split())
+
+
+def invoke(*arguments):
+    """Run the command line in this process and folder; errors are raised as they are."""
+    return CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False)
 
 
 @dataclass

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from helpers.commands import invoke
 
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ConfigError, ExitCode, InputError, StoreError
@@ -36,10 +36,6 @@ def calls(monkeypatch):
     for home in (session, first_screen):
         monkeypatch.setattr(home, "run_stages", lambda *args: seen.append(args))
     return seen
-
-
-def invoke(*arguments):
-    return CliRunner().invoke(app.app, list(arguments), catch_exceptions=False)
 
 
 @pytest.mark.parametrize("name", ["simulate", "histogram", "fit", "maps", "ensemble", "report", "electrons"])

@@ -4,9 +4,8 @@ import json
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from helpers.commands import invoke
 
-from pchem_pipeline.cli import app
 from pchem_pipeline.commands import watch as watch_module
 from pchem_pipeline.commands.watch import pace_words, rows, watch
 from pchem_pipeline.config.load import parse_config
@@ -81,9 +80,9 @@ def test_json_lines_and_ctrl_c(looks):
 
 def test_the_command_looks_once_unless_asked(looks, monkeypatch):
     monkeypatch.setattr(target, "find_run", lambda path: TARGET)
-    result = CliRunner().invoke(app.app, ["status", "run.yaml"], catch_exceptions=False)
+    result = invoke("status", "run.yaml")
     assert result.stdout.splitlines() == rows([DONE, PART], PACE)
-    result = CliRunner().invoke(app.app, ["status", "run.yaml", "--json"], catch_exceptions=False)
+    result = invoke("status", "run.yaml", "--json")
     assert json.loads(result.stdout)["progress"]["done"] == 16
 
 

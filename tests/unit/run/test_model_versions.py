@@ -6,12 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from helpers.commands import arrays_of, assert_equal_arrays
+from helpers.commands import arrays_of, assert_equal_arrays, invoke
 from helpers.discrepancy_material import verdict_of
-from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
-from pchem_pipeline.cli import app
 from pchem_pipeline.commands.model import adopt_verdict, list_models, model_lines, use_model
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.config.tree import RunConfig
@@ -186,9 +184,9 @@ def test_status_tells_the_model_that_each_result_rests_on(run):
     run_stages(find_run(path), ["fit"], QUIET)
     assert states(path)["fit"] == ("complete", 2)
     assert states(path)["maps"] == ("stale - fit was run again", 1)
-    shown = CliRunner().invoke(app.app, ["status", str(path)], catch_exceptions=False).stdout
+    shown = invoke("status", path).stdout
     assert "fit         complete  (with model 2)" in shown.splitlines()
-    shown = CliRunner().invoke(app.app, ["status", str(path), "--json"], catch_exceptions=False).stdout
+    shown = invoke("status", path, "--json").stdout
     assert [stage["model"] for stage in json.loads(shown)["stages"]][3:5] == [2, 1]
 
 
@@ -200,7 +198,7 @@ def test_a_verdict_is_put_in_force_and_taken_back(run):
     held = f"model 2 is now in use: plain model + row_noise 1.2 DN (in {beside})"
     assert words == f"{held}; to go back: pchem model {run} --use 1"
     assert run.read_text(encoding="utf-8") == text
-    shown = CliRunner().invoke(app.app, ["fit", str(run)], catch_exceptions=False).stderr
+    shown = invoke("fit", run).stderr
     assert "the model is that of run.effects.yaml, instead of the one in run.yaml" in shown
     assert load_config(run).model == settings(ROW) == target.config.model
     assert states(run)["fit"] == ("complete", 2)
@@ -276,8 +274,8 @@ def test_a_model_that_cannot_be_written_leaves_all_as_it_is(run, monkeypatch):
 
 
 def test_the_command_lists_and_refuses(run):
-    shown = CliRunner().invoke(app.app, ["model", str(run), "--json"], catch_exceptions=False).stdout
+    shown = invoke("model", run, "--json").stdout
     [only] = json.loads(shown)["models"]
     assert (only["number"], only["current"], only["results"]) == (1, True, ["fit", "maps"])
     with pytest.raises(ConfigError, match="has no model 7"):
-        CliRunner().invoke(app.app, ["model", str(run), "--use", "7"], catch_exceptions=False)
+        invoke("model", run, "--use", "7")

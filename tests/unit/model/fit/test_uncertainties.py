@@ -33,15 +33,14 @@ def fitted(case, seed=3):
 
 def intervals(pixel, level):
     settings = FitSettings(intervals="profile", interval_level=level)
-    found = fit_histograms(pixel.counts, pixel.origin, settings=settings).intervals
-    return found
+    return fit_histograms(pixel.counts, pixel.origin, settings=settings).intervals
 
 
-def minuit(pixel, at, cost):
-    """Return the profile limits of iminuit, below and above its maximum, of a law's parameters."""
+def minuit(pixel, start, plain):
+    """Return iminuit at the maximum; ``plain`` makes H, g, mu and sigma of its own parameters."""
     codes = np.flatnonzero(pixel.counts[0])
     x, c = (pixel.origin[0] + codes).astype(float), pixel.counts[0, codes]
-    found = Minuit(lambda *theta: -float(c @ log_pcd(x, *cost(*theta))), *at, name=("h", "g", "mu", "s"))
+    found = Minuit(lambda *own: -float(c @ log_pcd(x, *plain(*own))), *start, name=("h", "g", "mu", "s"))
     found.errordef = Minuit.LIKELIHOOD
     found.tol = 1e-4
     return found.migrad()

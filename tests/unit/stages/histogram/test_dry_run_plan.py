@@ -158,6 +158,7 @@ def test_bands_are_sound(ny, tile, most, workers, together, data):
         (10_000, 2, 500, 1),
         # odd strips: each worker keeps its band, at the price of a few strips decoded twice
         (10_000, 4, 27, 4),
+        (10_000, 4, 96, 4),
         # unless memory forbids
         (64, 8, 512, 8),
     ],
