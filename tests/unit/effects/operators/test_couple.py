@@ -31,10 +31,17 @@ def test_capacitance_moves_charge_without_losing_any():
     np.testing.assert_allclose(seen.sum(axis=(1, 2)), charge.sum(axis=(1, 2)), atol=1e-12)
 
 
-def test_memory_is_of_the_frame_before():
-    effect = AnalogMemory(memory=-0.1)
-    after, before, k, _ = analog(effect, (6, 3, 4))
-    np.testing.assert_allclose(after[1:] - before[1:], -0.1 * k[:-1], atol=1e-12)
+@pytest.mark.parametrize(
+    ("effect", "left"),
+    [
+        (AnalogMemory(memory=-0.1), lambda k: -0.1 * k),
+        (AnalogMemory(memory=0.1, saturation_e=5.0), lambda k: 0.5 * (1 - np.exp(-k / 5))),
+    ],
+    ids=["linear", "levels off"],
+)
+def test_memory_is_of_the_frame_before(effect, left):
+    after, before, k, _ = analog(effect, (6, 3, 4), charge=np.arange(6)[:, None, None] ** 3)
+    np.testing.assert_allclose(after[1:] - before[1:], left(k[:-1]), atol=1e-12)
 
 
 def test_memory_may_differ_from_pixel_to_pixel():
@@ -47,14 +54,6 @@ def test_memory_may_differ_from_pixel_to_pixel():
     logs = np.log(memory[0] / 0.1)
     within(logs.mean(), -(0.5**2) / 2, 0.5 / 60)
     within(logs.std(), 0.5, 0.5 / 60 / np.sqrt(2))
-
-
-def test_memory_levels_off():
-    after, before, _, _ = analog(
-        AnalogMemory(memory=0.1, saturation_e=5.0), (6, 1, 1), charge=np.arange(6)[:, None, None] ** 3
-    )
-    left = (after - before)[1:, 0, 0]
-    np.testing.assert_allclose(left, 0.5 * (1 - np.exp(-(np.arange(5) ** 3) / 5)), atol=1e-12)
 
 
 def test_the_code_before_moves_a_sample_one_after_the_other():

@@ -70,10 +70,28 @@ def test_metamorph_stack_with_one_directory(tmp_path):
     np.testing.assert_array_equal(read(path), STACK)
 
 
-def test_volumes_are_refused(tmp_path):
-    path = tmp_path / "volume.tif"
-    tifffile.imwrite(path, STACK, photometric="minisblack", volumetric=True, tile=(2, 16, 16))
-    refused("pages of 6 x 21 x 34 uint16 are volumes", path)
+RGB = np.zeros((2, 8, 9, 3), np.uint8)
+PALETTE = {"photometric": "palette", "colormap": np.zeros((3, 256), np.uint16)}
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "words"),
+    [
+        (STACK, {"volumetric": True, "tile": (2, 16, 16)}, "pages of 6 x 21 x 34 uint16 are volumes"),
+        (
+            STACK,
+            {"planarconfig": "separate", "compression": "zlib"},
+            "one page of 6 compressed planes; write",
+        ),
+        (RGB, {"photometric": "rgb"}, r"a\.tif: colour or multi-channel images \(RGB, 3 samples per pixel\)"),
+        (np.moveaxis(RGB, -1, 1), {"photometric": "rgb", "planarconfig": "separate"}, "colour"),
+        (RGB[..., 0], PALETTE, "PALETTE"),
+    ],
+    ids=["volumes", "planes", "colour", "planes of colour", "palette"],
+)
+def test_volumes_planes_and_colour_are_refused(tmp_path, data, options, words):
+    layouts.tiff(tmp_path / "a.tif", data, **options)
+    refused(words, tmp_path / "a.tif")
 
 
 def test_pages_are_frames_although_metadata_tell_several_series(tmp_path):
@@ -178,12 +196,6 @@ def test_page_without_its_strips(tmp_path):
     refused(r"unfinished\.tif: page 1 has 0 strips or tiles and 3 sizes", path)
 
 
-def test_compressed_planes_are_refused(tmp_path):
-    path = tmp_path / "planes.tif"
-    tifffile.imwrite(path, STACK, photometric="minisblack", planarconfig="separate", compression="zlib")
-    refused("one page of 6 compressed planes; write one frame per page", path)
-
-
 def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path):
     lossy = [Image.fromarray((frame >> 4).astype(np.uint8)) for frame in STACK]
     lossy[0].save(tmp_path / "jpeg.tif", save_all=True, append_images=lossy[1:], compression="jpeg")
@@ -192,17 +204,6 @@ def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path):
     words = {"jpeg": "JPEG compression can be lossy", "white": "declare 0 as white", "planes": "the 6 planes"}
     for name, said in words.items():
         assert said in TiffReader.open(tmp_path / f"{name}.tif", InputSettings()).notes[0]
-
-
-def test_colour_is_refused(tmp_path):
-    path = tmp_path / "rgb.tif"
-    rgb = np.zeros((2, 8, 9, 3), np.uint8)
-    tifffile.imwrite(path, rgb, photometric="rgb")
-    refused(r"rgb\.tif: colour or multi-channel images \(RGB, 3 samples per pixel\)", path)
-    tifffile.imwrite(path, np.moveaxis(rgb, -1, 1), photometric="rgb", planarconfig="separate")
-    refused("colour", path)
-    tifffile.imwrite(path, rgb[..., 0], photometric="palette", colormap=np.zeros((3, 256), np.uint16))
-    refused("PALETTE", path)
 
 
 def test_pages_of_another_shape_or_type(tmp_path):

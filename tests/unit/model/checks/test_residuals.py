@@ -22,16 +22,12 @@ def test_window_ignores_far_outliers():
     assert central_window(single, 0.999) == slice(1, 2)
 
 
-def test_rmse_and_floor_use_the_window():
+def test_rmse_and_floor_use_the_window_and_residuals_their_variance():
     data, model = np.array([9.0, 1.0, 2.0]), np.array([0.0, 1.0, 4.0])
     assert rmse(data, model, slice(1, 3)) == pytest.approx(np.sqrt(2.0))
     assert noise_floor(np.array([100.0, 1.0, 3.0]), slice(1, 3)) == pytest.approx(np.sqrt(2.0))
-
-
-def test_normalised_residuals():
-    found = normalised_residuals(np.array([1.0, 2.0]), np.array([0.0, 2.0]), np.array([0.25, 0.0]))
-    assert found[0] == pytest.approx(2.0)
-    assert np.isnan(found[1])
+    found = normalised_residuals(data, model, np.array([9.0, 0.0, 4.0]))
+    np.testing.assert_allclose(found, [3.0, np.nan, -1.0])
 
 
 def test_chi_square_leaves_out_bins_with_few_samples():
