@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from helpers.damage import damaged, frames
-from helpers.layouts import LAYOUTS, write
+from helpers.layouts import LAYOUTS, tiff_pages, write
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.config.load import make_config
@@ -39,17 +39,9 @@ INGESTED = 7
 # -- files -------------------------------------------------------------------------------------------------
 
 
-def _tiff(path, *, name="a.tif", data=None, **options):
-    import tifffile
-
-    with tifffile.TiffWriter(path / name) as writer:
-        for frame in frames() if data is None else data:
-            writer.write(frame, photometric="minisblack", metadata=None, **options)
-
-
 def _tiff_sequence(path):
     for number, frame in enumerate(frames(n=3)):
-        _tiff(path, name=f"f{number}.tif", data=frame[None])
+        tiff_pages(path / f"f{number}.tif", frame)
 
 
 def _hdf5(path, **options):
@@ -102,9 +94,9 @@ def _npz(path):
 
 #: name -> what writes the undamaged files into a folder
 SEEDS = {layout: lambda p, layout=layout: write(p, layout, frames()) for layout in LAYOUTS} | {
-    "tiff, 8 bit": lambda p: _tiff(p, data=frames(dtype="uint8")),
-    "tiff, zstd": lambda p: _tiff(p, compression="zstd"),
-    "tiff, jpeg": lambda p: _tiff(p, data=frames(dtype="uint8"), compression="jpeg"),
+    "tiff, 8 bit": lambda p: tiff_pages(p / "a.tif", frames(dtype="uint8")),
+    "tiff, zstd": lambda p: tiff_pages(p / "a.tif", frames(), compression="zstd"),
+    "tiff, jpeg": lambda p: tiff_pages(p / "a.tif", frames(dtype="uint8"), compression="jpeg"),
     "tiff, a file a frame": _tiff_sequence,
     "hdf5, newest": _hdf5,
     "hdf5, newest, checksums": lambda p: _hdf5(p, chunks=(2, 8, 9), fletcher32=True),
