@@ -29,12 +29,9 @@ def die(number):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_every_backend_reports_values_and_errors_alike(backend):
-    executor = make_executor(ComputeSettings(backend=backend, workers=2))
     found = {}
-    try:
+    with contextlib.closing(make_executor(ComputeSettings(backend=backend, workers=2))) as executor:
         executor.map(reciprocal, [1, 2, 0, 4], lambda item, outcome: found.update({item: outcome}))
-    finally:
-        executor.close()
     assert {item: outcome.value for item, outcome in found.items()} == {1: 1.0, 2: 0.5, 0: None, 4: 0.25}
     assert isinstance(found[0].error, ZeroDivisionError)
     assert "reciprocal" in found[0].trace
@@ -45,11 +42,9 @@ def test_a_local_cluster_starts_beside_a_busy_dashboard_port_and_listens_on_loop
         with contextlib.suppress(OSError):  # whoever holds the port already serves as well
             other.bind(("127.0.0.1", 8787))
             other.listen()
-        executor = make_executor(ComputeSettings(backend="distributed", workers=1))
-        try:
+        made = make_executor(ComputeSettings(backend="distributed", workers=1))
+        with contextlib.closing(made) as executor:
             assert executor._cluster.scheduler.http_server.address == "127.0.0.1"
-        finally:
-            executor.close()
 
 
 @pytest.mark.parametrize("backend", BACKENDS[:2])

@@ -24,10 +24,12 @@ def edges_of(effect, first, last, **kwargs):
     return np.array([fine[np.searchsorted(codes, code)] for code in range(first + 1, last + 1)]) - 5e-4
 
 
-def test_listed_edges_move_and_no_others():
+def test_listed_edges_move_and_no_others_and_in_the_wrong_order_coincide():
     effect = AdcDnl(dnl_lsb=0.5, pattern="edges", first_code=101, edges=(0.6, -0.4))
     moved = edges_of(effect, 98, 104) - (np.arange(99, 105) - 0.5)
     np.testing.assert_allclose(moved, [0, 0, 0.3, -0.2, 0, 0], atol=2e-3)
+    crossed = AdcDnl(dnl_lsb=1.0, pattern="edges", first_code=101, edges=(1.0, -1.0))
+    assert set(coded(crossed, np.arange(99.5, 103.5, 1e-2))) == {100, 102, 103}
 
 
 def test_a_code_whose_edges_coincide_is_missing():
@@ -41,11 +43,6 @@ def test_a_code_whose_edges_coincide_is_missing():
     expected[expected == 104] = 105
     expected[expected == 106] = 107
     np.testing.assert_array_equal(codes, expected)
-
-
-def test_edges_in_the_wrong_order_coincide():
-    effect = AdcDnl(dnl_lsb=1.0, pattern="edges", first_code=101, edges=(1.0, -1.0))
-    assert set(coded(effect, np.arange(99.5, 103.5, 1e-2))) == {100, 102, 103}
 
 
 @pytest.mark.parametrize("bit", [0, 1, 3])
