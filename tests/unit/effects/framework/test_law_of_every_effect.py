@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers.small_sensors import make, taken
+from helpers.small_sensors import a_uniform_sensor, make, taken
 
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.truth import TruthMaps
 
 EXPOSURE, GAIN, BIAS, NOISE_E = 1.5, 0.1, 100.3, 0.3
 SHAPE, N_FRAMES = (34, 34), 400
@@ -55,8 +54,7 @@ EFFECTS = [
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=repr)
 def test_the_law_is_that_of_the_samples(effect):
-    parameters = (np.full(SHAPE, value) for value in (EXPOSURE, GAIN, BIAS, NOISE_E))
-    truth = TruthMaps(*parameters, np.zeros(SHAPE, np.uint8))
+    truth = a_uniform_sensor(SHAPE, EXPOSURE, GAIN, BIAS, NOISE_E)
     inside = taken(truth, effect, n_frames=N_FRAMES, seed=8)[:, 1:-1, 1:-1]  # fewer neighbours at the edge
     seen = np.bincount(inside.ravel(), minlength=CODES[-1] + 1)[CODES]
     assert seen.sum() == inside.size
