@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import operator
 import os
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -18,19 +17,12 @@ import numba
 from numba import _dynfunc
 from numba.core.ccallback import CFunc
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, DefaultPassBuilder, Flags, _LowerResult
+from numba.core.compiler import Compiler, DefaultPassBuilder, _LowerResult
 from numba.core.compiler_machinery import register_pass
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
 
 from pchem_pipeline.base.kernel_cache import TIGHT_MEMORY, KernelCache, values_of_closure
-
-# numba looks most calls up by all options of the caller, and compiles what it has of its own for each
-# variety; only these are passed on to it
-_passed_on = operator.attrgetter("nrt", "fastmath", "error_model")
-_HASH = hash(Flags())  # of the names of all options, so the same for all
-Flags.__hash__ = lambda _: _HASH
-Flags.__eq__ = lambda self, other: isinstance(other, Flags) and _passed_on(self) == _passed_on(other)
 
 
 def kernel(

@@ -16,14 +16,8 @@ from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 
 
 def sample(exposure, noise=0.3, n_pixels=3, n_frames=3000, seed=1, gain=1 / 11):
-    drawn = draw_histograms(
-        np.random.default_rng([seed, int(100 * exposure)]),
-        np.full(n_pixels, exposure),
-        gain,
-        100.3,
-        noise,
-        n_frames,
-    )
+    rng = np.random.default_rng([seed, int(100 * exposure)])
+    drawn = draw_histograms(rng, np.full(n_pixels, exposure), gain, 100.3, noise, n_frames)
     return Sample(drawn.counts, drawn.origin)
 
 
