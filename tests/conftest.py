@@ -5,8 +5,6 @@ Hypothesis draws the same examples every time; HYPOTHESIS_PROFILE=explore draws 
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 from filelock import FileLock
@@ -21,7 +19,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "steady"))
 
 
 @pytest.fixture(autouse=True)
-def _forget_stores() -> Iterator[None]:
+def _forget_stores():
     """Open no store that another test has opened."""
     from pchem_pipeline.run.stage import open_store  # it brings numpy, which the environment must precede
 
@@ -30,13 +28,13 @@ def _forget_stores() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def make_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+def make_once(tmp_path_factory):
     """Fill a folder by a function once for all workers of a session; none of them may change it then."""
     base = tmp_path_factory.getbasetemp()
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
     shared.mkdir(exist_ok=True)
 
-    def make(name: str, fill: Callable[[Path], object]) -> Path:
+    def make(name, fill):
         folder, made = shared / name, shared / f"{name}.made"
         with FileLock(shared / f"{name}.lock"):
             if not made.exists():

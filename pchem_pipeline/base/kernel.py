@@ -25,7 +25,13 @@ from numba.core.typed_passes import NativeLowering
 from pchem_pipeline.base.kernel_cache import TIGHT_MEMORY, KernelCache, values_of_closure
 
 
-def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False, borrows: bool = False) -> Any:
+def kernel(
+    function: Callable[..., Any] | None = None,
+    *,
+    inline: bool = False,
+    borrows: bool = False,
+    views: bool = False,
+) -> Any:
     """Compile a loop when it is first called.
 
     Division by zero gives infinity or NaN as in numpy, never an exception, so that loops vectorise; no kernel
@@ -34,25 +40,25 @@ def kernel(function: Callable[..., Any] | None = None, *, inline: bool = False, 
 
     Args:
         function: of scalars and arrays.
-        inline: put the code of the function into its callers, where they could not be optimised otherwise.
+        inline: have LLVM put the code into its callers however long it is: a record of arrays is dozens of
+            words to pass.
         borrows: all its arrays are its callers': it makes none and returns none. Then references are not
             counted, an atomic operation for each array, each part of one and each call, which takes a fourth
             of the time of loops as short as those of the fit.
+        views: it returns parts of its arrays, also to kernels that borrow: numba puts its code into each
+            caller, which takes many times as long to compile.
     """
     if function is None:
-        return lambda function: kernel(function, inline=inline, borrows=borrows)
+        return lambda function: kernel(function, inline=inline, borrows=borrows, views=views)
     if numba.config.DISABLE_JIT:
         return function
-    values = values_of_closure(function)
-    if values:
-        # of two machine codes with one name only the first that is loaded is run, and numba's names tell the
-        # functions of one maker apart within a process only
-        function.__qualname__ += "_".join(("", *values))
+    _name_apart(function)
     options = {
         "nopython": True,
         "nogil": True,
         "error_model": "numpy",
-        "inline": "always" if inline else "never",
+        "inline": "always" if views else "never",
+        "forceinline": inline,
         "no_cfunc_wrapper": True,
         **({"_nrt": False} if borrows else {}),
     }
@@ -76,6 +82,7 @@ def callback(
     """
     if numba.config.DISABLE_JIT:
         return function
+    _name_apart(function)
     kinds = tuple(types_of(arguments)), result
     compiled = CFunc(
         function, kinds, locals={}, options={"error_model": "numpy", **({"_nrt": False} if borrows else {})}
@@ -84,6 +91,15 @@ def callback(
     with _uncollected():
         compiled.compile()
     return compiled
+
+
+def _name_apart(function: Callable[..., Any]) -> None:
+    """Name a function after what its maker was given.
+
+    Of two machine codes with one name only the first that is loaded is run, and numba's names tell the
+    functions of one maker apart within a process only.
+    """
+    function.__qualname__ += "".join(f"_{value}" for value in values_of_closure(function))
 
 
 @contextlib.contextmanager
@@ -129,7 +145,7 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=options)
         self._cache = KernelCache(function)
-        self.callee = CPUDispatcher(
+        self.callee = _Callee(
             function, targetoptions={**options, "no_cpython_wrapper": True}, pipeline_class=_CalleeCompiler
         )
 
@@ -141,6 +157,14 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
     @property
     def _numba_type_(self) -> Any:
         return self.callee._numba_type_
+
+
+class _Callee(CPUDispatcher):  # type: ignore[misc]
+    """A kernel as other kernels see it."""
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Return the signature of a call; numba's own way is to compile anew for each constant."""
+        return super().get_call_template([numba.types.unliteral(each) for each in args], kws)
 
 
 class _CalleeLibrary(JITCodeLibrary):  # type: ignore[misc]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Sample, methods
+from pchem_pipeline.methods.base import Method, PixelSamples, Sample, methods
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import (
     expected_information,
@@ -23,69 +22,24 @@ from pchem_pipeline.model.errors.expected_information import (
 COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 
 
-@dataclass(frozen=True)
-class ErrorSummary:
-    """Errors of one parameter over the pixels with an answer; relative, or in e- for the bias.
-
-    Attributes:
-        n: pixels with an answer and a reference.
-        bias: mean error.
-        bias_stderr: its standard error.
-        rmse: root mean square error.
-        median: median error.
-        robust_sd: 1.4826 times the median absolute deviation.
-        bound: root mean square of the Cramer-Rao bounds of these pixels, from the samples that the
-            method was given.
-    """
-
-    n: int
-    bias: float | None
-    bias_stderr: float | None
-    rmse: float | None
-    median: float | None
-    robust_sd: float | None
-    bound: float | None
+#: Errors of a parameter over the pixels, JSON data.
+Errors = dict[str, float | None]
 
 
-@dataclass(frozen=True)
-class MethodResult:
+class MethodResult(NamedTuple):
     """What one method made of the pixels.
 
     Attributes:
-        name, title, source, remark: of the method.
-        samples: how many samples it was given.
-        missing: why it was not run; empty if it was.
-        n_pixels: pixels that it was given.
-        n_answered: pixels with a gain.
-        reasons: why others have none, or a doubtful one.
-        seconds_per_pixel: processor time.
-        medians: of the estimates (H, g, mu, s_e) over the pixels, by name of :data:`COMPARED`, in e-, e-/DN,
-            DN and e-; None where no pixel has one.
-        errors: by parameter of :data:`COMPARED`; empty where nothing is known.
+        facts: JSON data: ``name``, ``title``, ``source`` and ``remark`` of the method, how many ``samples``
+            it was given, and why it was not run (``missing``, empty if it was); then ``n_pixels``,
+            ``n_answered`` with a gain, ``reasons`` why others have none or a doubtful one, processor time
+            ``seconds_per_pixel``, and by name of :data:`COMPARED` the ``medians`` of the estimates, in e-,
+            e-/DN, DN and e-, and the ``errors`` of :func:`summarise_errors`, where something is known.
         estimates: (H, g, mu, sigma), shape (n, 4); None if it was not run.
     """
 
-    name: str
-    title: str
-    source: str
-    remark: str
-    samples: int
-    missing: str
-    n_pixels: int = 0
-    n_answered: int = 0
-    reasons: Mapping[str, int] | None = None
-    seconds_per_pixel: float | None = None
-    medians: Mapping[str, float | None] | None = None
-    errors: Mapping[str, ErrorSummary] | None = None
+    facts: dict[str, Any]
     estimates: FloatArray | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """Return everything but the estimates as plain data."""
-        found = {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "estimates"}
-        found["reasons"] = dict(self.reasons or {})
-        found["medians"] = dict(self.medians or {})
-        found["errors"] = {name: asdict(summary) for name, summary in (self.errors or {}).items()}
-        return found
 
 
 def compare(
@@ -105,48 +59,39 @@ def compare(
         skip_errors: methods whose errors mean nothing, since the reference is theirs.
         only: names of methods to run; all by default.
     """
-    found = []
-    for name, method in methods().items():
-        if only is None or name in only:
-            known = None if name in skip_errors else reference
-            found.append(_run(name, method, pixels, known, settings))
-    return found
+    return [
+        _run(method, pixels, None if name in skip_errors else reference, settings)
+        for name, method in methods().items()
+        if only is None or name in only
+    ]
 
 
 def _run(
-    name: str, method: Method, pixels: PixelSamples, reference: FloatArray | None, settings: MethodsSettings
+    method: Method, pixels: PixelSamples, reference: FloatArray | None, settings: MethodsSettings
 ) -> MethodResult:
-    head = (name, method.title, method.source, method.remark)
     used = pixels if method.needs != "one sample" else PixelSamples(pixels.samples[:1], pixels.adc_limits)
     n_samples = len(used.samples)
-    lacking = method.missing(n_samples)
-    if lacking:
-        return MethodResult(*head, n_samples, lacking)
+    facts: dict[str, Any] = {each: getattr(method, each) for each in ("name", "title", "source", "remark")}
+    facts |= {"samples": n_samples, "missing": method.missing(n_samples), "n_pixels": 0, "n_answered": 0}
+    facts |= {"reasons": {}, "seconds_per_pixel": None, "medians": {}, "errors": {}}
+    if facts["missing"]:
+        return MethodResult(facts)
     # compiled code is loaded before the clock starts
     first = tuple(Sample(sample.counts[:1], sample.origin[:1]) for sample in used.samples)
     method.estimate(PixelSamples(first, used.adc_limits), settings)
     start = time.process_time()
-    estimates: Estimates = method.estimate(used, settings)
-    seconds = (time.process_time() - start) / max(pixels.n_pixels, 1)
-    errors = None
+    estimates = method.estimate(used, settings)
+    facts["seconds_per_pixel"] = (time.process_time() - start) / max(pixels.n_pixels, 1)
+    found = estimates.parameters
+    facts["n_pixels"], facts["n_answered"] = pixels.n_pixels, int(np.isfinite(found[:, 1]).sum())
+    facts["reasons"], facts["medians"] = dict(estimates.reasons), _medians(found)
     if reference is not None:
-        bounds = pixel_bounds(used.samples, reference)
-        errors = {
-            parameter: summarise_errors(values, bounds[:, column])
-            for column, (parameter, values) in enumerate(errors_of(estimates.parameters, reference).items())
+        errors, bounds = errors_of(found, reference), pixel_bounds(used.samples, reference).T
+        facts["errors"] = {
+            name: summarise_errors(values, bound)
+            for (name, values), bound in zip(errors.items(), bounds, strict=True)
         }
-    return MethodResult(
-        *head,
-        n_samples,
-        "",
-        pixels.n_pixels,
-        int(np.count_nonzero(np.isfinite(estimates.parameters[:, 1]))),
-        estimates.reasons,
-        seconds,
-        _medians(estimates.parameters),
-        errors,
-        estimates.parameters,
-    )
+    return MethodResult(facts, found)
 
 
 def _medians(parameters: FloatArray) -> dict[str, float | None]:
@@ -177,24 +122,32 @@ def errors_of(parameters: FloatArray, reference: FloatArray) -> dict[str, FloatA
         }
 
 
-def summarise_errors(errors: FloatArray, bounds: FloatArray) -> ErrorSummary:
-    """Return the summary of the errors of one parameter; NaN are pixels without an answer or a reference."""
+def summarise_errors(errors: FloatArray, bounds: FloatArray) -> Errors:
+    """Return what the errors of one parameter come to; relative, or in e- for the bias.
+
+    Args:
+        errors: of each pixel; NaN without an answer or a reference.
+        bounds: Cramer-Rao bound of each pixel, from the samples that the method was given.
+
+    Returns:
+        ``n`` pixels with an error, its mean ``bias`` with ``bias_stderr``, ``rmse``, ``median``,
+        ``robust_sd`` (1.4826 times the median absolute deviation), and ``bound``, the rms of the bounds.
+    """
     known = np.isfinite(errors)
     values, bound = errors[known], bounds[known]
-    if values.size == 0:
-        return ErrorSummary(0, None, None, None, None, None, None)
-    mean, median = float(values.mean()), float(np.median(values))
-    scatter = float(values.std(ddof=1) / np.sqrt(values.size)) if values.size > 1 else None
-    finite = bound[np.isfinite(bound)]
-    return ErrorSummary(
-        int(values.size),
-        mean,
-        scatter,
-        float(np.sqrt(np.mean(values**2))),
-        median,
-        float(1.4826 * np.median(np.abs(values - median))),
-        float(np.sqrt(np.mean(finite**2))) if finite.size else None,
-    )
+    n, bound = int(values.size), bound[np.isfinite(bound)]
+    if n == 0:
+        return {"n": 0} | dict.fromkeys(("bias", "bias_stderr", "rmse", "median", "robust_sd", "bound"))
+    median = float(np.median(values))
+    return {
+        "n": n,
+        "bias": float(values.mean()),
+        "bias_stderr": float(values.std(ddof=1) / np.sqrt(n)) if n > 1 else None,
+        "rmse": float(np.sqrt(np.mean(values**2))),
+        "median": median,
+        "robust_sd": float(1.4826 * np.median(np.abs(values - median))),
+        "bound": float(np.sqrt(np.mean(bound**2))) if bound.size else None,
+    }
 
 
 def pixel_bounds(samples: Sequence[Sample], reference: FloatArray) -> FloatArray:
@@ -221,12 +174,12 @@ def pixel_bounds(samples: Sequence[Sample], reference: FloatArray) -> FloatArray
         frames.append(moments.n_frames)
     noise = reference[:, 1] * reference[:, 3]
     pixels = zip(np.stack(exposures, 1), noise, reference[:, 1], np.stack(frames, 1), strict=True)
-    rows = [_bound(tuple(map(float, h)), float(s), float(g), tuple(map(float, n))) for h, s, g, n in pixels]
+    rows = [bounds(tuple(map(float, h)), float(s), float(g), tuple(map(float, n))) for h, s, g, n in pixels]
     return np.array(rows).reshape(-1, 4)
 
 
 @functools.lru_cache(maxsize=1 << 16)
-def _bound(exposures: tuple[float, ...], noise: float, gain: float, frames: tuple[float, ...]) -> FloatArray:
+def bounds(exposures: tuple[float, ...], noise: float, gain: float, frames: tuple[float, ...]) -> FloatArray:
     """Return the bound of (H of the first sample, g, mu, s_e), relative, the bias in e-."""
     if not (
         np.isfinite([*exposures, noise]).all() and exposures[0] > 0 and noise > 0 and min(exposures) >= 0

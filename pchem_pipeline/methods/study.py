@@ -14,14 +14,9 @@ import numpy as np
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.methods.base import PixelSamples, Sample, methods
-from pchem_pipeline.methods.compare import MethodResult, compare
+from pchem_pipeline.methods.compare import bounds, compare
 from pchem_pipeline.methods.photon_transfer import gain_variance
 from pchem_pipeline.methods.settings import MethodsSettings
-from pchem_pipeline.model.errors.expected_information import (
-    expected_information,
-    inverse_information,
-    shared_information,
-)
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 
 #: Exposures of the samples in units of H, by what a method needs; frames are shared evenly.
@@ -62,7 +57,7 @@ def study_point(point: StudyPoint, settings: MethodsSettings) -> dict[str, Any]:
         point: what to simulate.
         settings: of the iterative methods.
     """
-    results: list[MethodResult] = []
+    found: dict[str, dict[str, Any]] = {}
     for number, (needs, exposures) in enumerate(SHARES.items()):
         names = [n for n, m in methods().items() if m.needs == needs and not m.sensor_wide]
         rng = np.random.default_rng([point.seed, number, round(1e6 * point.read_noise_e)])
@@ -74,23 +69,21 @@ def study_point(point: StudyPoint, settings: MethodsSettings) -> dict[str, Any]:
             for share in exposures
         ]
         pixels = PixelSamples(tuple(Sample(one.counts, one.origin) for one in drawn))
-        results += compare(pixels, drawn[0].truth, settings, only=names)
-    order = list(methods())
-    results.sort(key=lambda result: order.index(result.name))
+        results = compare(pixels, drawn[0].truth, settings, only=names)
+        found |= {result.facts["name"]: result.facts for result in results}
     return {
         "read_noise_e": point.read_noise_e,
         "bounds": _gain_bounds(point),
-        "methods": {result.name: result.as_json() for result in results},
+        "methods": {name: found[name] for name in methods() if name in found},
     }
 
 
 def _gain_bounds(point: StudyPoint) -> dict[str, float | None]:
     """Return the smallest relative errors of g: one sample, dark and bright, and photon transfer's own."""
-    exposure, noise, n = point.quanta_exposure, point.read_noise_e, float(point.n_frames)
-    gain = point.conversion_gain
-    one = inverse_information(expected_information(exposure, noise, gain) * n)[1, 1]
-    two = shared_information(exposure, noise, gain) + shared_information(0.0, noise, gain)
-    both = inverse_information(two * (n / 2))[0, 0]
-    transfer = gain_variance(exposure, 0.0, noise, n / 2, n / 2)
+    exposure, noise = point.quanta_exposure, point.read_noise_e
+    gain, n = point.conversion_gain, point.n_frames
+    one = bounds((exposure,), noise, gain, (n,))[1]
+    both = bounds((exposure, 0.0), noise, gain, (n / 2, n / 2))[1]
+    transfer = np.sqrt(gain_variance(exposure, 0.0, noise, n / 2, n / 2))
     found = {"one sample": one, "a dark and a bright sample": both, "photon_transfer": transfer}
-    return {name: plain(np.sqrt(value)) for name, value in found.items()}
+    return {name: plain(value) for name, value in found.items()}

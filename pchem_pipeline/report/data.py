@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,15 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
+from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
 from pchem_pipeline.report.settings import Criteria
+from pchem_pipeline.report.style.ranges import finite
 
 if TYPE_CHECKING:
     from pchem_pipeline.model.checks.map_parts import Parts
@@ -45,6 +48,15 @@ CHANNELS = ("charge", "readout")
 
 #: Codes from which their distance is known.
 _FEWEST_CODES = 8
+
+
+def reasons_in(status: NDArray[np.integer[Any]]) -> list[tuple[FitStatus, str, int]]:
+    """Return each reason for caution or failure in status words, gravest first: bit, sentence, pixels.
+
+    A pixel with several reasons counts for each of them.
+    """
+    counts = [(bit, text, int(np.count_nonzero(status & int(bit)))) for bit, text in MEANINGS.items()]
+    return [row for row in counts if row[2]]
 
 
 @dataclass(frozen=True)
@@ -90,16 +102,21 @@ class DiscrepancyData:
     Attributes:
         found: the verdict.
         arrays: arrays of group ``discrepancy`` by name; any may lack.
-        statistics: name of each statistic, in the order of ``z_before``, to its channel and sentence.
-        titles: tag of an effect to its name in the literature.
-        sources: tag of an effect to where it is described.
     """
 
     found: Verdict
     arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    statistics: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-    titles: Mapping[str, str] = field(default_factory=dict)
-    sources: Mapping[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def statistics(self) -> dict[str, tuple[str, str]]:
+        """Name of each statistic, in the order of ``z_before``, to its channel and sentence."""
+        signs = dict(zip(STATISTICS, self.arrays.get("z_before", ()), strict=False))
+        return {name: (s.channel, s.says(signs.get(name, 1.0))) for name, s in STATISTICS.items()}
+
+    @cached_property
+    def titles(self) -> dict[str, str]:
+        """Tag of an effect to its name in the literature."""
+        return {tag: effect.title for tag, effect in effect_classes().items() if effect.title}
 
     def title(self, tag: str) -> str:
         """Return the name of an effect in the literature, or its tag."""
@@ -159,7 +176,6 @@ class ReportData:
         camera: name, serial number and temperature of the sensor as the files say; empty where they do not.
         maps: ``name`` and ``name_stderr`` of ``variables.py`` group ``maps`` (y, x); NaN where a fit failed.
         fit: ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... (y, x).
-        status_words: bit of ``fit_status`` to its short sentence, gravest first.
         criteria: limits of the sensor.
         pixels: the shown pixels.
         ensemble: arrays of group ``ensemble``.
@@ -192,9 +208,6 @@ class ReportData:
         samples: the exposures of a run whose input is several samples, or None.
     """
 
-    #: bits of ``fit_status`` for which the parameters are NaN
-    failed_mask: ClassVar[int] = int(FAILED)
-
     title: str
     shape: tuple[int, int]
     kind: str = "unknown"
@@ -203,7 +216,6 @@ class ReportData:
     camera: str = ""
     maps: Mapping[str, FloatArray] = field(default_factory=dict)
     fit: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    status_words: Mapping[int, str] = field(default_factory=lambda: {int(b): t for b, t in MEANINGS.items()})
     criteria: Criteria = field(default_factory=Criteria)
     pixels: Sequence[PixelFit] = ()
     ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
@@ -245,38 +257,36 @@ class ReportData:
         return self.shape[0] == 1 and self.shape[1] < FEW_CHANNELS
 
     @cached_property
+    def status(self) -> NDArray[np.integer[Any]]:
+        """Status word of each pixel; without a fit none is fitted; shape ``shape``."""
+        return self.fit.get("fit_status", np.full(self.shape, int(FitStatus.NOT_FITTED)))
+
+    @cached_property
+    def failed(self) -> BoolArray:
+        """Pixels that have a reason for having no value; shape ``shape``."""
+        return np.asarray(self.status & int(FAILED) != 0)
+
+    @cached_property
     def unfitted(self) -> BoolArray:
         """Pixels that no fit has reached yet: neither a value nor a reason; shape ``shape``."""
-        status, gain = self.fit.get("fit_status"), self.maps.get("conversion_gain")
-        if status is None or gain is None:
-            return np.zeros(self.shape, dtype=bool)
-        return np.asarray((status & self.failed_mask == 0) & ~np.isfinite(gain))
+        gain = self.maps.get("conversion_gain")
+        return np.asarray(~self.failed & (np.False_ if gain is None else ~np.isfinite(gain)))
 
     @cached_property
     def flagged(self) -> BoolArray:
         """Pixels with a value that the data leave open by whole electrons, or altogether; shape ``shape``."""
-        return self._with_bits(int(FLAGGED))
+        return self._with_bits(FLAGGED)
 
     def flagged_in(self, name: str) -> BoolArray:
         """Tell which pixels the data leave open in one map: a gain is known where the bias is not."""
-        return self._with_bits(int(FLAGGED & flags_of(name)))
+        return self._with_bits(flags_of(name))
 
-    def _with_bits(self, bits: int) -> BoolArray:
-        status = self.fit.get("fit_status")
-        if status is None:
-            return np.zeros(self.shape, dtype=bool)
-        return np.asarray((status & self.failed_mask == 0) & (status & bits != 0))
-
-    @cached_property
-    def any_flagged(self) -> bool:
-        """Whether a pixel is flagged."""
-        return bool(self.flagged.any())
+    def _with_bits(self, bits: FitStatus) -> BoolArray:
+        return np.asarray(~self.failed & (self.status & int(bits) != 0))
 
     def flagged_share(self, name: str = "quanta_exposure") -> float:
         """Return the share of flagged pixels among those with a value, in one map; by default all flags."""
-        status = self.fit.get("fit_status")
-        valued = 0 if status is None else int(np.count_nonzero(status & self.failed_mask == 0))
-        return int(np.count_nonzero(self.flagged_in(name))) / max(valued, 1)
+        return int(self.flagged_in(name).sum()) / max(int((~self.failed).sum()), 1)
 
     @property
     def mostly_flagged(self) -> bool:
@@ -286,8 +296,7 @@ class ReportData:
     @property
     def mostly_coarse(self) -> bool:
         """Tell whether rounding, which the fit did not count, biases the estimates of most pixels."""
-        status = self.fit.get("fit_status")
-        return status is not None and bool(np.mean((status & int(FitStatus.COARSE_STEPS)) != 0) > 0.5)
+        return bool(np.mean(self.status & int(FitStatus.COARSE_STEPS) != 0) > 0.5)
 
     @property
     def typed_run(self) -> str:
@@ -340,7 +349,7 @@ class ReportData:
         """
         if (name, with_flagged) not in self._summaries:
             self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
-            if self.any_flagged:
+            if self.flagged.any():
                 known = Ordered.of(self.maps[name], self.flagged_in(name))
                 self._summaries[name, False] = self._summarised(known)
         return self._summaries[name, with_flagged]
@@ -359,8 +368,32 @@ class ReportData:
         errors = self.maps.get(f"{name}_stderr")
         if errors is None:
             return None
-        key = name, with_flagged or not self.any_flagged
+        key = name, with_flagged or not bool(self.flagged.any())
         if key not in self._errors:
             median = median_of(errors, None if key[1] else self.flagged_in(name))
             self._errors[key] = None if np.isnan(median) else median
         return self._errors[key]
+
+
+class TruthErrors(NamedTuple):
+    """Estimates of a map against the truth: medians, root mean square error, (estimate - truth) / error."""
+
+    true_median: float
+    median: float
+    rmse: float
+    pulls: FloatArray
+
+
+def truth_errors(data: ReportData) -> dict[str, TruthErrors]:
+    """Return by map how the estimates of simulated pixels differ from the truth, flagged pixels left out."""
+    found = {}
+    for name in (name for name in data.truth if name in data.maps):
+        known = np.isfinite(data.maps[name]) & ~data.flagged_in(name)
+        if not known.any():
+            continue
+        truth, estimate = (np.asarray(maps[name][known], np.float64) for maps in (data.truth, data.maps))
+        errors = data.maps.get(f"{name}_stderr", np.full(data.shape, np.nan))[known]
+        rmse = float(np.sqrt(np.mean((estimate - truth) ** 2)))
+        pulls = finite((estimate - truth) / errors)
+        found[name] = TruthErrors(float(np.median(truth)), float(np.median(estimate)), rmse, pulls)
+    return found

@@ -16,25 +16,24 @@ import json
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.model.maps.ordered import Ordered
-from pchem_pipeline.report.data import MAP_NAMES, ReportData
+from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.style.palette import shades
 from pchem_pipeline.report.style.ranges import DECADES
-from pchem_pipeline.report.style.wording import symbol, unit_text
+from pchem_pipeline.report.style.wording import unit_text
 
 #: Codes with a meaning of their own, and the last one of the regular range.
 _NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535
 #: Quantiles between which a value is surely inside the range; the range is three times wider on each side.
 _TAIL = 1e-3
-#: Values that are worked on at a time.
-AT_ONCE = 1 << 17
 #: Step of logarithmic maps: 2.3 %.
 _LOG_STEP = 0.01
 #: Bars of a map's histogram, at least and at most.
@@ -130,14 +129,9 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
         scale: from :func:`choose_scale`.
     """
     flat = np.asarray(values).ravel()
-    codes = np.empty(flat.size, "<u2")
-    bars = _empty_bars(flat, scale)
-    for start in range(0, flat.size, AT_ONCE):
-        part = slice(start, start + AT_ONCE)
-        place = _places(flat[part], scale)
-        if bars is not None:
-            _count(place, bars)
-        codes[part] = _codes(place, flat[part])
+    place = _places(flat, scale)
+    bars = None if flat.dtype.kind in "iub" else _bars(place)
+    codes = _codes(place, flat).astype("<u2")
     outside = (codes == _BELOW) | (codes == _ABOVE)
     if scale.log:  # zeros, which may be many, need no place in the list
         outside &= flat != 0
@@ -171,33 +165,29 @@ def _codes(place: FloatArray, values: NDArray[Any]) -> FloatArray:
     return place
 
 
-def _empty_bars(flat: NDArray[Any], scale: Scale) -> Bars | None:
-    """Return bars over the bulk of a map, empty; None where codes are narrow enough to be bars.
+def _bars(place: FloatArray) -> Bars | None:
+    """Return the histogram over the bulk of a map; None where codes are narrow enough to be bars.
 
     The axis is that of the script: from the 1st to the 99th percentile and 0.3 of it beyond, where there are
-    values.
+    values; those beyond it are in no bar.
+
+    Args:
+        place: of each value on the scale, in steps, shape (n,).
     """
-    if flat.dtype.kind in "iub":
+    known = Ordered.of(some_of(place))
+    if known.size < 2:
         return None
-    place = Ordered.of(_places(some_of(flat), scale))
-    if place.size < 2:
-        return None
-    low, high = place.quantiles([0.01, 0.99])
+    low, high = known.quantiles([0.01, 0.99])
     margin = 0.3 * (high - low)
-    ends = max(low - margin, place.values[0], 0.0), min(high + margin, place.values[-1])
+    ends = max(low - margin, known.values[0], 0.0), min(high + margin, known.values[-1])
     first, last = np.rint(ends).astype(int)
-    wanted = np.clip(2.0 * np.cbrt(flat.size), _FEWEST_BARS, _MOST_BARS)
+    wanted = np.clip(2.0 * np.cbrt(place.size), _FEWEST_BARS, _MOST_BARS)
     parts = round(float(wanted) / max(int(last - first) + 1, 1))
     if parts < 2 or not high > low:
         return None
-    return Bars(int(first) + _FIRST, parts, np.zeros((int(last - first) + 1) * parts, np.int64))
-
-
-def _count(place: FloatArray, bars: Bars) -> None:
-    """Add the values at some places to their bars; those beyond the axis are in none."""
-    bar = (place - (bars.first - _FIRST - 0.5)) * bars.parts
-    inside = bar[(bar >= 0.0) & (bar < bars.counts.size)]
-    bars.counts[:] += np.bincount(inside.astype(np.int64), minlength=bars.counts.size)
+    n, bar = int(last - first + 1) * parts, (place - (first - 0.5)) * parts
+    inside = bar[(bar >= 0.0) & (bar < n)].astype(np.int64)
+    return Bars(int(first) + _FIRST, parts, np.bincount(inside, minlength=n))
 
 
 def varints(values: NDArray[Any]) -> bytes:
@@ -262,6 +252,14 @@ class MapEntry:
     same_as: tuple[str, float] | None = None
 
 
+class Notable(NamedTuple):
+    """Why pixels are in the file: in words, which (``y * nx + x``), and the map whose value it is, if one."""
+
+    words: str
+    pixels: tuple[int, ...]
+    path: str = ""
+
+
 @dataclass(frozen=True)
 class PixelSample:
     """Pixels that are in the file in full.
@@ -273,7 +271,7 @@ class PixelSample:
         counts: their histograms.
         deciding: parameters that decide electron numbers, where these are not the fitted ones: (4, n).
         masses: probability of each bin under a model with effects, of as many of the first pixels.
-        reasons: why pixels are here, with their indices, e.g. ``"poorest goodness of fit"``.
+        reasons: why pixels are here, those of the even sample excepted.
     """
 
     index: IntArray
@@ -282,7 +280,7 @@ class PixelSample:
     counts: list[NDArray[np.integer[Any]]]
     deciding: FloatArray | None = None
     masses: list[FloatArray] = field(default_factory=list)
-    reasons: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    reasons: Sequence[Notable] = ()
 
 
 @dataclass(frozen=True)
@@ -329,27 +327,17 @@ _GROUPS = {
 }
 
 
-@dataclass(frozen=True)
-class Embedded:
-    """What the page holds for the inspector, ready to stand in it: facts as JSON, data by id, the script."""
+def embedded(data: ReportData) -> dict[str, Any] | None:
+    """Return the inspector's part of the page: ``facts`` as JSON, ``blobs`` of data by id, the ``script``.
 
-    facts: Markup
-    blobs: list[tuple[str, Markup]]
-    script: Markup
-
-
-def embedded(data: ReportData) -> Embedded | None:
-    """Return the inspector's part of the page; None where the run has nothing to inspect."""
+    None where the run has nothing to inspect.
+    """
     if data.inspector is None:
         return None
     shown = data.inspector()
-    parts = [(name, Markup(text)) for name, text in _blobs(shown)]
-    return Embedded(json_for_html(_facts(data, shown)), parts, Markup(script()))
-
-
-def script() -> str:
-    """Return the script of the pixel inspector."""
-    return text_of("inspector.js")
+    blobs = {name: Markup(text) for name, text in _blobs(shown)}
+    script = Markup(text_of("inspector.js"))
+    return {"facts": json_for_html(_facts(data, shown)), "blobs": blobs, "script": script}
 
 
 def text_of(name: str, folder: str = "templates") -> str:
@@ -400,8 +388,8 @@ def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
         "noun": data.noun,
         "channels": list(data.channel_names),
         "samples": "samples" if data.shape[0] == 1 else "frames",
-        "statusWords": {str(bit): text for bit, text in data.status_words.items()},
-        "failedMask": data.failed_mask,
+        "statusWords": {str(int(bit)): text for bit, text in MEANINGS.items()},
+        "failedMask": int(FAILED),
         "model": data.run.get("model", ""),
         "command": shown.command,
         "keptTo": shown.kept_to,
@@ -414,24 +402,8 @@ def _facts(data: ReportData, shown: InspectorData) -> dict[str, Any]:
             "deciding": sample.deciding is not None,
             "masses": len(sample.masses),
         },
-        "notable": [
-            {"words": words, "pixels": list(where), "path": _shown_value(words)}
-            for words, where in sample.reasons
-        ],
+        "notable": [each._asdict() for each in sample.reasons],
     }
-
-
-def _shown_value(reason: str) -> str:
-    """Return the path of the map whose value makes a pixel notable; empty where it is no value."""
-    if reason == "poorest goodness of fit":
-        return "fit/goodness_p"
-    for name in MAP_NAMES:
-        words = symbol(name)[1]
-        if reason.endswith(f"standard error of the {words}"):
-            return f"maps/{name}_stderr"
-        if reason in (f"largest {words}", f"smallest {words}"):
-            return f"maps/{name}"
-    return ""
 
 
 def map_facts(entry: MapEntry) -> dict[str, Any]:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.stream import FrameSource
 
 LISTED_FILES = 64
+#: Files of a run with the input as known now, and as the run holds it.
+_KNOWN, _HELD = ".pchem/input.json", ".pchem/ingested.json"
 
 
 def known_identity(context: StageContext) -> dict[str, Any]:
@@ -37,7 +39,7 @@ def known_identity(context: StageContext) -> dict[str, Any]:
     known: dict[str, Any] = {}
     held: dict[str, Any] = {}
     with suppress(StoreError):  # one that is damaged is as good as none: the files are hashed again
-        known = read_record(_place(context)) or {}
+        known = read_record(context.store.path / _KNOWN) or {}
         held = ingested_identity(context) or {}
     same_files = known.get("files") == list(settings.files)
     try:
@@ -68,14 +70,14 @@ def known_identity(context: StageContext) -> dict[str, Any]:
 
 def identity_is_new(context: StageContext) -> bool:
     """Tell whether nothing is known of the input yet."""
-    return not _place(context).exists()
+    return not (context.store.path / _KNOWN).exists()
 
 
 def keep_ingested(context: StageContext) -> None:
     """Remember the input as known now as that which the run holds, whatever is found in its place later."""
-    known = read_record(_place(context))
+    known = read_record(context.store.path / _KNOWN)
     if known is not None:
-        write_record(_ingested(context), known)
+        write_record(context.store.path / _HELD, known)
 
 
 def ingested_identity(context: StageContext) -> dict[str, Any] | None:
@@ -84,11 +86,7 @@ def ingested_identity(context: StageContext) -> dict[str, Any] | None:
     Raises:
         StoreError: what was kept is damaged.
     """
-    return read_record(_ingested(context), cure_of(context.store.path, "frames"))
-
-
-def _ingested(context: StageContext) -> Path:
-    return context.store.path / ".pchem" / "ingested.json"
+    return read_record(context.store.path / _HELD, cure_of(context.store.path, "frames"))
 
 
 def keep_identity(context: StageContext, quick: dict[str, Any], identity: dict[str, Any]) -> None:
@@ -98,11 +96,7 @@ def keep_identity(context: StageContext, quick: dict[str, Any], identity: dict[s
         StoreError: the store cannot be written.
     """
     files = list(context.config.input.files)
-    write_record(_place(context), {"files": files, "quick": quick, "identity": identity})
-
-
-def _place(context: StageContext) -> Path:
-    return context.store.path / ".pchem" / "input.json"
+    write_record(context.store.path / _KNOWN, {"files": files, "quick": quick, "identity": identity})
 
 
 def inspect_input(context: StageContext) -> None:

@@ -79,19 +79,9 @@ def parts_told(parts: Iterable[T]) -> Iterator[T]:
 
 
 def paced(label: str, unit: str, done: float, total: int, new: float, seconds: float) -> dict[str, Any]:
-    """Return how far a stage is, for machines.
+    """Return how far a stage is, for machines: units done of all, rate and remaining time (s).
 
-    Args:
-        label: the stage, or a part of one.
-        unit: what is counted.
-        done: units finished.
-        total: units of the whole.
-        new: units finished in this run.
-        seconds: time that those took.
-
-    Returns:
-        ``stage``, ``unit``, ``done``, ``total``, ``elapsed`` (s), ``rate`` (units per s), ``remaining`` (s);
-        the last two are None before the first unit.
+    These are None before the first unit; ``new`` units took the given time (s) in this run.
     """
     known = new > 0 and seconds > 0
     return {

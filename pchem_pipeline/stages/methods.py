@@ -216,7 +216,7 @@ def _do(
         "reference": source,
         "samples": words,
         "remarks": _remarks(words),
-        "methods": [result.as_json() for result in results],
+        "methods": [result.facts for result in results],
     }
 
 

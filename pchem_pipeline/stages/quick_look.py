@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import IntArray
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
 from pchem_pipeline.discrepancy.quick.codes import CodeSample
@@ -27,23 +29,22 @@ _MOST_BLOCK_SUMS, _MOST_LINE_SUMS = 1 << 22, 1 << 22
 _PIXELS, _PIECES, _FEWEST = 1024, 8, 16
 
 
-def run_quick_look(store: RunStore, run: StoredRun, sums: StackSums | None) -> QuickLook | None:
+def run_quick_look(run: StoredRun, sums: StackSums | None) -> QuickLook | None:
     """Return the quick look at a run; None where no pixel has parameters.
 
     Args:
-        store: the run.
-        run: what was read of it.
+        run: that is looked at.
         sums: of :func:`read_sums`.
 
     Raises:
         StoreError: an array is missing or corrupt.
     """
-    maps = _maps(run)
+    maps = _maps(run.data.fit, run.data.maps)
     if maps is None:
         return None
     missing: dict[str, str] = {}
     if sums is None:
-        why = store.attributes("summary").get("missing", "the stage histogram has none")
+        why = run.store.attributes("summary").get("missing", "the stage histogram has none")
         missing["rows, columns, frames, neighbours and lags"] = str(why)
     codes = None
     if run.model.effects:
@@ -51,16 +52,16 @@ def run_quick_look(store: RunStore, run: StoredRun, sums: StackSums | None) -> Q
     elif maps.usable.sum() < _FEWEST:
         missing["codes"] = f"fewer than {_FEWEST} pixels have a reliable fit"
     else:
-        codes = _codes(store, maps, run.sensor)
+        codes = _codes(run.store, maps, run.sensor)
     # the path of the run is told at the end, as it is seen from where the command was typed
     return quick_look(sums, maps, codes, run.model.effects, missing, "pchem discrepancy")
 
 
-def _maps(run: StoredRun) -> PixelMaps | None:
-    status = run.fit.get("fit_status")
-    if status is None or not all(name in run.maps for name in PARAMETERS):
+def _maps(fit: Mapping[str, NDArray[Any]], maps: Mapping[str, FloatArray]) -> PixelMaps | None:
+    status = fit.get("fit_status")
+    if status is None or not all(name in maps for name in PARAMETERS):
         return None
-    exposure, gain, bias, sigma = (np.asarray(run.maps[name], np.float64) for name in PARAMETERS)
+    exposure, gain, bias, sigma = (np.asarray(maps[name], np.float64) for name in PARAMETERS)
     usable = (status & int(UNTRUSTWORTHY)) == 0
     for values in (exposure, gain, bias, sigma):
         usable &= np.isfinite(values)

@@ -128,7 +128,7 @@ def _levels_of(
 ) -> tuple[Cells, Levels]:
     """Return cells and levels of a pixel under other parameters, the weight of its satellites held."""
     known_theta(parameters, pixel.centre, weight, theta)
-    cells = cells_of(pixel, np.int64(0))
+    cells = cells_of(pixel, 0)
     return cells, list_levels(theta, cells, codes)
 
 
@@ -178,7 +178,7 @@ def estimate_exposures(
         pixel, codes = place_codes(index, first[index] + low, n, parts, law, satellites, room)
         if not known_theta(parameters[index], pixel.centre, satellites[index, 1], theta):
             continue
-        cells = cells_of(pixel, np.int64(0))
+        cells = cells_of(pixel, 0)
         levels = list_levels(theta, cells, codes)
         seen = weights[:n]
         start = (codes.first + moment / total / parts - theta[2]) / theta[1]

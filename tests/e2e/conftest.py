@@ -73,3 +73,25 @@ def browser():
         chromium = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
         yield chromium
         chromium.close()
+
+
+@pytest.fixture
+def open_page(browser):
+    """Open pages that must say nothing and ask nobody but their own place; checked at the end of a test."""
+    said, asked, contexts = [], [], []
+
+    def open_(url, width=1200, **options):
+        contexts.append(browser.new_context(viewport={"width": width, "height": 900}, **options))
+        page, place = contexts[-1].new_page(), url.partition("#")[0].rpartition("/")[0]
+        page.on("console", lambda message: said.append(message.text))
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("request", lambda request: asked.append((place, request.url)))
+        page.goto(url)
+        return page
+
+    open_.asked = asked
+    yield open_
+    assert said == []
+    assert [url for place, url in asked if not url.startswith((place, "data:"))] == []
+    for context in contexts:
+        context.close()

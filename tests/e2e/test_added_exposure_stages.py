@@ -1,7 +1,5 @@
 """A sensor with pixels whose dark current blinks: after the search the fit gives their steady exposure."""
 
-from pathlib import Path
-
 import numpy as np
 
 from pchem_pipeline.commands.model import adopt_verdict, use_model
@@ -21,11 +19,11 @@ BLINKING = {
 }
 
 
-def states(path: Path) -> dict[str, str]:
+def states(path):
     return {state.stage: state.words() for state in run_status(find_run(path))}
 
 
-def test_exposure_of_blinking_pixels_is_their_steady_one(tmp_path: Path) -> None:
+def test_exposure_of_blinking_pixels_is_their_steady_one(tmp_path):
     content = {
         "run": {"tile": 8},
         "simulate": {"shape": [16, 20], "n_frames": 2400, "seed": 3, "format": "npy", "effects": [BLINKING]},

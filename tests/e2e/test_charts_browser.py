@@ -1,9 +1,7 @@
 """The charts of a report in a real browser: Debian's Chromium, headless, driven by Playwright."""
 
-from collections.abc import Callable, Iterator
+import functools
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from helpers.discrepancy_material import discrepancy_data
 from helpers.quick_stacks import stack, sums_of
 from helpers.report_material import report_data
 
-from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
 from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.pages.report import render_report
@@ -24,7 +21,7 @@ OPEN = "() => { for (const each of document.querySelectorAll('details.folded')) 
 
 
 @pytest.fixture(scope="module")
-def data() -> ReportData:
+def data():
     frames = stack(np.random.default_rng(2), (300, 24, 32))
     return replace(
         report_data((24, 32)),
@@ -35,7 +32,7 @@ def data() -> ReportData:
 
 
 @pytest.fixture(scope="module")
-def page_url(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
+def page_url(data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("charts")
     for name, text in render_report(data).items():
         (folder / name).write_text(text)
@@ -43,7 +40,7 @@ def page_url(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def names(data: ReportData) -> dict[str, list[str]]:
+def names(data):
     pages = {"report": report_figures(data), "discrepancy": discrepancy_figures(data.discrepancy)}
     return {
         page: sorted(each.name for each in figures if not each.chart.still and each.section)
@@ -52,30 +49,12 @@ def names(data: ReportData) -> dict[str, list[str]]:
 
 
 @pytest.fixture
-def open_page(browser: Any, page_url: str) -> Iterator[Callable[..., Any]]:
-    """Open the report; it must say nothing and ask nobody, which is checked at the end of each test."""
-    said: list[str] = []
-    contexts = []
-
-    def open_(width: int = 1200, **options: Any) -> Any:
-        context = browser.new_context(viewport={"width": width, "height": 900}, **options)
-        contexts.append(context)
-        page = context.new_page()
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
-        page.on(
-            "request", lambda request: request.url.startswith(("file:", "data:")) or said.append(request.url)
-        )
-        page.goto(page_url)
-        return page
-
-    yield open_
-    assert said == []
-    for context in contexts:
-        context.close()
+def report(open_page, page_url):
+    """Open the report, with options of the browser."""
+    return functools.partial(open_page, page_url)
 
 
-def chart(page: Any, name: str) -> Any:
+def chart(page, name):
     """Return a figure whose chart is drawn."""
     page.evaluate(OPEN)
     for part in page.locator("details.part").all():
@@ -86,7 +65,7 @@ def chart(page: Any, name: str) -> Any:
     return figure
 
 
-def drag(page: Any, over: Any, start: tuple[float, float], end: tuple[float, float]) -> None:
+def drag(page, over, start, end):
     box = over.bounding_box()
     (x0, y0), (x1, y1) = (
         (box["x"] + u * box["width"], box["y"] + v * box["height"]) for u, v in (start, end)
@@ -100,10 +79,8 @@ def drag(page: Any, over: Any, start: tuple[float, float], end: tuple[float, flo
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1200, "light"), (1200, "dark"), (400, "light")])
-def test_every_chart_is_drawn(
-    open_page: Callable[..., Any], names: dict[str, list[str]], width: int, scheme: str
-) -> None:
-    page = open_page(width, color_scheme=scheme)
+def test_every_chart_is_drawn(report, names, width, scheme):
+    page = report(width, color_scheme=scheme)
     assert names["discrepancy"]
     for file, name in [(file, name) for file, shown in names.items() for name in shown]:
         if not page.url.endswith(f"{file}.html"):
@@ -121,8 +98,8 @@ def test_every_chart_is_drawn(
     assert page.evaluate("() => document.scrollingElement.scrollWidth") <= width
 
 
-def test_a_drag_zooms_and_a_double_click_goes_back(open_page: Callable[..., Any]) -> None:
-    page = open_page()
+def test_a_drag_zooms_and_a_double_click_goes_back(report):
+    page = report()
     figure = chart(page, "ensemble")
     top, strip = (figure.locator("canvas").nth(i) for i in (0, 1))
     before = [each.evaluate(SHOWN) for each in (top, strip)]
@@ -137,10 +114,8 @@ def test_a_drag_zooms_and_a_double_click_goes_back(open_page: Callable[..., Any]
     assert [each.evaluate(SHOWN) for each in (top, strip)] == before
 
 
-def test_the_legend_has_values_and_hides_what_it_names(
-    open_page: Callable[..., Any], data: ReportData
-) -> None:
-    page = open_page()
+def test_the_legend_has_values_and_hides_what_it_names(report, data):
+    page = report()
     figure = chart(page, "electron_numbers")
     button = figure.get_by_role("button", name="estimated electron numbers")
     box = figure.locator(".u-over").nth(0).bounding_box()
@@ -166,8 +141,8 @@ def test_the_legend_has_values_and_hides_what_it_names(
     assert (button.get_attribute("aria-pressed"), canvas.evaluate(SHOWN)) == ("true", before)
 
 
-def test_keys_read_values_and_zoom(open_page: Callable[..., Any]) -> None:
-    page = open_page()
+def test_keys_read_values_and_zoom(report):
+    page = report()
     figure = chart(page, "frame_means")
     panel, canvas = figure.locator(".panel").nth(0), figure.locator("canvas").nth(0)
     before = canvas.evaluate(SHOWN)
@@ -183,20 +158,20 @@ def test_keys_read_values_and_zoom(open_page: Callable[..., Any]) -> None:
     assert canvas.evaluate(SHOWN) == before
 
 
-def test_paper_and_readers_without_scripts_get_the_plain_picture(open_page: Callable[..., Any]) -> None:
-    page = open_page()
+def test_paper_and_readers_without_scripts_get_the_plain_picture(report):
+    page = report()
     figure = chart(page, "ensemble")
     page.emulate_media(media="print")
     assert figure.locator("img").is_visible()
     assert not figure.locator(".chart").is_visible()
-    page = open_page(java_script_enabled=False)
+    page = report(java_script_enabled=False)
     image = page.locator("#figure-ensemble img")
     assert image.is_visible()
     assert image.bounding_box()["height"] > 200
 
 
-def test_a_chart_follows_the_width_of_the_window(open_page: Callable[..., Any]) -> None:
-    page = open_page()
+def test_a_chart_follows_the_width_of_the_window(report):
+    page = report()
     figure = chart(page, "pixel_fits")
     wide = figure.locator("canvas").nth(0).bounding_box()["width"]
     page.set_viewport_size({"width": 420, "height": 900})
@@ -207,8 +182,8 @@ def test_a_chart_follows_the_width_of_the_window(open_page: Callable[..., Any]) 
     assert page.evaluate("() => document.scrollingElement.scrollWidth") <= 420
 
 
-def test_a_picture_is_saved_from_the_page(open_page: Callable[..., Any], tmp_path: Path) -> None:
-    page = open_page()
+def test_a_picture_is_saved_from_the_page(report, tmp_path):
+    page = report()
     figure = chart(page, "ensemble")
     with page.expect_download() as download:
         figure.get_by_role("button", name="Save ensemble as SVG").click()

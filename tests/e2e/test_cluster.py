@@ -32,13 +32,28 @@ def processes(tmp_path):
         yield made
 
 
+def workers_of(file, **settings):
+    """Return settings of the cluster whose scheduler is told by a file."""
+    return ComputeSettings(backend="distributed", scheduler=str(file), **settings)
+
+
 @pytest.fixture
 def executor(processes):
     file, _ = processes
-    made = make_executor(ComputeSettings(backend="distributed", scheduler=str(file)))
+    made = make_executor(workers_of(file))
     made._client.wait_for_workers(2, timeout=60)
     yield made
     made.close()
+
+
+@pytest.fixture
+def deserted(processes):
+    """The file of a scheduler whose workers are gone."""
+    file, (_, *workers) = processes
+    for worker in workers:
+        worker.kill()
+        worker.wait()
+    return file
 
 
 def test_a_killed_worker_costs_nothing_but_time(processes, executor, tmp_path):
@@ -111,28 +126,20 @@ class Counted:
         self.asked += 1
 
 
-def test_a_scheduler_without_workers_is_said_and_given_up(processes):
-    file, (_, *workers) = processes
-    for worker in workers:
-        worker.kill()
-        worker.wait()
-    heard = Counted()
-    settings = ComputeSettings(backend="distributed", scheduler=str(file), wait_for_workers=1)
-    with pytest.raises(
-        IncompleteRunError, match=r"had no worker for 1 s \(compute.wait_for_workers\)"
-    ) as caught:
-        make_executor(settings, heard.lines.append, heard.check)
-    assert heard.lines == [f"waiting for workers of the dask scheduler {file}"]
+def test_a_scheduler_without_workers_is_said_and_given_up(deserted):
+    heard, words = Counted(), r"had no worker for 1 s \(compute.wait_for_workers\)"
+    with pytest.raises(IncompleteRunError, match=words) as caught:
+        make_executor(workers_of(deserted, wait_for_workers=1), heard.lines.append, heard.check)
+    assert heard.lines == [f"waiting for workers of the dask scheduler {deserted}"]
     assert heard.asked > 3
-    assert str(file) in str(caught.value)
+    assert str(deserted) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_workers_that_all_leave_are_waited_for_and_given_up(processes, tmp_path):
     file, (_, *workers) = processes
-    settings = ComputeSettings(backend="distributed", scheduler=str(file), wait_for_workers=3)
     heard = Counted()
-    executor = make_executor(settings, heard.lines.append, heard.check)
+    executor = make_executor(workers_of(file, wait_for_workers=3), heard.lines.append, heard.check)
     executor._client.wait_for_workers(2, timeout=60)
     found = []
 
@@ -150,17 +157,12 @@ def test_workers_that_all_leave_are_waited_for_and_given_up(processes, tmp_path)
     assert len(heard.lines) == 1
 
 
-def test_a_signal_ends_the_wait_for_workers(processes):
-    file, (_, *workers) = processes
-    for worker in workers:
-        worker.kill()
-        worker.wait()
-
+def test_a_signal_ends_the_wait_for_workers(deserted):
     def check():
         raise InterruptedRunError(signal.SIGTERM)
 
     with pytest.raises(InterruptedRunError, match="stopped by SIGTERM"):
-        make_executor(ComputeSettings(backend="distributed", scheduler=str(file)), check=check)
+        make_executor(workers_of(deserted), check=check)
 
 
 def test_paused_workers_are_not_waited_for_forever(monkeypatch):

@@ -13,6 +13,7 @@ from helpers.html_page import Page
 from helpers.report_material import report_data
 
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.compare.compare import compare_runs, comparison_of
 from pchem_pipeline.commands.compare.history import history_csv
 from pchem_pipeline.frames.camera import CameraFacts
@@ -41,8 +42,9 @@ def here(shell, *names):
     return ""
 
 
-def whole(store, name):
-    return (slice(None),) * store.array(name).ndim
+def put(store, name, values):
+    """Write a whole array of a run."""
+    store.write(name, (slice(None),) * values.ndim, values)
 
 
 def numbers(shell, folder="compare"):
@@ -79,7 +81,7 @@ def test_one_value_that_moved_is_found(shell, copies):
     bias = copies.read("maps/bias")
     y, x = np.argwhere(np.isfinite(bias))[5]
     bias[y, x] *= 1 + 1e-9
-    copies.write("maps/bias", whole(copies, "maps/bias"), bias)
+    put(copies, "maps/bias", bias)
     result = shell("compare", "a.zarr", "b.zarr", "-o", "out")
     assert result.code == 3
     assert result.stdout == ""
@@ -111,18 +113,11 @@ def test_lost_and_new_arrays_settings_and_versions(shell, copies):
 def other_capture(store, *, exposure=1.0, seed=1):
     """Make of a run what another capture would have given: noise of its standard errors, other frames."""
     rng = np.random.default_rng(seed)
-    for name in (
-        "quanta_exposure",
-        "conversion_gain",
-        "bias",
-        "read_noise_dn",
-        "read_noise_e",
-        "charge_rate",
-    ):
+    for name in (*PARAMETERS, "read_noise_e", "charge_rate"):
         values, error = store.read(f"maps/{name}"), store.read(f"maps/{name}_stderr")
         factor = exposure if name in ("quanta_exposure", "charge_rate") else 1.0
         values = factor * values + np.sqrt(2) * error * rng.standard_normal(values.shape)
-        store.write(f"maps/{name}", whole(store, f"maps/{name}"), values)
+        put(store, f"maps/{name}", values)
     store.delete("maps/analog_read_noise_e")
     sensor = store.attributes("frames")["sensor"]
     sensor["identity"]["digest"] = f"capture {seed}"
@@ -142,10 +137,8 @@ def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished):
     assert moved["maps"]["charge_rate"]["reasons"]["shifted"]
     assert not any(moved["maps"]["bias"]["reasons"].values())
     # 20 % of the exposure is many standard errors: the test can fail
-    z = moved["maps"]["charge_rate"]["median_z"] / np.sqrt(
-        np.pi / (2 * moved["maps"]["charge_rate"]["n_counted"])
-    )
-    assert z > 20
+    rate = moved["maps"]["charge_rate"]
+    assert rate["median_z"] / np.sqrt(np.pi / (2 * rate["n_counted"])) > 20
     page = (shell.folder / "compare" / "compare.html").read_text(encoding="utf-8")
     assert "warm &lt;b&gt;.zarr" in page
     assert "<b>.zarr" not in page
@@ -161,7 +154,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
     good = np.argwhere(third.read("maps/quality") == 0)[:40]
     for y, x in good:
         bias[y, x] += 12 * error[y, x]
-    third.write("maps/bias", whole(third, "maps/bias"), bias)
+    put(third, "maps/bias", bias)
     exposure = third.read("maps/quanta_exposure")
     places = [tuple(place) for place in good[:3].tolist()]
     words = third.read("fit/fit_status")
@@ -169,19 +162,14 @@ def test_the_history_of_a_camera(shell, copies, finished):
     for place in places:  # a flagged pixel is hot, too
         exposure[place] = 60.0
         origin[place] += 50  # its samples are others, too
-    third.write("histogram/origin", whole(third, "histogram/origin"), origin)
+    put(third, "histogram/origin", origin)
     words[places[0]] |= int(FitStatus.BIAS_AMBIGUOUS)
-    third.write("maps/quanta_exposure", whole(third, "maps/quanta_exposure"), exposure)
-    third.write("fit/fit_status", whole(third, "fit/fit_status"), words)
+    put(third, "maps/quanta_exposure", exposure)
+    put(third, "fit/fit_status", words)
     labels = ["-20 C", "-10 C", "0 C"]
+    paths = [shell.folder / f"{name}.zarr" for name in "abc"]
     with pytest.raises(ChangedError):
-        compare_runs(
-            [shell.folder / f"{name}.zarr" for name in "abc"],
-            shell.folder / "history",
-            labels=labels,
-            rate=0.05,
-            progress="off",
-        )
+        compare_runs(paths, shell.folder / "history", labels=labels, rate=0.05, progress="off")
     with (shell.folder / "history" / "history.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["label"] for row in rows] == labels
@@ -215,12 +203,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
     assert "-20 C" in page
     for each in ({"labels": ["one"]}, {"rate": 0.0}):
         with pytest.raises(ConfigError, match="--"):
-            comparison_of(
-                [shell.folder / "a.zarr", shell.folder / "b.zarr"],
-                1e-12,
-                Reporter("off"),
-                **each,
-            )
+            comparison_of(paths[:2], 1e-12, Reporter("off"), **each)
 
 
 def test_the_history_has_date_and_temperature_of_the_files(shell, copies, finished):
@@ -242,10 +225,8 @@ def test_the_history_has_date_and_temperature_of_the_files(shell, copies, finish
 
 
 def test_bad_input_gets_one_line(shell, finished):
-    result = shell("compare", finished)
-    assert (result.code, result.last) == (2, "pchem: compare: give two runs or more")
-    with pytest.raises(StoreError, match=r"nothing\.zarr does not exist"):
-        here(shell, finished, "nothing.zarr")
+    assert shell.refused(2, "compare", finished) == "pchem: compare: give two runs or more"
     RunStore.create(shell.folder / "empty.zarr")
-    with pytest.raises(StoreError, match=r"empty\.zarr"):
-        here(shell, finished, "empty.zarr")
+    for name, words in (("nothing", "does not exist"), ("empty", "")):
+        with pytest.raises(StoreError, match=rf"{name}\.zarr.*{words}"):
+            here(shell, finished, f"{name}.zarr")

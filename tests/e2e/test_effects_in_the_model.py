@@ -2,7 +2,6 @@
 
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,30 +25,20 @@ EFFECTS: list[dict[str, Any]] = [
 QUIET = Command(quiet=True)
 
 
-def configured(folder: Path, effects: list[dict[str, Any]], tile: int = 8) -> Path:
-    content = {
-        "run": {"tile": tile},
-        "simulate": {
-            "shape": [16, 20],
-            "n_frames": 3000,
-            "seed": 3,
-            "format": "npy",
-            "effects": EFFECTS,
-            "truth_frames": 500,
-        },
-        "model": {"effects": effects},
-        "compute": {"backend": "serial"},
-    }
+def configured(folder, effects):
+    simulate = {"shape": [16, 20], "n_frames": 3000, "seed": 3, "format": "npy", "truth_frames": 500}
+    content = {"run": {"tile": 8}, "simulate": {**simulate, "effects": EFFECTS}}
+    content |= {"model": {"effects": effects}, "compute": {"backend": "serial"}}
     path = folder / "run.yaml"
     path.write_text(dump_config(RunConfig.model_validate(content)), encoding="utf-8")
     return path
 
 
-def states(path: Path) -> dict[str, str]:
+def states(path):
     return {state.stage: state.words() for state in run_status(find_run(path))}
 
 
-def mean_pulls(store: RunStore) -> dict[str, float]:
+def mean_pulls(store):
     """Mean pull against the truth of the pixels with a good value, in units of its own standard error."""
     found = {}
     for name in (*PARAMETERS, "read_noise_e"):
@@ -62,7 +51,7 @@ def mean_pulls(store: RunStore) -> dict[str, float]:
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def both(tmp_path_factory):
     """The folder of the run, extended, and what was seen of it before."""
     folder = tmp_path_factory.mktemp("extended")
     path = configured(folder, [])
@@ -76,7 +65,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     return path, before
 
 
-def test_bias_is_cut_at_least_five_times_where_it_was_significant(both) -> None:
+def test_bias_is_cut_at_least_five_times_where_it_was_significant(both):
     path, before = both
     after = mean_pulls(RunStore.open(path.parent / "run.zarr"))
     for name, was in before["pulls"].items():
@@ -89,7 +78,7 @@ def test_bias_is_cut_at_least_five_times_where_it_was_significant(both) -> None:
         assert abs(now) < 5, name
 
 
-def test_a_plan_has_the_noise_of_the_effects(both) -> None:
+def test_a_plan_has_the_noise_of_the_effects(both):
     """As many frames as the run has give the error of the gain that its fit has."""
     path, _ = both
     store = RunStore.open(path.parent / "run.zarr")
@@ -100,7 +89,7 @@ def test_a_plan_has_the_noise_of_the_effects(both) -> None:
     assert "effects in the model of the run (signal_dependent_noise, row_noise, nonlinearity): noise" in words
 
 
-def test_ensemble_is_predicted_with_the_extended_law(both) -> None:
+def test_ensemble_is_predicted_with_the_extended_law(both):
     path, before = both
     store = RunStore.open(path.parent / "run.zarr")
     facts, old = dict(store.attributes("ensemble")), before["facts"]
@@ -129,7 +118,7 @@ def test_ensemble_is_predicted_with_the_extended_law(both) -> None:
     assert total == pytest.approx(rows["variance"]["predicted"], rel=1e-12)
 
 
-def test_electron_numbers_err_as_often_as_predicted(both) -> None:
+def test_electron_numbers_err_as_often_as_predicted(both):
     path, before = both
     facts, old = dict(RunStore.open(path.parent / "run.zarr").attributes("ensemble")), before["facts"]
     expected, rate, stderr = (
@@ -140,7 +129,7 @@ def test_electron_numbers_err_as_often_as_predicted(both) -> None:
     assert rate <= old["error_rate"] + stderr
 
 
-def test_the_inspector_holds_the_law_of_the_extended_model(both) -> None:
+def test_the_inspector_holds_the_law_of_the_extended_model(both):
     store = RunStore.open(both[0].parent / "run.zarr")
     pixel = RunView(store).answer("GET", "/api/pixel?y=3&x=4", {"host": "127.0.0.1:1"}, 1)
     content = json.loads(pixel.content)

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 import pytest
-from helpers.commands import RUN, arrays_of
+from helpers.commands import RUN, arrays_of, assert_same_results
 
 pytestmark = pytest.mark.skipif(
     find_spec("moto") is None or find_spec("s3fs") is None, reason='pip install ".[dev]" brings moto and s3fs'
@@ -77,22 +77,17 @@ def test_frames_are_read_from_s3_and_fetched_once(cloud, server, camera, finishe
     (cloud.folder / "run.yaml").write_text(text)
     cloud.ok("ingest", "run.yaml")
     cloud.ok("histogram", "run.yaml")
-    expected = arrays_of(finished, ("histogram", "summary"))
-    found = arrays_of(cloud.folder / "run.zarr", ("histogram", "summary"))
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        np.testing.assert_allclose(found[name], values, rtol=1e-12, err_msg=name)
+    assert_same_results(cloud.folder / "run.zarr", finished, rtol=1e-12, groups=("histogram", "summary"))
     fetched = sorted((tmp_path / "cache").rglob("*.tif"))
     before = [path.stat().st_mtime_ns for path in fetched]
     assert len(fetched) == 4
-    assert cloud.ok("status", "run.yaml").stdout.splitlines()[0].split() == ["ingest", "complete"]
+    assert cloud.states("run.yaml")["ingest"] == "complete"
     assert [path.stat().st_mtime_ns for path in fetched] == before
     # an object that changed is fetched again, and seen
     changed = bytearray(fetched[0].read_bytes())
     changed[-1] ^= 1
     put(f"{server}/lab/night/{fetched[0].name}", bytes(changed))
-    status = cloud.ok("status", "run.yaml").stdout.splitlines()[0]
-    assert status == "ingest      stale - the input has changed"
+    assert cloud.states("run.yaml")["ingest"] == "stale - the input has changed"
 
 
 @pytest.mark.parametrize(
@@ -100,10 +95,9 @@ def test_frames_are_read_from_s3_and_fetched_once(cloud, server, camera, finishe
 )
 def test_what_is_not_there_is_one_line(cloud, url, words):
     (cloud.folder / "run.yaml").write_text(RUN.replace("frames/*.tif", f'"{url}"'))
-    result = cloud("ingest", "run.yaml")
-    assert result.code == 4
-    assert result.last.startswith("pchem: ")
-    assert words in result.last
+    said = cloud.refused(4, "ingest", "run.yaml")
+    assert said.startswith("pchem: ")
+    assert words in said
 
 
 STORED = (
@@ -143,18 +137,11 @@ def fetched(server, folder):
     return folder / "night" / "run.zarr"
 
 
-def assert_same(store, finished, groups):
-    expected, found = arrays_of(finished, groups), arrays_of(store, groups)
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        np.testing.assert_allclose(found[name], values, rtol=1e-12, err_msg=name)
-
-
 def test_a_run_whose_store_is_on_s3(cloud, server, frames, finished, tmp_path):
     (cloud.folder / "run.yaml").write_text(STORED)
     cloud.ok("run", "run.yaml", "--until", "maps")
     store = fetched(server, tmp_path / "first")
-    assert_same(store, finished, ("histogram", "summary", "fit", "maps"))
+    assert_same_results(store, finished, rtol=1e-12, groups=("histogram", "summary", "fit", "maps"))
     cloud.ok("export", "s3://lab/night/run.zarr", "--format", "npz", "--output", "out")
     (written,) = (cloud.folder / "out").glob("*.npz")
     with np.load(written) as maps:
@@ -164,8 +151,9 @@ def test_a_run_whose_store_is_on_s3(cloud, server, frames, finished, tmp_path):
     for lost in (marker, store / "fit" / "bias" / "c" / "0" / "0"):
         ask(f"{server}/lab/{lost.relative_to(tmp_path / 'first')}", method="DELETE")
     cloud.ok("fit", "run.yaml", "--backend", "processes", "--workers", "1")
-    assert_same(fetched(server, tmp_path / "second"), finished, ("histogram", "fit"))
-    states = [line.split()[1] for line in cloud.ok("status", "s3://lab/night/run.zarr").stdout.splitlines()]
+    store = fetched(server, tmp_path / "second")
+    assert_same_results(store, finished, rtol=1e-12, groups=("histogram", "fit"))
+    states = [words.split()[0] for words in cloud.states("s3://lab/night/run.zarr").values()]
     assert states[:4] == ["complete"] * 4
     assert not list(cloud.folder.glob("s3*"))
 
@@ -178,7 +166,7 @@ def test_a_report_in_a_store_on_s3_begun_from_files(cloud, server, frames, finis
     assert result.stdout.strip() == f"{url}/report.html"
     assert (cloud.folder / "run.yaml").exists()
     store = fetched(server, tmp_path / "fetched")
-    assert_same(store, finished, ("frames", "histogram"))
+    assert_same_results(store, finished, rtol=1e-12, groups=("frames", "histogram"))
     assert 'id="figure-ensemble"' in (store / "report.html").read_text()
     assert not [path for path in store.rglob("*") if path.is_file() and SECRET in path.read_bytes()]
 
@@ -188,14 +176,12 @@ def test_a_store_on_s3_is_locked_for_all_machines(cloud, server, frames):
     cloud.ok("ingest", "run.yaml")
     lock = f"{server}/lab/night/run.zarr/.pchem/lock.json"
     put(lock, b'{"token": "x", "host": "far", "machine": "far 1", "pid": 7}')
-    result = cloud("ingest", "run.yaml")
-    assert result.code == 75
-    assert "s3://lab/night/run.zarr is in use by pchem on far (process 7, since " in result.last
+    words = "s3://lab/night/run.zarr is in use by pchem on far (process 7, since "
+    assert words in cloud.refused(75, "ingest", "run.yaml")
     put(lock, b"{")
-    result = cloud("ingest", "run.yaml")
-    assert result.code == 75
-    assert "lock.json is damaged; if no pchem command uses this run: python -c" in result.last
-    code = result.last.partition('python -c "')[2].rstrip('"')
+    said = cloud.refused(75, "ingest", "run.yaml")
+    assert "lock.json is damaged; if no pchem command uses this run: python -c" in said
+    code = said.partition('python -c "')[2].rstrip('"')
     subprocess.run([sys.executable, "-c", code], env=cloud.environment, check=True)
     cloud.ok("ingest", "run.yaml")
     with pytest.raises(urllib.error.HTTPError, match="404"):

@@ -47,7 +47,6 @@ def test_the_commands_in_readme_work(shell, frames):
     assert result.returncode == 0, result.stderr
     assert (shell.folder / "run.zarr" / "report.html").exists()
     shown = re.search(r"<!-- output of: (pchem status .*?) -->\n```\n(.*?)```", DOCS, re.S)
-    assert shown is not None
     assert shell.ok(*shown[1].split()[1:]).stdout == shown[2]
 
 
@@ -80,14 +79,11 @@ def test_readme_is_short_and_its_links_lead_somewhere():
         assert (ROOT / link).exists(), link
 
 
-def test_the_documentation_names_every_stage_and_exit_code():
+def test_the_documentation_names_every_stage_exit_code_and_shipped_config():
     for stage in pipeline():
         assert stage in README
     for code in ExitCode:
         assert re.search(rf"^\|[ \d,]*\b{code.value}\b", DOCS, re.M), code
-
-
-def test_the_documentation_names_the_shipped_configs():
     for path in (ROOT / "configs").iterdir():
         assert f"`{path.name}`" in DOCS
 

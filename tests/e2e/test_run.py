@@ -52,7 +52,7 @@ def test_a_folder_of_tiffs_becomes_a_report(shell, frames):
 def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, finished):
     shutil.copytree(finished, shell.folder / "run.zarr")
     (shell.folder / "run.yaml").write_text(RUN.replace("4.87", "5"))
-    rows = dict(line.split(maxsplit=1) for line in shell.ok("status", "run.yaml").stdout.splitlines())
+    rows = shell.states("run.yaml")
     assert rows["maps"] == "stale - input.integration_time 4.87 → 5.0  (with model 1)"
     assert rows["ensemble"] == "complete  (with model 1)"  # it reads no maps
     assert rows["report"] == "stale - maps is stale  (with model 1)"
@@ -60,8 +60,7 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
     assert export.last.startswith("warning: maps: stale - input.integration_time")
     (shell.folder / "run.yaml").write_text(RUN + "fit: {gap_threshold: 6}\n")
     before = {stage: record(shell.folder / "run.zarr", stage) for stage in STAGES}
-    result = shell.ok("status", "run.yaml")
-    rows = dict(line.split(maxsplit=1) for line in result.stdout.splitlines())
+    rows = shell.states("run.yaml")
     assert rows["histogram"] == "complete"
     assert rows["fit"] == "stale - fit.gap_threshold 5.0 → 6.0  (with model 1)"
     assert rows["report"].startswith("stale")
@@ -71,7 +70,7 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
     after = {stage: record(shell.folder / "run.zarr", stage) for stage in STAGES}
     same = [stage for stage in STAGES if before[stage] == after[stage]]
     assert same == ["ingest", "histogram", "report"]
-    rows = dict(line.split(maxsplit=1) for line in shell.ok("status", "run.yaml").stdout.splitlines())
+    rows = shell.states("run.yaml")
     assert rows["ensemble"] == "complete  (with model 1)"
     assert rows["report"].startswith("stale")
 
@@ -98,8 +97,7 @@ def test_a_run_stops_where_it_was_told_to(shell, frames):
     (shell.folder / "run.yaml").write_text(RUN)
     result = shell.ok("run", "run.yaml", "--until", "histogram")
     assert result.stdout == f"{shell.folder / 'run.zarr'}\n"
-    rows = dict(line.split(maxsplit=1) for line in shell.ok("status", "run.yaml").stdout.splitlines())
+    rows = shell.states("run.yaml")
     assert [stage for stage in STAGES if rows[stage] == "complete"] == ["ingest", "histogram"]
-    wrong = shell("run", "run.yaml", "--until", "simulate")
-    assert wrong.code == 2
-    assert wrong.last == f"pchem: --until simulate: the stages of this run are {', '.join(STAGES)}"
+    wrong = shell.refused(2, "run", "run.yaml", "--until", "simulate")
+    assert wrong == f"pchem: --until simulate: the stages of this run are {', '.join(STAGES)}"

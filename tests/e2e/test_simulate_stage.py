@@ -1,18 +1,16 @@
 """The stage simulate: every format holds the same frames, resuming, and what it refuses to overwrite."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.stage import Options
-from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
@@ -31,7 +29,7 @@ SIMULATE: dict[str, Any] = {
 }
 
 
-def prepare(folder: Path, *, backend: str = "serial", **changes: Any) -> Target:
+def prepare(folder, *, backend="serial", **changes):
     content = {
         "run": {"tile": 8},
         "simulate": {**SIMULATE, **changes},
@@ -42,21 +40,20 @@ def prepare(folder: Path, *, backend: str = "serial", **changes: Any) -> Target:
     return find_run(path)
 
 
-def simulated(target: Target, **options: Any) -> str:
+def simulated(target, **options):
     command = Command(options=Options(**options), quiet=True)
     return run_stages(target, ["simulate"], command)[0].state
 
 
-def frames_of(target: Target) -> NDArray[Any]:
+def frames_of(target):
     with open_frames(target.config.input, target.base_dir) as reader:
         frames = np.empty(reader.shape, reader.dtype)
         reader.read_into(frames, 0, reader.shape[0])
     return frames
 
 
-def expected(target: Target) -> tuple[NDArray[Any], NDArray[np.uint32]]:
+def expected(target):
     settings = target.config.simulate
-    assert settings is not None
     return simulate_block(draw_truth(settings), settings, (0, settings.n_frames))
 
 
@@ -87,35 +84,30 @@ def test_integration_time_and_bit_depth_travel_with_the_files(tmp_path):
         assert (reader.integration_time, reader.bit_depth) == (2.5, 12)
 
 
-def test_processes_give_the_same_frames(tmp_path):
-    target = prepare(tmp_path, backend="processes", frames_per_file=12)
+@pytest.mark.parametrize(
+    ("backend", "limits", "n_files"),
+    [
+        ("processes", {}, 2),
+        ("threads", {"_BUDGET": 1, "_CHUNK": 3 * 4 * 9 * 11}, 1),  # small blocks
+        ("serial", {"_MOST_UNITS": 4}, 23),  # many files share few units
+    ],
+)
+def test_blocks_units_and_processes_give_the_same_frames(tmp_path, monkeypatch, backend, limits, n_files):
+    for name, value in limits.items():
+        monkeypatch.setattr(stage, name, value)
+    target = prepare(tmp_path, backend=backend, frames_per_file=-(-23 // n_files))
     assert simulated(target) == "complete"
-    np.testing.assert_array_equal(frames_of(target), expected(target)[0])
-
-
-def test_small_blocks_give_the_same_frames(tmp_path, monkeypatch):
-    monkeypatch.setattr(stage, "_BUDGET", 1)
-    monkeypatch.setattr(stage, "_CHUNK", 3 * 4 * 9 * 11)
-    target = prepare(tmp_path, backend="threads")
-    simulated(target)
     dn, electrons = expected(target)
     np.testing.assert_array_equal(frames_of(target), dn)
     np.testing.assert_array_equal(RunStore.open(target.store).read("truth/electron_number"), electrons[:10])
-
-
-def test_many_files_share_few_units(tmp_path, monkeypatch):
-    monkeypatch.setattr(stage, "_MOST_UNITS", 4)
-    target = prepare(tmp_path, frames_per_file=1)
-    simulated(target)
-    np.testing.assert_array_equal(frames_of(target), expected(target)[0])
-    assert len(list((tmp_path / "frames").glob("*.raw"))) == 23
+    assert len(list((tmp_path / "frames").glob("*.raw"))) == n_files
 
 
 def test_a_failed_run_goes_on_where_it_was(tmp_path, monkeypatch):
     target = prepare(tmp_path, frames_per_file=4)
     real, written = stage.write_frames, []
 
-    def failing(format: str, path: Path, *args: Any, **kwargs: Any) -> Any:
+    def failing(format, path, *args, **kwargs):
         if path.stem == "frames_00004" and len(written) < 10:
             raise PchEmError("the cable fell out")
         written.append(path.name)

@@ -5,16 +5,7 @@ import subprocess
 import sys
 
 import pytest
-
-COMMAND = """
-import sys
-from pchem_pipeline.cli import app
-try:
-    app.main(sys.argv[1:])
-except SystemExit as end:
-    assert end.code in (0, None), end.code
-print(' '.join(sorted({name.partition('.')[0] for name in sys.modules})))
-"""
+from helpers.commands import imported_by
 
 #: what takes a tenth of a second or more to import, or draws such things in
 HEAVY = {
@@ -26,38 +17,24 @@ MIDDLING = {"numpy", "zarr", "pydantic", "yaml"}
 
 
 @pytest.fixture
-def libraries(finished, tmp_path):
-    """Call a command on a copy of a finished run, and return the libraries that it imported."""
-    store = tmp_path / "run.zarr"
-    shutil.copytree(finished, store)
-
-    def call(*arguments):
-        outcome = subprocess.run(
-            [sys.executable, "-c", COMMAND, *(a.format(store=store) for a in arguments)],
-            capture_output=True,
-            text=True,
-            timeout=200,
-        )
-        assert outcome.returncode == 0, outcome.stderr
-        return set(outcome.stdout.splitlines()[-1].split())
-
-    return call
+def store(finished, tmp_path):
+    return shutil.copytree(finished, tmp_path / "run.zarr")
 
 
-def test_help_imports_next_to_nothing(libraries):
-    assert not libraries("--help") & (HEAVY | MIDDLING)
+def test_help_imports_next_to_nothing():
+    assert not imported_by("--help") & (HEAVY | MIDDLING)
     # the command line library loads pydantic by itself where it is installed
-    assert not libraries("run", "--help") & (HEAVY | MIDDLING - {"pydantic", "numpy"})
+    assert not imported_by("run", "--help") & (HEAVY | MIDDLING - {"pydantic", "numpy"})
 
 
-def test_status_imports_nothing_that_computes(libraries):
-    found = libraries("status", "{store}")
+def test_status_imports_nothing_that_computes(store):
+    found = imported_by("status", store)
     assert not found & HEAVY
     assert found >= MIDDLING  # the list of imports is read right
 
 
-def test_fit_imports_its_kernels_and_not_those_who_draw_or_read_cameras(libraries):
-    found = libraries("fit", "{store}", "--force", "--quiet", "--backend", "serial")
+def test_fit_imports_its_kernels_and_not_those_who_draw_or_read_cameras(store):
+    found = imported_by("fit", store, "--force", "--quiet", "--backend", "serial")
     assert "numba" in found
     assert not found & (HEAVY - {"numba", "scipy"})
 

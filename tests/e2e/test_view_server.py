@@ -7,11 +7,11 @@ import json
 import shutil
 import signal
 import socket
-import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.commands import served
 from helpers.packed_maps import unpack_map
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
@@ -23,10 +23,10 @@ from pchem_pipeline.store.run_store import RunStore
 class Client:
     """Asks the server, with any header."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port):
         self.port = port
 
-    def ask(self, method: str, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    def ask(self, method, path, **headers):
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
         names = {name.replace("_", "-"): value for name, value in headers.items()}
         connection.request(method, path, headers=names)
@@ -35,7 +35,7 @@ class Client:
         connection.close()
         return found
 
-    def json(self, path: str) -> dict:
+    def json(self, path):
         status, _, content = self.ask("GET", path)
         assert status == 200, content
         return json.loads(content)
@@ -43,17 +43,13 @@ class Client:
 
 @pytest.fixture(scope="module")
 def client(finished):
-    server, address = make_server(finished)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    assert address == f"http://127.0.0.1:{server.server_port}/"
-    yield Client(server.server_port)
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with served(finished) as (server, address):
+        assert address == f"http://127.0.0.1:{server.server_port}/"
+        assert server.server_address[0] == "127.0.0.1"  # for this computer only
+        yield Client(server.server_port)
 
 
-def digest(folder) -> str:
+def digest(folder):
     found = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
         if path.is_file():
@@ -105,69 +101,41 @@ def test_a_whole_map_as_the_store_has_it(client, finished):
     np.testing.assert_allclose(unpack_map(packed, stored.shape), stored, rtol=0, atol=error / 16 * 1.001)
 
 
-@pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE", "CONNECT"])
-def test_other_methods_are_refused(client, method):
-    status, headers, _ = client.ask(method, "/")
-    assert status == 405
-    assert headers["allow"] == "GET, HEAD"
-
-
-def test_unknown_methods_are_refused(client):
-    assert client.ask("MOVE", "/")[0] == 501
-
-
-@pytest.mark.parametrize(
-    "host", ["evil.example", "127.0.0.1", "evil.example:80", "127.0.0.1:1", "", "[::1]:80"]
-)
-def test_other_hosts_are_refused(client, host):
-    assert client.ask("GET", "/", Host=host)[0] == 403
-    assert client.ask("GET", "/api/pixel?y=0&x=0", Host=host)[0] == 403
-
-
-def test_this_host_is_not_refused(client):
-    assert client.ask("GET", "/report.json", Host=f"localhost:{client.port}")[0] == 200
-    assert client.ask("HEAD", "/report.json", Host=f"127.0.0.1:{client.port}")[2] == b""
-
-
-def test_pages_of_other_sites_are_refused(client):
-    assert client.ask("GET", "/api/pixel?y=0&x=0", Origin="http://evil.example")[0] == 403
-    assert client.ask("GET", "/api/pixel?y=0&x=0", Origin="null")[0] == 403
-    assert client.ask("GET", "/api/pixel?y=0&x=0", Sec_Fetch_Site="cross-site")[0] == 403
-    assert client.ask("GET", "/api/pixel?y=0&x=0", Sec_Fetch_Site="same-origin")[0] == 200
-    assert client.ask("GET", "/api/pixel?y=0&x=0", Origin=f"http://127.0.0.1:{client.port}")[0] == 200
+PIXEL = "/api/pixel?y=0&x=0"
+HOSTS = ("evil.example", "127.0.0.1", "evil.example:80", "127.0.0.1:1", "", "[::1]:80")
+NOT_THERE = (
+    "/zarr.json", "/fit/bias/zarr.json", "/.pchem/config.yaml", "/../run.yaml", "/%2e%2e/run.yaml",
+    "/report.html/../zarr.json", "//etc/passwd", "/figures/ensemble.svg", "/discrepancy.html", "/api/",
+    "/api/map?path=frames/dn", "/api/map?path=../fit/bias", "/api/map?path=fit/bias&path=fit/bias",
+    "/api/pixel?y=20&x=0", "/api/pixel?y=0&x=28",
+)  # fmt: skip
+METHODS = ("POST", "PUT", "PATCH", "DELETE", "OPTIONS", "TRACE", "CONNECT")
+NO_PIXELS = ("", "y=1", "y=-1&x=0", "y=1.5&x=0", "y=1&x=0&z=3", "y=a&x=0", "y=%EF%BC%91&x=0")
 
 
 @pytest.mark.parametrize(
-    "path",
+    ("status", "method", "path", "headers"),
     [
-        "/zarr.json",
-        "/fit/bias/zarr.json",
-        "/.pchem/config.yaml",
-        "/../run.yaml",
-        "/%2e%2e/run.yaml",
-        "/report.html/../zarr.json",
-        "//etc/passwd",
-        "/figures/ensemble.svg",
-        "/api/",
-        "/api/map?path=frames/dn",
-        "/api/map?path=../fit/bias",
-        "/api/map?path=fit/bias&path=fit/bias",
-        "/api/pixel?y=20&x=0",
-        "/api/pixel?y=0&x=28",
-        "/discrepancy.html",
+        *((405, method, "/", {}) for method in METHODS),
+        (501, "MOVE", "/", {}),
+        *((403, "GET", path, {"Host": host}) for host in HOSTS for path in ("/", PIXEL)),
+        (200, "GET", "/report.json", {"Host": "localhost:PORT"}),
+        (200, "HEAD", "/report.json", {"Host": "127.0.0.1:PORT"}),
+        (403, "GET", PIXEL, {"Origin": "http://evil.example"}),
+        (403, "GET", PIXEL, {"Origin": "null"}),
+        (200, "GET", PIXEL, {"Origin": "http://127.0.0.1:PORT"}),
+        (403, "GET", PIXEL, {"Sec_Fetch_Site": "cross-site"}),
+        (200, "GET", PIXEL, {"Sec_Fetch_Site": "same-origin"}),
+        *((404, "GET", path, {}) for path in NOT_THERE),
+        *((400, "GET", f"/api/pixel?{query}", {}) for query in NO_PIXELS),
     ],
 )
-def test_other_paths_are_not_there(client, path):
-    assert client.ask("GET", path)[0] == 404
-
-
-@pytest.mark.parametrize("query", ["", "y=1", "y=-1&x=0", "y=1.5&x=0", "y=1&x=0&z=3", "y=a&x=0", "y=１&x=0"])
-def test_pixels_that_are_none(client, query):
-    query = query.encode().decode("latin-1")
-    connection_path = f"/api/pixel?{query}".encode("latin-1").decode("latin-1")
-    if any(ord(sign) > 127 for sign in connection_path):
-        connection_path = "/api/pixel?y=%EF%BC%91&x=0"
-    assert client.ask("GET", connection_path)[0] == 400
+def test_other_methods_hosts_sites_and_paths_are_refused(client, status, method, path, headers):
+    headers = {name: value.replace("PORT", str(client.port)) for name, value in headers.items()}
+    found, answered, content = client.ask(method, path, **headers)
+    assert found == status
+    assert status != 405 or answered["allow"] == "GET, HEAD"
+    assert method != "HEAD" or content == b""
 
 
 def test_a_port_scanner_stops_nothing(client):
@@ -234,12 +202,6 @@ def test_nothing_is_written(client, finished):
     client.json("/api/map?path=fit/goodness_p")
     client.ask("POST", "/api/pixel?y=3&x=4")
     assert digest(finished) == before
-
-
-def test_it_listens_on_this_computer_only(finished):
-    server, _ = make_server(finished)
-    with server:
-        assert server.server_address[0] == "127.0.0.1"
 
 
 def test_a_taken_port_is_said(finished):

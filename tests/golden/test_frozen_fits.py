@@ -44,7 +44,7 @@ HISTOGRAM = ("counts", "origin")
 Arrays = dict[str, NDArray[Any]]
 
 
-def fitted(kind: str, histograms: Arrays) -> Arrays:
+def fitted(kind, histograms):
     """Fit the frozen histograms through the package's interface; arrays by name, the pixel first."""
     settings = SETTINGS[kind]
     if kind.startswith("joint"):
@@ -68,7 +68,7 @@ def fitted(kind: str, histograms: Arrays) -> Arrays:
 
 
 @pytest.fixture(scope="module")
-def frozen() -> Arrays:
+def frozen():
     if os.environ.get("FREEZE_FITS"):
         freeze()
     with np.load(FROZEN) as stored:
@@ -76,16 +76,13 @@ def frozen() -> Arrays:
 
 
 @pytest.mark.parametrize("kind", SETTINGS)
-def test_a_fit_is_the_frozen_one(kind: str, frozen: Arrays) -> None:
-    old = {
-        name.removeprefix(f"{kind}/"): array for name, array in frozen.items() if name.startswith(f"{kind}/")
-    }
-    new = fitted(kind, frozen)
+def test_a_fit_is_the_frozen_one(kind, frozen):
+    old, new = of_kind(kind, frozen), fitted(kind, frozen)
     assert old.keys() <= new.keys()
     assert differences(old, new) == []
 
 
-def test_the_comparison_sees_what_it_should(frozen: Arrays) -> None:
+def test_the_comparison_sees_what_it_should(frozen):
     old = of_kind("plain", frozen)
     good = int(np.flatnonzero(old["fit_status"] == 0)[0])
     for name, change in (
@@ -102,16 +99,16 @@ def test_the_comparison_sees_what_it_should(frozen: Arrays) -> None:
         assert differences(old, old | {name: changed}) != [], name
 
 
-def of_kind(kind: str, frozen: Arrays) -> Arrays:
+def of_kind(kind, frozen):
     """Return the arrays of one kind of fit."""
     return {name.split("/")[1]: array for name, array in frozen.items() if name.startswith(f"{kind}/")}
 
 
-def differences(old: Arrays, new: Arrays) -> list[str]:
+def differences(old, new):
     """Name the fields that differ by more than a refit may: estimates by 1e-3 of their standard errors."""
     wrong = []
 
-    def within(name: str, allowed: Any, chosen: Any = True) -> None:
+    def within(name, allowed, chosen=True):
         left, right = old[name], new[name]
         with np.errstate(invalid="ignore"):
             same = (np.abs(right - left) <= allowed) | (left == right) | (np.isnan(left) & np.isnan(right))
@@ -152,19 +149,19 @@ def differences(old: Arrays, new: Arrays) -> list[str]:
     return wrong
 
 
-def drawn_histograms() -> Arrays:
+def drawn_histograms():
     """Draw histograms that cover read noise, exposure and gain, and some such as no model describes."""
     rng = np.random.default_rng(20261122)
     found: Arrays = {}
 
-    def keep(name: str, x: NDArray[np.float64]) -> None:
+    def keep(name, x):
         x = np.clip(np.rint(x), *ADC).astype(np.int64)
         origin = x.min(axis=1)
         counts = np.zeros((x.shape[0], int((x.max(axis=1) - origin).max()) + 1), np.uint16)
         np.add.at(counts, (np.arange(x.shape[0])[:, None], x - origin[:, None]), 1)
         found[f"{name}_counts"], found[f"{name}_origin"] = counts, origin
 
-    def pixels(n: int, frames: int, exposure: Any, step: Any, noise: Any) -> Any:
+    def pixels(n, frames, exposure, step, noise):
         k = rng.poisson(np.reshape(exposure, (-1, 1)), (n, frames)).astype(float)
         g, mu, s = (rng.uniform(*each, (n, 1)) for each in (step, (95, 105), noise))
         return mu, g, k, s * rng.standard_normal(k.shape)
@@ -197,7 +194,7 @@ def drawn_histograms() -> Arrays:
     return found
 
 
-def freeze() -> None:
+def freeze():
     """Keep today's fits of the frozen histograms, which are drawn anew only where there are none."""
     histograms = drawn_histograms()
     if FROZEN.exists():

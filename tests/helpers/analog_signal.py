@@ -1,12 +1,11 @@
 """The analog signal of a block of frames, with and without an effect, by numpy."""
 
-from types import MappingProxyType
+from dataclasses import replace
 
 import numpy as np
+from helpers.small_sensors import context_of
 
-from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.simulate.streams import KeyedStreams
 
 
 def analog(effect: Effect, shape=(500, 20, 30), *, charge=None, first=0, n_run=None, noise=0.3, seed=1):
@@ -14,20 +13,10 @@ def analog(effect: Effect, shape=(500, 20, 30), *, charge=None, first=0, n_run=N
     rng = np.random.default_rng(seed)
     k = rng.poisson(1.5, shape) if charge is None else np.broadcast_to(charge, shape)
     r = noise * rng.standard_normal(shape)
-    frames, rows = np.arange(first, first + shape[0]), np.arange(shape[1])
-    context = EffectContext(
-        frames=frames,
-        n_frames=n_run or shape[0],
-        rows=rows,
-        shape=shape[1:],
-        integration_time=1.0,
-        bit_depth=12,
-        truth=MappingProxyType({"analog_read_noise_e": np.full(shape[1:], noise)}),
-        random=KeyedStreams(seed, effect.tag, frames, rows, np.arange(shape[2])),
-        charge=k,
-        read_noise=r,
-    )
-    return effect.apply(k + r, context), k + r, k, r
+    frames = np.arange(first, first + shape[0])
+    context = context_of(shape[1:], n_run or shape[0], frames=frames, seed=seed)
+    truth = {"analog_read_noise_e": np.full(shape[1:], noise)}
+    return effect.apply(k + r, replace(context, truth=truth, charge=k, read_noise=r)), k + r, k, r
 
 
 def within(seen, expected, stderr, widths: float = 5.0) -> None:

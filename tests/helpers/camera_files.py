@@ -6,6 +6,7 @@ from typing import Any
 
 import h5py
 import pytest
+from astropy.io import fits
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ExitCode, InputError
@@ -40,4 +41,12 @@ def write_hdf5(path: Path, **arrays: Any) -> Path:
     with h5py.File(path, "w") as file:
         for name, values in arrays.items():
             file[name] = values
+    return path
+
+
+def write_fits(path: Path, data: NDArray[Any], **cards: Any) -> Path:
+    """Write an image with these cards, which may be values with their comments."""
+    image = fits.PrimaryHDU(data)
+    image.header.update(cards)
+    image.writeto(path)
     return path

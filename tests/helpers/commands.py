@@ -5,15 +5,19 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
+from typer.testing import CliRunner
 
-from pchem_pipeline.cli.app import main
+from pchem_pipeline.cli.app import app, main
+from pchem_pipeline.commands.view import make_server
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.store.run_store import RunStore
 
@@ -23,6 +27,30 @@ RUN = """
 run: {store: run.zarr, tile: 8}
 input: {files: [frames/*.tif], integration_time: 4.87, bit_depth: 14}
 """
+
+
+LISTING = """
+import sys
+from pchem_pipeline.cli import app
+try:
+    app.main(sys.argv[1:])
+except SystemExit as end:
+    assert end.code in (0, None), end.code
+print(' '.join(sorted({name.partition('.')[0] for name in sys.modules})))
+"""
+
+
+def imported_by(*arguments) -> set[str]:
+    """Run a command in a process of its own, which must succeed; return the libraries that it imported."""
+    command = [sys.executable, "-c", LISTING, *map(str, arguments)]
+    outcome = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert outcome.returncode == 0, outcome.stderr
+    return set(outcome.stdout.splitlines()[-1].split())
+
+
+def invoke(*arguments):
+    """Run the command line in this process and folder; errors are raised as they are."""
+    return CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False)
 
 
 @dataclass
@@ -98,11 +126,36 @@ class Shell:
         open_store.cache_clear()  # as a process of its own forgets them
         return Result(code or 0, stdout.getvalue(), stderr.getvalue())
 
+    def refused(self, code: int, *arguments) -> str:
+        """Run the command, which must end with this code; return what it says last, in one line."""
+        result = self(*arguments)
+        assert result.code == code, result.stderr
+        assert "Traceback" not in result.stderr
+        return result.last
+
+    def states(self, run) -> dict[str, str]:
+        """Return what ``pchem status`` says of each stage."""
+        return dict(line.split(maxsplit=1) for line in self.ok("status", run).stdout.splitlines())
+
     def ok(self, *arguments) -> Result:
         """Run the command, which must succeed."""
         result = self(*arguments)
         assert result.code == 0, result.stderr
         return result
+
+
+@contextmanager
+def served(path) -> Iterator[tuple[ThreadingHTTPServer, str]]:
+    """Serve the page of a run meanwhile: the server, and its address."""
+    server, address = make_server(path)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield server, address
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
 
 
 def arrays_of(path, groups=("frames", "histogram", "summary", "fit", "maps", "ensemble")):
@@ -116,14 +169,19 @@ def arrays_of(path, groups=("frames", "histogram", "summary", "fit", "maps", "en
     return found
 
 
-def assert_same_results(one, other, *, rtol=0.0, groups=("histogram", "summary", "fit", "maps", "ensemble")):
-    """Integers must be equal, floats to ``rtol`` (0: to the bit)."""
-    left, right = arrays_of(one, groups), arrays_of(other, groups)
-    assert left.keys() == right.keys()
-    assert len(left) > 40
-    for name, array in left.items():
-        if rtol and array.dtype.kind == "f":
-            scale = np.nanmax(np.abs(array), initial=0.0)
-            np.testing.assert_allclose(array, right[name], rtol=rtol, atol=rtol * scale, err_msg=name)
+def assert_equal_arrays(found, expected, *, rtol=0.0):
+    """Arrays by name: integers must be equal, floats to ``rtol`` of the largest (0: to the bit)."""
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        if rtol and values.dtype.kind == "f":
+            scale = np.nanmax(np.abs(values), initial=0.0)
+            np.testing.assert_allclose(found[name], values, rtol=rtol, atol=rtol * scale, err_msg=name)
         else:
-            np.testing.assert_array_equal(array, right[name], err_msg=name)
+            np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def assert_same_results(one, other, *, rtol=0.0, groups=("histogram", "summary", "fit", "maps", "ensemble")):
+    """Compare the arrays of two runs."""
+    found, expected = arrays_of(one, groups), arrays_of(other, groups)
+    assert len(found) > 5
+    assert_equal_arrays(found, expected, rtol=rtol)

@@ -6,20 +6,7 @@ import struct
 import numpy as np
 
 #: numbers that programs forget: none, the ends of the integer types, and a little more or less
-WILD = (
-    0,
-    1,
-    2,
-    255,
-    1 << 15,
-    (1 << 16) - 1,
-    1 << 20,
-    (1 << 31) - 1,
-    1 << 31,
-    (1 << 32) - 1,
-    1 << 40,
-    (1 << 63) - 1,
-)
+WILD = (0, 1, 2, 255, *(1 << n for n in (15, 20, 31, 40)), *((1 << n) - 1 for n in (16, 31, 32, 63)))
 
 
 def damaged(content, rng):
@@ -115,19 +102,9 @@ def other_number(content, rng):
 
 
 KINDS = (
-    flip_bits,
-    change_bytes,
-    zero_block,
-    cut,
-    remove,
-    insert,
-    swap_blocks,
-    wild_integer,
-    wild_integer,
-    copied_word,
-    pointer_to_itself,
-    other_number,
-)
+    flip_bits, change_bytes, zero_block, cut, remove, insert, swap_blocks, wild_integer, wild_integer,
+    copied_word, pointer_to_itself, other_number,
+)  # fmt: skip
 
 
 def frames(seed=3, n=6, shape=(8, 9), dtype="uint16"):

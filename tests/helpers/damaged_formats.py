@@ -1,11 +1,11 @@
 """Camera files of all formats in many layouts, damaged: the same frames, or one clear line.
 
 Run as a program (``python -m helpers.damaged_formats FOLDER FIRST END``) it works through cases in one
-process and prints a line of JSON before and after each, so that who reads knows to which case a crash or a
-hang belongs.
+process and prints a line of JSON after each: the next one is that to which a crash or a hang belongs.
 """
 
 import contextlib
+import faulthandler
 import json
 import resource
 import shutil
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from helpers.damage import damaged, frames
-from helpers.layouts import LAYOUTS, write
+from helpers.layouts import LAYOUTS, tiff_pages, write
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.config.load import make_config
@@ -39,17 +39,9 @@ INGESTED = 7
 # -- files -------------------------------------------------------------------------------------------------
 
 
-def _tiff(path, *, name="a.tif", data=None, **options):
-    import tifffile
-
-    with tifffile.TiffWriter(path / name) as writer:
-        for frame in frames() if data is None else data:
-            writer.write(frame, photometric="minisblack", metadata=None, **options)
-
-
 def _tiff_sequence(path):
     for number, frame in enumerate(frames(n=3)):
-        _tiff(path, name=f"f{number}.tif", data=frame[None])
+        tiff_pages(path / f"f{number}.tif", frame)
 
 
 def _hdf5(path, **options):
@@ -102,9 +94,9 @@ def _npz(path):
 
 #: name -> what writes the undamaged files into a folder
 SEEDS = {layout: lambda p, layout=layout: write(p, layout, frames()) for layout in LAYOUTS} | {
-    "tiff, 8 bit": lambda p: _tiff(p, data=frames(dtype="uint8")),
-    "tiff, zstd": lambda p: _tiff(p, compression="zstd"),
-    "tiff, jpeg": lambda p: _tiff(p, data=frames(dtype="uint8"), compression="jpeg"),
+    "tiff, 8 bit": lambda p: tiff_pages(p / "a.tif", frames(dtype="uint8")),
+    "tiff, zstd": lambda p: tiff_pages(p / "a.tif", frames(), compression="zstd"),
+    "tiff, jpeg": lambda p: tiff_pages(p / "a.tif", frames(dtype="uint8"), compression="jpeg"),
     "tiff, a file a frame": _tiff_sequence,
     "hdf5, newest": _hdf5,
     "hdf5, newest, checksums": lambda p: _hdf5(p, chunks=(2, 8, 9), fletcher32=True),
@@ -277,8 +269,10 @@ def main(folder, first, end):
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     limit = size + 3 * MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    print("ready", flush=True)
     for number in range(int(first), int(end)):
-        print(json.dumps({"begun": number}), flush=True)
+        # a hang below Python, where no alarm is heard, ends the process
+        faulthandler.dump_traceback_later(3 * SECONDS, exit=True)
         print(json.dumps(run_case(seeds, number, Path(folder), expected).__dict__), flush=True)
 
 
@@ -292,47 +286,18 @@ def run_cases(folder, first, end):
         write_seeds(seeds)
     while first < end:
         command = [sys.executable, "-m", "helpers.damaged_formats", str(folder), str(first), str(end)]
-        tests = str(Path(__file__).parents[1])
-        begun = None
-        with subprocess.Popen(
-            command, cwd=tests, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as process:
-            watch = _Watch(process)
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        with subprocess.Popen(command, cwd=Path(__file__).parents[1], **pipes) as process:
+            begun = process.stdout.readline() == "ready\n"
             for line in process.stdout:
-                record = json.loads(line)
-                if "begun" in record:
-                    begun = record["begun"]
-                    watch.patience(3 * SECONDS)
-                else:
-                    begun, first = None, record["number"] + 1
-                    yield Case(**record)
-            watch.cancel()
-            _, words = process.communicate()
-        if begun is not None:
-            first = begun + 1
-            yield Case(begun, layout_of(begun), "crashed", f"exit code {process.returncode}: {words[-300:]}")
-        elif process.returncode:
+                first += 1
+                yield Case(**json.loads(line))
+            words = process.stderr.read()
+        if not begun:
             raise AssertionError(words)
-
-
-class _Watch:
-    """Kills a process that says nothing for too long (a hang below Python, where no alarm is heard)."""
-
-    def __init__(self, process):
-        self._process, self._timer = process, None
-        self.patience(120)
-
-    def patience(self, seconds):
-        import threading
-
-        self.cancel()
-        self._timer = threading.Timer(seconds, self._process.kill)
-        self._timer.daemon = True
-        self._timer.start()
-
-    def cancel(self):
-        if self._timer is not None:
-            self._timer.cancel()
+        if first < end:
+            yield Case(first, layout_of(first), "crashed", f"exit code {process.returncode}: {words[-300:]}")
+            first += 1
 
 
 if __name__ == "__main__":

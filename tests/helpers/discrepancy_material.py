@@ -278,15 +278,4 @@ def discrepancy_data(verdict: str = "named", **changes: Any) -> DiscrepancyData:
         position = arrays["frame_number"] / arrays["frame_number"][-1] - 0.5
         arrays["frame_readout_model"] = 0.12 * position
         arrays["frame_charge_model"] = 0.004 * position
-    data = DiscrepancyData(
-        found=verdict_of(verdict, **changes),
-        arrays=arrays,
-        statistics={name: (s.channel, s.sentence) for name, s in STATISTICS.items()},
-        titles={
-            "row_noise": "Row noise",
-            "periodic_pickup": "Periodic pickup (EMI)",
-            "bias_drift": "Bias drift",
-        },
-        sources={"row_noise": "Janesick 2007"},
-    )
-    return data
+    return DiscrepancyData(verdict_of(verdict, **changes), arrays)

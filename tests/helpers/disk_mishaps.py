@@ -63,17 +63,16 @@ class ForgetfulDisk:
 
         return call
 
-    def after_power_cut(self, end, rng, honest=True, before=None):
+    def after_power_cut(self, end, rng, before=None):
         """Return the files (path -> content) where the power is cut behind ``end`` operations.
 
         ``before`` are those that were on the disk already.
 
         Each change of names in a folder that was not synced later is there or not, in any order; so is what
-        lies in a new folder whose own name was not. A content that was not synced is whole, cut, or empty. A
-        disk that is not ``honest`` forgets what it was told to keep.
+        lies in a new folder whose own name was not. A content that was not synced is whole, cut, or empty.
         """
         log = self.log[:end]
-        files, kept = dict(before or {}), self._kept(log) if honest else set()
+        files, kept = dict(before or {}), self._kept(log)
         lost = []
         for i, (name, *arguments) in enumerate(log):
             path = arguments[0]
@@ -85,11 +84,11 @@ class ForgetfulDisk:
                 lost += [
                     folder
                     for folder in arguments[1]
-                    if not (honest and ("sync_folder", folder.parent) in log[i:]) and rng.random() < 0.2
+                    if ("sync_folder", folder.parent) not in log[i:] and rng.random() < 0.2
                 ]
             elif name == "write":
                 data = arguments[1]
-                files[path] = data if honest and _is_synced(log[i:]) else _what_is_left(data, rng)
+                files[path] = data if _is_synced(log[i:]) else _what_is_left(data, rng)
             elif name == "replace":
                 if path in files:
                     files[arguments[1]] = files.pop(path)

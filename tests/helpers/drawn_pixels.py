@@ -6,6 +6,8 @@ import numpy as np
 from helpers.plain_law import pcd_mass
 from numpy.typing import ArrayLike, NDArray
 
+from pchem_pipeline.model.law.parameters import UsablePixels
+
 
 class Drawn(NamedTuple):
     """Histograms and the true (H, g, mu, sigma)."""
@@ -40,3 +42,24 @@ def samples(counts: ArrayLike, origin: int) -> NDArray[np.float64]:
     """Return the raw sample of a histogram, sorted."""
     values = np.asarray(counts)
     return np.repeat(origin + np.arange(values.size), values).astype(float)
+
+
+def codes(rng, shape, exposure, step, noise_e, bias=100.3):
+    """Return whole DN of samples by plain numpy: ``bias + step (electrons + noise)`` rounded; noise in e-."""
+    electrons = rng.poisson(exposure, shape) + noise_e * rng.standard_normal(shape)
+    return np.rint(bias + step * electrons).astype(np.int64)
+
+
+def histograms(dn):
+    """Return the histograms (pixel, bin) of whole DN (pixel, frame), and the DN of bin 0, one for all."""
+    low, width = dn.min(), int(np.ptp(dn)) + 1
+    counts = np.stack([np.bincount(row - low, minlength=width) for row in dn])
+    return counts.astype(np.uint32), np.full(len(dn), low)
+
+
+def unlike_pixels(n, seed=2):
+    """Return pixels whose parameters all vary and depend on one another."""
+    z = np.random.default_rng(seed).standard_normal((4, n))
+    exposure, gain = 2.0 * np.exp(0.4 * z[1] + 0.2 * z[0]), 0.1 * np.exp(0.1 * z[0])
+    bias, sigma = 100.0 + 4.0 * z[2] + 2.0 * z[0], 3.0 * np.exp(0.1 * z[3] - 0.1 * z[1])
+    return UsablePixels(exposure, gain, bias, sigma)

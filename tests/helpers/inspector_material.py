@@ -50,10 +50,10 @@ def inspector_of(
     store: RunStore, maps: Mapping[str, Any], fit: Mapping[str, Any], shown: Sequence[tuple[int, int]] = ()
 ) -> InspectorData:
     """Return the inspector of a run that was fitted with the PCD."""
-    shape, chosen = maps["bias"].shape, choose_inspected(maps, fit, shown)
-    entries, exact = read_maps(store, shape, chosen.index)
-    held = read_histograms(store, chosen.index, shape)
-    sample = PixelSample(chosen.index, exact, held.origin, held.counts, reasons=chosen.reasons)
+    shape, (index, reasons) = maps["bias"].shape, choose_inspected(maps, fit, shown)
+    entries, exact = read_maps(store, shape, index)
+    held = read_histograms(store, index, shape)
+    sample = PixelSample(index, exact, held.origin, held.counts, reasons=reasons)
     return inspector_data(store.path.name, shape, entries, sample)
 
 

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm, poisson
 
+from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.use.calibration import Calibration
+from pchem_pipeline.use.exposure import estimate_exposure
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,13 @@ class KnownCamera:
     def drawn(cls, rng, shape, read_noise=(0.15, 0.35), gain=(0.07, 0.12)):
         """Return a camera with pixels that differ."""
         return cls(rng.uniform(*gain, shape), rng.normal(100.0, 4.0, shape), rng.uniform(*read_noise, shape))
+
+    @classmethod
+    def taken(cls, seed, shape, exposure, n, **ranges):
+        """Return a generator, a camera drawn with it, and true electron numbers and DN of its frames."""
+        rng = np.random.default_rng(seed)
+        camera = cls.drawn(rng, shape, **ranges)
+        return rng, camera, *camera.frames(rng, exposure, n)
 
     @property
     def sigma(self):
@@ -58,3 +67,9 @@ class KnownCamera:
             joint = poisson.pmf(k, h) * np.diff(norm.cdf(edges), axis=1)
             out[place] = 1.0 - joint.max(axis=0).sum()
         return out
+
+
+def estimated(frames, calibration):
+    """Return the exposures that frames of known pixels tell."""
+    histograms = histogram_frames(frames)
+    return estimate_exposure(histograms.counts, histograms.origin, calibration)

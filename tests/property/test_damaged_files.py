@@ -4,7 +4,6 @@ import io
 import json
 import struct
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 
 
-def test_300_damaged_files(tmp_path: Path) -> None:
+def test_300_damaged_files(tmp_path):
     cases = list(run_cases(tmp_path, 0, 300))
     assert len(cases) == 300
     assert [case for case in cases if case.bad] == []
@@ -27,7 +26,7 @@ def test_300_damaged_files(tmp_path: Path) -> None:
     assert {case.layout for case in cases} == set(SEEDS)
 
 
-def refusal(path: Path) -> str:
+def refusal(path):
     with pytest.raises(InputError) as caught:
         open_frames(InputSettings(files=(str(path),)), path.parent)
     return str(caught.value)
@@ -35,7 +34,7 @@ def refusal(path: Path) -> str:
 
 @pytest.mark.parametrize("bigtiff", [False, True])
 @pytest.mark.parametrize("target", [0, 150, 299])
-def test_a_chain_of_directories_in_a_circle(tmp_path: Path, bigtiff: bool, target: int) -> None:
+def test_a_chain_of_directories_in_a_circle(tmp_path, bigtiff, target):
     path = tmp_path / "a.tif"
     with tifffile.TiffWriter(path, bigtiff=bigtiff) as writer:
         for frame in frames(n=300, shape=(2, 3)):
@@ -51,7 +50,7 @@ def test_a_chain_of_directories_in_a_circle(tmp_path: Path, bigtiff: bool, targe
     assert "after 300 pages the list of pages is circular" in refusal(path)
 
 
-def npy(path: Path, header: str) -> Path:
+def npy(path, header):
     text = header.encode().ljust(117) + b"\n"
     path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(100))
     return path
@@ -68,12 +67,12 @@ def npy(path: Path, header: str) -> Path:
         (f"(2, 1, {1 << 40})", "damaged header"),
     ],
 )
-def test_headers_of_npy(tmp_path: Path, shape: str, words: str) -> None:
+def test_headers_of_npy(tmp_path, shape, words):
     path = npy(tmp_path / "a.npy", f"{{'descr': '<u2', 'fortran_order': False, 'shape': {shape}, }}")
     assert words in refusal(path)
 
 
-def test_bytes_behind_an_array_are_told(tmp_path: Path) -> None:
+def test_bytes_behind_an_array_are_told(tmp_path):
     path = tmp_path / "a.npy"
     with path.open("wb") as file:
         np.save(file, frames())
@@ -83,7 +82,7 @@ def test_bytes_behind_an_array_are_told(tmp_path: Path) -> None:
         assert "992 bytes after the array" in stack.notes[0]
 
 
-def test_a_zarr_array_that_claims_to_be_huge(tmp_path: Path) -> None:
+def test_a_zarr_array_that_claims_to_be_huge(tmp_path):
     place = tmp_path / "seeds"
     place.mkdir()
     SEEDS["zarr"](place)
@@ -93,7 +92,7 @@ def test_a_zarr_array_that_claims_to_be_huge(tmp_path: Path) -> None:
     assert "cannot hold" in refusal(place / "a.zarr")
 
 
-def test_the_judge_sees_what_must_not_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_judge_sees_what_must_not_be(tmp_path, monkeypatch):
     SEEDS["npy"](tmp_path)
     expected = frames()
     assert outcome_of(tmp_path, expected) == ("same", "")

@@ -73,14 +73,14 @@ def stages(monkeypatch):
     monkeypatch.setattr(runner, "STAGES", STAGES)
 
 
-def run(path: Path, threshold: float = 0.5, forced: str = ""):
+def run(path, threshold=0.5, forced=""):
     """Bring a run of two tiles and three stages up to date; return its results."""
     open_store.cache_clear()
     with RunStore.create(path).locked():
         return _run(RunStore.open(path, writable=True), threshold, forced)
 
 
-def gone_on(path: Path):
+def gone_on(path):
     """Return the results of a run after a power cut, and how often a line named the stage to be forced."""
     forced = ""
     for refused in range(5):
@@ -93,7 +93,7 @@ def gone_on(path: Path):
     raise AssertionError(words)
 
 
-def _run(store: RunStore, threshold: float, forced: str):
+def _run(store, threshold, forced):
     path = store.path
     try:
         known = "sensor" in store.attributes("frames")

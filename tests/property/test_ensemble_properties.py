@@ -36,7 +36,7 @@ ORIGIN = RNG.integers(80, 100, N)
 WITH_GAPS = tuple(np.where(np.arange(N) == 11, np.nan, column) for column in MAPS)
 
 
-def sums_of(start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+def sums_of(start, stop):
     part = slice(start, stop)
     chosen = PixelHistograms(COUNTS[part] // 2, ORIGIN[part], OUTSIDE[part] // 2)
     everything = PixelHistograms(COUNTS[part], ORIGIN[part], OUTSIDE[part])
@@ -46,7 +46,7 @@ def sums_of(start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
 
 @given(st.sets(st.integers(1, N - 1)))
 @settings(max_examples=30, deadline=None)
-def test_any_tiling_gives_the_same_ensemble(cuts: set[int]) -> None:
+def test_any_tiling_gives_the_same_ensemble(cuts):
     borders = [0, *sorted(cuts), N]
     rows = [sums_of(a, b) for a, b in itertools.pairwise(borders)]
     integers, floats = sums_of(0, N)
@@ -68,9 +68,7 @@ def test_any_tiling_gives_the_same_ensemble(cuts: set[int]) -> None:
     data=st.data(),
 )
 @settings(max_examples=100, deadline=None)
-def test_numbers_have_the_largest_joint_mass(
-    exposure: float, gain: float, bias: float, noise: float, data: st.DataObject
-) -> None:
+def test_numbers_have_the_largest_joint_mass(exposure, gain, bias, noise, data):
     dn = np.array(data.draw(st.lists(st.integers(0, 6000), min_size=1, max_size=30)), dtype=np.uint16)
     sigma = np.sqrt((noise / gain) ** 2 + 1 / 12)
     pixels = KnownPixels([np.full(1, v) for v in (exposure, gain, bias, sigma)], SampleLaw())
@@ -85,7 +83,7 @@ def test_numbers_have_the_largest_joint_mass(
 
 @given(st.lists(st.floats(allow_nan=False, allow_infinity=False, width=32), min_size=1, max_size=40))
 @settings(deadline=None)
-def test_the_display_of_a_map_follows_the_ranks(values: list[float]) -> None:
+def test_the_display_of_a_map_follows_the_ranks(values):
     array, levels = np.array(values), np.arange(1, 100) / 100
     known = Ordered.of(array)
     edges = display_edges(known, levels)
@@ -99,7 +97,7 @@ def test_the_display_of_a_map_follows_the_ranks(values: list[float]) -> None:
 _N = 24
 
 
-def _pixels() -> tuple[np.ndarray, np.ndarray, FitResult]:
+def _pixels():
     rng = np.random.default_rng(9)
     pixels = draw(
         rng, rng.uniform(0.05, 9, _N), rng.uniform(8, 14, _N), rng.uniform(0.15, 0.5, _N), n_frames=4000
@@ -118,7 +116,7 @@ _COUNTS, _ORIGIN, _WHOLE = _pixels()
     extra=st.integers(0, 40),
     reverse=st.booleans(),
 )
-def test_any_batching_gives_the_same_bits(cuts: list[int], extra: int, reverse: bool) -> None:
+def test_any_batching_gives_the_same_bits(cuts, extra, reverse):
     order = np.arange(_N)[::-1] if reverse else np.arange(_N)
     padded = np.pad(_COUNTS, ((0, 0), (3, extra)))
     for part in np.split(order, sorted(cuts)):

@@ -2,13 +2,10 @@
 
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import tifffile
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
@@ -18,19 +15,19 @@ DTYPES = ("uint8", "uint16", "uint32")
 
 
 @st.composite
-def stacks(draw: st.DrawFn) -> NDArray[Any]:
+def stacks(draw):
     shape = draw(st.tuples(st.integers(2, 9), st.integers(1, 12), st.integers(1, 12)))
     dtype = draw(st.sampled_from(DTYPES))
     seed = draw(st.integers(0, 2**32 - 1))
     return np.random.default_rng(seed).integers(0, np.iinfo(dtype).max, shape, dtype=dtype, endpoint=True)
 
 
-def window(data: st.DataObject, length: int, least: int = 0) -> tuple[int, int]:
+def window(data, length, least=0):
     start = data.draw(st.integers(0, length - least))
     return start, data.draw(st.integers(start + least, length))
 
 
-def check(data: st.DataObject, path: Path, stack: NDArray[Any], **more: Any) -> None:
+def check(data, path, stack, **more):
     """Compare drawn windows, with a drawn region and range, with slices of the array."""
     n, rows, columns = stack.shape
     t, y, x = window(data, n, 2), window(data, rows, 1), window(data, columns, 1)
@@ -47,7 +44,7 @@ def check(data: st.DataObject, path: Path, stack: NDArray[Any], **more: Any) -> 
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data(), stack=stacks(), format=st.sampled_from(sorted(WRITERS)))
-def test_windows_of_what_we_write(data: st.DataObject, stack: NDArray[Any], format: str) -> None:
+def test_windows_of_what_we_write(data, stack, format):
     if format == "ser" and stack.dtype.itemsize == 4:
         stack = stack.astype(np.uint16)
     parts = data.draw(st.one_of(st.none(), st.integers(1, len(stack))))
@@ -56,29 +53,3 @@ def test_windows_of_what_we_write(data: st.DataObject, stack: NDArray[Any], form
             format, Path(folder) / "in" / "a", iter([stack]), stack.shape, stack.dtype, frames_per_file=parts
         )
         check(data, Path(folder) / "in", stack, format=format)
-
-
-@settings(max_examples=40, deadline=None)
-@given(
-    data=st.data(),
-    stack=stacks(),
-    compression=st.sampled_from([None, "zlib", "lzw"]),
-    byteorder=st.sampled_from("<>"),
-    rows=st.one_of(st.none(), st.integers(1, 12)),
-    bigtiff=st.booleans(),
-)
-def test_windows_of_tiff(
-    data: st.DataObject,
-    stack: NDArray[Any],
-    compression: str | None,
-    byteorder: Any,
-    rows: int | None,
-    bigtiff: bool,
-) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "a.tif"
-        with tifffile.TiffWriter(path, byteorder=byteorder, bigtiff=bigtiff) as writer:
-            for frame in stack:
-                options = {"compression": compression, "rowsperstrip": rows, "metadata": None}
-                writer.write(frame, photometric="minisblack", **options)
-        check(data, path, stack)

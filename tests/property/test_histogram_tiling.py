@@ -3,14 +3,13 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms, pixels_by_range
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, BlockSums, CovarianceMaps, SummaryAccumulator
 
 
 @st.composite
-def stacks(draw: st.DrawFn, rows: st.SearchStrategy[int]) -> NDArray[np.unsignedinteger]:
+def stacks(draw, rows):
     """Frames of any kind: quiet, drifting, with jumps and glitches, over the whole range of the type."""
     dtype = draw(st.sampled_from([np.uint8, np.uint16, np.uint32]))
     top = min(np.iinfo(dtype).max, (1 << 24) - 1)
@@ -24,23 +23,23 @@ def stacks(draw: st.DrawFn, rows: st.SearchStrategy[int]) -> NDArray[np.unsigned
     return np.clip(np.rint(values), 0, top).astype(dtype)
 
 
-def cuts(draw: st.DrawFn, start: int, end: int) -> list[int]:
+def cuts(draw, start, end):
     return sorted(draw(st.sets(st.integers(start, end), max_size=4)))
 
 
-def count(parts: list[NDArray], bins: int) -> RowHistograms:
+def count(parts, bins):
     histograms = HistogramAccumulator(parts[0].shape[1:], bins, sum(part.shape[0] for part in parts))
     for part in parts:
         histograms.add(part)
     return histograms.finish()
 
 
-def assert_same(one: object, other: object) -> None:
+def assert_same(one, other):
     for name, expected in vars(one).items():
         np.testing.assert_array_equal(getattr(other, name), expected, err_msg=name)
 
 
-def joined(bands: list[RowHistograms]) -> RowHistograms:
+def joined(bands):
     return RowHistograms(
         **{name: np.concatenate([getattr(b, name) for b in bands]) for name in vars(bands[0])}
     )
@@ -87,7 +86,7 @@ def test_ranges_do_not_depend_on_bands(data, frames):
     )
 
 
-def summarise(parts: list[NDArray], block: int) -> tuple[list[BlockSums], CovarianceMaps]:
+def summarise(parts, block):
     accumulator = SummaryAccumulator(parts[0].shape[1:], block)
     blocks = [done for part in parts for done in accumulator.add(part)]
     last, maps = accumulator.finish()

@@ -11,14 +11,9 @@ from pchem_pipeline.effects.framework.registry import effect_class
 
 PIXELS, SAMPLES = 24, 9000
 CANDIDATES = (
-    "branching_counts",
-    "overdispersed_counts",
-    "signal_dependent_noise",
-    "nonlinearity",
-    "heavy_tailed_noise",
-    "noise_skew",
-    "row_noise",
-)
+    "branching_counts", "overdispersed_counts", "signal_dependent_noise", "nonlinearity",
+    "heavy_tailed_noise", "noise_skew", "row_noise",
+)  # fmt: skip
 SETTINGS = DiscrepancySettings(replicates=24, candidates=CANDIDATES, seed=3)
 
 
@@ -32,27 +27,32 @@ def branching_numbers(rng, mean, branching, size):
     return total
 
 
-def histograms(seed, *, hidden="", sigma_e=0.25, strength=0.0):
-    """Histograms of sensors with every sample drawn; ``hidden`` names what the PCD does not have."""
-    rng = np.random.default_rng(seed)
-    exposure = rng.uniform(0.6, 4.0, PIXELS)
-    step, bias = rng.uniform(13.0, 15.0, PIXELS), rng.uniform(80.0, 120.0, PIXELS)
-    size = (PIXELS, SAMPLES)
-    h = np.broadcast_to(exposure[:, None], size)
+def signal(rng, h, hidden, strength, sigma_e):
+    """Electrons of every sample and their noise, e-; ``hidden`` names what the PCD does not have."""
     if hidden == "branching_counts":
-        k = branching_numbers(rng, h, strength, size)
+        k = branching_numbers(rng, h, strength, h.shape)
     elif hidden == "overdispersed_counts":
-        k = rng.poisson(h * rng.gamma(1 / strength, strength, size))
+        k = rng.poisson(h * rng.gamma(1 / strength, strength, h.shape))
     else:
         k = rng.poisson(h)
-    noise = rng.normal(size=size) * sigma_e
+    noise = rng.normal(size=h.shape) * sigma_e
     if hidden == "signal_dependent_noise":
-        noise += rng.normal(size=size) * np.sqrt(k) * strength
-    return counted(np.rint(bias[:, None] + step[:, None] * (k + noise)).astype(np.int64))
+        noise += rng.normal(size=h.shape) * np.sqrt(k) * strength
+    return k + noise
+
+
+def histograms(seed, *, hidden="", sigma_e=0.25, strength=0.0):
+    """Histograms of sensors with every sample drawn."""
+    rng = np.random.default_rng(seed)
+    exposure = rng.uniform(0.6, 4.0, PIXELS)
+    step, bias = rng.uniform(13.0, 15.0, (PIXELS, 1)), rng.uniform(80.0, 120.0, (PIXELS, 1))
+    h = np.broadcast_to(exposure[:, None], (PIXELS, SAMPLES))
+    return counted(bias + step * signal(rng, h, hidden, strength, sigma_e))
 
 
 def counted(x, **sample):
-    """Samples of codes (pixel, sample) as histograms."""
+    """Samples in DN (pixel, sample) as histograms."""
+    x = np.rint(x).astype(np.int64)
     origin = x.min(axis=1)
     width = int((x.max(axis=1) - origin).max()) + 1
     counts = [np.bincount(row - first, minlength=width) for row, first in zip(x, origin, strict=True)]
@@ -138,22 +138,13 @@ def test_too_few_samples_are_refused_in_one_line():
 def exposures(seed, levels, *, hidden="", strength=0.0, sigma_e=0.25, times=(None, None, None)):
     """A bias and three exposures of a sensor whose pixels differ by some percent, every sample drawn."""
     rng = np.random.default_rng(seed)
-    step, bias = rng.uniform(13.9, 14.1, PIXELS), rng.uniform(80.0, 120.0, PIXELS)
+    step, bias = rng.uniform(13.9, 14.1, (PIXELS, 1)), rng.uniform(80.0, 120.0, (PIXELS, 1))
     scale = rng.uniform(0.98, 1.02, PIXELS)
     samples = []
     for level, time in zip((0.0, *levels), (None, *times), strict=True):
-        h = np.broadcast_to((level * scale)[:, None], (PIXELS, 6000))
-        if hidden == "spurious_charge" and level:
-            h = h + strength
-        k = rng.poisson(h)
-        if hidden == "branching_counts":
-            k = branching_numbers(rng, h, strength, h.shape)
-        elif hidden == "overdispersed_counts":
-            k = rng.poisson(h * rng.gamma(1 / strength, strength, h.shape))
-        noise = rng.normal(size=k.shape) * sigma_e
-        if hidden == "signal_dependent_noise":
-            noise += rng.normal(size=k.shape) * np.sqrt(k) * strength
-        x = np.rint(bias[:, None] + step[:, None] * (k + noise)).astype(np.int64)
+        charge = strength if hidden == "spurious_charge" and level else 0.0
+        h = np.broadcast_to((level * scale)[:, None] + charge, (PIXELS, 6000))
+        x = bias + step * signal(rng, h, hidden, strength, sigma_e)
         samples.append(counted(x, bias=level == 0.0, integration_time=time))
     return samples
 

@@ -8,7 +8,6 @@ import pytest
 from helpers.small_sensors import drawn_truth, seen, taken
 
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.operators.couple import AnalogMemory, InterpixelCapacitance
 from pchem_pipeline.effects.operators.curve import Nonlinearity
 from pchem_pipeline.effects.operators.drifts import GainDrift
@@ -29,7 +28,7 @@ N_FRAMES = 2400
 
 
 @functools.cache
-def evidence_of(*effects: Effect, seed: int = 1) -> Evidence:
+def evidence_of(*effects, seed=1):
     return seen(taken(TRUTH, *effects, n_frames=N_FRAMES, seed=seed))
 
 

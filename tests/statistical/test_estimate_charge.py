@@ -4,15 +4,11 @@ The evidence is that of the workflow, from simulated frames. Standard errors are
 truth is many of them away from nothing.
 """
 
-import dataclasses
-
 import numpy as np
 import pytest
 from helpers import small_sensors
 from helpers.small_sensors import a_sensor, drawn_truth, some_blocks, taken
 
-from pchem_pipeline.discrepancy.observe.observe import observe
-from pchem_pipeline.effects.estimators.charge_sums import block_charge, exposure_profile
 from pchem_pipeline.effects.estimators.spots import Fading
 from pchem_pipeline.effects.operators import light
 from pchem_pipeline.effects.operators.drifts import ExposureDrift, ExposureFlicker
@@ -28,18 +24,9 @@ from pchem_pipeline.effects.operators.light import DarkCurrentRts, Persistence
 from pchem_pipeline.effects.operators.strike import CosmicRays
 
 CLASSES = (
-    ExposureDrift,
-    Persistence,
-    DarkCurrentRts,
-    ExposureFlicker,
-    OverdispersedCounts,
-    BranchingCounts,
-    OpticalCrosstalk,
-    CosmicRays,
-    ChargeLag,
-    ChargeDiffusion,
-    SpuriousCharge,
-)
+    ExposureDrift, Persistence, DarkCurrentRts, ExposureFlicker, OverdispersedCounts, BranchingCounts,
+    OpticalCrosstalk, CosmicRays, ChargeLag, ChargeDiffusion, SpuriousCharge,
+)  # fmt: skip
 TRUTH = a_sensor((24, 24))
 N = 3000
 
@@ -59,14 +46,6 @@ def seen(*effects, seed=1, n_frames=N):
 def test_noise_and_what_cannot_be_seen_give_no_hypothesis(hidden, seed):
     evidence = seen(*hidden, seed=seed)
     assert [h for cls in CLASSES for h in cls.estimate(evidence)] == []
-
-
-def test_evidence_without_time_gives_no_hypothesis_on_time():
-    evidence = dataclasses.replace(seen(ExposureDrift(drift=0.5)), time=None)
-    assert exposure_profile(evidence) is None
-    assert block_charge(evidence) is None
-    for cls in (ExposureDrift, Persistence, DarkCurrentRts, ExposureFlicker, OpticalCrosstalk, CosmicRays):
-        assert len(cls.estimate(evidence)) == 0
 
 
 @pytest.mark.parametrize("drift", [0.1, -0.1])
@@ -181,8 +160,7 @@ def test_a_strong_afterglow_has_the_image_that_it_has_however_wrong_the_fits_are
     steady = rng.uniform(2.0, 4.0, shape)
     signal = rng.poisson(steady + peak * left * disc) + 0.33 * rng.standard_normal((n_frames, *shape))
     frames = np.rint(100.0 + 10.0 * signal).astype(np.uint16)
-    evidence = observe(frames, np.arange(n_frames), n_run=n_frames, block_frames=50)
-    image, _ = Persistence.estimate(evidence)
+    image, _ = Persistence.estimate(small_sensors.seen(frames))
     # a pixel's amplitude is known to 0.2 e-; by two time constants in steps of 27 % the first frame to less
     pattern = image.pattern(np.arange(24), shape)[np.hypot(y - 11.5, x - 11.5) < 4]
     assert pattern.std() < 0.05 * pattern.mean()
@@ -211,8 +189,8 @@ def frames_with(events, n_frames, shape=(24, 24), seed=3):
 
 def test_round_clouds_among_tracks_have_their_own_share_and_size():
     clouds, lines = 40, 80
-    frames = frames_with([True] * clouds + [False] * lines, n_frames=1500)
-    (found,) = CosmicRays.estimate(observe(frames, np.arange(1500), n_run=1500, block_frames=50))
+    both, tracks = (frames_with([True] * n + [False] * lines, n_frames=1500) for n in (clouds, 0))
+    (found,) = CosmicRays.estimate(small_sensors.seen(both))
     share = clouds / (clouds + lines)
     # at the edge some of either are cut, few merge
     assert abs(found.cloud_share - share) < 0.05
@@ -220,7 +198,5 @@ def test_round_clouds_among_tracks_have_their_own_share_and_size():
     assert abs(found.cloud_um / found.pixel_pitch_um / 0.9 - 1) < 0.15
     # the clouds have forty times the charge of a track: left among the tracks they would be all of it
     assert abs(found.electrons_per_um * found.pixel_pitch_um / 240 - 1) < 0.35
-    (alone,) = CosmicRays.estimate(
-        observe(frames_with([False] * lines, 1500), np.arange(1500), n_run=1500, block_frames=50)
-    )
+    (alone,) = CosmicRays.estimate(small_sensors.seen(tracks))
     assert alone.cloud_share < 0.02

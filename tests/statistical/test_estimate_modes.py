@@ -1,7 +1,6 @@
 """What the estimators of common modes, ADC and data path make of simulated frames."""
 
 import functools
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from helpers.small_sensors import context_of, drawn_truth, seen, some_blocks, ta
 
 from pchem_pipeline.effects.estimators.series import find_steps
 from pchem_pipeline.effects.framework.effect import FEWEST_SHOWN, Effect
-from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.operators.curve import AdcDnl, AdcInl, Clipping
 from pchem_pipeline.effects.operators.drifts import BiasDrift
 from pchem_pipeline.effects.operators.offsets import (
@@ -28,12 +26,12 @@ TRUTH = drawn_truth(SHAPE)
 
 
 @functools.cache
-def evidence_of(*effects: Effect, third: bool = True, seed: int = 1) -> Evidence:
+def evidence_of(*effects, third=True, seed=1):
     frames = taken(TRUTH, *effects, n_frames=N_FRAMES, seed=seed)
     return seen(frames, some_blocks(N_FRAMES) if third else None)
 
 
-def estimated(effect: Effect, **kwargs: Any) -> list[Any]:
+def estimated(effect, **kwargs):
     return list(type(effect).estimate(evidence_of(effect, **kwargs)))
 
 
@@ -143,7 +141,7 @@ def test_a_common_drift_is_no_jump_and_jumps_too_many_to_tell_apart_still_count(
     assert any(0.15 < e.amplitude_dn < 1.5 and e.rate == 1e-2 for e in estimated(many) if not e.path)
 
 
-def estimated_as(other: type[Effect], *effects: Effect) -> list[Any]:
+def estimated_as(other, *effects):
     return list(other.estimate(evidence_of(*effects)))
 
 

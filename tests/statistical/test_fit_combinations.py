@@ -13,7 +13,6 @@ from iminuit import Minuit
 from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -26,7 +25,7 @@ PAIRS = list(combinations(("law", "exact", "sandwich", "profile", "guard", "warm
 FACTORS = (1.0, 2.5)
 
 
-def truth(rng: np.random.Generator) -> Array:
+def truth(rng):
     """(H, g, mu, sigma) of the pixels."""
     columns = (
         rng.uniform(1.0, 2.5, N),
@@ -37,13 +36,13 @@ def truth(rng: np.random.Generator) -> Array:
     return np.stack(columns, axis=1)
 
 
-def draw(rng: np.random.Generator, law: SampleLaw, at: Array, factor: float) -> NDArray[np.uint32]:
+def draw(rng, law, at, factor):
     scaled = at * [factor, 1, 1, 1]
     mass = np.maximum(sample_mass(law, list(scaled.T), np.arange(FIRST, FIRST + N_CODES)), 0)
     return rng.multinomial(FRAMES, mass / mass.sum(axis=1, keepdims=True)).astype(np.uint32)
 
 
-def fitted(told: tuple[str, ...], seed: int = 5) -> tuple[FitResult, Array]:
+def fitted(told, seed=5):
     """Draw pixels, and fit them as told; return also the true (H_1 ... g, mu, sigma)."""
     rng = np.random.default_rng(seed)
     at = truth(rng)
@@ -73,7 +72,7 @@ def fitted(told: tuple[str, ...], seed: int = 5) -> tuple[FitResult, Array]:
 
 
 @pytest.mark.parametrize("told", PAIRS, ids="-".join)
-def test_each_pair_has_the_right_pulls_and_covers_the_truth(told: tuple[str, ...]) -> None:
+def test_each_pair_has_the_right_pulls_and_covers_the_truth(told):
     found, whole = fitted(told)
     good = found.fit_status == 0
     assert good.mean() > 0.97
@@ -85,7 +84,6 @@ def test_each_pair_has_the_right_pulls_and_covers_the_truth(told: tuple[str, ...
     assert (np.abs(pulls.std(axis=0) - 1) < 5 / np.sqrt(2 * n) + 0.02).all()
     if "profile" in told:
         ends = found.intervals
-        assert ends is not None
         inside = (ends[good, :-1, 0] <= whole[good]) & (whole[good] <= ends[good, :-1, 1])
         np.testing.assert_allclose(inside.mean(axis=0), 0.6827, atol=5 * np.sqrt(0.22 / n))
     if "guard" in told:
@@ -93,7 +91,7 @@ def test_each_pair_has_the_right_pulls_and_covers_the_truth(told: tuple[str, ...
         np.testing.assert_allclose(np.median(found.outlier_share), share, rtol=0.6)
 
 
-def minus(law: SampleLaw, samples: list[NDArray[np.uint32]], aside: Array, *at: float) -> float:
+def minus(law, samples, aside, *at):
     """Minus the log-likelihood of a pixel's samples given that a code is not set aside."""
     value = 0.0
     *exposures, gain, bias, sigma = at
@@ -107,7 +105,7 @@ def minus(law: SampleLaw, samples: list[NDArray[np.uint32]], aside: Array, *at: 
 
 
 @pytest.mark.parametrize("case", ["series-law", "law-excluding"])
-def test_iminuit_finds_the_same_maximum_errors_and_intervals(case: str) -> None:
+def test_iminuit_finds_the_same_maximum_errors_and_intervals(case):
     rng = np.random.default_rng(9)
     at = truth(rng)[:2]
     factors = FACTORS if case == "series-law" else FACTORS[:1]
@@ -119,7 +117,6 @@ def test_iminuit_finds_the_same_maximum_errors_and_intervals(case: str) -> None:
     found = fit_histograms(
         counts, origins, law=[LAW] * len(counts), settings=settings, start=plain, excluding=excluding
     )
-    assert found.intervals is not None
     for pixel in range(2):
         place = (np.arange(FIRST, FIRST + N_CODES) - plain.bias[pixel]) * plain.conversion_gain[pixel]
         aside = np.array([any(low <= v < high for low, high in excluding) for v in place])

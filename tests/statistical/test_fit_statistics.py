@@ -2,31 +2,27 @@
 
 import numpy as np
 import pytest
-from helpers.drawn_pixels import Drawn, draw
+from helpers.drawn_pixels import draw
 from helpers.em_trace import em_trace
-from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd
 
 
-def wrong(result: FitResult, truth: NDArray[np.float64]) -> NDArray[np.bool_]:
+def wrong(result, truth):
     """Bias off by more than half an electron, gain by a quarter, or no answer."""
     _, gain, bias, _ = result.columns.T
     return ~((np.abs(bias - truth[:, 2]) * truth[:, 1] < 0.5) & (np.abs(gain / truth[:, 1] - 1) < 0.25))
 
 
-def drawn_in_range(
-    seed: int, n: int, exposure: tuple[float, float], noise: tuple[float, float], **k: int
-) -> Drawn:
+def drawn_in_range(seed, n, exposure, noise, **k):
     rng = np.random.default_rng(seed)
     h = np.exp(rng.uniform(*np.log(exposure), n))
     return draw(rng, h, rng.uniform(8, 14, n), rng.uniform(*noise, n), rng.uniform(95, 105, n), **k)
 
 
-def test_the_right_maximum_is_found_or_flagged() -> None:
+def test_the_right_maximum_is_found_or_flagged():
     pixels = drawn_in_range(32, 4000, (0.1, 10), (0.15, 0.35))
     result = fit_histograms(pixels.counts, pixels.origin)
     assert not np.any(wrong(result, pixels.truth) & (result.fit_status == 0))
@@ -40,7 +36,7 @@ def test_the_right_maximum_is_found_or_flagged() -> None:
         assert np.count_nonzero(bad & (result.fit_status == 0)) <= 1
 
 
-def test_with_few_frames_no_answer_is_less_likely_than_the_truth() -> None:
+def test_with_few_frames_no_answer_is_less_likely_than_the_truth():
     """A global maximum never is; maxima at wrong gains are, where the side lobe sinks into the noise."""
     pixels = drawn_in_range(64, 1500, (1.5, 5), (0.36, 0.42), n_frames=1000)
     result = fit_histograms(pixels.counts, pixels.origin)
@@ -53,26 +49,20 @@ def test_with_few_frames_no_answer_is_less_likely_than_the_truth() -> None:
     assert np.count_nonzero(gain[unflagged] < -1e-9) <= 1
 
 
-def test_a_gap_below_thirty_is_that_to_the_polished_neighbour() -> None:
+def test_a_gap_below_thirty_is_that_to_the_polished_neighbour():
     pixels = draw(np.random.default_rng(35), 12.0, 11.0, 0.33)
     result = fit_histograms(pixels.counts, pixels.origin)
     best = result.columns[0]
     a = 1 / best[1]
-    runners = [
-        em_trace(
-            pixels.counts[0], int(pixels.origin[0]), (best[0] + d, best[1], best[2] - d * a, best[3]), 6000
-        )
-        for d in (-1, 1)
-    ]
+    starts = [(best[0] + d, best[1], best[2] - d * a, best[3]) for d in (-1, 1)]
+    paths = [em_trace(pixels.counts[0], int(pixels.origin[0]), start, 6000) for start in starts]
     assert 0 < result.likelihood_gap[0] < 30
-    heights = [runner.log_likelihood[-1] for runner in runners]
+    heights = [path.log_likelihood[-1] for path in paths]
     assert result.log_likelihood[0] - max(heights) == pytest.approx(result.likelihood_gap[0], abs=1e-3)
 
 
 @pytest.mark.parametrize("case", [(1.0, 0.2), (2.8, 0.35), (4.0, 0.22), (5.6, 0.3)])
-def test_a_large_expected_gap_is_that_to_the_polished_neighbour_but_for_some(
-    case: tuple[float, float],
-) -> None:
+def test_a_large_expected_gap_is_that_to_the_polished_neighbour_but_for_some(case):
     pixels = draw(np.random.default_rng(38), case[0], 11.0, case[1])
     result = fit_histograms(pixels.counts, pixels.origin)
     h, g, mu, sigma = result.columns[0]
@@ -88,7 +78,7 @@ def test_a_large_expected_gap_is_that_to_the_polished_neighbour_but_for_some(
     assert result.likelihood_gap[0] == pytest.approx(gap, rel=0.4)
 
 
-def test_starting_points_are_near_where_they_should_be() -> None:
+def test_starting_points_are_near_where_they_should_be():
     regression, side_lobe = range(2)
     few = drawn_in_range(42, 200, (0.15, 0.6), (0.2, 0.35))
     many = drawn_in_range(43, 200, (1.5, 8), (0.2, 0.35))

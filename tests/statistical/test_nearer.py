@@ -9,14 +9,14 @@ SHAPE, FRAMES = (12, 12), 400
 EDGES = np.arange(0, FRAMES + 1, 50)
 
 
-def drawn(seed: int, exposure: float, noise: float, step: float) -> np.ndarray:
+def drawn(seed, exposure, noise, step):
     """Return frames of pixels of equal law, and their maps."""
     rng = np.random.default_rng(seed)
     signal = rng.poisson(exposure, (FRAMES, *SHAPE)) + noise * rng.standard_normal((FRAMES, *SHAPE))
     return np.floor(100.5 + step * signal).astype(np.uint16)
 
 
-def statistic(frames: np.ndarray, exposure: float, noise: float, step: float) -> float:
+def statistic(frames, exposure, noise, step):
     """Return how much nearer samples are than by chance."""
     maps = PixelMaps.known(
         (np.full(SHAPE, v) for v in (exposure, 1 / step, 100.0, noise * step)), np.ones(SHAPE, bool)
@@ -24,7 +24,7 @@ def statistic(frames: np.ndarray, exposure: float, noise: float, step: float) ->
     return nearer_statistics(frames, EDGES, maps)["time.nearer"]
 
 
-def test_samples_averaged_with_those_before_them_are_nearer() -> None:
+def test_samples_averaged_with_those_before_them_are_nearer():
     law = 2.0, 0.3, 11.0
     frames = drawn(1, *law)
     chosen = np.random.default_rng(2).random(frames[1:].shape) < 0.4
@@ -33,7 +33,7 @@ def test_samples_averaged_with_those_before_them_are_nearer() -> None:
     assert statistic(frames, *law) > 8.0
 
 
-def test_frames_too_few_or_samples_that_always_agree_give_none() -> None:
+def test_frames_too_few_or_samples_that_always_agree_give_none():
     maps = PixelMaps.known((np.full(SHAPE, v) for v in (1.0, 0.1, 100.0, 3.0)), np.ones(SHAPE, bool))
     assert nearer_statistics(drawn(1, 1.0, 0.3, 10.0)[:5], np.array([0, 5]), maps) == {}
     assert nearer_statistics(np.full((FRAMES, *SHAPE), 7, np.uint16), EDGES, maps) == {}

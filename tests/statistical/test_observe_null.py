@@ -21,7 +21,7 @@ SMALLEST_STD = {True: 0.2, False: 0.7}
 COARSE = ("cnt", "pixels", "count", "misplaced.rows", "misplaced.columns")
 
 
-def _vector(seed: int) -> list[float]:
+def _vector(seed):
     frames = small_stack(SHAPE, N_FRAMES, seed)
     # blocks as they are dealt to a third of a run
     numbers = np.concatenate([np.arange(a, a + BLOCK) for a in range(0, 3 * N_FRAMES, 3 * BLOCK)])
@@ -30,17 +30,17 @@ def _vector(seed: int) -> list[float]:
 
 
 @pytest.fixture(scope="module")
-def vectors() -> dict[str, np.ndarray]:
+def vectors():
     found = np.array([_vector(1000 + seed) for seed in range(N_STACKS)])
     return dict(zip(STATISTICS, found.T, strict=True))
 
 
-def _mean_is_zero(name: str, z: np.ndarray) -> bool:
+def _mean_is_zero(name, z):
     return bool(abs(z.mean()) < BIAS.get(STATISTICS[name].family, 0.0) + LIMIT * max(z.std(), 1.0))
 
 
 @pytest.mark.parametrize("name", [name for name in STATISTICS if name not in SILENT])
-def test_a_statistic_is_standard_normal_without_effects(name: str, vectors: dict[str, np.ndarray]) -> None:
+def test_a_statistic_is_standard_normal_without_effects(name, vectors):
     z = vectors[name]
     assert _mean_is_zero(name, z), z.mean()
     assert SMALLEST_STD[name.endswith(COARSE)] < z.std(ddof=1) < 1.4, z.std()
@@ -48,5 +48,5 @@ def test_a_statistic_is_standard_normal_without_effects(name: str, vectors: dict
 
 
 @pytest.mark.parametrize("name", SILENT)
-def test_impossible_events_do_not_happen(name: str, vectors: dict[str, np.ndarray]) -> None:
+def test_impossible_events_do_not_happen(name, vectors):
     assert np.abs(vectors[name]).max() < 0.01

@@ -7,19 +7,18 @@ have caught the error that it guards against.
 import numpy as np
 import pytest
 from helpers.plain_law import joint_mass
-from numpy.typing import NDArray
+from helpers.small_sensors import a_uniform_sensor
 from scipy import stats
 
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 FALSE_ALARM = 6e-7
 N = 1 << 20
 
 
-def chi_square_p(dn: NDArray[np.uint16], h: float, g: float, mu: float, sigma: float) -> float:
+def chi_square_p(dn, h, g, mu, sigma):
     """Probability of a larger chi-square against the exact mass, bins of fewer than 20 expected merged."""
     top = int(mu + (h + 12 * np.sqrt(h) + 20) / g)
     fitted = np.sqrt((sigma / g) ** 2 + 1 / 12)
@@ -29,10 +28,6 @@ def chi_square_p(dn: NDArray[np.uint16], h: float, g: float, mu: float, sigma: f
     o = np.append(observed[full], dn.size - observed[full].sum())
     e = np.append(expected[full], dn.size - expected[full].sum())
     return float(stats.chi2.sf(((o - e) ** 2 / e).sum(), full.sum()))
-
-
-def identical_pixels(shape: tuple[int, int], h: float, g: float, mu: float, sigma: float) -> TruthMaps:
-    return TruthMaps(*(np.full(shape, v) for v in (h, g, mu, sigma)), defect=np.zeros(shape, np.uint8))
 
 
 @pytest.mark.parametrize("effects", [[], [{"tag": "row_noise", "row_noise_dn": 0.0}]])
@@ -48,7 +43,7 @@ def identical_pixels(shape: tuple[int, int], h: float, g: float, mu: float, sigm
 )
 def test_frames_have_the_exact_mass_of_the_model(h, dn_per_electron, mu, sigma, effects):
     settings = SimulateSettings(shape=(32, 64), n_frames=N // 2048, seed=21, effects=effects)
-    truth = identical_pixels(settings.shape, h, 1 / dn_per_electron, mu, sigma)
+    truth = a_uniform_sensor(settings.shape, h, 1 / dn_per_electron, mu, sigma)
     dn, electrons = simulate_block(truth, settings, (0, settings.n_frames))
     assert chi_square_p(dn, h, 1 / dn_per_electron, mu, sigma) > FALSE_ALARM
     # an exposure wrong by 5 % would not have passed, nor, with peaks, a read noise wrong by 10 %

@@ -12,14 +12,13 @@ from scipy.stats import binom, kstest
 from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 
 Array = NDArray[np.float64]
 
 
-def judge_together(fit: FitResult) -> FitResult:
+def judge_together(fit):
     """Return the fit of a sensor's pixels with the word of those that are weakly identified."""
     of_gain, of_sigma = np.sqrt(fit.covariance[:, 1, 1]), np.sqrt(fit.covariance[:, 3, 3])
     together = fit.covariance[:, 1, 3] / (of_gain * of_sigma)
@@ -32,12 +31,12 @@ def judge_together(fit: FitResult) -> FitResult:
     return replace(fit, fit_status=fit.fit_status | word.astype(np.uint16))
 
 
-def errors(fit: FitResult) -> Array:
+def errors(fit):
     return np.asarray(np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)))
 
 
 @pytest.mark.parametrize("case", [(2.0, 0.48, 2000), (8.0, 0.48, 17_750), (2.0, 0.42, 2000)])
-def test_pixels_that_pass_together_are_no_selection(case: tuple[float, float, int]) -> None:
+def test_pixels_that_pass_together_are_no_selection(case):
     """Judged one by one, those that pass on a poor sensor are the lucky ones, and their intervals miss."""
     h, noise, n_frames = case
     n = 600
@@ -46,7 +45,7 @@ def test_pixels_that_pass_together_are_no_selection(case: tuple[float, float, in
     together = judge_together(alone)
     np.testing.assert_array_equal(alone.fit_status, together.fit_status & ~np.uint16(2048))
 
-    def tail(fit: FitResult) -> float:
+    def tail(fit):
         """Return the smallest probability of so few intervals, or fewer, that hold the truth."""
         good = fit.fit_status == 0
         held = np.abs(fit.columns - pixels.truth)[good] <= 1.96 * errors(fit)[good]
@@ -62,7 +61,7 @@ def test_pixels_that_pass_together_are_no_selection(case: tuple[float, float, in
         assert np.mean(together.fit_status == 0) > 0.4
 
 
-def test_goodness_of_fit_is_uniform_with_few_frames_too() -> None:
+def test_goodness_of_fit_is_uniform_with_few_frames_too():
     n = 4000
     pixels = draw(np.random.default_rng(62), np.full(n, 0.1), 11.0, 0.15, n_frames=600)
     fit = fit_histograms(pixels.counts, pixels.origin)

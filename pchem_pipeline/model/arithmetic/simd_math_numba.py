@@ -53,23 +53,19 @@ PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 
 
 @kernel(borrows=True)
-def artanh_series(z: Simd) -> Simd:
-    """Return ``artanh(q) / q`` of ``z = q^2``."""
-    top, rest = _ARTANH
-    series = fused(z, fused(z, fused(z, top[0], top[1]), top[2]), top[3])
-    return fused(z, fused(z, fused(z, fused(z, series, rest[0]), rest[1]), rest[2]), rest[3])
-
-
-@kernel(borrows=True)
 def simd_log(x: Simd) -> Simd:
     """Return log(x) of positive normal numbers.
 
     From the exponent and ``2 artanh((f - 1)/(f + 1))`` of the fraction f in [sqrt(1/2), sqrt(2)).
     """
+    top, rest = _ARTANH
     exponent = exponent_of(x * ROOT2)
     fraction = scaled(x, 0.0 - exponent)
     q = (fraction - 1.0) / (fraction + 1.0)
-    return fused(exponent, LN2, 2.0 * q * artanh_series(q * q))
+    z = q * q
+    series = fused(z, fused(z, fused(z, top[0], top[1]), top[2]), top[3])
+    series = fused(z, fused(z, fused(z, fused(z, series, rest[0]), rest[1]), rest[2]), rest[3])
+    return fused(exponent, LN2, 2.0 * q * series)
 
 
 @kernel(borrows=True)

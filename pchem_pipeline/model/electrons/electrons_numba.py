@@ -69,15 +69,6 @@ class SampleNumbers(NamedTuple):
 
 
 @kernel
-def _longest(start: IntArray) -> int:
-    """Return the codes of the pixel that has most."""
-    most = 1
-    for p in range(start.size - 1):
-        most = max(most, start[p + 1] - start[p])
-    return most
-
-
-@kernel
 def fill_tables(
     tables: CodeTables, parts: int, prior: FloatArray, pixels: PixelLaws, largest: int, missing: int
 ) -> None:
@@ -93,7 +84,9 @@ def fill_tables(
     """
     first, start, number, mass, right, expected = tables
     parameters, satellites, law = pixels
-    most = _longest(start)
+    most = 1
+    for p in range(first.size):
+        most = max(most, start[p + 1] - start[p])
     pixel, scratch = pixel_scratch(most + 2, law)
     detailed, share = mass.size > 0, share_scratch(most)
     theta, sums = scratch.small[OWN], np.empty((3, most))
@@ -109,7 +102,7 @@ def fill_tables(
         placed, codes = place_codes(p, first[p], n, parts, law, satellites, pixel)
         if not known_theta(parameters[p], placed.centre, satellites[p, 1], theta):
             continue
-        cells = cells_of(placed, np.int64(0))
+        cells = cells_of(placed, 0)
         for i in range(n):
             sums[0, i] = sums[1, i] = sums[2, i] = 0.0
             number[at + i] = 0

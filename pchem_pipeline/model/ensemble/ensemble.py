@@ -147,6 +147,7 @@ def _on_axes(
     sums = raw, bins, moments = np.zeros((2, dn.size)), np.zeros((2, nuced.size + 2)), np.zeros(2)
     _, gain, bias, _ = pixels.maps
     axis, held = (float(nuced.width), nuced.start), np.zeros(values.shape[1])
+    values = np.asarray(values, np.float64)
     ensemble_numba.add_to_axes(values, codes, forms, gain, bias, dn.start, axis, *sums, held)
     return AxisSums(*raw, *bins[:, 1:-1], *moments.tolist())
 

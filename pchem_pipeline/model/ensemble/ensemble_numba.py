@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
-
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
@@ -13,7 +10,7 @@ from pchem_pipeline.base.kernel import kernel
 
 @kernel(borrows=True)
 def add_to_axes(
-    values: NDArray[Any],
+    values: FloatArray,
     codes: tuple[IntArray, IntArray, IntArray],
     forms: FloatArray,
     gain: FloatArray,
@@ -71,12 +68,12 @@ def add_to_axes(
 
 
 @kernel(borrows=True)
-def _form(values: NDArray[Any], form: FloatArray) -> float:
+def _form(values: FloatArray, form: FloatArray) -> float:
     """Return v' C v."""
     total = 0.0
     for i in range(values.size):
         for j in range(values.size):
-            total += form[i, j] * (float(values[i]) * float(values[j]))
+            total += form[i, j] * (values[i] * values[j])
     return total
 
 
@@ -85,4 +82,5 @@ def _release(held: FloatArray, form: FloatArray, out: FloatArray) -> None:
     """Add what was summed up of a bin, and its form, to the bin, and begin anew."""
     out[0] += held[0]
     out[1] += _form(held, form)
-    held[:] = 0.0
+    for i in range(held.size):
+        held[i] = 0.0

@@ -83,7 +83,7 @@ def back_substitute(lower: FloatArray, start: int, end: int, vector: FloatArray)
     return squared
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _solve_without_satellites(at: FloatArray, share: float, scratch: Scratch, step: FloatArray) -> float:
     """Do as :func:`solve_arrow` where there are no satellites: by L D L', five times faster.
 
@@ -162,16 +162,15 @@ def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray
     n, held, small = at.shape[0], scratch.flags[HELD], scratch.small
     if held[n + SATELLITE]:
         return float(_solve_without_satellites(at, share, scratch, step))
-    size = np.int64(N_BLOCK)
     right, schur, lower = small[RIGHT], small[SCHUR:LOWER], small[LOWER:HERE]
-    for row in range(1, size):
+    for row in range(1, N_BLOCK):
         right[row] = 0.0
         for column in range(1, row + 1):
             schur[row, column] = 0.0
     squared = 0.0
     for j in range(n):
         block = at[j]
-        for row in range(1, size):
+        for row in range(1, N_BLOCK):
             right[row] += block[SCORE, row]
             for column in range(1, row + 1):
                 schur[row, column] += block[INFORMATION + row, column] + share * block[DAMPING + row, column]
@@ -181,7 +180,7 @@ def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray
         if not own > _SMALLEST * block[DAMPING, 0]:
             return math.nan
         squared += block[SCORE, 0] * block[SCORE, 0] / own
-        for row in range(1, size):
+        for row in range(1, N_BLOCK):
             across = block[INFORMATION + row, 0] + share * block[DAMPING + row, 0]
             factor = across / own
             right[row] -= factor * block[SCORE, 0]
@@ -189,27 +188,27 @@ def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray
                 schur[row, column] -= factor * (
                     block[INFORMATION + column, 0] + share * block[DAMPING + column, 0]
                 )
-    for row in range(1, size):
+    for row in range(1, N_BLOCK):
         if held[n + row - 1]:
             right[row] = 0.0
-    if not cholesky(schur, np.int64(1), size, _SINGULAR, held[n:], lower):
+    if not cholesky(schur, 1, N_BLOCK, _SINGULAR, held[n:], lower):
         return math.nan
-    squared += float(back_substitute(lower, np.int64(1), size, right))
-    for row in range(1, size):
+    squared += float(back_substitute(lower, 1, N_BLOCK, right))
+    for row in range(1, N_BLOCK):
         step[n + row - 1] = 0.0 if held[n + row - 1] else right[row]
     for j in range(n):
         block = at[j]
         step[j] = 0.0
         if not held[j]:
             value = block[SCORE, 0]
-            for row in range(1, size):
+            for row in range(1, N_BLOCK):
                 across = block[INFORMATION + row, 0] + share * block[DAMPING + row, 0]
                 value -= across * step[n + row - 1]
             step[j] = value / (block[INFORMATION, 0] + share * block[DAMPING, 0])
     return squared
 
 
-@kernel(inline=True)
+@kernel
 def invert_arrow(at: FloatArray, theta: FloatArray, held: BoolArray, covariance: FloatArray) -> bool:
     """Fill the inverse of the observed information of (H_1 ... H_J, 1/g, mu, v, q).
 
@@ -225,7 +224,7 @@ def invert_arrow(at: FloatArray, theta: FloatArray, held: BoolArray, covariance:
     Returns:
         Whether the information is positive definite.
     """
-    n, _, end = at.shape  # a constant would have its own compilation of what is called
+    n = at.shape[0]
     factors, own = np.zeros((n, N_BLOCK)), np.zeros(n)
     schur, lower, column = np.zeros((N_BLOCK, N_BLOCK)), np.zeros((N_BLOCK, N_BLOCK)), np.zeros(N_BLOCK)
     for row in range(n + N_SHARED):
@@ -247,14 +246,14 @@ def invert_arrow(at: FloatArray, theta: FloatArray, held: BoolArray, covariance:
         for row in range(1, N_BLOCK):
             for other in range(1, row + 1):
                 schur[row, other] -= factors[j, row] * factors[j, other] * own[j]
-    if not cholesky(schur, np.int64(1), end, _SINGULAR, held[n:], lower):
+    if not cholesky(schur, 1, N_BLOCK, _SINGULAR, held[n:], lower):
         return False
     for i in range(1, N_BLOCK):
         if held[n + i - 1]:
             continue
         for row in range(1, N_BLOCK):
             column[row] = 1.0 if row == i else 0.0
-        back_substitute(lower, np.int64(1), end, column)
+        back_substitute(lower, 1, N_BLOCK, column)
         for row in range(1, N_BLOCK):
             covariance[n + row - 1, n + i - 1] = 0.0 if held[n + row - 1] else column[row]
     for j in range(n):
@@ -274,7 +273,7 @@ def invert_arrow(at: FloatArray, theta: FloatArray, held: BoolArray, covariance:
     return True
 
 
-@kernel(inline=True)
+@kernel
 def enclose(at: FloatArray, theta: FloatArray, covariance: FloatArray) -> None:
     """Replace the inverse information C by the sandwich ``C (sum of squared scores) C`` (White 1982).
 
@@ -310,7 +309,7 @@ def enclose(at: FloatArray, theta: FloatArray, covariance: FloatArray) -> None:
             covariance[row, column] = product[row, column]
 
 
-@kernel(inline=True)
+@kernel
 def to_natural(
     theta: FloatArray,
     dark: BoolArray,

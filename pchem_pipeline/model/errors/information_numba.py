@@ -26,7 +26,7 @@ from pchem_pipeline.model.law.pixel_numba import (
 )
 
 
-@kernel(inline=True)
+@kernel
 def fill_squared_scores(pixel: Pixel, theta: FloatArray, at: FloatArray) -> None:
     """Fill the sums of outer products of the samples' scores, the middle of the sandwich, of the density.
 

@@ -356,14 +356,16 @@ class _Batch:
         packed = pack(laws, n)
         cells = limits.cells
         evaluate = engine.likelihood(cells)
-        search = engine.cells_search() if cells else engine.density_search()
+        plain = self.n_samples == 1 and not limits.sandwich
+        fit_tile = tile_numba.fit_plain_tile if plain else tile_numba.fit_tile
+        search = engine.cells_search(starts.amplitudes.size > 0) if cells else engine.density_search()
 
         def fit(pixels: NDArray[np.intp], quick: bool) -> None:
             answers.parameters[pixels] = np.nan
             answers.covariance[pixels] = np.nan
             # a few at a time: a signal is heard between kernels only
             for some in np.array_split(pixels, pixels.size // 1024 + 1):
-                tile_numba.fit_tile(
+                fit_tile(
                     given,
                     some,
                     packed,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy import special
@@ -47,6 +48,7 @@ from pchem_pipeline.model.fit.starts_numba import (
     combs_of_step,
     fill_starts,
     keep_start,
+    no_starts,
     scan_steps,
 )
 from pchem_pipeline.model.law.pixel_numba import (
@@ -65,7 +67,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     LOG_VARIANCE,
     N_BINS,
     N_FRAMES,
-    N_KEPT,
     N_PEAKS,
     PER_ELECTRON,
     PER_ELECTRON2,
@@ -95,7 +96,7 @@ _CUT_NOISE_E, _CUT_RATIO = 0.28, 1.2
 _STEPS, _AROUND = 3, 3  # biases per electron, and to either side
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _from_density(pixel: Pixel, warm: bool, near: FloatArray, theta: FloatArray) -> None:
     """Fill ``theta`` from parameters with the whole variance of the read noise.
 
@@ -154,8 +155,7 @@ def _scan_cut(pixel: Pixel, tools: Tools) -> int:
     """
     trial, place, used = tools.scratch.small[HERE], 0, 0
     facts, cumulative = pixel.facts[0], pixel.bins[0, CUMULATIVE]
-    for i in range(N_KEPT):
-        tools.scratch.small[HEIGHTS, i] = -math.inf
+    no_starts(tools.scratch.small[HEIGHTS])
     while cumulative[place + 1] < 0.5 * facts[N_FRAMES]:
         place += 1
     a, least = facts[N_BINS] + 1.0, max(0.25 * math.sqrt(facts[VARIANCE]), LEAST_STEP)
@@ -166,7 +166,7 @@ def _scan_cut(pixel: Pixel, tools: Tools) -> int:
                 trial[0], trial[1 + STEP], trial[1 + SATELLITE] = math.log(exposure), a, 0.0
                 trial[1 + BIAS] = facts[FIRST] + place - a * (middle + around / _STEPS)
                 trial[1 + LOG_VARIANCE] = 2.0 * math.log(max(_CUT_NOISE_E * a, 0.3))
-                used += keep_start(pixel, tools.evaluate, np.bool_(True), tools.scratch)
+                used += keep_start(pixel, tools.evaluate, True, tools.scratch)
         a /= _CUT_RATIO
     return used
 
@@ -176,11 +176,11 @@ def _climb_few(pixel: Pixel, tools: Tools, best: FloatArray, out: FloatArray, fo
     """Climb from starts ranked by the cells, where a DN is no small part of an electron."""
     scratch = tools.scratch
     if pixel.facts.shape[0] == 1:
-        used = scan_steps(pixel, tools.evaluate, np.bool_(True), scratch)
+        used = scan_steps(pixel, tools.evaluate, True, scratch)
     else:
-        _, used = fill_starts(np.int64(1), np.bool_(False), pixel, tools.basis, tools.evaluate, scratch)
-        used += add_line_starts(pixel, tools.evaluate, np.bool_(True), np.bool_(True), scratch)
-    found = climb_starts(pixel, tools, np.bool_(False), plus(found, used), best, out)
+        _, used = fill_starts(1, False, pixel, tools.basis, tools.evaluate, scratch)
+        used += add_line_starts(pixel, tools.evaluate, True, True, scratch)
+    found = climb_starts(pixel, tools, False, plus(found, used), best, out)
     return found
 
 
@@ -207,11 +207,11 @@ def _flat_at_two(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) ->
     if abs(1.0 / best[1 + STEP] - 0.5) > NEAR_TWO:
         return False
     combs_of_step(pixel, tools.evaluate, 2.0, tools.scratch)
-    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, np.int64(1 + STEP))
+    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, 1 + STEP)
     return bool(fall < CLEAR_GAP and 2.0 * fall < parabola)
 
 
-@kernel(inline=True)
+@kernel
 def _start_anew(
     pixel: Pixel,
     tools: Tools,
@@ -229,11 +229,11 @@ def _start_anew(
     arrive. Of other pixels the density has scanned all combs, unless their law is another: then those with a
     near rival are started anew, too.
     """
-    n, limits, no = pixel.facts.shape[0], tools.limits, np.bool_(False)
+    n, limits = pixel.facts.shape[0], tools.limits
     place = n + STEP
     if cut and (limits.scan or not best[place] > 0.0 or score > _POOR):
         used = _scan_cut(pixel, tools)
-        found = climb_starts(pixel, tools, no, plus(found, used), best, out)
+        found = climb_starts(pixel, tools, False, plus(found, used), best, out)
     few = not best[place] > FEW_STEP
     astray = few or score > SUSPICIOUS
     rivalled = n == 1 and not limits.warm and min(gap, found.loglik - found.runner_up) < limits.gap
@@ -244,16 +244,16 @@ def _start_anew(
         return found
     if abs(1.0 / best[place] - 0.5) > NEAR_TWO:
         used = alias_of_step(pixel, tools.evaluate, best, tools.scratch)
-        found = climb_starts(pixel, tools, no, plus(found, used), best, out)
+        found = climb_starts(pixel, tools, False, plus(found, used), best, out)
     elif n == 1:
         for nearer in (1.0, 3.0):
             a = 1.0 / (0.5 - (1.0 / best[place] - 0.5) / nearer)
             used = combs_of_step(pixel, tools.evaluate, a, tools.scratch)
-            found = climb_starts(pixel, tools, np.bool_(False), plus(found, used), best, out)
+            found = climb_starts(pixel, tools, False, plus(found, used), best, out)
     return found
 
 
-@kernel(inline=True)
+@kernel
 def _try_satellites(
     pixel: Pixel, tools: Tools, task: Task, unsure: bool, best: FloatArray, out: FloatArray, found: Found
 ) -> Found:
@@ -271,65 +271,70 @@ def _try_satellites(
     return Found(loglik, found.runner_up, found.used + count + 1, found.degenerate)
 
 
-def search_cells(
-    pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: FloatArray
-) -> tuple[int, int, int]:
-    """Find the most likely parameters of one pixel with its cells integrated, under any law.
+def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
+    """Make the search; ``satellites``: with what tries free ones."""
 
-    From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
-    exclude them, or where its law was too different to do so. Pixels that the density may have led astray
-    are also started anew. Where the law has free satellites, each amplitude is tried.
+    def search_cells(
+        pixel: Pixel, tools: Tools, task: Task, best: FloatArray, out: FloatArray
+    ) -> tuple[int, int, int]:
+        """Find the most likely parameters of one pixel with its cells integrated, under any law.
 
-    Args:
-        pixel: its samples and its law.
-        tools: of the search, with the cells; out: score and information at the maximum in ``at_best``.
-        task: the law, and the fit to start from.
-        best: out, theta at the maximum; its step is 0 where there is none.
-        out: out, a row of results.
+        From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
+        exclude them, or where its law was too different to do so. Pixels that the density may have led astray
+        are also started anew. Where the law has free satellites, each amplitude is tried.
 
-    Returns:
-        Status word, evaluations, degrees of freedom of the goodness of fit.
-    """
-    n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
-    known = task.near[n + STEP] > 0.0
-    gap, score = task.gap if known else math.inf, math.inf
-    best[n + STEP] = 0.0
-    tools.scratch.flags[FIXED, n + SATELLITE] = True
-    out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
-    found = Found(-math.inf, -math.inf, 0, np.bool_(False))
-    at_limits = not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
-    cut = n == 1 and at_limits
-    if known:
-        found = _climb_known(pixel, tools, task.near, best)
-    if best[n + STEP] > 0.0:
-        loglik, runner_up, used = found.loglik, found.runner_up, found.used
-        if cut or gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
-            loglik, runner_up, count = climb_neighbours(pixel, tools, best, loglik)
-            used += count
-            if runner_up > -math.inf and (cut or not limits.scan):
-                gap = math.inf  # that of another law, or of a sample that nothing cuts
-        examine(pixel, tools, best, out)
-        score = score_of(out)
-        found = Found(loglik, runner_up, used + 1, found.degenerate)
-    found = _start_anew(pixel, tools, known, cut, score, gap, best, out, found)
-    if not best[n + STEP] > 0.0:
-        return FIT_NOT_CONVERGED, found.used, 0
-    bias_gap = min(gap, found.loglik - found.runner_up)
-    blurred = math.inf
-    if n == 1 and not (limits.warm or limits.reshapes):
-        blurred = min(found.loglik - null, above_blurred(pixel, tools, best, found.loglik))
-    gap = min(bias_gap, found.loglik - null, blurred)
-    if task.amplitudes.size > 0:
-        found = _try_satellites(pixel, tools, task, gap < CLEAR_GAP, best, out, found)
-    out[LOG_LIKELIHOOD], out[GAP] = found.loglik, gap
-    # the density has told whether there is a gain: it knows no other law than one Gaussian does
-    above_null = math.inf if known else found.loglik - null
-    of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
-    of_gain = of_gain or (n == 1 and limits.scan and _flat_at_two(pixel, tools, best, found.loglik))
-    # of several samples, combs that the limits leave open are not looked for
-    unsure = nats_of_peaks(pixel, best) < SURELY_SEEN or best[n + STEP] < FEW_STEP
-    if n == 1:
-        unsure = bias_gap < limits.gap
-    of_gain = of_gain or (at_limits and unsure)
-    word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
-    return word, found.used, int(out[DEGREES])
+        Args:
+            pixel: its samples and its law.
+            tools: of the search, with the cells; out: score and information at the maximum in ``at_best``.
+            task: the law, and the fit to start from.
+            best: out, theta at the maximum; its step is 0 where there is none.
+            out: out, a row of results.
+
+        Returns:
+            Status word, evaluations, degrees of freedom of the goodness of fit.
+        """
+        n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
+        known = task.near[n + STEP] > 0.0
+        gap, score = task.gap if known else math.inf, math.inf
+        best[n + STEP] = 0.0
+        tools.scratch.flags[FIXED, n + SATELLITE] = True
+        out[AMPLITUDE] = out[SATELLITE_WEIGHT] = 0.0
+        found = Found(-math.inf, -math.inf, 0, np.bool_(False))
+        at_limits = not limits.warm and _share_at_limits(pixel) > _CUT_SHARE
+        cut = n == 1 and at_limits
+        if known:
+            found = _climb_known(pixel, tools, task.near, best)
+        if best[n + STEP] > 0.0:
+            loglik, runner_up, used = found.loglik, found.runner_up, found.used
+            if cut or gap < CLEAR_GAP or (limits.reshapes and not limits.warm):
+                loglik, runner_up, count = climb_neighbours(pixel, tools, best, loglik)
+                used += count
+                if runner_up > -math.inf and (cut or not limits.scan):
+                    gap = math.inf  # that of another law, or of a sample that nothing cuts
+            examine(pixel, tools, best, out)
+            score = score_of(out)
+            found = Found(loglik, runner_up, used + 1, found.degenerate)
+        found = _start_anew(pixel, tools, known, cut, score, gap, best, out, found)
+        if not best[n + STEP] > 0.0:
+            return FIT_NOT_CONVERGED, found.used, 0
+        bias_gap = min(gap, found.loglik - found.runner_up)
+        blurred = math.inf
+        if n == 1 and not (limits.warm or limits.reshapes):
+            blurred = min(found.loglik - null, above_blurred(pixel, tools, best, found.loglik))
+        gap = min(bias_gap, found.loglik - null, blurred)
+        if satellites and task.amplitudes.size > 0:
+            found = _try_satellites(pixel, tools, task, gap < CLEAR_GAP, best, out, found)
+        out[LOG_LIKELIHOOD], out[GAP] = found.loglik, gap
+        # the density has told whether there is a gain: it knows no other law than one Gaussian does
+        above_null = math.inf if known else found.loglik - null
+        of_gain = rival_moves_gain(pixel, tools, best, found.loglik, found.loglik - bias_gap)
+        of_gain = of_gain or (n == 1 and limits.scan and _flat_at_two(pixel, tools, best, found.loglik))
+        # of several samples, combs that the limits leave open are not looked for
+        unsure = nats_of_peaks(pixel, best) < SURELY_SEEN or best[n + STEP] < FEW_STEP
+        if n == 1:
+            unsure = bias_gap < limits.gap
+        of_gain = of_gain or (at_limits and unsure)
+        word = judge(pixel, limits, best, above_null, blurred, bias_gap, of_gain)
+        return word, found.used, int(out[DEGREES])
+
+    return search_cells

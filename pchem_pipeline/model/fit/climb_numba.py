@@ -143,14 +143,6 @@ def min_log_variance(a: float, cells: bool) -> float:
     return max(MIN_LOG_VARIANCE, 2.0 * math.log(MIN_ELECTRON_NOISE * a))
 
 
-@kernel(inline=True)
-def floor_in_electrons(a: float, cells: bool) -> bool:
-    """Tell whether the lower bound of v is that in e-, which moves with the step a."""
-    if cells:
-        return LEAST_NOISE_E * a > LEAST_NOISE_DN
-    return 2.0 * math.log(MIN_ELECTRON_NOISE * a) > MIN_LOG_VARIANCE
-
-
 @kernel(borrows=True)
 def keep_inside(theta: FloatArray, limits: Limits) -> None:
     """Move ``theta`` to the nearest allowed values."""
@@ -215,7 +207,7 @@ def find_held(theta: FloatArray, at: FloatArray, fixed: BoolArray, limits: Limit
     held[n + SATELLITE] = fixed[n + SATELLITE] or at_end
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def em_step(pixel: Pixel, theta: FloatArray, at: FloatArray, limits: Limits, out: FloatArray) -> bool:
     """One EM update, eq. (update_eqns), from an evaluation of the density; False where it is not defined.
 
@@ -286,21 +278,14 @@ def _take_step(theta: FloatArray, step: FloatArray, tied: float, limits: Limits,
     for i in range(theta.size):
         out[i] = theta[i] + factor * step[i]
     if tied >= 0.0:
-        _tie(theta, tied, out)
+        ratio = out[n + STEP] / a
+        variance = (math.exp(theta[n + LOG_VARIANCE]) + tied) * ratio * ratio - tied
+        out[n + LOG_VARIANCE] = math.log(max(variance, 1e-12))
     keep_inside(out, limits)
     return factor
 
 
-@kernel(inline=True)
-def _tie(theta: FloatArray, rounding: float, out: FloatArray) -> None:
-    """Set v so that the read noise in e-, that variance of rounding included, is that of ``theta``."""
-    n = theta.size - N_BLOCK + 1
-    ratio = out[n + STEP] / theta[n + STEP]
-    variance = (math.exp(theta[n + LOG_VARIANCE]) + rounding) * ratio * ratio - rounding
-    out[n + LOG_VARIANCE] = math.log(max(variance, 1e-12))
-
-
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def tie_noise(theta: FloatArray, at: FloatArray, rounding: float) -> None:
     """Turn score and information in 1/g at known sigma into those at known ``sigma g``, in place.
 
@@ -324,16 +309,20 @@ def tie_noise(theta: FloatArray, at: FloatArray, rounding: float) -> None:
         block[SCORE, step] += slope * block[SCORE, noise]
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _tie_of(theta: FloatArray, goal: Goal, flags: BoolArray, limits: Limits, rounding: float) -> float:
     """Return the variance of rounding with which sigma moves with 1/g; negative where it does not."""
     noise = theta.size - N_BLOCK + 1 + LOG_VARIANCE
     if flags[HELD, noise] and not flags[FIXED, noise]:  # at its floor, which moves with 1/g
-        return 0.0 if floor_in_electrons(theta[noise - LOG_VARIANCE + STEP], limits.cells) else -1.0
+        a = theta[noise - LOG_VARIANCE + STEP]
+        moves = 2.0 * math.log(MIN_ELECTRON_NOISE * a) > MIN_LOG_VARIANCE
+        if limits.cells:
+            moves = LEAST_NOISE_E * a > LEAST_NOISE_DN
+        return 0.0 if moves else -1.0
     return rounding if goal.tied else -1.0
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _end_of(
     theta: FloatArray, known: FloatArray, loglik: float, rise: float, limits: Limits, goal: Goal
 ) -> int:
@@ -349,7 +338,7 @@ def _end_of(
     return _GOING
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _damping_after(risen: float, expected: float, rise: float, share: float) -> float:
     """Return the share of the damping matrix for the step after one that rose by so much."""
     if risen > 0.75 * expected:

@@ -70,9 +70,9 @@ def density_search() -> Any:
 
 
 @functools.cache
-def cells_search() -> Any:
-    """Return the search with the cells, :func:`.cells_search_numba.search_cells`."""
-    return callback(cells_search_numba.search_cells, _FOUND, _search_arguments())
+def cells_search(satellites: bool) -> Any:
+    """Return the search with the cells, and of free satellites: :func:`.cells_search_numba.search_with`."""
+    return callback(cells_search_numba.search_with(satellites), _FOUND, _search_arguments())
 
 
 @functools.cache

@@ -113,7 +113,7 @@ def _with_weight(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, 
     return without, rise
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _from_fit(pixel: Pixel, tools: Tools, theta: FloatArray) -> bool:
     """Add the weight of free satellites to the fit without; False where nothing speaks for them."""
     scratch = tools.scratch
@@ -127,7 +127,7 @@ def _from_fit(pixel: Pixel, tools: Tools, theta: FloatArray) -> bool:
     return bool(rise > least or expected > least)
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _beside(direction: float, pixel: Pixel, tools: Tools, theta: FloatArray) -> float:
     """Move ``theta`` by one electron (H + direction, mu - direction/g); return the log-likelihood there.
 
@@ -146,17 +146,7 @@ def _beside(direction: float, pixel: Pixel, tools: Tools, theta: FloatArray) -> 
     return float(without + rise)
 
 
-@kernel(inline=True)
-def third_cumulant(histogram: Histogram) -> float:
-    """Return the third cumulant, DN^3, but at least that of a small skewness."""
-    third = 0.0
-    for i in range(histogram.n_bins):
-        third += histogram.weights[i] * (histogram.first + i - histogram.mean) ** 3
-    least = _LEAST_SKEWNESS * histogram.variance * math.sqrt(histogram.variance)
-    return max(third / histogram.n, least)
-
-
-@kernel(inline=True)
+@kernel(borrows=True)
 def _with_cumulants(
     a: float,
     third: float,
@@ -190,11 +180,11 @@ def _with_cumulants(
     theta[1 + BIAS] = histogram.mean - a * (exposure + weight * m1)
     theta[1 + LOG_VARIANCE] = 2.0 * math.log(_NOISE_E * a)
     theta[1 + SATELLITE] = weight
-    fine: bool = sensible(theta, math.inf, np.bool_(True))
+    fine: bool = sensible(theta, math.inf, True)
     return fine
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _from_cumulants(
     pixel: Pixel, law: Law, amplitude: float, tools: Tools, theta: FloatArray
 ) -> tuple[bool, int]:
@@ -203,9 +193,12 @@ def _from_cumulants(
     Returns:
         Whether there is one, and evaluations.
     """
-    scratch, histogram, used = tools.scratch, histogram_of(pixel, np.int64(0)), 0
-    third = third_cumulant(histogram)
-    m1 = m2 = m3 = 0.0
+    scratch, histogram, used = tools.scratch, histogram_of(pixel, 0), 0
+    third = m1 = m2 = m3 = 0.0
+    for i in range(histogram.n_bins):
+        third += histogram.weights[i] * (histogram.first + i - histogram.mean) ** 3
+    # the third cumulant, DN^3, but at least that of a small skewness
+    third = max(third / histogram.n, _LEAST_SKEWNESS * histogram.variance * math.sqrt(histogram.variance))
     for side in range(law.pattern.shape[0]):
         shift = law.pattern[side, 0] * amplitude
         m1 += law.pattern[side, 1] * shift
@@ -217,11 +210,11 @@ def _from_cumulants(
     for scale in _SCALES:
         a = scale * third / histogram.variance
         if _with_cumulants(a, third, histogram, (m1, m2, m3), scratch.small[HERE]):
-            used += keep_start(pixel, tools.evaluate, np.bool_(True), scratch)
+            used += keep_start(pixel, tools.evaluate, True, scratch)
     return next_start(scratch, theta), used
 
 
-@kernel(inline=True)
+@kernel
 def _refine(
     amplitude: float, theta: FloatArray, highest: float, pixel: Pixel, law: Law, index: int, tools: Tools
 ) -> tuple[float, float, int]:
@@ -261,7 +254,7 @@ def _refine(
     return amplitude, highest, used
 
 
-@kernel(inline=True)
+@kernel
 def search_satellites(
     theta: FloatArray,
     loglik: float,
@@ -299,7 +292,7 @@ def search_satellites(
         set_peaks(law, index, amplitude, pixel)
         for attempt in range(_N_ATTEMPTS):
             copy(theta, trial)
-            usable, count = np.bool_(False), 1
+            usable, count = False, 1
             if attempt == 0:
                 usable = _from_fit(pixel, tools, trial)
             elif attempt == 1 and (unsure or thorough):

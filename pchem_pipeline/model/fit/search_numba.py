@@ -156,19 +156,19 @@ def climb_on(
     return outcome, loglik, used
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def from_start() -> Goal:
     """Return the goal of a climb from a start."""
     return Goal(np.bool_(True), -math.inf, -math.inf, math.inf, np.bool_(False))
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def goal_beside(first: bool, loglik: float, runner_up: float) -> Goal:
     """Return the goal of a climb from a start, or from a neighbour, the best and the next known."""
     return Goal(np.bool_(first), loglik - CLEAR_GAP, runner_up, loglik, np.bool_(False))
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def nats_of_peaks(pixel: Pixel, best: FloatArray) -> float:
     """Return the nats that peaks of contrast ``2 r``, ``r = exp(-2 pi^2 s_e^2)``, bring: ``N r^2``."""
     n, frames = pixel.facts.shape[0], 0.0
@@ -179,7 +179,7 @@ def nats_of_peaks(pixel: Pixel, best: FloatArray) -> float:
     return frames * math.exp(-4.0 * math.pi**2 * noise2)
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _most_electrons(pixel: Pixel, theta: FloatArray) -> float:
     """Return the largest exposure of a pixel's samples, e-."""
     most = 0.0
@@ -189,7 +189,7 @@ def _most_electrons(pixel: Pixel, theta: FloatArray) -> float:
     return most
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _count_neighbours(pixel: Pixel, cells: bool, theta: FloatArray) -> int:
     """Return how many neighbours a maximum has: of its bias two, the others differ in their gains.
 
@@ -206,7 +206,7 @@ def _count_neighbours(pixel: Pixel, cells: bool, theta: FloatArray) -> int:
     return 4 + 2 * int(min(reach, _MOST_STEPS))
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _neighbour(which: int, pixel: Pixel, theta: FloatArray, out: FloatArray) -> bool:
     """Fill ``out`` with a neighbour of ``theta``: electrons more or (odd ``which``) fewer.
 
@@ -246,7 +246,7 @@ def climb_neighbours(
         Log-likelihood of the best, that of the best other one (-inf without one), evaluations.
     """
     trial, runner_up = tools.scratch.small[OTHER], -math.inf
-    came_from, used, moves, which = -1, 0, 0, int(np.int64(0))
+    came_from, used, moves, which = -1, 0, 0, 0
     while which < _count_neighbours(pixel, tools.limits.cells, best):
         if which == came_from or not _neighbour(which, pixel, best, trial):
             which += 1
@@ -311,7 +311,7 @@ def loglik_without_ripple(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scr
     return loglik
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
     """Return the height exp(-2 pi^2 s_e^2) of the side lobe in units of its noise, 1/sqrt(N) at most.
 
@@ -326,7 +326,7 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
     return math.sqrt(most) * math.exp(-2.0 * math.pi**2 * noise2)
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def settled(
     pixel: Pixel, theta: FloatArray, clear: bool, above_null: float, out: FloatArray
 ) -> tuple[bool, bool]:
@@ -351,7 +351,7 @@ def settled(
     return good, not (good or of_the_model)
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def expected_gap(n: float, theta: FloatArray) -> float:
     """Return how many nats the likelier neighbour (H -+ 1, mu +- 1/g) of a right answer is expected below it.
 
@@ -452,7 +452,7 @@ def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> f
     return loglik
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def score_of(out: FloatArray) -> float:
     """Return the goodness of fit in a row of results as a standard normal deviate."""
     score: float = normal_score(out[CHI2], int(out[DEGREES]))
@@ -533,7 +533,7 @@ def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
     return bool(runner_up > highest + _SAME_RIVAL)
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def next_start(scratch: Scratch, theta: FloatArray) -> bool:
     """Take the highest of the starts; False where none is left."""
     heights, which = scratch.small[HEIGHTS], 0
@@ -596,12 +596,12 @@ def ripple_by_chance(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float
     trial[n + LOG_VARIANCE] = math.log(_BLURRED2 * best[n + STEP] ** 2)
     no_starts(tools.scratch.small[HEIGHTS])
     keep_start(pixel, tools.evaluate, tools.limits.cells, tools.scratch)
-    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, np.int64(n + LOG_VARIANCE))
+    fall, parabola = fall_and_parabola(pixel, tools, best, loglik, n + LOG_VARIANCE)
     least = tools.limits.gap
     return bool(fall < 2.0 * least and parabola > 2.0 * max(fall, least))
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> float:
     """Return the nats that a maximum is above the likelihood without peaks; infinite where that is sure."""
     if pixel.facts.shape[0] > 1 or nats_of_peaks(pixel, best) > SURELY_SEEN:
@@ -668,21 +668,10 @@ def _climb_start(
     return weighed
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def plus(found: Found, count: int) -> Found:
     """Count evaluations."""
     return Found(found.loglik, found.runner_up, found.used + count, found.degenerate)
-
-
-@kernel(inline=True)
-def _keep_highest(heights: FloatArray) -> None:
-    """Drop all starts but the highest."""
-    most = heights[0]
-    for i in range(1, N_KEPT):
-        most = max(most, heights[i])
-    for i in range(N_KEPT):
-        if heights[i] < most:
-            heights[i] = -math.inf
 
 
 @kernel(borrows=True)
@@ -705,7 +694,7 @@ def climb_starts(
     return found
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _stay_near(
     pixel: Pixel, tools: Tools, task: Task, trial: FloatArray, out: FloatArray
 ) -> tuple[bool, float, int]:
@@ -738,6 +727,7 @@ def search_density(
         Status word, evaluations, degrees of freedom of the goodness of fit.
     """
     n, trial, limits = pixel.facts.shape[0], tools.scratch.small[HERE], tools.limits
+    heights = tools.scratch.small[HEIGHTS]
     null, used = loglik_without_gain(pixel), 0
     best[n + STEP] = 0.0
     if task.near[n + STEP] > 0.0:
@@ -752,7 +742,11 @@ def search_density(
         clear, count = fill_starts(attempt, limits.quick, pixel, tools.basis, tools.evaluate, tools.scratch)
         before = found.loglik
         if clear and attempt == 0:
-            _keep_highest(tools.scratch.small[HEIGHTS])
+            most = -math.inf
+            for i in range(N_KEPT):  # the highest is kept
+                most = max(most, heights[i])
+            for i in range(N_KEPT):
+                heights[i] = heights[i] if heights[i] == most else -math.inf
         found = climb_starts(pixel, tools, clear, plus(found, count), best, out)
         if (n > 1 or attempt == 0) and best[n + STEP] > 0.0:
             poor, least = score_of(out) > SUSPICIOUS, found.loglik - CLEAR_GAP

@@ -124,7 +124,7 @@ def ecf_power(histogram: Histogram, step: float, n_frequencies: int, work: Float
     for m in range(n_frequencies + _SIDE_BY_SIDE * SIMD_WIDTH):
         work[1, m] = present
         before, present = present, base * present - before
-    _clenshaw(histogram, np.int64(0), n_frequencies, work)
+    _clenshaw(histogram, 0, n_frequencies, work)
     share = 1.0 / (histogram.n * histogram.n)
     for m in range(0, n_frequencies, SIMD_WIDTH):
         turn, even, odd = simd_load(work, 1, m), simd_load(work, 2, m), simd_load(work, 3, m)
@@ -158,7 +158,7 @@ def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
     return math.hypot(real, imag), math.atan2(imag, real)
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _regress(
     basis: FloatArray,
     power: FloatArray,
@@ -293,7 +293,7 @@ def start_regression(
     """
     n, variance = histogram.n, histogram.variance
     sd = math.sqrt(variance)
-    n_used = np.int64(min(N_FREQUENCIES, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP)))
+    n_used = min(N_FREQUENCIES, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP))
     ecf_power(histogram, FREQUENCY_STEP / sd, n_used, work)
     satellite, exposure = _regress(basis, work[0, :n_used], 9.0 / n, work[4:7])
     if satellite <= 0.0:
@@ -309,16 +309,16 @@ def _keep_noises(pixel: Pixel, evaluate: Any, a: float, around: int, scratch: Sc
     Aliases of the lobe at 1/a hide modulus and phase, so some read noises are tried, and exposures, so many
     to either side of the one that has the variance right.
     """
-    histogram, trial, used = histogram_of(pixel, np.int64(0)), scratch.small[HERE], 0
+    histogram, trial, used = histogram_of(pixel, 0), scratch.small[HERE], 0
     trial[1 + STEP], trial[1 + SATELLITE] = a, 0.0
     for noise in _FEW_NOISES:
         middle = (histogram.variance - QUANTISATION_VARIANCE) / (a * a) - noise * noise
-        trial[1 + LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, np.bool_(True)))
+        trial[1 + LOG_VARIANCE] = max(2.0 * math.log(noise * a), min_log_variance(a, True))
         for place in range(-around, around + 1):
             exposure = middle + 0.2 * place
             if exposure > 1e-3:
                 trial[0], trial[1 + BIAS] = math.log(exposure), histogram.mean - exposure * a
-                used += keep_start(pixel, evaluate, np.bool_(True), scratch)
+                used += keep_start(pixel, evaluate, True, scratch)
     return used
 
 
@@ -331,7 +331,7 @@ def _keep_lobe(
     Of few DN per electron, what is left of other frequencies adds to the lobe where H is low; there mean and
     variance alone give bias and H, for some read noises.
     """
-    histogram, trial = histogram_of(pixel, np.int64(0)), scratch.small[HERE]
+    histogram, trial = histogram_of(pixel, 0), scratch.small[HERE]
     trial[1 + SATELLITE] = 0.0
     _on_lobe(histogram, a, math.inf, lobe, trial)
     if cells:
@@ -339,7 +339,7 @@ def _keep_lobe(
         trial[1 + LOG_VARIANCE] = max(math.log(analog), min_log_variance(a, cells))
     used: int = keep_start(pixel, evaluate, cells, scratch)
     if cells and a < FEW_STEP and trial[0] < _DIM:
-        used += _keep_noises(pixel, evaluate, a, np.int64(0), scratch)
+        used += _keep_noises(pixel, evaluate, a, 0, scratch)
     return used
 
 
@@ -353,7 +353,7 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
     closer than the likelihood's maxima. Past the central lobe few are tried of those that stay in the noise,
     ``3 / sqrt(N)``.
     """
-    histogram, work, used = histogram_of(pixel, np.int64(0)), scratch.rows, 0
+    histogram, work, used = histogram_of(pixel, 0), scratch.rows, 0
     no_starts(scratch.small[HEIGHTS])
     first, sd = work.shape[1] - SCANNED, math.sqrt(histogram.variance)
     highest = min(_SCAN_END / sd, 1.0 / (LEAST_STEP if cells else MIN_STEP))
@@ -381,7 +381,7 @@ def scan_steps(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
     return used
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def no_starts(heights: FloatArray) -> None:
     """Forget all starts."""
     for i in range(N_KEPT):
@@ -411,12 +411,12 @@ def alias_of_step(pixel: Pixel, evaluate: Any, best: FloatArray, scratch: Scratc
         Evaluations.
     """
     no_starts(scratch.small[HEIGHTS])
-    n, cells = pixel.facts.shape[0], np.bool_(True)
+    n, cells = pixel.facts.shape[0], True
     a = 1.0 / (1.0 - 1.0 / best[n + STEP])
     if n > 1:
         rescaled: int = _keep_rescaled(pixel, evaluate, cells, best, a / best[n + STEP], scratch)
         return rescaled
-    lobe = ecf_at(histogram_of(pixel, np.int64(0)), 1.0 / a)
+    lobe = ecf_at(histogram_of(pixel, 0), 1.0 / a)
     used: int = _keep_lobe(pixel, evaluate, cells, a, lobe, scratch)
     return used
 
@@ -425,11 +425,11 @@ def alias_of_step(pixel: Pixel, evaluate: Any, best: FloatArray, scratch: Scratc
 def combs_of_step(pixel: Pixel, evaluate: Any, a: float, scratch: Scratch) -> int:
     """Put the likeliest combs of a few DN per electron, of one step, among the starts; see `_keep_noises`."""
     no_starts(scratch.small[HEIGHTS])
-    used: int = _keep_noises(pixel, evaluate, a, np.int64(2), scratch)
+    used: int = _keep_noises(pixel, evaluate, a, 2, scratch)
     return used
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _holds_one(histogram: Histogram, theta: FloatArray) -> bool:
     """Tell whether the peak of one electron is there: a comb of half the step has nothing where this has it.
 
@@ -457,8 +457,8 @@ def longer_steps(
     there. Several samples that fit poorly may have such a comb at any exposure. Starts below ``least`` are
     left out.
     """
-    cells = np.bool_(False)
-    histogram, heights, used = histogram_of(pixel, np.int64(0)), scratch.small[HEIGHTS], 0
+    cells = False
+    histogram, heights, used = histogram_of(pixel, 0), scratch.small[HEIGHTS], 0
     no_starts(heights)
     n = pixel.facts.shape[0]
     a = best[n + STEP]
@@ -518,7 +518,7 @@ def fill_theta(pixel: Pixel, a: float, bias: float, noise2: float, cells: bool, 
     return brightest > _SMALLEST_EXPOSURE
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def variance_line(pixel: Pixel) -> tuple[float, float, float]:
     """Return the slope of the variances against the means, and the point (mean, variance) that it is through.
 
@@ -543,7 +543,7 @@ def variance_line(pixel: Pixel) -> tuple[float, float, float]:
     return (xy / xx if xx > 0.0 else 0.0), x0, y0
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _line_start(
     scale: float,
     noise: float,
@@ -570,7 +570,7 @@ def _line_start(
     return answer
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def _regression_start(
     j: int, pixel: Pixel, basis: FloatArray, scratch: Scratch, theta: FloatArray
 ) -> tuple[bool, bool]:
@@ -592,7 +592,7 @@ def _regression_start(
         if facts[i, DARK] > 0.0:
             bias = facts[i, CENTRE] + facts[i, MEAN]
             noise2 = facts[i, VARIANCE]
-    return fill_theta(pixel, own[1], bias, noise2, np.bool_(False), theta), clear
+    return fill_theta(pixel, own[1], bias, noise2, False, theta), clear
 
 
 @kernel(borrows=True)
@@ -621,7 +621,7 @@ def keep_start(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
     return 1
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def fill_starts(
     attempt: int,
     quick: bool,
@@ -648,10 +648,10 @@ def fill_starts(
     no_starts(heights)
     if n_samples == 1:
         if attempt > 0:
-            return False, scan_steps(pixel, evaluate, np.bool_(False), scratch)
+            return False, scan_steps(pixel, evaluate, False, scratch)
         start = scratch.small[KEPT_STARTS]
         start[1 + SATELLITE] = trial[1 + SATELLITE] = 0.0
-        found, clear = start_regression(histogram_of(pixel, np.int64(0)), basis, scratch.rows, start)
+        found, clear = start_regression(histogram_of(pixel, 0), basis, scratch.rows, start)
         if clear or (quick and found):
             heights[0] = 0.0
         return False, 0
@@ -659,10 +659,9 @@ def fill_starts(
         found, clear = _regression_start(j, pixel, basis, scratch, trial)
         any_clear = any_clear or (found and clear)
         if found:
-            used += keep_start(pixel, evaluate, np.bool_(False), scratch)
+            used += keep_start(pixel, evaluate, False, scratch)
     if attempt > 0 or not any_clear:
-        no = np.bool_(False)
-        used += add_line_starts(pixel, evaluate, no, attempt > 0, scratch)
+        used += add_line_starts(pixel, evaluate, False, attempt > 0, scratch)
     return any_clear, used
 
 

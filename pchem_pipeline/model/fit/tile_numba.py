@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -122,7 +123,7 @@ class Answers(NamedTuple):
 @kernel
 def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
     """Load the samples of a pixel; return the pixel, which shares the room's arrays."""
-    centre, widest = int(np.int64(0)), 0.0
+    centre, widest = 0, 0.0
     for j in range(given.dark.size):
         first, end = given.places[j], given.places[j + 1]
         own = load(given.counts[index, first:end], given.mask[index, first:end], room.bins[j], room.facts[j])
@@ -134,7 +135,7 @@ def load_pixel(given: Histograms, index: int, room: Pixel) -> Pixel:
     return Pixel(room.bins, room.facts, room.peaks, room.mixtures, centre, 4.0 * widest + 10.0)
 
 
-@kernel(inline=True)
+@kernel(borrows=True)
 def describe(pixel: Pixel, moments: FloatArray, words: IntArray) -> tuple[float, float]:
     """Fill moments, frames and extreme codes; return the fewest frames and the most occupied bins."""
     lowest, highest, n, least, occupied = 2**62, -(2**62), 0.0, math.inf, 0.0
@@ -173,38 +174,7 @@ def theta_of(parameters: FloatArray, pixel: Pixel, limits: Limits, theta: FloatA
     return True
 
 
-@kernel(inline=True)
-def _write(
-    pixel: Pixel,
-    theta: FloatArray,
-    limits: Limits,
-    scratch: Scratch,
-    parameters: FloatArray,
-    covariance: FloatArray,
-) -> bool:
-    """Fill parameters and covariance at a maximum; tell whether the information is positive definite."""
-    n, at, fixed = pixel.facts.shape[0], scratch.evaluations[AT_BEST], scratch.flags[FIXED]
-    held = fixed.copy()
-    floor = min_log_variance(theta[n + STEP], limits.cells)
-    held[n + LOG_VARIANCE] = theta[n + LOG_VARIANCE] <= floor + 1e-9
-    full = np.empty((n + N_SHARED, n + N_SHARED))
-    regular: bool = invert_arrow(at, theta, held, full)
-    if limits.sandwich and regular:
-        if not limits.cells:
-            fill_squared_scores(pixel, theta, at)
-        enclose(at, theta, full)
-    absolute = theta.copy()
-    absolute[n + BIAS] += pixel.centre
-    rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
-    to_natural(absolute, fixed[:n], held, rounding, full, parameters, covariance)
-    if not regular:
-        for row in range(n + 3):
-            for column in range(n + 3):
-                covariance[row, column] = math.nan
-    return regular
-
-
-@kernel(inline=True)
+@kernel
 def _expect_information(
     pixel: Pixel, theta: FloatArray, limits: Limits, evaluate: Any, scratch: Scratch
 ) -> None:
@@ -229,7 +199,7 @@ def _expect_information(
 @kernel
 def make_room(given: Histograms, law: Law) -> Pixel:
     """Return room for the histograms of a pixel."""
-    most = np.int64(0)
+    most = 0
     for j in range(given.dark.size):
         most = max(most, given.places[j + 1] - given.places[j])
     n_peaks = law.peaks.shape[3] * (1 + law.pattern.shape[0])
@@ -248,76 +218,115 @@ def start_tile(given: Histograms, law: Law, basis: FloatArray, parameters: Float
         pixel = load_pixel(given, index, room)
         if pixel.facts[0, OCCUPIED] < 3:
             continue
-        if start_regression(histogram_of(pixel, np.int64(0)), basis, scratch.rows, theta)[0]:
+        if start_regression(histogram_of(pixel, 0), basis, scratch.rows, theta)[0]:
             parameters[index, 0] = math.exp(theta[0])
             parameters[index, 1] = 1.0 / theta[1 + STEP]
             parameters[index, 2] = theta[1 + BIAS] + pixel.centre
             parameters[index, 3] = math.exp(0.5 * theta[1 + LOG_VARIANCE])
 
 
-@kernel
-def fit_tile(
-    given: Histograms,
-    chosen: IntArray,
-    law: Law,
-    starts: Starts,
-    limits: Limits,
-    evaluate: Any,
-    climb: Any,
-    search: Any,
-    basis: FloatArray,
-    answers: Answers,
-) -> None:
-    """Fit pixels; they do not influence each other.
+def _tile_kernel(plain: bool) -> Callable[..., None]:
+    """Make the loop; ``plain``: of single samples and errors from the information, half to compile."""
 
-    Args:
-        given: histograms; codes left out by the tail guard do not count.
-        chosen: pixels to fit.
-        law: of the samples.
-        starts: what is known.
-        limits: bounds and limits.
-        evaluate: the likelihood.
-        climb: the climb on it.
-        search: the search for its maximum.
-        basis: of the regression on the characteristic function.
-        answers: out.
-    """
-    n = given.dark.size
-    room = make_room(given, law)
-    scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
-    tools = Tools(limits, evaluate, climb, basis, scratch)
-    near, best = np.zeros(n + N_SHARED), np.zeros(n + N_SHARED)
-    fixed = scratch.flags[FIXED]
-    fixed[n + SATELLITE] = True
-    for j in range(n):
-        fixed[j] = given.dark[j]
-    for index in chosen:
-        pixel = load_pixel(given, index, room)
-        out, words = answers.out[index], answers.words[index]
-        least, occupied = describe(pixel, answers.moments[index], words)
-        for i in range(out.size):
-            out[i] = math.nan
-        if least == 0.0 or occupied < 3.0:
-            words[STATUS] = NO_DATA if least == 0.0 else TOO_FEW_BINS
-            continue
-        if limits.cells:
-            resolve(law, index, 0.0, pixel)
-        near[n + STEP], gap = 0.0, math.inf
-        if starts.parameters.shape[0] > 0:
-            theta_of(starts.parameters[index], pixel, limits, near)
-            gap = starts.gaps[index]
-        tried = starts.looked[index if starts.looked.size > 1 else 0]
-        amplitudes = starts.amplitudes if tried else starts.amplitudes[:0]
-        task = Task(law, index, amplitudes, near, gap)
-        status, used, words[FREEDOM] = search(pixel, tools, task, best, out)
-        words[EVALUATIONS] += used
-        if best[n + STEP] > 0.0:
-            parameters, covariance = answers.parameters[index], answers.covariance[index]
-            if n > 1 and nats_of_peaks(pixel, best) < SURELY_SEEN:
-                if ripple_by_chance(pixel, tools, best, out[LOG_LIKELIHOOD]):
-                    status |= GAIN_AMBIGUOUS
-                if not limits.sandwich:
-                    _expect_information(pixel, best, limits, evaluate, scratch)
-            if not _write(pixel, best, limits, scratch, parameters, covariance):
-                status |= FIT_NOT_CONVERGED
-        words[STATUS] = status
+    @kernel
+    def _write(
+        pixel: Pixel,
+        theta: FloatArray,
+        limits: Limits,
+        scratch: Scratch,
+        parameters: FloatArray,
+        covariance: FloatArray,
+    ) -> bool:
+        """Fill parameters and covariance at a maximum; tell whether the information is positive definite."""
+        n, at, fixed = pixel.facts.shape[0], scratch.evaluations[AT_BEST], scratch.flags[FIXED]
+        held = fixed.copy()
+        floor = min_log_variance(theta[n + STEP], limits.cells)
+        held[n + LOG_VARIANCE] = theta[n + LOG_VARIANCE] <= floor + 1e-9
+        full = np.empty((n + N_SHARED, n + N_SHARED))
+        regular: bool = invert_arrow(at, theta, held, full)
+        if not plain and limits.sandwich and regular:
+            if not limits.cells:
+                fill_squared_scores(pixel, theta, at)
+            enclose(at, theta, full)
+        absolute = theta.copy()
+        absolute[n + BIAS] += pixel.centre
+        rounding = QUANTISATION_VARIANCE if limits.cells else 0.0
+        to_natural(absolute, fixed[:n], held, rounding, full, parameters, covariance)
+        if not regular:
+            for row in range(n + 3):
+                for column in range(n + 3):
+                    covariance[row, column] = math.nan
+        return regular
+
+    @kernel
+    def fit_tile(
+        given: Histograms,
+        chosen: IntArray,
+        law: Law,
+        starts: Starts,
+        limits: Limits,
+        evaluate: Any,
+        climb: Any,
+        search: Any,
+        basis: FloatArray,
+        answers: Answers,
+    ) -> None:
+        """Fit pixels; they do not influence each other.
+
+        Args:
+            given: histograms; codes left out by the tail guard do not count.
+            chosen: pixels to fit.
+            law: of the samples.
+            starts: what is known.
+            limits: bounds and limits.
+            evaluate: the likelihood.
+            climb: the climb on it.
+            search: the search for its maximum.
+            basis: of the regression on the characteristic function.
+            answers: out.
+        """
+        n = given.dark.size
+        room = make_room(given, law)
+        scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
+        tools = Tools(limits, evaluate, climb, basis, scratch)
+        near, best = np.zeros(n + N_SHARED), np.zeros(n + N_SHARED)
+        fixed = scratch.flags[FIXED]
+        fixed[n + SATELLITE] = True
+        for j in range(n):
+            fixed[j] = given.dark[j]
+        for index in chosen:
+            pixel = load_pixel(given, index, room)
+            out, words = answers.out[index], answers.words[index]
+            least, occupied = describe(pixel, answers.moments[index], words)
+            for i in range(out.size):
+                out[i] = math.nan
+            if least == 0.0 or occupied < 3.0:
+                words[STATUS] = NO_DATA if least == 0.0 else TOO_FEW_BINS
+                continue
+            if limits.cells:
+                resolve(law, index, 0.0, pixel)
+            near[n + STEP], gap = 0.0, math.inf
+            if starts.parameters.shape[0] > 0:
+                theta_of(starts.parameters[index], pixel, limits, near)
+                gap = starts.gaps[index]
+            tried = starts.looked[index if starts.looked.size > 1 else 0]
+            amplitudes = starts.amplitudes if tried else starts.amplitudes[:0]
+            task = Task(law, index, amplitudes, near, gap)
+            status, used, words[FREEDOM] = search(pixel, tools, task, best, out)
+            words[EVALUATIONS] += used
+            if best[n + STEP] > 0.0:
+                parameters, covariance = answers.parameters[index], answers.covariance[index]
+                if not plain and n > 1 and nats_of_peaks(pixel, best) < SURELY_SEEN:
+                    if ripple_by_chance(pixel, tools, best, out[LOG_LIKELIHOOD]):
+                        status |= GAIN_AMBIGUOUS
+                    if not limits.sandwich:
+                        _expect_information(pixel, best, limits, evaluate, scratch)
+                if not _write(pixel, best, limits, scratch, parameters, covariance):
+                    status |= FIT_NOT_CONVERGED
+            words[STATUS] = status
+
+    compiled: Callable[..., None] = fit_tile
+    return compiled
+
+
+fit_tile, fit_plain_tile = _tile_kernel(False), _tile_kernel(True)

@@ -30,14 +30,6 @@ _NARROW = 0.7
 
 
 @kernel
-def fill_zeros(table: FloatArray) -> None:
-    """Set all elements of a table to 0; a slice takes numba ten times as long to compile."""
-    for i in range(table.shape[0]):
-        for j in range(table.shape[1]):
-            table[i, j] = 0.0
-
-
-@kernel
 def electron_range(exposure: float, negligible: float) -> tuple[int, int]:
     """Return the smallest and largest electron number with at least the negligible probability."""
     mode = int(exposure)
@@ -135,7 +127,9 @@ def fill_law(
         far: down to the far ends of the tails; else up to `REACH` from the peaks, which is faster.
         law: to fill; its first dimension is the number of codes.
     """
-    fill_zeros(law)
+    for i in range(law.shape[0]):  # a slice takes numba ten times as long to compile
+        for j in range(law.shape[1]):
+            law[i, j] = 0.0
     root = math.sqrt(exposure)
     c2, c3 = math.sqrt(2.0) * exposure, math.sqrt(6.0) * exposure * root
     log_h = math.log(exposure)

@@ -15,8 +15,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
@@ -201,7 +199,7 @@ class Component(NamedTuple):
     high: int
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _row(values: FloatArray, index: int) -> int:
     """Return the row of a pixel in an array with one row for all, or one for each."""
     return index if values.shape[1] > 1 else 0
@@ -276,7 +274,7 @@ def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
     set_peaks(law, index, amplitude, pixel)
 
 
-@kernel(inline=True)
+@kernel(views=True)
 def cells_of(pixel: Pixel, j: int) -> Cells:
     """Return one sample as the loops below take it."""
     bins, facts = pixel.bins[j], pixel.facts[j]
@@ -306,7 +304,7 @@ def cells_of(pixel: Pixel, j: int) -> Cells:
     )
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _level(k: float, cells: Cells) -> float:
     """Return the level of k electrons, e-."""
     return cells.level_scale * k * (1.0 + 0.5 * cells.curvature * (k - 1.0)) + cells.level_shift
@@ -336,7 +334,7 @@ def component(k: float, peak: int, theta: FloatArray, cells: Cells, reach: float
     return Component(mean, variance, sd, charge, 0.5 * by_sigma, 2.0 * a * spread, own, low, high)
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _list_numbers(theta: FloatArray, cells: Cells, reach: float, cut: float, numbers: FloatArray) -> int:
     """Fill the electron numbers that reach the cells, with their probabilities; return how many."""
     a, analog2, exposure = theta[_STEP], math.exp(theta[_VARIANCE]), math.exp(theta[_EXPOSURE])
@@ -376,7 +374,7 @@ def _list_numbers(theta: FloatArray, cells: Cells, reach: float, cut: float, num
     return count
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _place_for(part: Component, place: int) -> tuple[int, int]:
     """Return where the edges of a component are kept, and where those of the next one; where only for now."""
     width = part.high - part.low + 1 + SIMD_WIDTH
@@ -400,7 +398,7 @@ def _fill_edges(bins: FloatArray, part: Component, edges: FloatArray, place: int
         edges[row, behind] = edges[row, behind - 1]
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def cell_of(mean: float, cells: Cells, low: int, high: int) -> int:
     """Return the cell that holds a mean, if it is one of these, the end excluded, or one outside."""
     middle = int(min(max(mean - cells.first, low - 1.0), float(high)))
@@ -411,7 +409,7 @@ def cell_of(mean: float, cells: Cells, low: int, high: int) -> int:
     return middle
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _add_component(
     row: FloatArray,
     peak: int,
@@ -482,7 +480,7 @@ def fill_masses(
         for i in range(0, cells.n_bins, SIMD_WIDTH):
             simd_store(room, MASS if row == 0 else SLOPES + row - 1, i, 0.0)
     count: int = _list_numbers(theta, cells, reach, cut, numbers)
-    following = count - count
+    following = 0
     for row in range(count):
         for peak in range(cells.n_peaks):
             part = component(numbers[row, 0], peak, theta, cells, reach)
@@ -514,7 +512,7 @@ def fill_far_enough(
     Returns:
         Number of electron numbers in use, and how many standard deviations a component reaches.
     """
-    count = np.int64(0)
+    count = 0
     for stage in range(len(_REACH)):  # the last one is taken whatever the masses are, NaN too
         count = fill_masses(theta, cells, stage, what, numbers, edges, room)
         lowest = 1.0
@@ -523,10 +521,10 @@ def fill_far_enough(
                 lowest = min(lowest, room[MASS, i])
         if lowest >= _OUTLIER[stage]:
             break
-    return int(count), _REACH[stage]
+    return count, _REACH[stage]
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _log_mass(cells: Cells, room: FloatArray) -> float:
     """Return the log-likelihood of the masses in the room."""
     total, inside = counting() * 0.0, 1.0
@@ -540,7 +538,7 @@ def _log_mass(cells: Cells, room: FloatArray) -> float:
     return float(simd_sum(total)) - cells.frames * math.log(max(inside, SMALLEST_MASS))
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
     """Return the log-likelihood of the masses in the room; fill score, squared scores and ratios.
 
@@ -582,7 +580,7 @@ def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray)
     return loglik
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _condition(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
     """Take off what all kept codes together give; return the change of the log-likelihood.
 
@@ -616,7 +614,7 @@ def _condition(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArr
     return -n * math.log(inside)
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _hermite_sums(
     cells: Cells, part: Component, room: FloatArray, edges: FloatArray, place: int
 ) -> tuple[float, float, float, float, float]:
@@ -642,7 +640,7 @@ def _hermite_sums(
     return whole, float(simd_sum(s1)), float(simd_sum(s2)), float(simd_sum(s3)), float(simd_sum(s4))
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _subtract_curvature(
     theta: FloatArray,
     cells: Cells,
@@ -654,7 +652,7 @@ def _subtract_curvature(
 ) -> None:
     """Take the second derivatives of the masses, times counts over mass, off the information."""
     information = out[INFORMATION:DAMPING]
-    following = numbers.shape[0] - numbers.shape[0]
+    following = 0
     for row in range(numbers.shape[0]):
         k, p0, p1, p2 = numbers[row, 0], numbers[row, 1], numbers[row, 2], numbers[row, 3]
         for peak in range(cells.n_peaks):
@@ -692,18 +690,7 @@ def _subtract_curvature(
             information[3, 3] -= w * (f_mm * mv * mv + 2.0 * f_mq * mv * qv + f_qq * qv * qv + bend)
 
 
-@kernel(borrows=True)
-def own_theta(pixel: Pixel, j: int, theta: FloatArray, own: FloatArray) -> None:
-    """Fill a sample's own parameters from those of its pixel."""
-    n = pixel.facts.shape[0]
-    own[_EXPOSURE] = theta[j] if pixel.facts[j, DARK] == 0.0 else _NO_ELECTRONS
-    own[_STEP] = theta[n + STEP]
-    own[_BIAS] = theta[n + BIAS] - pixel.facts[j, CENTRE]
-    own[_VARIANCE] = theta[n + LOG_VARIANCE]
-    own[_SATELLITE] = theta[n + SATELLITE]
-
-
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _expect(pixel: Pixel, j: int, cells: Cells, room: FloatArray) -> None:
     """Fill the counts expected of the codes that are not set aside."""
     inside = 1.0
@@ -728,10 +715,12 @@ def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch,
     Returns:
         The log-likelihood, nats.
     """
-    own = scratch.small[OWN]
-    loglik = 0.0
-    for j in range(pixel.facts.shape[0]):
-        own_theta(pixel, j, theta, own)
+    own, n, loglik = scratch.small[OWN], pixel.facts.shape[0], 0.0
+    own[_STEP], own[_VARIANCE] = theta[n + STEP], theta[n + LOG_VARIANCE]
+    own[_SATELLITE] = theta[n + SATELLITE]
+    for j in range(n):
+        own[_EXPOSURE] = theta[j] if pixel.facts[j, DARK] == 0.0 else _NO_ELECTRONS
+        own[_BIAS] = theta[n + BIAS] - pixel.facts[j, CENTRE]
         cells, room = cells_of(pixel, j), scratch.cells[j]
         count, reach = fill_far_enough(own, cells, what, scratch.numbers, scratch.edges, room)
         if what == LOGLIK_ALONE:

@@ -110,7 +110,7 @@ class _Comb(NamedTuple):
     stride: int
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _half_width(electron_noise: float, exposure: float, first: int, last: int, dropped: float) -> int:
     """Return how many components matter on either side of the nearest one, down to so many nats below it."""
     variance = electron_noise * electron_noise
@@ -122,7 +122,7 @@ def _half_width(electron_noise: float, exposure: float, first: int, last: int, d
     return min(max(1, math.ceil(half)), (MAX_COMPONENTS - 1) // 2)
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _fill_levels(
     rows: FloatArray, log_factorials: FloatArray, comb: _Comb, log_exposure: float, constant: float
 ) -> None:
@@ -140,7 +140,7 @@ def _fill_levels(
         simd_store(rows, _LEVEL, k - lowest, fused(number, log_exposure, constant - log_factorial))
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _fill_coefficients(coefficients: FloatArray, rows: FloatArray, comb: _Comb) -> None:
     """Fill the coefficients of the polynomials, a row for each nearest component j.
 
@@ -160,7 +160,7 @@ def _fill_coefficients(coefficients: FloatArray, rows: FloatArray, comb: _Comb) 
             simd_store(coefficients, cell, place, own)
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _fill_blocks(rows: FloatArray, comb: _Comb, n_blocks: int) -> None:
     """Fill what the loops need of the blocks.
 
@@ -189,7 +189,7 @@ def _fill_blocks(rows: FloatArray, comb: _Comb, n_blocks: int) -> None:
     simd_store(rows, _DENSITY, (comb.n_bins - 1) // SIMD_WIDTH * SIMD_WIDTH, counting() * 0.0 + 1.0)
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _lanes(
     block: int, own: int, cell: int, half: int, rows: FloatArray, ratios: Simd, most_ratio: float
 ) -> tuple[Simd, Simd, Simd]:
@@ -202,7 +202,7 @@ def _lanes(
     return d, r, level
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _weighted_logs(bins: FloatArray, rows: FloatArray, n_bins: int) -> Simd:
     """Sum up counts times the logarithms of `_DENSITY`.
 
@@ -215,7 +215,7 @@ def _weighted_logs(bins: FloatArray, rows: FloatArray, n_bins: int) -> Simd:
     return total
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _add_moments(
     a: float,
     square: float,
@@ -353,7 +353,7 @@ def _loglik_alone(
     return float(simd_sum(loglik))
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _finish(
     facts: FloatArray,
     log_exposure: float,
@@ -414,7 +414,7 @@ def _fill_complete(n: float, of_exposure: float, inverse: float, out: FloatArray
     out[DAMPING + 3, 3] = 0.5 * sums[SUM_EE] * inverse
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _evaluate_sample(
     pixel: Pixel,
     sample: int,
@@ -460,7 +460,7 @@ def _evaluate_sample(
     return float(rows[_TOTALS, _LOGLIK])
 
 
-@kernel(inline=True)
+@kernel(inline=True, borrows=True)
 def _evaluate_dark(
     pixel: Pixel, j: int, bias: float, log_variance: float, expect: bool, out: FloatArray
 ) -> float:

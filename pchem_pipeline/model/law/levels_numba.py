@@ -127,7 +127,7 @@ def _span(k: int, theta: FloatArray, cells: Cells, codes: Codes, reach: float) -
 @kernel(borrows=True)
 def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, law: Law) -> tuple[int, int]:
     """Return the first and last whole code that samples of a pixel show, after its centre."""
-    cells = cells_of(pixel, np.int64(0))
+    cells = cells_of(pixel, 0)
     factor = added = 0.0
     for i in range(cells.mixtures.shape[1]):
         factor = max(factor, cells.mixtures[EXPOSURE_FACTOR, i])

@@ -41,13 +41,7 @@ def pixel_scratch(n_bins: int, law: Law) -> tuple[Pixel, Scratch]:
     n_peaks = law.peaks.shape[3] * (1 + law.pattern.shape[0])
     n_exposures = max(law.exposures.shape[3], law.added.shape[3])
     pixel = make_pixel(np.zeros(1, np.bool_), n_bins, n_peaks, n_exposures)
-    return pixel, make_scratch(np.int64(1), n_bins, np.bool_(True))
-
-
-@kernel
-def _at(room: Pixel, centre: int) -> Pixel:
-    """Return the pixel counted from a code."""
-    return Pixel(room.bins, room.facts, room.peaks, room.mixtures, centre, 0.0)
+    return pixel, make_scratch(1, n_bins, True)
 
 
 @kernel
@@ -104,9 +98,9 @@ def mass_tile(
     for index in range(parameters.shape[0]):
         if not known_theta(parameters[index], first[index], satellites[index, 1], theta):
             continue
-        pixel = _at(room, first[index])
+        pixel = Pixel(room.bins, room.facts, room.peaks, room.mixtures, first[index], 0.0)
         resolve(law, index, satellites[index, 0], pixel)
-        cells = cells_of(pixel, np.int64(0))
+        cells = cells_of(pixel, 0)
         fill_masses(theta, cells, stage, what, scratch.numbers, scratch.edges, scratch.cells[0])
         for i in range(n_codes):
             out[index, i] = scratch.cells[0, MASS, i]

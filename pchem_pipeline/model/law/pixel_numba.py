@@ -81,7 +81,7 @@ OWN, TRIAL, STEPS, RIGHT, SCHUR, LOWER = 0, 1, 2, 3, 4, 4 + N_BLOCK
 HERE, OTHER, KEPT_STARTS = 4 + 2 * N_BLOCK, 5 + 2 * N_BLOCK, 6 + 2 * N_BLOCK
 N_KEPT = 6
 HEIGHTS = KEPT_STARTS + N_KEPT
-N_SMALL = HEIGHTS + 1
+N_SMALL = HEIGHTS + 2  # of a single sample, the heights are more than a row
 # rows of `Scratch.flags`: parameters that stay in a step, and all the time
 HELD, FIXED = range(2)
 # places in `Scratch.evaluations`: of the last climb, of its trials, at the best maximum
@@ -293,7 +293,7 @@ def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray,
     return int(low + middle)
 
 
-@kernel(inline=True)
+@kernel(views=True)
 def histogram_of(pixel: Pixel, j: int) -> Histogram:
     """Return one sample's histogram, counted from its own centre."""
     facts = pixel.facts[j]

@@ -283,18 +283,16 @@ class Chart:
     """What a figure draws.
 
     Attributes:
-        stacks: from left to right and from top to bottom.
+        stacks: from left to right and from top to bottom, at least one.
         widths: shares of the columns where stacks have room side by side; one below the other elsewhere.
         legend: columns of a legend below all on paper, on a page and in a column; 0: none.
         keys: colours and what they mean, in lines below all.
-        empty: what is said where there is no stack.
     """
 
     stacks: tuple[Stack, ...]
     widths: tuple[float, ...] = (1.0,)
     legend: tuple[int, int] = (0, 0)
     keys: tuple[tuple[str, str], ...] = ()
-    empty: str = ""
 
     @property
     def still(self) -> bool:

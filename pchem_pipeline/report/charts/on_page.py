@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import MISSING, fields, replace
 from typing import Any
 
@@ -86,28 +86,18 @@ def _panel(panel: Panel, x: Axis, across: Ends) -> dict[str, Any]:
     found: dict[str, Any] = {"height": panel.height, "y": _axis(panel.y, up)}
     if panel.note:
         found |= {"note": without_formulas(panel.note), "corner": panel.corner}
-    found["marks"] = [_mark(mark, _Rounding(x, across), _Rounding(panel.y, up)) for mark in panel.marks]
+    found["marks"] = [_mark(mark, (across, x.log), (up, panel.y.log)) for mark in panel.marks]
     return found
 
 
-class _Rounding:
-    """How the numbers along an axis are written."""
-
-    def __init__(self, axis: Axis, ends: Ends) -> None:
-        self.log, self.ends = axis.log, ends
-
-    def __call__(self, values: Values | Sequence[float]) -> list[float | None]:
-        return rounded(np.asarray(values, dtype=np.float64), self.ends, self.log)
-
-    def places(self, values: Values) -> list[float | None] | dict[str, float]:
-        """Return places along the axis; evenly spaced ones as the first, the step and their number."""
-        values = np.asarray(values, dtype=np.float64)
-        if values.size > 3:
-            step = (values[-1] - values[0]) / (values.size - 1)
-            even = values[0] + step * np.arange(values.size)
-            if step and np.abs(values - even).max() < 1e-6 * abs(step):
-                return {"from": float(values[0]), "step": float(f"{step:.12g}"), "n": values.size}
-        return self(values)
+def _places(values: Values, ends: Ends, log: bool) -> list[float | None] | dict[str, float]:
+    """Return places along an axis; evenly spaced ones as the first, the step and their number."""
+    if values.size > 3:
+        step = (values[-1] - values[0]) / (values.size - 1)
+        even = values[0] + step * np.arange(values.size)
+        if step and np.abs(values - even).max() < 1e-6 * abs(step):
+            return {"from": float(values[0]), "step": float(f"{step:.12g}"), "n": values.size}
+    return rounded(values, ends, log)
 
 
 def rounded(values: Values, ends: Ends, log: bool = False) -> list[float | None]:
@@ -119,8 +109,8 @@ def rounded(values: Values, ends: Ends, log: bool = False) -> list[float | None]
     return [value if math.isfinite(value) else None for value in found]
 
 
-def _mark(mark: Mark, x: _Rounding, y: _Rounding) -> dict[str, Any]:
-    """Return what the page draws of a mark; what it has as every other is left out."""
+def _mark(mark: Mark, x: tuple[Ends, bool], y: tuple[Ends, bool]) -> dict[str, Any]:
+    """Return what the page draws of a mark between axes (ends, logarithmic); what all have is left out."""
     if isinstance(mark, Image):
         raise TypeError("the page cannot draw an Image")
     mark = _fewer(mark)
@@ -128,9 +118,10 @@ def _mark(mark: Mark, x: _Rounding, y: _Rounding) -> dict[str, Any]:
     for field in fields(mark):
         name, value = _NAMES.get(field.name, field.name), getattr(mark, field.name)
         if field.name == "error":
-            found |= {} if value is None else {name: [y(each) for each in np.nan_to_num(value)]}
+            found |= {} if value is None else {name: [rounded(each, *y) for each in np.nan_to_num(value)]}
         elif isinstance(value, np.ndarray):
-            found[name] = x.places(value) if name == "x" else y(value)
+            values = value.astype(np.float64)
+            found[name] = _places(values, *x) if name == "x" else rounded(values, *y)
         elif field.name in _ON_PAPER or value == getattr(Mark, field.name, None):
             continue
         elif value or field.default is MISSING:

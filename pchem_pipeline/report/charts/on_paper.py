@@ -108,18 +108,6 @@ class Look:
         """Whether panels have room side by side."""
         return self.width_mm > 1.5 * COLUMN_MM
 
-    def empty(self, height_mm: float) -> Drawing:
-        """Return an empty drawing of that height with a canvas of its own."""
-        size = (inches(self.width_mm), inches(height_mm))
-        drawing = Drawing(figsize=size, layout="constrained")
-        drawing.look = self
-        FigureCanvasAgg(drawing)
-        return drawing
-
-    def parameters(self) -> Any:
-        """Return the parameters of matplotlib that make this look."""
-        return {**_STYLE, **LIGHT.parameters(), "svg.fonttype": "none" if self.svg_text else "path"}
-
 
 class Drawing(MatplotlibFigure):
     """A drawn figure that is saved in its own look, and that notebooks show."""
@@ -142,7 +130,8 @@ def _in(look: Look) -> Iterator[None]:
     with mpl.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         mpl.rcdefaults()
-        mpl.rcParams.update(look.parameters())
+        mpl.rcParams.update(_STYLE | LIGHT.parameters())
+        mpl.rcParams["svg.fonttype"] = "none" if look.svg_text else "path"
         yield
 
 
@@ -262,12 +251,10 @@ def _drawn(look: Look, chart: Chart) -> Drawing:
     ]
     keys = _keys(chart, look)
     lines = sum(1 + text.count("\n") for text in keys)
-    drawing = look.empty((sum(heights) or 40.0) + (5.0 + _LINE_MM * lines if keys else 0.0))
-    if not rows:
-        axes = drawing.add_subplot()
-        axes.text(0.5, 0.5, chart.empty, ha="center", va="center", transform=axes.transAxes)
-        axes.set_axis_off()
-        return drawing
+    height_mm = sum(heights) + (5.0 + _LINE_MM * lines if keys else 0.0)
+    drawing = Drawing(figsize=(inches(look.width_mm), inches(height_mm)), layout="constrained")
+    drawing.look = look
+    FigureCanvasAgg(drawing)  # a canvas of its own
     widths = chart.widths if columns > 1 else (1.0,)
     grid = drawing.add_gridspec(len(rows), columns, height_ratios=heights, width_ratios=widths)
     handles: dict[str, Handle] = {}
@@ -387,15 +374,6 @@ def _end(axes: Axes, name: str, axis: Axis) -> None:
         getattr(axes, f"set_{name}lim")(*ends)
 
 
-def _style(mark: Mark) -> dict[str, Any]:
-    return {
-        "color": colour_of(mark.colour),
-        "linewidth": mark.width,
-        "linestyle": _DASHES.get(mark.dash, mark.dash),
-        "alpha": None if mark.alpha == 1.0 else mark.alpha,
-    }
-
-
 def colour_of(name: str) -> str:
     """Return the colour of that name in the palette; others are colours already."""
     return str(getattr(LIGHT, name, name))
@@ -403,17 +381,13 @@ def colour_of(name: str) -> str:
 
 def _draw_mark(axes: Axes, mark: Mark, look: Look, order: int) -> Handle:
     """Draw a mark over those before it and return what a legend shows of it."""
-    style: dict[str, Any] = {
-        **_style(mark),
+    area: dict[str, Any] = {
+        "color": colour_of(mark.colour),
+        "alpha": None if mark.alpha == 1.0 else mark.alpha,
         "label": mark.label or None,
         "zorder": 1.0 + 0.01 * order,
     }
-    area = {
-        "color": style["color"],
-        "alpha": style["alpha"],
-        "label": style["label"],
-        "zorder": style["zorder"],
-    }
+    style: dict[str, Any] = {"linewidth": mark.width, "linestyle": _DASHES.get(mark.dash, mark.dash), **area}
     match mark:
         case Line():
             dots: dict[str, Any] = {"marker": "o", "markersize": mark.dots} if mark.dots else {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -83,11 +84,11 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
 def ensembles_figures(runs: Sequence[RunFacts]) -> Iterator[Figure]:
     """Return the ensembles of runs over each other, where at least two have one."""
     runs = [run for run in runs if "density" in run.ensemble]
-    if len(runs) < 2:
+    tables = ensemble_tables(runs)
+    if len(runs) < 2 or not tables:
         return
     highest = (run.ensemble["dn"][int(np.argmax(run.ensemble["density"]))] for run in runs)
     peaks = ", ".join(f"{run.title}: {int(dn)} DN" for run, dn in zip(runs, highest, strict=True))
-    tables = ensemble_tables(runs)
     yield Figure(
         "ensembles",
         "",
@@ -155,16 +156,13 @@ def _limit(known: FloatArray, least: float) -> float:
 
 
 def ensembles_chart(tables: Sequence[DataTable]) -> Chart:
-    """Return the chart of the ensemble histograms of runs over each other, raw and NUCed (fig:ensemble_plot).
+    """Return the chart of :func:`ensemble_tables`: runs over each other, raw and NUCed (fig:ensemble_plot).
 
     The strip below each shows the difference to the first run in standard errors of counting.
-
-    Args:
-        tables: of :func:`ensemble_tables`.
     """
     titles = {half.part: half.title for half in HALVES}
     stacks = tuple(_one_half(table, unit_text(table.units["signal"]), titles[table.part]) for table in tables)
-    return Chart(stacks, empty="no ensemble histograms")
+    return Chart(stacks)
 
 
 def _one_half(table: DataTable, unit: str, title: str) -> Stack:
@@ -228,20 +226,19 @@ def history_figures(rows: Sequence[HistoryRow], labelled: bool) -> Iterator[Figu
         ordered = by_date = False
     at = places - (places.min() if by_date else 0.0) if ordered else np.arange(len(rows), dtype=np.float64)
     axis = "days since the first" if by_date else "label" if ordered else "run"
-    columns: dict[str, object] = {
-        "run": [row.run.name for row in rows],
-        "label": [row.label for row in rows],
-        axis: at,
+    heads = ("run", "label") if by_date else ("name", "text")
+    columns: dict[str, Any] = {
+        heads[0]: [row.run.name for row in rows],
+        heads[1]: [row.label for row in rows],
     }
-    if axis in ("run", "label"):
-        columns = {"name": columns["run"], "text": columns["label"], axis: at}
+    columns[axis] = at
     units = {}
     for name in shown:
         for part, key in enumerate(("median", "standard error", "scatter")):
             heading = f"{name} {key}"
             columns[heading] = [row.run.summary[name][part] for row in rows]
             units[heading] = symbol(name)[2].replace("e⁻", "e-")
-    table = DataTable(columns, units)  # type: ignore[arg-type]
+    table = DataTable(columns, units)
     first, last = rows[0], rows[-1]
     words = "; ".join(
         f"{symbol(name)[1]} from {short(first.run.summary[name][0])} to {short(last.run.summary[name][0])} "

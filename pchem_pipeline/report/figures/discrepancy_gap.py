@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -96,9 +95,9 @@ def _gap_tables(found: Verdict) -> tuple[DataTable, ...]:
     bars, parts = gap_bars(found), families(found)
     if not bars:
         return ()
-    names = [each.name for each in fields(GapBar)]
-    columns = {name: [getattr(bar, name) for bar in bars] for name in names}
-    columns = {"model": columns.pop("label"), **columns, "floor": [MICRO * found.gap.floor] * len(bars)}
+    names = ("model", *GapBar._fields[1:])
+    columns = dict(zip(names, map(list, zip(*bars, strict=True)), strict=True))
+    columns["floor"] = [MICRO * found.gap.floor] * len(bars)
     tables = [DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), _GAP_UNIT))]
     if parts:
         shares = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
@@ -149,8 +148,7 @@ def _gap_alt(found: Verdict) -> str:
     return "; ".join([*words, f"floor {micronats(found.gap.floor)}"])
 
 
-@dataclass(frozen=True)
-class GapBar:
+class GapBar(NamedTuple):
     """One line of the gap's figure: its label, its role, the gap and its interval in 1e-6 nats."""
 
     label: str

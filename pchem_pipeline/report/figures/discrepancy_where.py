@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,8 +161,7 @@ def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
     return f"{LINE_WORDS[line]}: {' and '.join(found) or 'not known'}"
 
 
-@dataclass(frozen=True)
-class PixelMap:
+class PixelMap(NamedTuple):
     """A statistic of every pixel in sigma, with its overall significance.
 
     Attributes:
@@ -448,11 +447,8 @@ def _has(data: DiscrepancyData, *names: str) -> bool:
 def code_table(arrays: Mapping[str, NDArray[Any]]) -> DataTable:
     """Return the counts of the codes and their residuals, (observed - expected) / sqrt(expected).
 
-    Args:
-        arrays: ``code_dn``, ``code_observed``, ``code_expected``; ``code_extended`` where effects were named.
-
-    Returns:
-        The codes where a count is seen or expected; none where there is no such code.
+    They are made of ``code_dn``, ``code_observed``, ``code_expected``, and ``code_extended`` where effects
+    were named, from the first to the last code where a count is seen or expected.
     """
     dn, observed, expected = (
         np.asarray(arrays[f"code_{name}"], dtype=np.float64) for name in ("dn", "observed", "expected")

@@ -18,6 +18,7 @@ from pchem_pipeline.report.charts.chart import (
     Dash,
     Level,
     Line,
+    Mark,
     Panel,
     Points,
     Stack,
@@ -29,7 +30,7 @@ from pchem_pipeline.report.figures.pixels import shown_bins
 from pchem_pipeline.report.style.wording import power_of_ten, scientific, short
 
 #: Suffix of a prediction to (name in the legend, hue, line style).
-_PREDICTIONS: dict[str, tuple[str, str, Dash]] = {
+PREDICTIONS: dict[str, tuple[str, str, Dash]] = {
     "independent": ("independent parameters", "vermilion", ":"),
     "dependent": ("dependent parameters", "blue", "--"),
     "exact": ("exact mean over pixels", "ink", "-"),
@@ -148,18 +149,13 @@ def case_name(constant: Sequence[str]) -> str:
 
 
 def ensemble_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, ...]:
-    """Return data and predictions of the ensemble, raw and after correction; either may lack.
-
-    Args:
-        arrays: group ``ensemble`` of the store: ``dn``, ``counts``, ``density``, ``epcd_exact``, ... and
-            ``electrons``, ``nuced_counts``, ``nuced_density``, ``nuced_exact``, ...
-    """
+    """Return data and predictions of the group ``ensemble``, raw and after correction; either may lack."""
     tables = []
     for part, axis, data, model, unit, *_ in HALVES:
-        if axis not in arrays or f"{data}density" not in arrays:
+        if axis not in arrays or f"{data}density" not in arrays or not np.sum(arrays[f"{data}counts"]):
             continue
         columns = {axis: arrays[axis], "counts": arrays[f"{data}counts"]}
-        names = (f"{data}density", *(f"{model}{each}" for each in (*_PREDICTIONS, "stderr")))
+        names = (f"{data}density", *(f"{model}{each}" for each in (*PREDICTIONS, "stderr")))
         columns |= {name: arrays[name] for name in names if name in arrays}
         tables.append(DataTable(columns, dict.fromkeys(names, f"1/{unit}") | {axis: unit}, part))
     return tuple(tables)
@@ -190,19 +186,15 @@ def _held(case: str) -> str:
 def ensemble_chart(
     tables: Sequence[DataTable], rmse: Mapping[str, float], n_frames: int | None = None
 ) -> Chart:
-    """Return the chart of the ensemble histogram with the three EPCDs, raw and NUCed (fig:ensemble_plot).
+    """Return the chart of :func:`ensemble_tables`: data, the three EPCDs, differences (fig:ensemble_plot).
 
-    The strip below each shows data minus prediction; its gray band is two standard deviations of the
-    sampling noise of the data. On a page, a panel at the right shows all values on a logarithmic axis.
-
-    Args:
-        tables: of :func:`ensemble_tables`.
-        rmse: RMSE of each prediction under its name, and ``noise_floor``, ``nuced_noise_floor``.
-        n_frames: frames in the histogram, for the legend.
+    The strip below each shows data minus prediction over two standard deviations of the sampling noise. On a
+    page, a panel at the right shows all values on a logarithmic axis. The legend has the RMSE of each
+    prediction, and ``noise_floor``, ``nuced_noise_floor``.
     """
-    halves = [_Drawn(table, rmse, n_frames) for table in tables if table["counts"].sum() > 0]
+    halves = [_Drawn(table, rmse, n_frames) for table in tables]
     stacks = tuple(stack for half in halves for stack in (_bulk_stack(half), _tail_stack(half)))
-    return Chart(stacks, (2.4, 1.0), empty="no ensemble histogram")
+    return Chart(stacks, (2.4, 1.0))
 
 
 class _Drawn:
@@ -215,10 +207,10 @@ class _Drawn:
         self.step = float(np.median(np.diff(self.x))) if self.x.size > 1 else 1.0
         self.counts = table["counts"].astype(np.float64)
         self.density = table[f"{data}density"].astype(np.float64)
-        self.models = {each: table[model + each] for each in _PREDICTIONS if model + each in table}
+        self.models = {each: table[model + each] for each in PREDICTIONS if model + each in table}
         self.floor = rmse.get(f"{data}noise_floor")
         self.label = f"{words}, {n_frames:,} frames" if n_frames else words
-        self.rmse = {each: rmse[model + each] for each in _PREDICTIONS if model + each in rmse}
+        self.rmse = {each: rmse[model + each] for each in PREDICTIONS if model + each in rmse}
 
     def bars(self, where: slice, **style: Any) -> Steps:
         """Return the data as gray bars."""
@@ -230,7 +222,7 @@ class _Drawn:
         """Return a line for each prediction."""
         found = []
         for suffix, each in values.items():
-            words, hue, dash = _PREDICTIONS[suffix]
+            words, hue, dash = PREDICTIONS[suffix]
             label = f"{words}, RMSE {scientific(self.rmse[suffix])}" if suffix in self.rmse else words
             found.append(Line(self.x[where], each, colour=hue, dash=dash, label=label, **style))
         return found
@@ -292,10 +284,8 @@ def _tail_stack(half: _Drawn) -> Stack:
 def electrons_chart(table: DataTable) -> Chart:
     """Return the chart of estimated electron numbers against the predicted mass (eq. K_ensemble_pmf).
 
-    Args:
-        table: electron numbers ``k``, their share ``electron_mass`` among the estimates, the mass
-            ``electron_pmf`` predicted from the map of H; where known the mass ``electron_pmf_map`` that the
-            estimator itself should show, and ``electron_counts`` for the sampling noise in the strip.
+    The table has ``k``, ``electron_mass`` and ``electron_pmf``; where they are known ``electron_pmf_map``,
+    which the estimator itself should show, and ``electron_counts``.
     """
     # the last number with a mass that can be seen, at least 1
     seen = np.flatnonzero(np.nan_to_num(np.maximum(table["electron_mass"], table["electron_pmf"])) > 1e-3)
@@ -304,21 +294,19 @@ def electrons_chart(table: DataTable) -> Chart:
     power = _power([mass - pmf])
     scale = 10.0**-power
     estimated = Bars(k, np.zeros(k.size), mass, colour="bars", label="estimated electron numbers")
-    above: list[Bars | Points] = [
-        estimated,
-        Points(k, pmf, colour="ink", size=3.2, label=r"predicted mass $p_{K_e}$"),
-    ]
-    below: list[Bars | Points | Level] = []
+    predicted = r"predicted mass $p_{K_e}$"
+    above: list[Mark] = [estimated, Points(k, pmf, colour="ink", size=3.2, label=predicted)]
+    below: list[Mark] = []
     if "electron_counts" in table and table["electron_counts"].sum() > 0:
         noise = 2.0 * scale * np.sqrt(mass / float(table["electron_counts"].sum()))
         below.append(Bars(k, -noise, noise, colour="band"))
     rest = scale * (mass - pmf)
-    below.append(Points(k, rest, colour="ink", size=3.0, label=above[1].label, listed=False))
+    below.append(Points(k, rest, colour="ink", size=3.0, label=predicted, listed=False))
     if "electron_pmf_map" in table:
         expected, words = table["electron_pmf_map"][: last + 1], "expected share"
-        cross = {"colour": "vermilion", "mark": "x", "size": 4.0, "label": words}
-        above.append(Points(k, expected, **cross))  # type: ignore[arg-type]
-        below.append(Points(k, scale * (mass - expected), listed=False, **cross))  # type: ignore[arg-type]
+        cross: dict[str, Any] = {"colour": "vermilion", "mark": "x", "size": 4.0, "label": words}
+        above.append(Points(k, expected, **cross))
+        below.append(Points(k, scale * (mass - expected), listed=False, **cross))
     below.append(Level(0.0, colour="ink", width=0.5))
     y = Axis("probability", 0.0, 1.1 * max(float(np.nanmax(mass, initial=0.0)), 1e-12))
     panels = (
@@ -342,12 +330,7 @@ _CASES: tuple[tuple[str, Dash], ...] = (
 
 
 def components_chart(table: DataTable, highlight: Sequence[str] = ()) -> Chart:
-    """Return the chart of the width of the EPCD's components against the electron number (Appendix B).
-
-    Args:
-        table: of :func:`component_table`.
-        highlight: cases drawn in colour, at most six; the others are gray.
-    """
+    """Return the chart of :func:`component_table` (Appendix B): at most six cases in colour, others gray."""
     chosen = dict(zip(map(_held, highlight), _CASES, strict=False))
     k = table["k"]
     gray, lines = [], []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.model.checks.multiple_testing import misfit
+from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
@@ -27,7 +28,7 @@ from pchem_pipeline.report.charts.chart import (
     Steps,
     y_window,
 )
-from pchem_pipeline.report.data import FEW_CHANNELS, LINE_MAPS, MAP_NAMES, ReportData
+from pchem_pipeline.report.data import FEW_CHANNELS, LINE_MAPS, MAP_NAMES, ReportData, reasons_in
 from pchem_pipeline.report.figures.figure import (
     DataTable,
     Figure,
@@ -114,13 +115,11 @@ def _map_alt(data: ReportData, name: str, what: str) -> str:
 
 def status_figures(data: ReportData) -> Iterator[Figure]:
     """Return the map of the fit status."""
-    status = data.fit.get("fit_status")
-    if status is None:
-        return
-    rows = status_counts(status, data.status_words)
+    status, rows = data.status, reasons_in(data.status)
     parts = [f"{count(int(((status == 0) & ~data.unfitted).sum()), data.noun)} with a good fit"]
     parts += [f"{count(n, data.noun)}: {text}" for _, text, n in rows]
-    reasons = dict(zip(("bit", "meaning", "pixels"), map(list, zip(*rows, strict=True)), strict=False))
+    columns = zip(*((int(bit), text, n) for bit, text, n in rows), strict=True)
+    reasons = dict(zip(("bit", "meaning", "pixels"), map(list, columns), strict=False))
     yield Figure(
         "fit_status",
         "status",
@@ -164,12 +163,12 @@ def goodness_figures(data: ReportData) -> Iterator[Figure]:
 def map_tables(
     values: NDArray[Any], name: str, stderr: NDArray[Any] | None, known: Ordered
 ) -> tuple[DataTable, ...]:
-    """Return a map with its standard errors, and its histogram where one is drawn.
+    """Return a map (y, x) with its standard errors, and the histogram of its known values where one is drawn.
 
     Args:
-        values: map (y, x), NaN where there is no value.
-        name: name of the map in the store, e.g. ``"dark_current"``.
-        stderr: standard errors (y, x).
+        values: NaN where there is no value.
+        name: in the store, e.g. ``"dark_current"``.
+        stderr: of the values; None: not known.
         known: the values in their order.
     """
     unit = stored_unit(name)
@@ -189,14 +188,9 @@ def _histogram_table(known: Ordered, name: str, most: int) -> DataTable:
 
 
 def map_chart(tables: Sequence[DataTable], name: str, known: Ordered) -> Chart:
-    """Return the histogram of a map on top and the map below (Appendix C; fig:iD_map to fig:sigmaR_map).
+    """Return the chart of :func:`map_tables`: the histogram, the map below (Appendix C; fig:iD_map ...).
 
     A sensor of one row or column (ready-made histograms) is drawn as points with error bars.
-
-    Args:
-        tables: of :func:`map_tables`.
-        name: name of the map in the store.
-        known: the values in their order.
     """
     full = tables[0][name]
     sign, words, unit = symbol(name)
@@ -261,43 +255,19 @@ def _padded(shown: DisplayRange) -> tuple[float, float]:
     return shown.low - margin, shown.high + margin
 
 
-def status_counts(fit_status: NDArray[Any], words: Mapping[int, str]) -> list[tuple[int, str, int]]:
-    """Return ``(bit, sentence, pixels)`` of each bit that occurs, in the order of ``words``.
-
-    A pixel with several bits counts for each of them. Bits that have no sentence are called by their number.
-
-    Args:
-        fit_status: status words, any shape.
-        words: bit to sentence.
-    """
-    found = np.bincount(np.asarray(fit_status).ravel())
-    status = np.flatnonzero(found)
-    known = {int(bit): text for bit, text in words.items() if int(bit)}
-    rest = int(np.bitwise_or.reduce(status, initial=0))
-    for bit in known:
-        rest &= ~bit
-    known |= {1 << i: f"status bit {1 << i}" for i in range(rest.bit_length()) if rest >> i & 1}
-    counts = [(bit, text, int(found[status[(status & bit) != 0]].sum())) for bit, text in known.items()]
-    return [row for row in counts if row[2]]
-
-
 def status_chart(
-    status: NDArray[Any], rows: Sequence[tuple[int, str, int]], unfitted: BoolArray | None = None
+    status: NDArray[Any], rows: Sequence[tuple[FitStatus, str, int]], unfitted: BoolArray | None = None
 ) -> Chart:
     """Return where fits failed or deserve caution, with a legend of sentences.
 
-    A pixel with several bits has the colour of the first of them in ``rows``; the legend counts every bit.
-
-    Args:
-        status: status words (y, x).
-        rows: of :func:`status_counts`.
-        unfitted: pixels that no fit has reached yet (y, x).
+    A pixel with several bits has the colour of the first of them in the rows of :func:`reasons_in`; every bit
+    counts in the legend. Pixels that no fit has reached yet have a colour of their own.
     """
     last = len(_STATUS_COLOURS) - 1
     missing = None if unfitted is None or not unfitted.any() else unfitted & (status == 0)
     colour_of_word = np.zeros(int(status.max(initial=0)) + 1, np.uint8)
     for index in range(len(rows), 0, -1):
-        colour_of_word[(np.arange(colour_of_word.size) & rows[index - 1][0]) != 0] = min(index, last - 1)
+        colour_of_word[(np.arange(colour_of_word.size) & int(rows[index - 1][0])) != 0] = min(index, last - 1)
     colour = colour_of_word[status]
     good = int(np.count_nonzero(status == 0))
     keys = [("band", f"good fit: {_share(good, status.size)}")]

@@ -51,9 +51,9 @@ _RANGE = (0.03, 60.0)  # %
 def method_figures(data: ReportData) -> Iterator[Figure]:
     """Return the figure of the comparison, where one was made."""
     result = data.methods
-    if result is None:
+    known = [] if result is None else [method for method in result["methods"] if method["errors"]]
+    if result is None or not (known or result["study"]):
         return
-    known = [method for method in result["methods"] if method["errors"]]
     words = [
         f"{method['title']}: {percent_text(method['errors']['conversion_gain'].get('rmse'))} %"
         for method in known
@@ -109,7 +109,7 @@ def _methods_chart(result: Mapping[str, Any]) -> Chart:
     letters = ("(a) ", "(b) ") if study and known else ("", "")
     stacks = [_study(study, letters[0])] if study else []
     stacks += [_run(known, letters[1])] if known else []
-    return Chart(tuple(stacks), (1.5, 1.0) if len(stacks) > 1 else (1.0,), empty="nothing to compare")
+    return Chart(tuple(stacks), (2.3, 1.0) if len(stacks) > 1 else (1.0,))
 
 
 def _study(study: Sequence[Mapping[str, Any]], letter: str) -> Stack:
@@ -133,7 +133,7 @@ def _study(study: Sequence[Mapping[str, Any]], letter: str) -> Stack:
         words = Words(crossing, 0.02, f" {crossing:.2f} e⁻", "left", colour="faint")
         marks += [Level(crossing, "x", colour="#999999", width=0.7, dash=":"), words]
     ticks = ((0.1, "0.1"), (1.0, "1"), (10.0, "10"), (100.0, "100"))
-    y = Axis("rms error of the gain (%)", _RANGE[0], 40 * _RANGE[1], log=True, ticks=ticks)
+    y = Axis("rms error of the gain (%)", _RANGE[0], 150 * _RANGE[1], log=True, ticks=ticks)
     panel = Panel(y, tuple(marks), legend="upper left", columns=2)
     title = f"{letter}simulated pixels, as many frames for each"
     return Stack((panel,), Axis("read noise (e⁻)"), title, height_mm=86.0)

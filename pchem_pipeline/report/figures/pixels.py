@@ -45,7 +45,7 @@ def cell_figures(data: ReportData) -> Iterator[Figure]:
     pixel = next((pixel for pixel in data.pixels if has_fit(pixel.parameters)), None)
     if pixel is None:
         return
-    tables = cell_tables(pixel.parameters, pixel)
+    tables = cell_tables(pixel)
     edges = thresholds(*_theta(pixel.parameters), 4)
     first = ", ".join(short(float(edge), 4) for edge in edges if np.isfinite(edge))
     yield Figure(
@@ -136,17 +136,14 @@ def _density(pixel: PixelFit, dn: IntArray) -> FloatArray:
 
 def has_fit(parameters: Mapping[str, float]) -> bool:
     """Tell whether the four parameters of the PCD are all known and describe a density."""
-    values = [parameters.get(name, float("nan")) for name in PARAMETERS]
+    values = _theta(parameters)
     return bool(np.all(np.isfinite(values))) and values[1] > 0 and values[3] > 0 and values[0] >= 0
 
 
 def _theta(parameters: Mapping[str, float]) -> tuple[float, float, float, float]:
-    return (
-        parameters["quanta_exposure"],
-        parameters["conversion_gain"],
-        parameters["bias"],
-        parameters["read_noise_dn"],
-    )
+    """Return (H, g, mu, sigma); NaN where one is not known."""
+    exposure, gain, bias, sigma = (parameters.get(name, float("nan")) for name in PARAMETERS)
+    return exposure, gain, bias, sigma
 
 
 def _bars(counts: NDArray[Any], origin: int, where: slice) -> Steps:
@@ -180,10 +177,7 @@ def pixels_chart(pixels: Sequence[PixelFit]) -> Chart:
 
     Gray bars are the share of frames at each DN, the black line is the fitted density, or under a model with
     effects the mass of each DN. The strip below shows ``(count - expected) / sqrt(expected)`` where at least
-    one frame is expected.
-
-    Args:
-        pixels: any number; two in a row on a page, one in a row on a column.
+    one frame is expected. Of several pixels two are in a row on a page.
     """
     many = len(pixels) > 1
     stacks = [
@@ -257,15 +251,12 @@ def _title(pixel: PixelFit, letter: str) -> str:
     return "\n".join(lines)
 
 
-def cell_tables(parameters: Mapping[str, float], pixel: PixelFit) -> tuple[DataTable, ...]:
-    """Return a density, the edges between the cells of its electron numbers, and the pixel's histogram.
-
-    Args:
-        parameters: the four parameters of the PCD.
-        pixel: whose histogram is drawn behind.
-    """
-    theta = _theta(parameters)
-    low, high, last = cell_range(*theta)
+def cell_tables(pixel: PixelFit) -> tuple[DataTable, ...]:
+    """Return a pixel's density, the edges between the cells of its electron numbers, and its histogram."""
+    theta = _theta(pixel.parameters)
+    exposure, gain, bias, sigma = theta
+    last = int(np.ceil(exposure + 3.0 * np.sqrt(max(exposure, 0.3)))) + 1
+    low, high = bias - 4.0 * sigma, bias + last / gain + 4.0 * sigma
     x = np.linspace(low, high, 1200)
     edges = thresholds(*theta, last + 1)
     edges = edges[edges < high]
@@ -279,11 +270,7 @@ def cell_tables(parameters: Mapping[str, float], pixel: PixelFit) -> tuple[DataT
 
 
 def cells_chart(tables: Sequence[DataTable]) -> Chart:
-    """Return the chart of a PCD with the optimal edges between electron numbers (eq. demarg_K_eqn).
-
-    Args:
-        tables: of :func:`cell_tables`.
-    """
+    """Return the chart of :func:`cell_tables`: a PCD with the edges between numbers (eq. demarg_K_eqn)."""
     density, between, histogram = tables
     x, edges, dn = density["signal"], between["edge"], histogram["dn"]
     low, high = float(x[0]), float(x[-1])
@@ -302,16 +289,3 @@ def cells_chart(tables: Sequence[DataTable]) -> Chart:
     ]
     panel = Panel(Axis("density (1/DN)", 0.0, top), (bars, curve, dashed, *words))
     return Chart((Stack((panel,), Axis("signal (DN)", low, high), height_mm=55.0),), legend=(3, 3))
-
-
-def cell_range(exposure: float, gain: float, bias: float, sigma: float) -> tuple[float, float, int]:
-    """Return the signals between which cells are drawn (DN), and the last electron number among them.
-
-    Args:
-        exposure: H, e-.
-        gain: g, e-/DN.
-        bias: mu, DN.
-        sigma: read noise, DN.
-    """
-    last = int(np.ceil(exposure + 3.0 * np.sqrt(max(exposure, 0.3)))) + 1
-    return bias - 4.0 * sigma, bias + last / gain + 4.0 * sigma, last

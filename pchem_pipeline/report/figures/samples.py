@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.model.maps.maps import summarise
 from pchem_pipeline.report.charts.chart import Axis, Chart, Level, Line, Mark, Panel, Points, Stack
 from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.figures.figure import DataTable, Figure
@@ -113,14 +114,9 @@ def _transfer_table(samples: Samples, bias: NDArray[Any]) -> DataTable:
 
 def middle(values: NDArray[Any]) -> tuple[float, float, float, float]:
     """Return median, its standard error, and the 16 % and 84 % percentiles of the finite values."""
-    known = np.sort(finite(values))
-    if known.size == 0:
-        return (float("nan"),) * 4
-    low, centre, high = (float(q) for q in np.quantile(known, [0.1587, 0.5, 0.8413]))
-    # of the median, from the ranks half a standard deviation of the rank to either side
-    half, ranks = 0.5 * np.sqrt(known.size), np.arange(known.size)
-    ends = np.interp([0.5 * (known.size - 1) - half, 0.5 * (known.size - 1) + half], ranks, known)
-    return centre, 0.5 * float(ends[1] - ends[0]), low, high
+    found = summarise(np.asarray(values, np.float64), percentiles=(15.87, 84.13))
+    low, high = found.percentiles.values()
+    return found.median, found.median_stderr, low, high
 
 
 def _exposures_chart(table: DataTable, line: tuple[float, float, float]) -> Chart:

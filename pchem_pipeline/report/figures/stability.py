@@ -16,12 +16,13 @@ from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.inspector import AT_ONCE
 from pchem_pipeline.report.style.wording import count, short
 
 #: Points of a curve at most; longer runs are averaged over frames, spectra over frequencies.
 _MOST_POINTS, _MOST_FREQUENCIES = 1200, 160
 _LINES = ("row", "column")
+#: Values of lines that are worked on at a time.
+_AT_ONCE = 1 << 17
 _WIDTH = math.sqrt(math.pi / 2.0)  # standard error of a median over that of a mean
 
 
@@ -173,7 +174,7 @@ def line_spectra(sums: StackSums) -> tuple[DataTable, ...]:
 
 def _line_power(lines: Lines, length: int) -> FloatArray:
     """Return the mean power of the sums of lines along the sensor, over that of independent pixels."""
-    power, step = np.zeros(length // 2 + 1), max(1, AT_ONCE // length)
+    power, step = np.zeros(length // 2 + 1), max(1, _AT_ONCE // length)
     groups = lines.variance.size // length
     for start in range(0, lines.sums.shape[0] * groups, step):
         frames = slice(start // groups, -(-(start + step) // groups))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ from pchem_pipeline.report.figures.compare import difference_figures, ensembles_
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, draw_here, render_page
 from pchem_pipeline.report.pages.summary import Flag, Level
-from pchem_pipeline.report.pages.tables import Table, rmse_unit, rmse_words
+from pchem_pipeline.report.pages.tables import RMSES, Table
 from pchem_pipeline.report.style.wording import (
     count,
     cut,
@@ -186,18 +187,18 @@ def history_table(found: Comparison) -> Table:
         flagged = {name.replace("_", " "): n for name, n in row.flags.items() if n}
         moved = {symbol(name)[1]: n for name, n in row.moved.items() if n}
         rows.append(
-            (
-                row.run.label if row.label == row.date else row.label,
-                row.date[:16].replace("T", " "),
-                "" if row.temperature is None else f"{row.temperature:.4g}",
-                row.run.title,
-                f"{row.run.pixels[0]:,}",
-                _hot_words(row),
-                ", ".join(f"{name}: {n:,}" for name, n in flagged.items()) or "none",
-                ", ".join(row.effects) or "none",
-                f"{row.any_moved:,} of {row.compared:,}" if row.compared else "",
-                ", ".join(f"{name} {n:,}" for name, n in moved.items()),
-            )
+            {
+                "label": row.run.label if row.label == row.date else row.label,
+                "date": row.date[:16].replace("T", " "),
+                "°C": "" if row.temperature is None else f"{row.temperature:.4g}",
+                "run": row.run.title,
+                "good pixels": f"{row.run.pixels[0]:,}",
+                "hot": _hot_words(row),
+                "flags": ", ".join(f"{name}: {n:,}" for name, n in flagged.items()) or "none",
+                "effects": ", ".join(row.effects) or "none",
+                "changed": f"{row.any_moved:,} of {row.compared:,}" if row.compared else "",
+                "in": ", ".join(f"{name} {n:,}" for name, n in moved.items()),
+            }
         )
     return Table(
         "history-runs",
@@ -205,8 +206,7 @@ def history_table(found: Comparison) -> Table:
         "Changed: pixels with a good fit in both runs whose value differs significantly from the first run "
         f"(false-discovery rate {found.rate:g} over all pixels and maps). All medians: history.csv, one line "
         "per run.",
-        ("label", "date", "°C", "run", "good pixels", "hot", "flags", "effects", "changed", "in"),
-        tuple(rows),
+        rows,
     )
 
 
@@ -224,35 +224,29 @@ def _hot_words(row: HistoryRow) -> str:
 def run_table(found: Comparison) -> Table:
     """Return the runs side by side: sensor, frames, pixels, medians, RMSE."""
     runs = found.runs
-    rows: list[tuple[str, ...]] = [
-        ("pixels", *(f"{run.shape[0]} × {run.shape[1]}" for run in runs)),
-        ("frames", *("not known" if run.n_frames is None else f"{run.n_frames:,}" for run in runs)),
-    ]
+    rows = {
+        "pixels": [f"{run.shape[0]} × {run.shape[1]}" for run in runs],
+        "frames": ["not known" if run.n_frames is None else f"{run.n_frames:,}" for run in runs],
+    }
     for place, grade in enumerate(_GRADES):
-        rows.append(
-            (
-                grade,
-                *(f"{run.pixels[place]:,} ({percent(run.pixels[place], sum(run.pixels))})" for run in runs),
-            )
-        )
+        counts = [(run.pixels[place], sum(run.pixels)) for run in runs]
+        rows[grade] = [f"{n:,} ({percent(n, total)})" for n, total in counts]
     for name in dict.fromkeys(each for run in runs for each in run.summary):
-        nan = (float("nan"),) * 3
-        cells = [measured(*run.summary.get(name, nan)[:2], symbol(name)[2]) for run in runs]
-        rows.append((f"{heading(name)}, median", *cells))
+        medians = [run.summary.get(name, (math.nan, math.nan))[:2] for run in runs]
+        rows[f"{heading(name)}, median"] = [measured(*median, symbol(name)[2]) for median in medians]
     for name in dict.fromkeys(each for run in runs for each in run.rmse):
-        cells = [scientific(run.rmse[name]) if name in run.rmse else "not known" for run in runs]
-        rows.append((f"RMSE, {rmse_words(name)} ({rmse_unit(name)})", *cells))
-    return Table("runs", "Runs", "", ("", *(run.title for run in runs)), tuple(rows))
+        words, unit = RMSES.get(name, (name, "1/DN"))
+        rows[f"RMSE, {words} ({unit})"] = [
+            scientific(run.rmse[name]) if name in run.rmse else "not known" for run in runs
+        ]
+    titles = [run.title for run in runs]
+    cells = [{"": words} | dict(zip(titles, row, strict=True)) for words, row in rows.items()]
+    return Table("runs", "Runs", "", cells)
 
 
 def pair_tables(pair: Pair) -> list[Table]:
     """Return the tables of a run against the first one; empty ones are left out."""
-    tables = (
-        _map_table(pair),
-        _transitions(pair),
-        _settings(pair),
-        _versions(pair),
-    )
+    tables = (_map_table(pair), _transitions(pair), _settings(pair), _versions(pair))
     return [table for table in tables if table.rows]
 
 
@@ -262,15 +256,15 @@ def _map_table(pair: Pair) -> Table:
         reason = pair.reasons.get(name)
         verdict = "" if reason is None else "changed" if reason else "within sampling noise"
         rows.append(
-            (
-                heading(name),
-                measured(each.median, each.median_stderr) if each.median else "0",
-                f"{each.median_z:+.3f}".replace("-", "−"),
-                f"{each.spread_z:.3f}",
-                f"{each.n_changed:,} of {each.n_counted:,}",
-                short(each.largest_z),
-                verdict,
-            )
+            {
+                "map": heading(name),
+                "median": measured(each.median, each.median_stderr) if each.median else "0",
+                "median (σ)": f"{each.median_z:+.3f}".replace("-", "−"),
+                "scatter (σ)": f"{each.spread_z:.3f}",
+                "pixels changed": f"{each.n_changed:,} of {each.n_counted:,}",
+                "largest (σ)": short(each.largest_z),
+                "": verdict,
+            }
         )
     unit_words = (
         "Same frames: sigma is the standard error of one fit."
@@ -282,39 +276,31 @@ def _map_table(pair: Pair) -> Table:
         f"maps-{pair.other.label}",
         "Differences of the maps",
         f"{pair.other.label} − {pair.one.label}, pixels with a good fit in both runs. {unit_words}",
-        ("map", "median", "median (σ)", "scatter (σ)", "pixels changed", "largest (σ)", ""),
-        tuple(rows),
+        rows,
     )
 
 
 def _transitions(pair: Pair) -> Table:
-    rows = tuple(
-        (f"{_GRADES[i]} in {pair.one.label}", *(f"{int(n):,}" for n in row))
-        for i, row in enumerate(pair.transitions)
-    )
-    heads = tuple(f"{grade} in {pair.other.label}" for grade in _GRADES)
-    return Table(f"quality-{pair.other.label}", "Pixels by quality", "", ("", *heads), rows)
+    heads = [f"{grade} in {pair.other.label}" for grade in _GRADES]
+    rows = [
+        {"": f"{grade} in {pair.one.label}"} | dict(zip(heads, (f"{int(n):,}" for n in row), strict=True))
+        for grade, row in zip(_GRADES, pair.transitions, strict=False)
+    ]
+    return Table(f"quality-{pair.other.label}", "Pixels by quality", "", rows)
 
 
 def _settings(pair: Pair) -> Table:
-    return Table(
-        f"settings-{pair.other.label}",
-        "Settings that differ",
-        "",
-        ("setting", pair.one.label, pair.other.label, "read by"),
-        tuple((*_both(each), ", ".join(each.stages) or "no stage") for each in pair.settings),
-    )
+    rows = [
+        _both("setting", pair, each) | {"read by": ", ".join(each.stages) or "no stage"}
+        for each in pair.settings
+    ]
+    return Table(f"settings-{pair.other.label}", "Settings that differ", "", rows)
 
 
 def _versions(pair: Pair) -> Table:
-    return Table(
-        f"versions-{pair.other.label}",
-        "Versions that differ",
-        "",
-        ("program or algorithm", pair.one.label, pair.other.label),
-        tuple(_both(each) for each in pair.versions),
-    )
+    rows = [_both("program or algorithm", pair, each) for each in pair.versions]
+    return Table(f"versions-{pair.other.label}", "Versions that differ", "", rows)
 
 
-def _both(each: Setting) -> tuple[str, str, str]:
-    return each.name, cut(each.one, 80), cut(each.other, 80)
+def _both(what: str, pair: Pair, each: Setting) -> dict[str, str]:
+    return {what: each.name, pair.one.label: cut(each.one, 80), pair.other.label: cut(each.other, 80)}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from pchem_pipeline.base.units import typeset
 from pchem_pipeline.discrepancy.verdict import (
     CONVINCING_PLACEBO,
     RARE,
-    Candidate,
     GapChange,
     Place,
     Step,
@@ -19,6 +20,7 @@ from pchem_pipeline.discrepancy.verdict import (
     sigma_text,
 )
 from pchem_pipeline.effects.framework.region import Region
+from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import Finding, KeyFact, Section
@@ -52,15 +54,6 @@ def probability_text(p: float) -> str:
     if not math.isfinite(p):
         return ""
     return "< 0.001" if p < 0.001 else "> 0.999" if p > 0.999 else f"{p:.3f}"
-
-
-def parameter_texts(candidate: Candidate) -> list[tuple[str, str]]:
-    """Format the given fields of a candidate, numbers to three digits."""
-    return [
-        (name, f"{value:.3g}" if isinstance(value, int | float) else str(value))
-        for name, value in candidate.parameters.items()
-        if value is not None and not isinstance(value, list | dict)
-    ]
 
 
 def parameter_name(name: str) -> str:
@@ -110,23 +103,24 @@ def _frame_text(frames: Sequence[int]) -> str:
 
 
 def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
-    rows = tuple(
-        (
-            place.sentence or data.statistics.get(place.statistic, ("", ""))[1] or place.statistic,
-            place.channel or data.statistics.get(place.statistic, ("", ""))[0],
-            signed(place.z),
-            probability_text(place.p),
-            place_text(place) or "everywhere",
-            place.statistic,
+    rows = []
+    for place in places[:_MOST_PLACES]:
+        channel, sentence = data.statistics.get(place.statistic, ("", ""))
+        rows.append(
+            {
+                "disagreement": place.sentence or sentence or place.statistic,
+                "channel": place.channel or channel,
+                "sigma": signed(place.z),
+                "p": probability_text(place.p),
+                "where": place_text(place) or "everywhere",
+                "statistic": place.statistic,
+            }
         )
-        for place in places[:_MOST_PLACES]
-    )
     more = f" The first {_MOST_PLACES} of {len(places)}." if len(places) > _MOST_PLACES else ""
     return Table(
         "discrepancy-where",
         "Statistics that disagree",
         f"Deviation of each from the plain model in sigma, with its p-value; the largest first.{more}",
-        ("disagreement", "channel", "sigma", "p", "where", "statistic"),
         rows,
     )
 
@@ -134,23 +128,28 @@ def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
 def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     rows = []
     best = max((c.score for c in step.candidates if math.isfinite(c.score)), default=math.nan)
+    several = len(step.candidates) > 1
     # an empirical description has no competitors
     for candidate in step.candidates[: 0 if step.verdict == "described" else _MOST_CANDIDATES]:
         behind = candidate.score - best
+        given = {
+            name: f"{value:.3g}" if isinstance(value, int | float) else str(value)
+            for name, value in candidate.parameters.items()
+            if value is not None and not isinstance(value, list | dict)
+        }
         rows.append(
-            (
-                candidate.effect,
-                data.titles.get(candidate.effect, ""),
-                measured(candidate.score, candidate.stderr),
-                short(behind) if math.isfinite(behind) and behind < 0 else "best" if behind == 0 else "",
-                probability_text(candidate.probability) if len(step.candidates) > 1 else "only candidate",
-                ", ".join(f"{name} {value}" for name, value in parameter_texts(candidate)),
-            )
+            {
+                "effect": candidate.effect,
+                "name": data.titles.get(candidate.effect, ""),
+                "log-likelihood": measured(candidate.score, candidate.stderr),
+                "difference": short(behind) if -math.inf < behind < 0 else "best" if behind == 0 else "",
+                "probability": probability_text(candidate.probability) if several else "only candidate",
+                "parameters": ", ".join(f"{name} {value}" for name, value in given.items()),
+            }
         )
     if step.effect:
         outcome = f"{step.effect} was named"
     elif data.found.verdict == "ambiguous":
-        several = len(step.candidates) > 1
         outcome = "these data do not decide" if several else "not confirmed by the final samples"
     else:
         outcome = "none explains the data"
@@ -160,42 +159,40 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
         f"{title}: {outcome}",
         "Held-out log-likelihood and its standard error, difference to the best (nats, larger is better) and "
         "posterior probability.",
-        ("effect", "name", "log-likelihood", "difference", "probability", "parameters"),
-        tuple(rows),
+        rows,
     )
 
 
 def _rivals(data: DiscrepancyData) -> Table:
-    rows = tuple(
-        (
-            rival.effect,
-            data.titles.get(rival.effect, ""),
-            step.effect,
-            short(-rival.behind) if math.isfinite(rival.behind) else "not scored",
-            rival.why or "it has a lower log-likelihood",
-        )
-        for step in data.found.steps
-        if step.effect
-        for rival in step.rivals
-    )
     return Table(
         "discrepancy-rivals",
         "Rejected effects",
         "The next best effects, each fitted instead of the named one: difference of the held-out "
         "log-likelihood, nats, and reason of the rejection.",
-        ("effect", "name", "instead of", "log-likelihood lower by", "reason"),
-        rows,
+        [
+            {
+                "effect": rival.effect,
+                "name": data.titles.get(rival.effect, ""),
+                "instead of": step.effect,
+                "log-likelihood lower by": (
+                    short(-rival.behind) if math.isfinite(rival.behind) else "not scored"
+                ),
+                "reason": rival.why or "it has a lower log-likelihood",
+            }
+            for step in data.found.steps
+            if step.effect
+            for rival in step.rivals
+        ],
     )
 
 
 def _separate(steps: Sequence[Step]) -> Table:
-    rows = tuple(dict.fromkeys((rival, text) for step in steps for rival, text in step.separate.items()))
+    found = dict.fromkeys((rival, text) for step in steps for rival, text in step.separate.items())
     return Table(
         "discrepancy-separate",
         "Measurements that decide",
         "What distinguishes the effects above from similar ones.",
-        ("similar effect", "measurement: difference"),
-        rows,
+        [{"similar effect": rival, "measurement: difference": text} for rival, text in found],
     )
 
 
@@ -205,26 +202,26 @@ def _gaps(found: Verdict) -> Table:
         low, high = step.gap_interval_after
         interval = f" ({micronats(low)} to {micronats(high)})" if math.isfinite(low) else ""
         none = "none reduces it" if step.effect else "not fitted"
-        rivals = [
+        runner_up, placebo = (
             f"{micronats(rival.gap_after)} ({rival.effect})" if rival is not None else none
             for rival in (step.runner_up, step.placebo)
-        ]
+        )
         rows.append(
-            (
-                f"{i + 1}: {found.added(step) or step.verdict}",
-                micronats(step.gap_before),
-                f"{micronats(step.gap_after)}{interval}",
-                micronats(step.gap_floor),
-                *rivals,
-            )
+            {
+                "step": f"{i + 1}: {found.added(step) or step.verdict}",
+                "before": micronats(step.gap_before),
+                "after": f"{micronats(step.gap_after)}{interval}",
+                "floor": micronats(step.gap_floor),
+                "next best effect instead": runner_up,
+                "unrelated control instead": placebo,
+            }
         )
     return Table(
         "discrepancy-gap",
         "Gap by step",
         "Gap on held-out frames, micronats per sample, with 95 % interval. The next best effect and the "
         "unrelated control were fitted instead of the named effect.",
-        ("step", "before", "after", "floor", "next best effect instead", "unrelated control instead"),
-        tuple(rows),
+        rows,
     )
 
 
@@ -238,25 +235,24 @@ def _how(step: Step, found: Verdict) -> str:
 
 
 def _parameters(data: DiscrepancyData) -> Table:
-    rows = tuple(
-        (
-            f"{tag}: {name}",
-            value,
-            f"{data.title(tag)}{place}{_how(step, data.found)}",
-            data.sources.get(tag, ""),
-        )
-        for step in data.found.steps
-        for tag, place in [(step.likeliest, f", in {step.place}" if step.place else "")]
-        if tag and (step.effect or step.verdict == "described" or data.found.verdict == "ambiguous")
-        for name, value in _values(step).items()
-    )
+    effects = effect_classes()
     return Table(
         "discrepancy-parameters",
         "Parameters of the effects",
         "The strength with its standard error, and fixed parameters without one; names are keys of "
         "model.effects in the run's YAML.",
-        ("parameter", "value", "effect", "source"),
-        rows,
+        [
+            {
+                "parameter": f"{tag}: {name}",
+                "value": value,
+                "effect": f"{data.title(tag)}{place}{_how(step, data.found)}",
+                "source": effects[tag].source if tag in effects else "",
+            }
+            for step in data.found.steps
+            for tag, place in [(step.likeliest, f", in {step.place}" if step.place else "")]
+            if tag and (step.effect or step.verdict == "described" or data.found.verdict == "ambiguous")
+            for name, value in _values(step).items()
+        ],
     )
 
 
@@ -272,45 +268,48 @@ def _moved(found: Verdict) -> Table:
         for name, each in step.moved.items():
             unit = unit_text(each.unit)
             rows.append(
-                (
-                    f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
-                    f"{step.likeliest}{_how(step, found)}",
-                    short(each.median, 2) if math.isfinite(each.median) else "not known",
-                    signed(each.in_stderr),
-                )
+                {
+                    "parameter": f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
+                    "effect added": f"{step.likeliest}{_how(step, found)}",
+                    "change": short(each.median, 2),
+                    "in standard errors": signed(each.in_stderr),
+                }
             )
     return Table(
         "discrepancy-moved",
         "Changes of the parameter maps",
         "Median over the pixels concerned of (with the effect − without it), also in standard errors per "
         "pixel. An effect in fewer than half of them does not change a median.",
-        ("parameter", "effect added", "change", "in standard errors"),
-        tuple(rows),
+        rows,
     )
 
 
 def _untestable(data: DiscrepancyData) -> Table:
-    rows = tuple((tag, data.title(tag), why or "") for tag, why in data.found.untestable.items())
     return Table(
         "discrepancy-untestable",
         "Effects that are not testable with these data",
         "",
-        ("effect", "name", "reason, and data that would show it"),
-        rows,
+        [
+            {"effect": tag, "name": data.title(tag), "reason, and data that would show it": why or ""}
+            for tag, why in data.found.untestable.items()
+        ],
     )
 
 
 def _unexplained(places: Sequence[Place]) -> Table:
-    rows = tuple(
-        (place.sentence or place.statistic, signed(place.z), place_text(place), place.statistic)
-        for place in places[:_MOST_PLACES]
-    )
     return Table(
         "discrepancy-unexplained",
         "Unexplained",
         "Remaining disagreements with all named effects in the model.",
-        ("disagreement", "sigma", "where", "statistic"),
-        rows,
+        [
+            {
+                "disagreement": place.sentence or place.statistic,
+                "sigma": signed(place.z),
+                "where": place_text(place),
+                "statistic": place.statistic,
+            }
+            for place in places[:_MOST_PLACES]
+        ],
     )
 
 
@@ -319,8 +318,7 @@ def _defects(found: Verdict) -> Table:
         "discrepancy-defects",
         "Defects",
         "Candidates that failed and were not compared; the verdict does not cover them.",
-        ("effect", "error"),
-        tuple(found.defects.items()),
+        [{"effect": tag, "error": error} for tag, error in found.defects.items()],
     )
 
 
@@ -366,7 +364,8 @@ def _examined(data: DiscrepancyData) -> Table:
     if math.isfinite(found.work):
         rows.append(("counted work of the search, CPU s of a core of about 2020", f"{found.work:,.0f}"))
     rows += [(f"version: {name}", str(version)) for name, version in found.versions.items()]
-    return Table("discrepancy-examined", "Samples examined", "", ("item", "value"), tuple(rows))
+    cells = [{"item": item, "value": value} for item, value in rows]
+    return Table("discrepancy-examined", "Samples examined", "", cells)
 
 
 #: File of the verdict's own page in the folder of a run.
@@ -374,42 +373,42 @@ DISCREPANCY_PAGE = "discrepancy.html"
 
 #: Changes of a parameter in standard errors of a pixel: below these negligible, and none.
 _IMMATERIAL, _NOT_MOVED = 0.2, 0.01
-#: (id, heading, introduction, what is said where there is nothing to show) of the parts of the page.
-PARTS: tuple[tuple[str, str, str, str], ...] = (
-    (
+#: The parts of the page below the verdict.
+PARTS = (
+    Section(
         "signature",
         "Largest disagreement, before and after",
         "The statistic that the added effect changes most (else the largest disagreement), and all "
         "statistics before and after, in sigma.",
         "",
     ),
-    (
+    Section(
         "where",
         "Where data and model disagree",
         "Effects of light and charge show in the charge channel, effects of the electronics in the readout "
         "residuals. Figures show the training frames, numbers training and test frames.",
         "No data were kept for figures.",
     ),
-    (
+    Section(
         "evidence",
         "Identification of the effect",
         "Log-likelihood of each fitted candidate on test frames, relative to the best; larger is better. A "
         "difference below three standard errors is not decisive.",
         "No candidates were compared: data and model agree within sampling noise.",
     ),
-    (
+    Section(
         "shown",
         "Remaining gap between data and model",
         "Gap on held-out frames, micronats per sample.",
         "No gap was measured.",
     ),
-    (
+    Section(
         "parameters",
         "Parameters of the effect, and changes of the maps",
         "",
         "Nothing was added to the model.",
     ),
-    (
+    Section(
         "limits",
         "Limits of these data",
         "Effects that no number of frames of one constant exposure can show, and the samples examined.",
@@ -439,23 +438,19 @@ def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
         figures: of the verdict.
     """
     tables = discrepancy_tables(data)
-    parts = []
     first = _signature(data.found)
-    described = any(step.verdict == "described" for step in data.found.steps)
-    for id_, title, intro, empty in PARTS:
-        shown = [each for each in figures if each.section == id_ and each.name not in first]
-        if id_ == "signature":
+    words = {"where": {} if data.found.where else {"title": "Data and model side by side"}}
+    if any(step.verdict == "described" for step in data.found.steps):
+        described = "No known effect explains the disagreement; the empirical description has no rivals."
+        words["evidence"] = {"empty": described}
+    parts = []
+    for part in PARTS:
+        shown = [each for each in figures if each.section == part.id and each.name not in first]
+        if part.id == "signature":
             shown = [each for name in first for each in figures if each.name == name]
-        rows = tables.get(id_, [])
-        if id_ == "signature" and not shown:
-            continue  # no disagreement, or no data for figures
-        if id_ == "where" and not data.found.where:
-            title = "Data and model side by side"
-        if id_ == "evidence" and described:
-            empty = "No known effect explains the disagreement; the empirical description has no rivals."
-        missing = () if shown or rows else (empty,)
-        part = f"discrepancy-part-{id_}"
-        parts.append(Section(id=part, title=title, intro=intro, missing=missing, figures=shown, tables=rows))
+        section = part.filled(figures=shown, tables=tables.get(part.id, ()), **words.get(part.id, {}))
+        if section is not None:
+            parts.append(replace(section, id=f"discrepancy-part-{part.id}"))
     return parts
 
 
@@ -641,7 +636,7 @@ def _compared(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
     """State the share of the gap that the next best effect and an unrelated control close instead."""
 
     def short_title(tag: str) -> str:
-        return data.title(tag).partition(" (")[0]  # without synonyms
+        return re.sub(r" \(.*?\)", "", data.title(tag))  # without synonyms
 
     own, name = step.closed, short_title(step.effect or "")
     runner_up, placebo = step.runner_up, step.placebo

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
 from pchem_pipeline.model.maps.maps import hot_pixels
 from pchem_pipeline.report.data import ReportData
@@ -56,21 +56,23 @@ class EmvaRow:
 
 def emva_tables(data: ReportData) -> list[Table]:
     """Return the table of the report; of a line of channels or without values there is none."""
-    status = data.fit.get("fit_status")
-    if status is None or data.shape[0] == 1 or not all(data.has_values(name) for name in _NAMES):
+    if data.shape[0] == 1 or data.mostly_flagged or not all(map(data.has_values, _NAMES)):
         return []
-    if data.mostly_flagged:
-        return []
-    rows = tuple(
-        (row.quantity, row.symbol, row.text, row.definition_here, row.where_it_differs)
-        for row in emva_rows(data.maps, status, data.kind, data.outlier_sigmas)
-    )
+    rows = [
+        {
+            "quantity": row.quantity,
+            "symbol": row.symbol,
+            "value": row.text,
+            "definition here": row.definition_here,
+            "difference to EMVA 1288": row.where_it_differs,
+        }
+        for row in emva_rows(data.maps, data.status, data.kind, data.outlier_sigmas)
+    ]
     return [
         Table(
             "emva1288",
             "Data sheet quantities of EMVA 1288",
             f"Flagged {data.noun}s are excluded. As a file: pchem export {data.typed_run} --format emva",
-            ("quantity", "symbol", "value", "definition here", "difference to EMVA 1288"),
             rows,
             "emva",
         )
@@ -89,32 +91,52 @@ def emva_rows(
         outlier_sigmas: robust standard deviations above the median H from which a pixel is hot.
     """
     kept = (status & int(FAILED | FLAGGED)) == 0
-    maps, errors = _Kept(stored, kept), _Kept(stored, kept, "_stderr")
-    gain, exposure = maps["conversion_gain"], stored["quanta_exposure"]
+
+    def of(name: str) -> FloatArray:
+        values = stored[name][kept]
+        return values if values.size else np.full(1, np.nan)
+
+    gain, exposure = of("conversion_gain"), stored["quanta_exposure"]
     is_hot = hot_pixels(exposure, stored["quanta_exposure_stderr"], ~kept, outlier_sigmas)
     hot = int(is_hot.sum()) / max(int(np.isfinite(exposure).sum()), 1)
+    unknown: tuple[float | None, float | None] = (None, None)
+    response, current = unknown, unknown
+    if kind == "light":
+        response = _relative_spread(of("quanta_exposure"), of("quanta_exposure_stderr"))
+    if kind == "dark" and "dark_current" in stored and kept.any():
+        current = _mean(stored["dark_current"][kept])
     rows = [
         EmvaRow(
             "overall system gain", "K", *_mean(1.0 / gain), "DN/e-", "mean over the pixels of 1/g",
             "EMVA: one slope of temporal variance over mean for the whole sensor, above dark",
         ),
         EmvaRow(
-            "temporal dark noise", "sigma_d", *_root_mean_square(maps["read_noise_e"]), "e-",
+            "temporal dark noise", "sigma_d", *_root_mean_square(of("read_noise_e")), "e-",
             "root mean square over the pixels of the read noise sigma g, quantisation included",
             "EMVA: from dark frames, including shot noise of the dark current; excluded here",
         ),
         EmvaRow(
-            "temporal dark noise", "sigma_y.dark", *_root_mean_square(maps["read_noise_dn"]), "DN",
+            "temporal dark noise", "sigma_y.dark", *_root_mean_square(of("read_noise_dn")), "DN",
             "root mean square over the pixels of sigma, quantisation included", "as above",
         ),
-        _dsnu(maps, errors, kind),
-        _prnu(maps, errors, kind),
+        _dsnu(of, kind),
         EmvaRow(
-            "non-uniformity of the gain", "", *_relative_spread(gain, errors["conversion_gain"]), "%",
+            "photo response non-uniformity", "PRNU_1288 (similar)", *response, "%",
+            "standard deviation of H between the pixels over its mean, corrected for errors (input.kind: "
+            "light)",
+            "EMVA: at half saturation, dark subtracted, trends of the illumination filtered out; not done "
+            "here",
+        ),
+        EmvaRow(
+            "non-uniformity of the gain", "", *_relative_spread(gain, of("conversion_gain_stderr")), "%",
             "standard deviation of g between the pixels over its mean, corrected for their errors",
             "not in EMVA: K is one number for the sensor; PRNU combines gain and sensitivity",
         ),
-        _dark_current(stored.get("dark_current"), kept, kind),
+        EmvaRow(
+            "dark current from mean", "mu_I.mean", *current, "e-/px/s",
+            "mean over the pixels of H / integration time (input.kind: dark), or of its slope",
+            "EMVA: slope of the mean dark signal over six or more exposure times",
+        ),
         EmvaRow(
             "hot pixels", "", 100.0 * hot if kept.any() else np.nan, None, "%",
             f"pixels whose H is above the median by more than {outlier_sigmas:g} robust standard deviations",
@@ -131,19 +153,6 @@ def emva_rows(
         EmvaRow("dynamic range", "DR", None, None, "", "not determined", missing[1]),
     ]
     return rows
-
-
-@dataclass(frozen=True)
-class _Kept:
-    """The values of some pixels in each map, NaN where there are none; a map is large, so none is kept."""
-
-    stored: Mapping[str, NDArray[Any]]
-    pixels: BoolArray
-    suffix: str = ""
-
-    def __getitem__(self, name: str) -> FloatArray:
-        values = self.stored[f"{name}{self.suffix}"][self.pixels]
-        return values if values.size else np.full(1, np.nan)
 
 
 def _mean(values: FloatArray) -> tuple[float, float]:
@@ -175,16 +184,16 @@ def _relative_spread(values: FloatArray, stderr: FloatArray) -> tuple[float, flo
     return spread * scale, error * scale
 
 
-def _dsnu(maps: _Kept, errors: _Kept, kind: str) -> EmvaRow:
-    gain = float(np.median(maps["conversion_gain"]))
+def _dsnu(of: Callable[[str], FloatArray], kind: str) -> EmvaRow:
+    gain = float(np.median(of("conversion_gain")))
     if kind == "dark":
-        mean = maps["bias"] + maps["quanta_exposure"] / maps["conversion_gain"]
+        mean = of("bias") + of("quanta_exposure") / of("conversion_gain")
         # the mean of the samples is known far better than bias and H are: its own error is left in
         value, error = _spread(mean * gain, np.zeros_like(mean))
         words = "standard deviation of mu + H/g between the pixels, in e- by the median g"
         differs = "EMVA subtracts the temporal noise of the mean; not subtracted here"
     else:
-        value, error = _spread(maps["bias"] * gain, (errors["bias"] * gain) ** 2)
+        value, error = _spread(of("bias") * gain, (of("bias_stderr") * gain) ** 2)
         words = (
             "standard deviation of the bias between the pixels, in e- by the median g, corrected for errors"
         )
@@ -192,26 +201,3 @@ def _dsnu(maps: _Kept, errors: _Kept, kind: str) -> EmvaRow:
             "EMVA: from dark frames, dark current included; here the bias alone (input.kind is not dark)"
         )
     return EmvaRow("dark signal non-uniformity", "DSNU_1288", value, error, "e-", words, differs)
-
-
-def _prnu(maps: _Kept, errors: _Kept, kind: str) -> EmvaRow:
-    value, error = None, None
-    if kind == "light":
-        value, error = _relative_spread(maps["quanta_exposure"], errors["quanta_exposure"])
-    return EmvaRow(
-        "photo response non-uniformity", "PRNU_1288 (similar)", value, error, "%",
-        "standard deviation of H between the pixels over its mean, corrected for errors (input.kind: light)",
-        "EMVA: at half saturation, dark subtracted, trends of the illumination filtered out; not done here",
-    )  # fmt: skip
-
-
-def _dark_current(found: NDArray[Any] | None, kept: BoolArray, kind: str) -> EmvaRow:
-    value: float | None = None
-    error: float | None = None
-    if kind == "dark" and found is not None and kept.any():
-        value, error = _mean(found[kept])
-    return EmvaRow(
-        "dark current from mean", "mu_I.mean", value, error, "e-/px/s",
-        "mean over the pixels of H / integration time (input.kind: dark), or of its slope",
-        "EMVA: slope of the mean dark signal over six or more exposure times",
-    )  # fmt: skip

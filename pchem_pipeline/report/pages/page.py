@@ -6,8 +6,9 @@ import base64
 import gzip
 import importlib.resources
 import re
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
@@ -28,9 +29,13 @@ if TYPE_CHECKING:
 class Term:
     """A word of the field: how it is written in texts, and what it means."""
 
-    name: str
+    spellings: tuple[str, ...]
     meaning: str
-    spellings: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """How the list calls it."""
+        return self.spellings[0]
 
     @property
     def id(self) -> str:
@@ -39,138 +44,11 @@ class Term:
 
 
 #: In the order of the list.
-GLOSSARY: tuple[Term, ...] = (
-    Term(
-        "bias",
-        "The digital number (DN) at zero electrons, μ; also called offset or black level. Its spread between "
-        "pixels is a fixed-pattern noise.",
-    ),
-    Term(
-        "charge rate",
-        "Quanta exposure divided by integration time, electrons per pixel and second, whatever the source.",
-    ),
-    Term(
-        "conversion gain",
-        "Electrons per digital number, g (e⁻/DN). EMVA 1288 gives the inverse, the overall system gain "
-        "K = 1/g (DN/e⁻).",
-    ),
-    Term(
-        "dark current",
-        "Charge rate in the dark, electrons per pixel and second; only for frames with input.kind: dark.",
-    ),
-    Term("DN", "Digital number, the unit of raw data; also called ADU, count or LSB."),
-    Term(
-        "DSNU",
-        "Dark signal non-uniformity: spread between pixels of the mean dark signal. EMVA 1288 takes the "
-        "standard deviation of averaged dark frames, in e⁻.",
-        ("dark signal non-uniformity",),
-    ),
-    Term(
-        "ensemble",
-        "All values of all pixels in one histogram, as if the sensor were one pixel measured many times.",
-    ),
-    Term(
-        "fixed-pattern noise",
-        "Pattern that is the same in every frame: differences of bias (DSNU), dark current and gain between "
-        "pixels, rows and columns.",
-        ("fixed pattern",),
-    ),
-    Term(
-        "flagged",
-        "A pixel whose values the data do not fix, for example by one electron: the true errors are larger "
-        "than quoted. Flagged pixels are excluded from medians.",
-    ),
-    Term(
-        "gap",
-        "Kullback-Leibler divergence of the model from the data, on frames not used in the fit. More data do "
-        "not change it, but lower its floor (the value from sampling noise alone).",
-        ("floor",),
-    ),
-    Term(
-        "hot pixels",
-        "Pixels with far more charge than the others: H above its median by more than maps.outlier_sigmas "
-        "robust standard deviations. EMVA 1288 leaves the limit to the application.",
-        ("hot pixel",),
-    ),
-    Term(
-        "micronat",
-        "10⁻⁶ nat, the unit of the gap. N samples with a gap of G nats each have a likelihood ratio of "
-        "exp(N G) between data and model: a factor e for a million samples with 1 micronat.",
-        ("micronats",),
-    ),
-    Term(
-        "misfit",
-        "A pixel whose histogram the fitted density does not describe, at a given false-discovery rate.",
-        ("misfits",),
-    ),
-    Term(
-        "non-uniformity of the gain",
-        "Standard deviation of the conversion gain between pixels, relative to its mean. PRNU of EMVA 1288 "
-        "combines gain and sensitivity, measured under light.",
-    ),
-    Term(
-        "NUCed",
-        "After non-uniformity correction: each value minus its pixel's bias, times its gain, in electrons.",
-        ("non-uniformity correction",),
-    ),
-    Term(
-        "PCD",
-        "Photon counting distribution: a Poisson number of electrons with mean H, converted with gain g, on "
-        "top of the bias μ, with Gaussian read noise σ.",
-        ("photon counting distribution",),
-    ),
-    Term(
-        "placebo",
-        "Control: the best fit of an unrelated effect. A wrong effect can close as much of the gap.",
-        ("control",),
-    ),
-    Term(
-        "PRNU",
-        "Photo response non-uniformity: standard deviation of the response to light between pixels, relative "
-        "to its mean. Here computed from H under light; EMVA 1288 measures at half saturation.",
-        ("photo response non-uniformity",),
-    ),
-    Term("quanta exposure", "Mean number of electrons per pixel and frame, H (e⁻)."),
-    Term(
-        "read noise",
-        "Standard deviation that the readout adds to a pixel's signal, σ in DN or σ·g in e⁻, quantisation "
-        "included. Excludes dark shot noise, which the temporal dark noise of EMVA 1288 includes.",
-    ),
-    Term(
-        "readout and charge",
-        "Each sample is split by its pixel's fit into the expected number of electrons (charge) and the "
-        "remainder (readout). Effects of light appear in charge, effects of the electronics in readout.",
-        ("readout residuals", "readout channel", "charge channel"),
-    ),
-    Term(
-        "replicate",
-        "A stack simulated from the fitted model and analysed like the data; gives the sampling noise.",
-        ("replicates",),
-    ),
-    Term(
-        "RMSE",
-        "Root mean square difference between predicted and measured density of the ensemble; not 0 even for "
-        "a perfect model, because of sampling noise.",
-    ),
-    Term(
-        "sigma",
-        "Standard deviation of an estimate, or of a statistic between stacks simulated from the fitted "
-        "model. The largest of a hundred statistics is near 3 sigma by chance.",
-        ("sd",),
-    ),
-    Term(
-        "standard error",
-        "1 sigma error of an estimate, from the curvature of the likelihood.",
-        ("standard errors",),
-    ),
-    Term(
-        "temporal dark noise",
-        "Standard deviation of a pixel's dark signal from frame to frame (EMVA 1288: σ_d, σ_y.dark), shot "
-        "noise of the dark current included.",
-    ),
-)  # fmt: skip
+GLOSSARY = [
+    Term(tuple(key.split(" | ")), text) for key, text in tomllib.loads(text_of("glossary.toml")).items()
+]
 
-_BY_SPELLING = {spelling.lower(): term for term in GLOSSARY for spelling in (term.name, *term.spellings)}
+_BY_SPELLING = {spelling.lower(): term for term in GLOSSARY for spelling in term.spellings}
 _WORDS = "|".join(re.escape(word) for word in sorted(_BY_SPELLING, key=len, reverse=True))
 _ANY = re.compile(rf"(?<![\w-])(?:{_WORDS})(?![\w-])", re.IGNORECASE)
 
@@ -227,16 +105,17 @@ class Finding:
     remarks: Sequence[Flag] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Section:
     """A section of a page: its result, tables, figures, further tables.
 
     Attributes:
         id: anchor in the page.
         title: heading.
+        intro: introduction.
+        empty: sentence where there is nothing to show; empty: the section is left out.
         name: in the table of contents; empty: the title.
         verdict: what came out.
-        intro: introduction.
         missing: sentences on what is not shown, and why.
         first: tables above the figures.
         figures: between these and the others.
@@ -248,9 +127,10 @@ class Section:
 
     id: str
     title: str
+    intro: str = ""
+    empty: str = "Not shown: no data in this run."
     name: str = ""
     verdict: Finding | None = None
-    intro: str = ""
     missing: Sequence[str] = ()
     first: Sequence[Table] = ()
     figures: Sequence[Figure] = ()
@@ -258,6 +138,13 @@ class Section:
     kind: str = ""
     content: Any = None
     folded: bool = False
+
+    def filled(self, **content: Any) -> Section | None:
+        """Return the section with what it shows; without anything it says so, or is None."""
+        found = replace(self, **content)
+        if found.figures or found.tables or found.missing or found.kind:
+            return found
+        return replace(found, missing=(found.empty,)) if found.empty else None
 
 
 @dataclass(frozen=True)

@@ -1,23 +1,22 @@
 """The report: one HTML file without network access, and ``report.json``.
 
-The sections of the page are in one list, from top to bottom. A further one of figures and tables is a row in
-:data:`OPEN` or :data:`FOLDED`; figures and tables name its id. One of another kind is a maker in :data:`PAGE`
-and a template ``section_<kind>.html.j2``. The table of contents follows the list.
+The sections of the page are in one list, :data:`PAGE`, from top to bottom; the table of contents follows it.
+A further one of figures and tables is a row; these name its id. One of another kind has a template
+``section_<kind>.html.j2``, and what that shows comes from :data:`CONTENT`.
 What a paper would say of the run, and cite, is at the end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
 from importlib import metadata
+from typing import Any
 
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.samples import AXES, slope_of
-from pchem_pipeline.report.inspector import embedded, script
+from pchem_pipeline.report.inspector import embedded, text_of
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
 from pchem_pipeline.report.pages.emva import emva_tables
 from pchem_pipeline.report.pages.page import DrawAll, Drawn, Finding, Section, draw_here, render_page
@@ -33,62 +32,79 @@ from pchem_pipeline.report.pages.summary import (
 from pchem_pipeline.report.pages.tables import Table, method_tables, provenance_tables, result_tables
 from pchem_pipeline.report.style.wording import symbol
 
-#: (id, heading, introduction, parts that may be missing) of the sections that show figures; the first ones
-#: are open.
-OPEN: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
-    ("maps", "Parameter maps", "", ("maps", "charge_rate")),
-    (
+#: The sections from top to bottom.
+PAGE = (
+    Section(
+        "summary",
+        "Is the sensor within limits, and are these results reliable?",
+        name="Summary",
+        kind="summary",
+    ),
+    Section("maps", "Parameter maps"),
+    # what it shows lies at the end of the page
+    Section("inspector", "Look at pixels", kind="inspector"),
+    Section(
         "exposures",
         "Exposures",
-        "Each exposure has its own H. Slope against {against}: {noun}; offset: {offset} (or electrons in the "
-        "bias stack).",
-        ("samples",),
+        "Each exposure has its own H. Slope against {against}: {noun}; offset: {offset} (or electrons in "
+        "the bias stack).",
+        empty="",
     ),
-    (
+    Section(
         "photon-transfer",
         "Photon transfer",
         "Variance against mean. Points off the curve: nonlinearity, or samples of different gain.",
-        ("samples",),
+        empty="",
     ),
-    ("stability", "Stability and structure", "Drift in time, fixed-pattern noise, row and column noise.", ()),
-    ("status", "Fit status", "", ()),
-)
-FOLDED: tuple[tuple[str, str, str, tuple[str, ...]], ...] = (
-    ("pixels", "Single pixels", "Histograms with the fitted photon counting distribution.", ("pixels",)),
-    (
+    Section(
+        "stability", "Stability and structure", "Drift in time, fixed-pattern noise, row and column noise."
+    ),
+    Section("status", "Fit status"),
+    Section("discrepancy", "What the model is missing", kind="discrepancy"),
+    Section(
+        "pixels", "Single pixels", "Histograms with the fitted photon counting distribution.", folded=True
+    ),
+    Section(
         "goodness",
         "Does the model describe each pixel?",
         "Chi-square of merged bins; misfits at a given false-discovery rate. Samples far outside the model "
         "(cosmic rays, glitches) are excluded from the fit.",
-        (),
+        folded=True,
     ),
-    (
+    Section(
         "ensemble",
         "The sensor as a whole",
         "If the model holds, the parameters of the pixels predict the ensemble.",
-        ("ensemble", "nuced"),
+        folded=True,
     ),
-    (
+    Section(
         "electrons",
         "Electron numbers",
         "Most probable electron number of each sample of the ensemble.",
-        ("electrons",),
+        folded=True,
     ),
-    (
+    Section(
         "components",
         "Why the peaks of the ensemble blur",
         "Where pixels differ in gain, the peak of an electron number is the wider, the larger the number.",
-        ("components",),
+        folded=True,
     ),
-    ("uncertainty", "How precise are the numbers?", "", ()),
-    (
+    Section("uncertainty", "How precise are the numbers?", folded=True),
+    Section(
         "methods",
         "Comparison with other methods",
         "The same pixels analysed by methods of the literature, and the smallest possible errors.",
-        ("methods",),
+        folded=True,
     ),
-    ("plan", "How many frames are enough?", "", ()),
+    Section("plan", "How many frames are enough?", folded=True),
+    Section("tables", "Tables", empty="No pixel has a value.", folded=True),
+    Section("emva", "Quantities of EMVA 1288", empty="", folded=True),
+    Section("cite", "How to cite", kind="cite", folded=True),
+    Section("provenance", "Provenance", empty="Nothing was recorded.", folded=True),
+    Section("configuration", "Configuration", kind="text", folded=True),
 )
+#: Parts of the run that a section needs, where it is not the one of its name.
+_NEEDS = {"maps": ("maps", "charge_rate"), "ensemble": ("ensemble", "nuced")}
 
 #: How to read the figures of the section ``maps``: images, or lines of channels.
 _READ_IMAGES = (
@@ -99,48 +115,54 @@ _READ_CHANNELS = (
     "Points: channels with their standard errors; crosses at the bottom: channels without a value."
 )
 
-#: Sections that only a run of several samples has.
-_OF_SAMPLES = ("exposures", "photon-transfer")
 _NO_LINE = "The samples share g, μ and σ; no line was fitted (input.against: none)."
 
 
-@dataclass(frozen=True)
-class Material:
-    """What sections are made of.
+def page_sections(
+    data: ReportData, figures: Sequence[Figure], tables: Sequence[Table], verdict: Finding | None = None
+) -> list[Section]:
+    """Return the sections of a run's page, those that have nothing to show left out.
 
-    Attributes:
+    Args:
         data: what the run found.
         figures: all of the page; each names its section.
         tables: all tables of results; each names its section.
         verdict: on what the model is missing, or None where nobody looked.
     """
-
-    data: ReportData
-    figures: list[Figure]
-    tables: list[Table]
-    verdict: Finding | None = None
-
-    def figures_of(self, section: str) -> list[Figure]:
-        """Return the figures of a section, by its id."""
-        return [figure for figure in self.figures if figure.section == section]
-
-    def tables_of(self, section: str) -> list[Table]:
-        """Return the tables of a section, by its id."""
-        return [table for table in self.tables if table.section == section]
-
-
-Maker = Callable[[Material], Section | None]
-
-
-def page_sections(material: Material) -> list[Section]:
-    """Return the sections of a run's page; makers that have nothing to show return None."""
-    return [section for make in PAGE if (section := make(material)) is not None]
+    found = []
+    for each in PAGE:
+        parts = _NEEDS.get(each.id, (each.id,))
+        section = each.filled(
+            intro=_intro(each, data),
+            verdict=verdict if each.kind in ("summary", "discrepancy") else None,
+            figures=[figure for figure in figures if figure.section == each.id],
+            tables=[table for table in tables if table.section == each.id],
+            missing=[f"Not shown: {data.missing[part]}" for part in parts if part in data.missing],
+            # a joint fit has less to show
+            empty="" if data.samples is not None and each.empty == Section.empty else each.empty,
+            content=CONTENT[each.kind](data) if each.kind in CONTENT else each.content,
+        )
+        if section is not None:
+            found.append(section)
+    return found
 
 
-def _summary(material: Material) -> Section:
-    data = material.data
+def _intro(section: Section, data: ReportData) -> str:
+    """Return the introduction of a section; of maps and exposures it depends on the run."""
+    if section.id == "maps":
+        return _READ_CHANNELS if min(data.shape) < 2 else _READ_IMAGES
+    if section.id != "exposures" or data.samples is None:
+        return section.intro
+    words, slope = AXES.get(data.samples.against), slope_of(data)
+    if words is None:
+        return _NO_LINE
+    noun = symbol(slope)[1] if slope else "charge"
+    return section.intro.format(against=words[0], noun=noun, offset=symbol(words[3])[1])
+
+
+def _summary(data: ReportData) -> dict[str, Any]:
     remarks = flags(data)
-    content = {
+    return {
         "answers": answers(data, remarks),
         "caption": f"unflagged {data.noun}s" if data.often_flagged else f"{data.noun}s",
         "numbers": key_numbers(data),
@@ -151,97 +173,14 @@ def _summary(material: Material) -> Section:
         "passed": [flag for flag in remarks if flag.level == "good" and flag.about == "results"],
         "effects": data.discrepancy.found.effects if data.discrepancy else (),
     }
-    return Section(
-        id="summary",
-        title="Is the sensor within limits, and are these results reliable?",
-        name="Summary",
-        verdict=material.verdict,
-        figures=material.figures_of("summary"),
-        kind="summary",
-        content=content,
-    )
 
 
-def _inspector(_: Material) -> Section:
-    """Say where the inspector is; what it shows lies at the end of the page."""
-    return Section(id="inspector", title="Look at pixels", kind="inspector")
-
-
-def _part(row: tuple[str, str, str, tuple[str, ...]], folded: bool, material: Material) -> Section | None:
-    """Put figures and tables into their section; one without any says why."""
-    id_, title, intro, parts = row
-    data = material.data
-    if data.samples is None and id_ in _OF_SAMPLES:
-        return None
-    shown, tables = material.figures_of(id_), material.tables_of(id_)
-    missing = [data.missing[part] for part in parts if part in data.missing]
-    if not shown and not tables and not missing:
-        if data.samples is not None:
-            return None  # a joint fit has less to show
-        missing = ["no data in this run."]
-    if id_ == "maps":
-        intro = _READ_CHANNELS if min(data.shape) < 2 else _READ_IMAGES
-    if id_ == "exposures" and data.samples is not None:
-        words = AXES.get(data.samples.against)
-        slope = slope_of(data)
-        noun = symbol(slope)[1] if slope else "charge"
-        intro = intro.format(against=words[0], noun=noun, offset=symbol(words[3])[1]) if words else _NO_LINE
-    reasons = [f"Not shown: {reason}" for reason in missing]
-    return Section(
-        id=id_, title=title, intro=intro, missing=reasons, figures=shown, tables=tables, folded=folded
-    )
-
-
-def _discrepancy(material: Material) -> Section:
-    look = material.data.quick_look
-    content = {
-        "found": look is not None and bool(look.found),
-        "command": f"pchem discrepancy {material.data.typed_run}",
+def _discrepancy(data: ReportData) -> dict[str, Any]:
+    return {
+        "found": data.quick_look is not None and bool(data.quick_look.found),
+        "command": f"pchem discrepancy {data.typed_run}",
         "page": DISCREPANCY_PAGE,
     }
-    return Section(
-        id="discrepancy",
-        title="What the model is missing",
-        verdict=material.verdict,
-        tables=material.tables_of("discrepancy"),
-        kind="discrepancy",
-        content=content,
-    )
-
-
-def _tables(id_: str, title: str, empty: str, material: Material) -> Section | None:
-    """Put tables into their section; one without any says why, or is left out."""
-    tables = material.tables_of(id_)
-    missing = (empty,) if empty and not tables else ()
-    return (
-        Section(id=id_, title=title, missing=missing, tables=tables, folded=True) if tables or empty else None
-    )
-
-
-def _cite(material: Material) -> Section:
-    content = citation(material.data)
-    return Section(id="cite", title="How to cite", kind="cite", content=content, folded=True)
-
-
-def _configuration(material: Material) -> Section:
-    content = material.data.config_yaml
-    return Section(id="configuration", title="Configuration", kind="text", content=content, folded=True)
-
-
-#: The page from top to bottom.
-PAGE: tuple[Maker, ...] = (
-    _summary,
-    partial(_part, OPEN[0], False),
-    _inspector,
-    *(partial(_part, row, False) for row in OPEN[1:]),
-    _discrepancy,
-    *(partial(_part, row, True) for row in FOLDED),
-    partial(_tables, "tables", "Tables", "No pixel has a value."),
-    partial(_tables, "emva", "Quantities of EMVA 1288", ""),
-    _cite,
-    partial(_tables, "provenance", "Provenance", "Nothing was recorded."),
-    _configuration,
-)
 
 
 def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, str]:
@@ -258,7 +197,7 @@ def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, st
     verdict = None if data.discrepancy is None else finding(data.discrepancy)
     makers = (result_tables, method_tables, emva_tables, provenance_tables)
     tables = [table for make in makers for table in make(data)]
-    sections = page_sections(Material(data, shown, tables, verdict))
+    sections = page_sections(data, shown, tables, verdict)
     files = {}
     if data.discrepancy is not None and verdict is not None:
         parts = evidence(data.discrepancy, others)
@@ -269,7 +208,7 @@ def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, st
         "report.html.j2",
         sections,
         drawn,
-        *([script()] if inspector else []),
+        *([inspector["script"]] if inspector else []),
         title=data.title,
         data=data,
         inspector=inspector,
@@ -285,21 +224,6 @@ def _discrepancy_page(
         about += f"{', ' if about else ''}{data.n_frames:,} frames"
     sections = [Section(id="verdict", title="Verdict", verdict=verdict), *parts]
     return render_page("discrepancy.html.j2", sections, drawn, title=data.title, about=about)
-
-
-_VERIFICATION = """@article{Hendrickson2023,
-  author  = {Hendrickson, Aaron and Haefner, David P. and Shade, Nicholas R. and Fossum, Eric R.},
-  title   = {Experimental Verification of {PCH-EM} Algorithm for Characterizing {DSERN} Image Sensors},
-  journal = {arXiv preprint arXiv:2302.14654},
-  year    = {2023}
-}"""
-_SEVERAL = """@article{Hendrickson2024,
-  author  = {Hendrickson, Aaron J. and Haefner, David P. and Chan, Stanley H. and Shade, Nicholas R. and
-             Fossum, Eric R.},
-  title   = {{PCH-EM}: A Solution to Information Loss in the Photon Transfer Method},
-  journal = {arXiv preprint arXiv:2403.04498},
-  year    = {2024}
-}"""
 
 
 def citation(data: ReportData) -> dict[str, str]:
@@ -318,5 +242,14 @@ def citation(data: ReportData) -> dict[str, str]:
   title   = {{pchem\\_pipeline}},
   version = {{{version}}}
 }}"""
-    papers = [_VERIFICATION, *([] if data.samples is None else [_SEVERAL]), software]
-    return {"text": text, "bibtex": "\n\n".join(papers)}
+    papers = text_of("papers.bib").strip().split("\n\n")  # the second one is on several exposures
+    return {"text": text, "bibtex": "\n\n".join([*papers[: 1 if data.samples is None else 2], software])}
+
+
+#: What sections of a kind of their own show.
+CONTENT: dict[str, Callable[[ReportData], Any]] = {
+    "summary": _summary,
+    "discrepancy": _discrepancy,
+    "cite": citation,
+    "text": lambda data: data.config_yaml,
+}

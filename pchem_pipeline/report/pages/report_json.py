@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.base.plain import plain
-from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.model.maps.maps import status_counts
-from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.report.data import ReportData, reasons_in, truth_errors
 from pchem_pipeline.report.figures.samples import middle
 from pchem_pipeline.report.pages.summary import (
     answers,
@@ -100,8 +99,7 @@ def _summary(data: ReportData) -> dict[str, Any]:
 
 def _fit_status(data: ReportData) -> dict[str, Any]:
     pixels = pixel_counts(data)
-    status = data.fit.get("fit_status")
-    reasons = {} if status is None else status_counts(status)
+    found = {bit: n for bit, _, n in reasons_in(data.status)}
     return {
         "n_pixels": pixels.total,
         "n_good": pixels.fitted - pixels.caution,
@@ -111,9 +109,9 @@ def _fit_status(data: ReportData) -> dict[str, Any]:
         "n_unfitted": int(data.unfitted.sum()),
         "reasons": {
             bit.name.lower(): {
-                "pixels": reasons.get(bit.name.lower(), 0),
-                "meaning": data.status_words.get(int(bit), ""),
-                "failed": bool(int(bit) & data.failed_mask),
+                "pixels": found.get(bit, 0),
+                "meaning": MEANINGS[bit],
+                "failed": bit in FAILED,
             }
             for bit in FitStatus
             if bit.name and int(bit)
@@ -156,20 +154,15 @@ def _electron_numbers(data: ReportData) -> dict[str, Any]:
 
 
 def _truth(data: ReportData) -> dict[str, Any]:
-    found = {}
-    for name, truth in data.truth.items():
-        if name not in data.maps:
-            continue
-        error = np.where(data.flagged, np.nan, data.maps[name] - truth)
-        known = finite(error)
-        pull = finite(error / data.maps[f"{name}_stderr"]) if f"{name}_stderr" in data.maps else np.empty(0)
-        found[name] = {
-            "median": float(np.median(truth[np.isfinite(error)])) if known.size else None,
-            "rmse": float(np.sqrt(np.mean(known**2))) if known.size else None,
-            "pull_mean": float(pull.mean()) if pull.size else None,
-            "pull_sd": float(pull.std()) if pull.size else None,
+    return {
+        name: {
+            "median": found.true_median,
+            "rmse": found.rmse,
+            "pull_mean": np.mean(found.pulls) if found.pulls.size else None,
+            "pull_sd": np.std(found.pulls) if found.pulls.size else None,
         }
-    return found
+        for name, found in truth_errors(data).items()
+    }
 
 
 def _discrepancy(data: ReportData) -> dict[str, Any] | None:

@@ -14,10 +14,9 @@ from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.checks.map_parts import Parts
-from pchem_pipeline.model.fit.status import FLAGGED, FitStatus, flags_of
+from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import hot_pixels
-from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.maps import status_counts
+from pchem_pipeline.report.data import ReportData, reasons_in
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
     count,
@@ -73,8 +72,6 @@ def _read_noise(data: ReportData) -> _Found:
 
 
 def _failed(data: ReportData) -> _Found:
-    if "fit_status" not in data.fit:
-        return None
     pixels = pixel_counts(data)
     return pixels.failed / max(pixels.total, 1), f"{data.noun}s without a value"
 
@@ -238,12 +235,9 @@ class PixelCounts:
 
 def pixel_counts(data: ReportData) -> PixelCounts:
     """Count the pixels by outcome of their fit."""
-    status = data.fit.get("fit_status")
-    if status is None:
-        total = int(np.prod(data.shape))
-        return PixelCounts(total, total, 0)
+    status = data.status
     wanted = (status & int(FitStatus.EXCLUDED)) == 0
-    failed = (((status & data.failed_mask) != 0) | data.unfitted) & wanted
+    failed = (data.failed | data.unfitted) & wanted
     return PixelCounts(int(wanted.sum()), int(failed.sum()), int(((status != 0) & ~failed & wanted).sum()))
 
 
@@ -355,11 +349,7 @@ def _failed_pixels(data: ReportData) -> Iterator[Flag]:
 
 def _reasons(data: ReportData) -> str:
     """Return why pixels have no value, the commonest reason first, as the end of a sentence."""
-    status = data.fit.get("fit_status")
-    if status is None:
-        return ""
-    rows = [row for row in status_counts(status, data.status_words) if row[0] & data.failed_mask]
-    rows.sort(key=lambda row: -row[2])
+    rows = sorted((row for row in reasons_in(data.status) if row[0] in FAILED), key=lambda row: -row[2])
     return "".join(f"{'; ' if i else '. Reasons: '}{text} ({n:,})" for i, (_, text, n) in enumerate(rows))
 
 
@@ -406,20 +396,17 @@ def _flagged(data: ReportData) -> Iterator[Flag]:
     yield Flag(level, f"{share} of the {data.noun}s with a value are flagged{why}. Take {cure}.")
 
 
-def _left_out_words(bit: int) -> str:
-    if not bit & int(FLAGGED):
+def _left_out_words(bit: FitStatus) -> str:
+    if bit not in FLAGGED:
         return ""
-    which = "" if bit & int(flags_of("conversion_gain")) else " of exposure and bias"
+    which = "" if bit in flags_of("conversion_gain") else " of exposure and bias"
     return f" (excluded from medians and tables{which})"
 
 
 def _cautions(data: ReportData) -> Iterator[Flag]:
-    status = data.fit.get("fit_status")
-    if status is None:
-        return
     # what else is odd about a pixel without a value misleads nobody
-    kept = status[(status & data.failed_mask) == 0]
-    for bit, text, n in status_counts(kept, data.status_words):
+    kept = data.status[~data.failed]
+    for bit, text, n in reasons_in(kept):
         if n > _CAUTION_SHARE * kept.size:
             share = f"{percent(n, kept.size)} of the {data.noun}s with a value"
             yield Flag("caution", f"{share}: {text}{_left_out_words(bit)}.")
@@ -683,13 +670,13 @@ def next_steps(data: ReportData) -> list[Step]:
     """Return what to do next; the first is the one to begin with."""
     if any(stage.get("state") not in (None, "complete") for stage in data.stages) or data.unfitted.any():
         return [Step(f"pchem run {RUN}", "finish the run")]
-    step, status = data.code_step, data.fit.get("fit_status")
+    step = data.code_step
     if step > 1 and not step & (step - 1):
         why = (
             f"set input.bit_shift: {step.bit_length() - 1} in the YAML (left-justified samples) and run again"
         )
         return [Step(f"pchem run {RUN}", why)]
-    if status is not None and ((status & data.failed_mask) != 0).all():
+    if data.failed.all():
         return [
             Step(
                 f"pchem joint EXPOSED.yaml --bias {RUN} --store joint.zarr",

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
 
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
+from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.maps.maps import summarise
-from pchem_pipeline.report.data import ReportData, Samples
-from pchem_pipeline.report.figures.ensemble import bias_remark
-from pchem_pipeline.report.figures.maps import status_counts
+from pchem_pipeline.report.data import ReportData, Samples, reasons_in, truth_errors
+from pchem_pipeline.report.figures.ensemble import HALVES, PREDICTIONS, bias_remark
 from pchem_pipeline.report.figures.methods import crossing_text, percent_text
 from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.pages.summary import check_title
 from pchem_pipeline.report.pages.summary import size_text as check_size
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
+    MAPS,
     count,
     heading,
     measured,
@@ -30,30 +32,27 @@ from pchem_pipeline.report.style.wording import (
     unit_text,
 )
 
+#: A row of a table: cells by the heading of their column.
+Row = Mapping[str, str]
+
 
 @dataclass(frozen=True)
 class Table:
-    """A table: the first cell of each row is its heading; ``section`` is the id of the one that shows it."""
+    """A table: rows of the same columns, of which the first has the heading of the row.
+
+    ``section`` is the id of the section that shows it.
+    """
 
     id: str
     title: str
     caption: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    rows: Sequence[Row]
     section: str = "tables"
 
-    @classmethod
-    def of(
-        cls, id_: str, title: str, caption: str, rows: Iterable[Mapping[str, str]], section: str = "tables"
-    ) -> Table:
-        """Return a table of rows that have each cell by the heading of its column."""
-        known = list(rows)
-        head = tuple(known[0]) if known else ()
-        return cls(id_, title, caption, head, tuple(tuple(row.values()) for row in known), section)
-
-
-#: A row of a table: cells by the heading of their column.
-Row = dict[str, str]
+    @property
+    def head(self) -> tuple[str, ...]:
+        """Headings of the columns."""
+        return tuple(self.rows[0]) if self.rows else ()
 
 
 def result_tables(data: ReportData) -> list[Table]:
@@ -68,12 +67,12 @@ def result_tables(data: ReportData) -> list[Table]:
 def _quick_look(data: ReportData) -> Table:
     look = data.quick_look or QuickLook(())
     missing = "".join(f" Not tested: {part} ({why})." for part, why in look.missing.items())
-    return Table.of(
+    return Table(
         "quick-look",
         "Quick look",
         "Under the model, samples of different pixels and frames are independent. This is tested for all "
         f"pixels from sums that every run keeps; p-values are corrected for the number of checks.{missing}",
-        (
+        [
             {
                 "check": check_title(check),
                 "found": ("in the model" if check.in_model else "yes") if check.found else "no",
@@ -83,7 +82,7 @@ def _quick_look(data: ReportData) -> Table:
                 "where": check.where if check.found else "",
             }
             for check in look.checks
-        ),
+        ],
         "discrepancy",
     )
 
@@ -99,19 +98,19 @@ def _chance_text(p: float) -> str:
 
 
 def _parameters(data: ReportData) -> Table:
-    return Table.of(
+    return Table(
         "parameters",
         "Parameters",
         f"Median over the {data.noun}s with its standard error, robust standard deviation between "
         f"{data.noun}s (1.4826 MAD), median 1 sigma error per {data.noun}, percentiles, and outliers beyond "
         f"{data.outlier_sigmas:g} robust standard deviations.{_left_out(data)}",
-        (_parameter_row(data, name) for name in _known(data)),
+        [_parameter_row(data, name) for name in _known(data)],
     )
 
 
 def _known(data: ReportData) -> list[str]:
     """Return the maps that have values, in the order of the tables."""
-    return [name for name in _ORDER if data.has_values(name)]
+    return [name for name in MAPS if data.has_values(name)]
 
 
 def _parameter_row(data: ReportData, name: str) -> Row:
@@ -135,7 +134,7 @@ def _left_out(data: ReportData) -> str:
 def _flagged(data: ReportData) -> Table:
     """Return what flagged pixels read; their errors are no errors and are not shown."""
     rows = []
-    for name in _known(data) if data.any_flagged else ():
+    for name in _known(data) if data.flagged.any() else ():
         flagged = data.flagged_in(name)
         if not flagged.any():
             continue
@@ -148,7 +147,7 @@ def _flagged(data: ReportData) -> Table:
         }
         cells = {head: short(number, 4) for head, number in numbers.items()}
         rows.append({"parameter": heading(name), **cells, f"{data.noun}s": f"{summary.n_valid:,}"})
-    return Table.of(
+    return Table(
         "flagged",
         f"Flagged {data.noun}s",
         "The data do not fix these values: they can be off by an electron or more, far beyond their standard "
@@ -160,12 +159,11 @@ def _flagged(data: ReportData) -> Table:
 def _channels(data: ReportData) -> Table | None:
     if data.shape[0] > 1 or data.shape[1] > 100:
         return None  # the maps of the store have them all
-    rows = (_channel_row(data, x) for x in range(data.shape[1]))
-    return Table.of("channels", "Channels", "Estimates with their standard errors.", rows)
+    rows = [_channel_row(data, x) for x in range(data.shape[1])]
+    return Table("channels", "Channels", "Estimates with their standard errors.", rows)
 
 
 def _channel_row(data: ReportData, x: int) -> Row:
-    status = np.ravel(data.fit.get("fit_status", np.zeros(data.shape, dtype=np.uint16)))
     label = data.channel_names[x] if x < len(data.channel_names) else ""
     missing = np.full(data.shape, np.nan)
     values = {
@@ -174,87 +172,50 @@ def _channel_row(data: ReportData, x: int) -> Row:
         )
         for name in _known(data)
     }
-    words = "; ".join(text for bit, text in data.status_words.items() if int(status[x]) & bit)
-    return {"channel": f"{x} {label}".strip(), **values, "fit status": words or "good fit"}
-
-
-_ORDER = (
-    "quanta_exposure",
-    "charge_rate",
-    "dark_current",
-    "charge_per_level",
-    "spurious_charge",
-    "dark_signal",
-    "conversion_gain",
-    "bias",
-    "read_noise_dn",
-    "read_noise_e",
-    "analog_read_noise_e",
-)
+    return {"channel": f"{x} {label}".strip(), **values, "fit status": describe(int(data.status[0, x]))}
 
 
 def _against_truth(data: ReportData) -> Table:
-    return Table.of(
+    return Table(
         "truth",
         "Estimates against the truth",
         "Simulated data only. Pull: (estimate − truth) / standard error; mean 0 and standard deviation 1 if "
         f"estimates are unbiased and errors correct.{_left_out(data)}",
-        _truth_rows(data),
+        list(_truth_rows(data)),
     )
 
 
 def _truth_rows(data: ReportData) -> Iterator[Row]:
-    for name, truth in data.truth.items():
-        if name not in data.maps:
-            continue
-        estimate = np.where(data.flagged_in(name), np.nan, data.maps[name])
-        error = estimate - truth
-        known = finite(error)
-        if known.size == 0:
-            continue
-        pull = finite(error / data.maps[f"{name}_stderr"]) if f"{name}_stderr" in data.maps else np.empty(0)
-        n = pull.size
+    for name, found in truth_errors(data).items():
+        pull, n = found.pulls, found.pulls.size
         yield {
             "parameter": heading(name),
-            "true median": short(float(np.median(truth[np.isfinite(error)])), 4),
-            "estimated median": short(float(np.median(finite(estimate))), 4),
-            "RMSE": short(float(np.sqrt(np.mean(known**2)))),
+            "true median": short(found.true_median, 4),
+            "estimated median": short(found.median, 4),
+            "RMSE": short(found.rmse),
             "mean pull": measured(float(pull.mean()), float(1 / np.sqrt(n))) if n else "not known",
             "sd of pulls": measured(float(pull.std()), float(1 / np.sqrt(2 * n))) if n else "not known",
         }
 
 
-#: Predictions of the ensemble, and the sampling noise beside them, in words.
-_RMSE = {
-    "epcd_exact": "raw, exact mean over pixels",
-    "epcd_dependent": "raw, dependent parameters",
-    "epcd_independent": "raw, independent parameters",
-    "noise_floor": "raw, sampling noise alone",
-    "nuced_exact": "NUCed, exact mean over pixels",
-    "nuced_dependent": "NUCed, dependent parameters",
-    "nuced_independent": "NUCed, independent parameters",
-    "nuced_noise_floor": "NUCed, sampling noise alone",
+#: RMSE of each prediction of the ensemble, and of the sampling noise beside them, to words and unit.
+RMSES = {
+    name: (f"{half.words.removesuffix(' data')}, {words}", f"1/{unit_text(half.unit)}")
+    for half in HALVES
+    for name, words in (
+        *((f"{half.model}{each}", words) for each, (words, *_) in reversed(PREDICTIONS.items())),
+        (f"{half.data}noise_floor", "sampling noise alone"),
+    )
 }
-
-
-def rmse_words(name: str) -> str:
-    """Return what a prediction of the ensemble is called, or the sampling noise beside it."""
-    return _RMSE.get(name, name.replace("_", " "))
-
-
-def rmse_unit(name: str) -> str:
-    """Return the unit of the densities of an ensemble, raw or after correction."""
-    return "1/e⁻" if name.startswith("nuced") else "1/DN"
 
 
 def _rmse(data: ReportData) -> Table:
     rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
     rows = []
-    for name, words in _RMSE.items():
+    for name, (words, unit) in RMSES.items():
         if rmse.get(name) is None or name.endswith("noise_floor"):
             continue
         floor = rmse.get("nuced_noise_floor" if name.startswith("nuced") else "noise_floor")
-        unit = rmse_unit(name)
         rows.append(
             {
                 "prediction": words,
@@ -263,7 +224,7 @@ def _rmse(data: ReportData) -> Table:
                 "ratio": short(rmse[name] / floor) if floor else "not known",
             }
         )
-    return Table.of(
+    return Table(
         "rmse",
         "Ensemble prediction against data",
         "Root mean square difference of densities, and its expectation from sampling noise alone.",
@@ -275,12 +236,12 @@ def _rmse(data: ReportData) -> Table:
 def _moments(data: ReportData) -> Table:
     remark = bias_remark(data)
     bias = f" Variance of the bias:{remark}" if remark else ""
-    return Table.of(
+    return Table(
         "moments",
         "Moments of the ensemble",
         "From the parameter maps (Hendrickson et al. 2023, Appendix A) and from the data with their "
         f"standard error.{bias}",
-        map(_moment_row, data.moments),
+        [_moment_row(row) for row in data.moments],
         "ensemble",
     )
 
@@ -323,11 +284,11 @@ def _electrons(data: ReportData) -> Table | None:
     if facts.get("expected_error_rate") is not None:
         expected_errors = percent(float(facts["expected_error_rate"]), 1.0)
         words += f" Expected from the fitted parameters: {expected_errors}."
-    return Table.of(
+    return Table(
         "electron-table",
         "Electron numbers",
         f"Share of each estimated electron number, and its prediction.{words}",
-        (
+        [
             {
                 "k": str(int(k[i])),
                 "estimated": measured(float(mass[i]), float(errors[i])) if samples else f"{mass[i]:.5f}",
@@ -335,7 +296,7 @@ def _electrons(data: ReportData) -> Table | None:
                 "expected share": f"{expected[i]:.5f}" if expected is not None else "",
             }
             for i in range(min(last + 1, 24))  # ``report.json`` has all
-        ),
+        ],
         "electrons",
     )
 
@@ -344,14 +305,14 @@ def _misfits(data: ReportData) -> Table | None:
     facts = data.misfits
     if not facts.get("worst"):
         return None
-    return Table.of(
+    return Table(
         "misfits",
         f"Worst {data.noun}s",
         f"{int(facts['misfits']):,} of {int(facts['tested']):,} tested {data.noun}s disagree with the model "
         f"at a false-discovery rate of {facts['false_discovery_rate']:g} (Benjamini and Hochberg 1995). "
         f"{count(int(facts['pixels_with_outliers']), data.noun)} with excluded samples, at most "
         f"{percent(float(facts['largest_outlier_share']), 1.0)} of their frames.",
-        (
+        [
             {
                 data.noun: f"channel {row['x']}" if data.shape[0] == 1 else f"y = {row['y']}, x = {row['x']}",
                 "χ²": f"{row['chi2']:.1f}",
@@ -361,7 +322,7 @@ def _misfits(data: ReportData) -> Table | None:
                 "misfit": "yes" if float(row["q"]) <= float(facts["false_discovery_rate"]) else "no",
             }
             for row in facts["worst"]
-        ),
+        ],
         "goodness",
     )
 
@@ -371,45 +332,30 @@ def _intervals(data: ReportData) -> Table:
         f" Profile: distance of the ends of the {100 * data.interval_level:g} % profile-likelihood interval "
         "from the estimate, in standard errors."
     )
-    return Table.of(
+    return Table(
         "uncertainties",
         "Uncertainties",
         f"Median 1 sigma error per {data.noun}, and the share of the map's variance that is noise of the "
         "estimates; near 100 % the map shows only noise: take more frames."
         + (words if data.intervals else ""),
-        _interval_rows(data),
+        list(_interval_rows(data)),
         "uncertainty",
     )
 
 
-def _noise_shares(data: ReportData, names: tuple[str, ...]) -> dict[str, float]:
-    """Return, by map, the part of its variance over the pixels that the errors of the estimates make.
-
-    Both are robust: the median squared standard error over ``(1.4826 MAD)^2``. Maps that do not exist or have
-    fewer than 8 values are left out.
-    """
-    found = {}
-    for name in names:
-        error = data.pixel_error(name, with_flagged=True)
-        if error is None or not data.has_values(name):
-            continue
-        summary = data.summary(name, with_flagged=True)
-        if summary.n_valid >= 8 and summary.robust_sd > 0:
-            found[name] = float(error**2 / summary.robust_sd**2)
-    return found
-
-
 def _interval_rows(data: ReportData) -> Iterator[Row]:
-    shares = _noise_shares(data, _ORDER)
     for name in _known(data):
-        error = data.pixel_error(name, with_flagged=True)
+        error, summary = data.pixel_error(name, with_flagged=True), data.summary(name, with_flagged=True)
         if error is None:
             continue
+        # both robust: the median squared error over (1.4826 MAD)^2
+        known = summary.n_valid >= 8 and summary.robust_sd > 0
+        noise = percent(min(error**2 / summary.robust_sd**2, 1.0), 1.0) if known else "not known"
         row = {
             "quantity": heading(name),
             f"error per {data.noun}": short(error, 3),
-            "relative error": percent(error, abs(data.summary(name, with_flagged=True).median)),
-            "noise in the map": percent(min(shares[name], 1.0), 1.0) if name in shares else "not known",
+            "relative error": percent(error, abs(summary.median)),
+            "noise in the map": noise,
         }
         if data.intervals:
             ends = ["", ""]
@@ -421,27 +367,23 @@ def _interval_rows(data: ReportData) -> Iterator[Row]:
         yield row
 
 
-def _status(data: ReportData) -> Table | None:
-    status = data.fit.get("fit_status")
-    if status is None:
-        return None
-    unfitted = int(data.unfitted.sum())
+def _status(data: ReportData) -> Table:
+    status, unfitted = data.status, int(data.unfitted.sum())
     good = int((status == 0).sum()) - int((data.unfitted & (status == 0)).sum())
     rows = [("good fit", good, f"{good:,}")]
     if unfitted:
         rows.append(("not fitted yet", unfitted, "none"))
-    kept = status[(status & data.failed_mask) == 0]
-    for bit, text, n in status_counts(status, data.status_words):
-        usable = int(((kept & bit) != 0).sum())
+    for bit, text, n in reasons_in(status):
+        usable = int((~data.failed & (status & int(bit) != 0)).sum())
         rows.append((text, n, f"{usable:,}, with caution" if usable else "none"))
-    return Table.of(
+    return Table(
         "failures",
         "Fit status by reason",
         "A pixel with several reasons counts for each.",
-        (
+        [
             {"reason": reason, "pixels": f"{n:,}", "share": percent(n, status.size), "with a value": usable}
             for reason, n, usable in rows
-        ),
+        ],
         "status",
     )
 
@@ -452,11 +394,11 @@ def _samples(data: ReportData) -> Table | None:
     p = finite(data.samples.arrays.get("linearity_p", np.empty(0)))
     off = percent(int((p < 0.01).sum()), p.size)
     remark = f" {off} of the {data.noun}s are off the line (p < 0.01; 1 % expected)." if p.size else ""
-    return Table.of(
+    return Table(
         "samples",
         "Samples",
         f"Medians over the {data.noun}s, with their standard errors.{remark}",
-        (_sample_row(data.samples, i) for i in range(len(data.samples.samples))),
+        [_sample_row(data.samples, i) for i in range(len(data.samples.samples))],
         "exposures",
     )
 
@@ -496,7 +438,7 @@ def _plan(data: ReportData) -> Table | None:
                 "this run's": "" if reached is None else f"{short(scale * reached, 2)} {unit}",
             }
         )
-    return Table.of(
+    return Table(
         "plan-table",
         "Frames for a precision",
         f"Cramer-Rao bound for the median pixel (H = {short(plan['exposure'])} e⁻, read noise "
@@ -539,13 +481,13 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
 
 
 def _run(data: ReportData) -> Table:
-    rows = ({"item": item, "value": value} for item, value in _flat(data.run))
-    return Table.of("run", "Run", "Program and settings of this report.", rows, _SECTION)
+    rows = [{"item": item, "value": value} for item, value in _flat(data.run)]
+    return Table("run", "Run", "Program and settings of this report.", rows, _SECTION)
 
 
 def _stages(data: ReportData) -> Table:
     words = "Wall time, CPU time and largest resident memory of a process."
-    return Table.of("stages", "Stages", words, map(_stage_row, data.stages), _SECTION)
+    return Table("stages", "Stages", words, [_stage_row(stage) for stage in data.stages], _SECTION)
 
 
 def _stage_row(stage: Mapping[str, Any]) -> Row:
@@ -570,49 +512,36 @@ _MOST_FILES = 200
 def _inputs(data: ReportData) -> Table:
     more = len(data.inputs) - _MOST_FILES
     words = f" The first {_MOST_FILES} of {len(data.inputs):,} files." if more > 0 else ""
-    return Table.of(
+    return Table(
         "inputs",
         "Input files",
         f"Names, sizes and content hashes of the files that were read.{words}",
-        (
+        [
             {
                 "file": str(entry.get("name", "")),
                 "size": size_text(float(entry["size"])) if entry.get("size") is not None else "",
                 "hash": str(entry.get("hash", "")),
             }
             for entry in data.inputs[:_MOST_FILES]
-        ),
+        ],
         _SECTION,
     )
 
 
-_COLUMNS = (
-    "pixels",
-    "g, e-/DN",
-    "g bias %",
-    "g rmse %",
-    "g spread %",
-    "g bound %",
-    "rmse/bound",
-    "s_e rmse %",
-    "H rmse %",
-    "us/pixel",
-)
-
-
-_HEAD = (
-    "method",
-    "pixels with a result",
-    "median g (e⁻/DN)",
-    "bias of g (%)",
-    "rms error of g (%)",
-    "robust spread of g (1.4826 MAD, %)",
-    "bound (%)",
-    "error / bound",
-    "rms error of the read noise (%)",
-    "rms error of H (%)",
-    "µs per pixel",
-)
+#: Heading of each column of the comparison of methods on the page, and in the terminal.
+_HEADS = {
+    "method": "method",
+    "pixels with a result": "pixels",
+    "median g (e⁻/DN)": "g, e-/DN",
+    "bias of g (%)": "g bias %",
+    "rms error of g (%)": "g rmse %",
+    "robust spread of g (1.4826 MAD, %)": "g spread %",
+    "bound (%)": "g bound %",
+    "error / bound": "rmse/bound",
+    "rms error of the read noise (%)": "s_e rmse %",
+    "rms error of H (%)": "H rmse %",
+    "µs per pixel": "us/pixel",
+}
 
 
 def methods_text(result: Mapping[str, Any]) -> str:
@@ -624,7 +553,8 @@ def methods_text(result: Mapping[str, Any]) -> str:
     against = {"truth": "the truth", "fit": "this run's fit of the same frames"}[result["reference"]]
     lines = [f"{result['pixels']:,} pixels, errors against {against}"]
     lines += [f"sample {i}: {_sample(sample)}" for i, sample in enumerate(result["samples"])]
-    head = f"{'method':<34}" + "".join(f"{column:>12}" for column in _COLUMNS)
+    first, *others = _HEADS.values()
+    head = f"{first:<34}" + "".join(f"{column:>12}" for column in others)
     lines += ["", head, "-" * len(head)]
     for row in method_rows(result):
         lines.append(
@@ -682,7 +612,7 @@ def method_tables(data: ReportData) -> list[Table]:
     if result is None:
         return []
     against = {"truth": "the truth", "fit": "the fit of this run, from the same frames"}[result["reference"]]
-    rows = [row if len(row) > 2 else (*row, *[""] * (len(_HEAD) - 2)) for row in method_rows(result)]
+    rows = [dict(zip_longest(_HEADS, row, fillvalue="")) for row in method_rows(result)]
     remarks = " ".join(f"{remark[0].upper()}{remark[1:]}." for remark in result["remarks"])
     verdict = crossing_text(result["study"]) if result["study"] else ""
     caption = (
@@ -690,4 +620,4 @@ def method_tables(data: ReportData) -> list[Table]:
         f"{f'{verdict[0].upper()}{verdict[1:]}.' if verdict else ''} {remarks}"
     ).strip()
     caption = caption.replace(" e-", " e⁻")
-    return [Table("methods-table", "Methods", caption, _HEAD, tuple(rows), section="methods")]
+    return [Table("methods-table", "Methods", caption, rows, "methods")]

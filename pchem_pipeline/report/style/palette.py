@@ -37,7 +37,6 @@ class Palette:
         grid: lines of a grid.
         no_value: pixels without a value in maps, outside the range of ``MAP_COLOURS`` in hue and saturation.
         mark: what the verdict points to.
-        from_paper: colours of a map that begin with the paper's lightness.
     """
 
     ink: str = "#000000"
@@ -56,7 +55,6 @@ class Palette:
     grid: str = "#DDDDDD"
     no_value: str = "#D9D9D9"
     mark: str = "#F0E442"
-    from_paper: str = "viridis_r"
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters of matplotlib that hold colours."""
@@ -78,7 +76,6 @@ DARK = Palette(
     grid="#39434C",
     no_value="#4A4A4A",
     mark="#7A7320",
-    from_paper="viridis",
 )
 
 

@@ -6,35 +6,25 @@ import math
 import re
 import unicodedata
 
-_UNITS = {
-    "e-": "e⁻",
-    "e-2": "e⁻²",
-    "e-/DN": "e⁻/DN",
-    "DN/e-": "DN/e⁻",
-    "e-/px/s": "e⁻/px/s",
-    "e-/level": "e⁻/level",
-    "1/e-": "1/e⁻",
-    "DN2": "DN²",
-    "1": "",
-}
-
 #: Symbol (mathtext), words and stored unit of each map.
 _SYMBOLS = {
     "quanta_exposure": (r"$H$", "quanta exposure", "e-"),
+    "charge_rate": (r"$H/t$", "charge rate", "e-/px/s"),
+    "dark_current": (r"$i_\mathrm{d}$", "dark current", "e-/px/s"),
+    "charge_per_level": (r"$\mathrm{d}H/\mathrm{d}\ell$", "charge per light level", "e-/level"),
+    "spurious_charge": (r"$H_0$", "spurious charge", "e-"),
+    "dark_signal": (r"$H_0$", "dark signal", "e-"),
     "conversion_gain": (r"$g$", "conversion gain", "e-/DN"),
     "bias": (r"$\mu$", "bias", "DN"),
     "read_noise_dn": (r"$\sigma$", "read noise", "DN"),
     "read_noise_e": (r"$\sigma_{\mathrm{e}^-}$", "read noise", "e-"),
     "analog_read_noise_e": (r"$\sigma_R$", "analog read noise", "e-"),
-    "charge_rate": (r"$H/t$", "charge rate", "e-/px/s"),
-    "dark_current": (r"$i_\mathrm{d}$", "dark current", "e-/px/s"),
-    "spurious_charge": (r"$H_0$", "spurious charge", "e-"),
-    "dark_signal": (r"$H_0$", "dark signal", "e-"),
-    "charge_per_level": (r"$\mathrm{d}H/\mathrm{d}\ell$", "charge per light level", "e-/level"),
 }
+#: All maps in the order of tables.
+MAPS = tuple(_SYMBOLS)
 
 #: Digits and signs to their superscripts.
-SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 #: Formulas of mathtext as characters, the longer ones first; what is left of them loses its marks.
@@ -71,7 +61,7 @@ def plain(text: str) -> str:
 
 def unit_text(unit: str) -> str:
     """Return a stored unit as people write it, e.g. ``e-/DN`` as ``e⁻/DN``; ``1`` as nothing."""
-    return _UNITS.get(unit, unit)
+    return "" if unit == "1" else unit.replace("DN2", "DN²").replace("e-2", "e⁻²").replace("e-", "e⁻")
 
 
 def symbol(name: str) -> tuple[str, str, str]:
@@ -104,8 +94,7 @@ def short(value: float, digits: int = 3) -> str:
     exponent = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
     if -4 < exponent < max(digits, 5):
         return f"{value:.{max(digits - 1 - exponent, 0)}f}".replace("-", "−")
-    mantissa = value / 10.0**exponent
-    return f"{mantissa:.{digits - 1}f}×10{str(exponent).translate(SUPERSCRIPT)}".replace("-", "−")
+    return scientific(value, digits)
 
 
 def signed(value: float) -> str:
@@ -123,12 +112,12 @@ def scientific(value: float, digits: int = 2) -> str:
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     if int(exponent) == 0:
         return mantissa.replace("-", "−")
-    return f"{mantissa}×10{str(int(exponent)).translate(SUPERSCRIPT)}".replace("-", "−")
+    return f"{mantissa}×10{str(int(exponent)).translate(_SUPERSCRIPT)}".replace("-", "−")
 
 
 def power_of_ten(exponent: int) -> str:
     """Return ``10⁻⁴``, or nothing for the power 0."""
-    return f"10{str(exponent).translate(SUPERSCRIPT)}" if exponent else ""
+    return f"10{str(exponent).translate(_SUPERSCRIPT)}" if exponent else ""
 
 
 def measured(value: float, error: float, unit: str = "") -> str:

@@ -25,7 +25,6 @@ from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.inspector import (
-    AT_ONCE,
     InspectorData,
     MapEntry,
     PackedMap,
@@ -97,11 +96,11 @@ def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[MapEntry]:
     for variable in known:
         repeated = variable.group == "fit" and f"maps/{variable.name}" in VARIABLES
         if not repeated and store.has(variable.path) and store.array(variable.path).shape == shape:
-            found.append(_entry(variable, store.attributes(variable.path)))
+            found.append(_entry(variable))
     return found
 
 
-def _entry(variable: Variable, attributes: Mapping[str, Any]) -> MapEntry:
+def _entry(variable: Variable) -> MapEntry:
     """Return the words of a stored map."""
     # the sentences of these groups begin with the name of the quantity, those of others explain it
     named = variable.group in ("maps", "truth")
@@ -111,10 +110,6 @@ def _entry(variable: Variable, attributes: Mapping[str, Any]) -> MapEntry:
     kind, words = "value", {}
     if variable.path == "fit/fit_status":
         kind, words = "bits", {int(bit): text for bit, text in MEANINGS.items()}
-    elif "flag_masks" in attributes:
-        kind, words = "bits", _flag_texts(attributes, "flag_masks")
-    elif "flag_values" in attributes:
-        kind, words = "words", _flag_texts(attributes, "flag_values")
     elif variable.dtype == "uint8":
         found = re.findall(r"(\d+) ([^,;:]+)", variable.long_name)
         words = {int(number): text.strip() for number, text in found}
@@ -126,39 +121,24 @@ def _entry(variable: Variable, attributes: Mapping[str, Any]) -> MapEntry:
     return MapEntry(variable.path, label, variable.unit, variable.long_name, kind, words)
 
 
-def _flag_texts(attributes: Mapping[str, Any], key: str) -> dict[int, str]:
-    texts = str(attributes.get("flag_meanings", "")).split()
-    return {int(n): text.replace("_", " ") for n, text in zip(attributes[key], texts, strict=False)}
-
-
 class StoredMaps:
-    """Maps of a run, of which some are at hand.
-
-    Attributes:
-        store: the run.
-        loaded: maps that need not be read, by path.
-    """
+    """Maps of a run by their path: those ``loaded`` already, others from its store; the last two are kept."""
 
     def __init__(self, store: RunStore, loaded: Mapping[str, NDArray[Any]] | None = None) -> None:
         self.store, self.loaded = store, loaded or {}
-        self._last: tuple[str, NDArray[Any]] = ("", np.empty(0))
+        self._read = functools.lru_cache(maxsize=2)(store.read)
 
     def has(self, path: str) -> bool:
         """Tell whether there is such a map."""
         return path in self.loaded or self.store.has(path)
 
     def read(self, path: str) -> NDArray[Any]:
-        """Return a map; the last one is kept.
+        """Return a map.
 
         Raises:
             StoreError: it is missing or corrupt.
         """
-        if path in self.loaded:
-            return self.loaded[path]
-        last = self._last  # another thread may put another in its place meanwhile
-        if path != last[0]:
-            last = self._last = path, self.store.read(path)
-        return last[1]
+        return self.loaded[path] if path in self.loaded else self._read(path)
 
 
 def inspector_data(
@@ -279,18 +259,8 @@ def _multiple_of_exposure(maps: StoredMaps, path: str) -> tuple[str, float] | No
     current, exposure = maps.read(path), maps.read(other)
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = _median(some_of(current.ravel()) / some_of(exposure.ravel()))
-    rows = max(1, AT_ONCE // current.shape[1])
-    bands = [np.s_[y : y + rows] for y in range(0, current.shape[0], rows)]
-    same = factor != 0 and all(_proportional(current[band], exposure[band], factor) for band in bands)
+    same = factor != 0 and np.allclose(current, factor * exposure, rtol=1e-9, atol=0.0, equal_nan=True)
     return (other, factor) if same else None
-
-
-def _proportional(values: NDArray[Any], others: NDArray[Any], factor: float) -> bool:
-    """Tell whether values are others times a factor, and are known where these are."""
-    known = np.isfinite(values)
-    if (known != np.isfinite(others)).any():
-        return False
-    return np.allclose(values[known], factor * others[known], rtol=1e-9, atol=0.0)
 
 
 def deciding_parameters(columns: Sequence[FloatArray], model: FittedModel) -> FloatArray | None:

@@ -6,7 +6,6 @@ Held in full are the shown, flagged, worst and extreme ones, and an even sample.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from pchem_pipeline.model.fit.status import MEANINGS, describe
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.data import MAP_NAMES, PixelFit
-from pchem_pipeline.report.inspector import some_of
+from pchem_pipeline.report.inspector import Notable, some_of
 from pchem_pipeline.report.style.wording import symbol
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.report.stored import PixelHistograms
@@ -172,19 +171,6 @@ def bin_masses(
     return list(found)
 
 
-@dataclass(frozen=True)
-class ChosenPixels:
-    """Pixels and why they were chosen.
-
-    Attributes:
-        index: ``y * nx + x`` of each, each once, the shown and odd ones first; shape (n,).
-        reasons: words and indices; the even sample is not among them.
-    """
-
-    index: IntArray
-    reasons: tuple[tuple[str, tuple[int, ...]], ...]
-
-
 def choose_inspected(
     maps: Mapping[str, NDArray[Any]],
     fit: Mapping[str, NDArray[Any]],
@@ -194,7 +180,7 @@ def choose_inspected(
     bins: int = 1,
     everything: int = 4096,
     most: int = 2400,
-) -> ChosenPixels:
+) -> tuple[IntArray, list[Notable]]:
     """Choose the pixels that are in the report in full.
 
     Args:
@@ -205,29 +191,37 @@ def choose_inspected(
         bins: of a histogram; all that are taken have at most `MAX_BINS` together.
         everything: a sensor of at most so many pixels is taken whole.
         most: number of pixels of a larger one.
+
+    Returns:
+        ``y * nx + x`` of each, each once, the shown and odd ones first, shape (n,); and why they were chosen,
+        those of the even sample excepted.
     """
     status = np.asarray(fit["fit_status"])
     ny, nx = status.shape
     everything, most = (min(n, MAX_BINS // bins) for n in (everything, most))
     rng, p = np.random.default_rng(20_231), fit.get("goodness_p", np.full(status.shape, np.nan))
     reasons = [
-        ("shown in the report", _places(shown, nx)),
-        ("from the search for missing effects", _places(suspects, nx)),
-        ("poorest goodness of fit", _smallest(np.asarray(p, dtype=np.float64).ravel(), _POOR)),
+        ("shown in the report", "", _places(shown, nx)),
+        ("from the search for missing effects", "", _places(suspects, nx)),
+        (
+            "poorest goodness of fit",
+            "fit/goodness_p",
+            _smallest(np.asarray(p, dtype=np.float64).ravel(), _POOR),
+        ),
         *_flagged(status, rng),
         *_extreme(maps),
     ]
-    kept = [(words, where) for words, where in reasons if where.size]
-    first = np.concatenate([where for _, where in kept]) if kept else np.empty(0, np.int64)
     rest = np.arange(status.size) if status.size <= everything else _even(ny, nx, most, rng)
-    index = np.concatenate([first, rest])
+    index = np.concatenate([*(where for _, _, where in reasons), rest])
     _, once = np.unique(index, return_index=True)  # each where it comes first
     index = index[np.sort(once)]
     if status.size > everything:
         index = index[:most]
     there = set(index.tolist())
-    listed = ((words, tuple(i for i in where.tolist() if i in there)) for words, where in kept)
-    return ChosenPixels(index, tuple((words, where) for words, where in listed if where))
+    found = [
+        Notable(words, tuple(i for i in where.tolist() if i in there), path) for words, path, where in reasons
+    ]
+    return index, [each for each in found if each.pixels]
 
 
 def _places(pixels: Sequence[tuple[int, int]], nx: int) -> IntArray:
@@ -245,31 +239,29 @@ def _smallest(values: FloatArray, n: int) -> IntArray:
     return np.asarray(known[order], dtype=np.int64)
 
 
-def _flagged(status: NDArray[Any], rng: np.random.Generator) -> list[tuple[str, IntArray]]:
+def _flagged(status: NDArray[Any], rng: np.random.Generator) -> list[tuple[str, str, IntArray]]:
     """Return some pixels of each reason for caution or failure, drawn at random, in their order."""
     found = []
     for bit, words in MEANINGS.items():
         where = np.flatnonzero(status.ravel() & int(bit))
         if where.size > _FLAGGED:
             where = np.sort(rng.choice(where, _FLAGGED, replace=False))
-        found.append((words, where.astype(np.int64)))
+        found.append((words, "", where.astype(np.int64)))
     return found
 
 
-def _extreme(maps: Mapping[str, NDArray[Any]]) -> list[tuple[str, IntArray]]:
+def _extreme(maps: Mapping[str, NDArray[Any]]) -> list[tuple[str, str, IntArray]]:
     found = []
     for name in MAP_NAMES:
-        if name not in maps:
-            continue
         words = symbol(name)[1]
-        values = np.asarray(maps[name], dtype=np.float64).ravel()
-        found += [
-            (f"largest {words}", _smallest(-values, _EXTREME)),
-            (f"smallest {words}", _smallest(values, _EXTREME)),
-        ]
-        if f"{name}_stderr" in maps:
-            errors = np.asarray(maps[f"{name}_stderr"], dtype=np.float64).ravel()
-            found.append((f"largest standard error of the {words}", _smallest(-errors, _UNSURE)))
+        for path, sign, n, what in (
+            (name, -1.0, _EXTREME, f"largest {words}"),
+            (name, 1.0, _EXTREME, f"smallest {words}"),
+            (f"{name}_stderr", -1.0, _UNSURE, f"largest standard error of the {words}"),
+        ):
+            if path in maps:
+                values = sign * np.asarray(maps[path], dtype=np.float64).ravel()
+                found.append((what, f"maps/{path}", _smallest(values, n)))
     return found
 
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import (
     CHARGE_RATES,
     FREE_SATELLITES,
@@ -20,15 +22,31 @@ from pchem_pipeline.base.variables import (
     variables_of,
 )
 from pchem_pipeline.compute.executor import call_all
+from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
+from pchem_pipeline.effects.framework.compose import model_words
+from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.fit.status import FAILED
+from pchem_pipeline.model.maps.ordered import median_of
+from pchem_pipeline.planning.frames import frames_needed, precision
+from pchem_pipeline.planning.point import Point
+from pchem_pipeline.planning.targets import parse_target
+from pchem_pipeline.report.data import DiscrepancyData, ReportData, Sample, Samples
+from pchem_pipeline.report.figures.ensemble import case_name
+from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
+from pchem_pipeline.stages.maps import NO_TIME
 from pchem_pipeline.stages.methods import read_methods
+from pchem_pipeline.stages.samples import exposure_axis
+from pchem_pipeline.store.run_store import stored_config
 
 if TYPE_CHECKING:
-    from pchem_pipeline.store.records import StageRecord
+    from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.store.run_store import RunStore
+
+Arrays = Mapping[str, NDArray[Any]]
 
 #: Group to the names of the arrays that the report is made from.
 _ARRAYS: dict[str, tuple[str, ...]] = {
@@ -38,6 +56,213 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
     "truth": (*PARAMETERS, "read_noise_e"),
     "samples": ("quanta_exposure", "mean", "variance", "linearity_residual", "linearity_p"),
 }
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A run as it is stored.
+
+    Attributes:
+        store: where.
+        sensor: its input.
+        model: of the fit.
+        data: all that its report shows, but single pixels and what is made of sums over frames.
+    """
+
+    store: RunStore
+    sensor: SensorInfo
+    model: FittedModel
+    data: ReportData
+
+    def parameters(self, index: IntArray) -> list[FloatArray]:
+        """Return (H, g, mu, sigma) of the pixels with these places ``y * nx + x``."""
+        return [self.data.maps[name].reshape(-1)[index] for name in PARAMETERS]
+
+
+def read_run(
+    store: RunStore, config: RunConfig, stages: Sequence[Mapping[str, Any]] = (), threads: int = 1
+) -> StoredRun:
+    """Read all of a run but its histograms.
+
+    Args:
+        store: the run.
+        config: its configuration.
+        stages: rows of the table of stages.
+        threads: that read an array each.
+
+    Raises:
+        StoreError: an array is missing or corrupt.
+    """
+    sensor, model, verdict = SensorInfo.read(store), FittedModel.read(store), read_verdict(store.path)
+    groups = _read_arrays(store, verdict is not None, threads)
+    maps, fit, ensemble = groups["maps"], groups["fit"], groups["ensemble"]
+    if "goodness_q" in maps:
+        fit["goodness_q"] = maps.pop("goodness_q")
+    if "fit_status" in fit:
+        # only what has a value can agree with its model or not
+        failed = (fit["fit_status"] & int(FAILED)) != 0
+        for name in (name for name in fit if name.startswith("goodness_")):
+            fit[name][failed] = np.nan
+    ends = {name: interval_names(name) for name in (*INTERVALS, *CHARGE_RATES)}
+    intervals = {name: (maps.pop(low), maps.pop(high)) for name, (low, high) in ends.items() if low in maps}
+    facts, methods = dict(store.attributes("ensemble")), read_methods(store)
+    moments, _ = facts.pop("moments", []), facts.pop("missing", {})
+    cases = facts.pop("component_cases", COMPONENT_CASES)
+    n_frames = sensor.n_frames if sensor.kind == "frames" else None
+    data = ReportData(
+        title=config.run.title or store.path.name,
+        shape=sensor.shape,
+        kind=config.input.kind,
+        n_frames=n_frames,
+        integration_time=sensor.with_settings(config.input).integration_time,
+        camera=sensor.camera.words(),
+        maps=maps,
+        fit=fit,
+        misfits=store.attributes("maps").get("goodness", {}),
+        intervals=intervals,
+        interval_level=config.fit.interval_level,
+        ensemble=ensemble,
+        ensemble_facts=facts,
+        component_cases=[case_name(case) for case in cases],
+        moments=moments,
+        truth=groups["truth"],
+        channel_names=[short_name(name) for name in sensor.names],
+        percentiles=config.maps.percentiles,
+        outlier_sigmas=config.maps.outlier_sigmas,
+        allowed_failed=config.run.allowed_failed_pixels,
+        criteria=config.report.criteria,
+        # what a single command was given is no setting of the run
+        config_yaml=stored_config(store.path) or dump_config(config),
+        run=_run_facts(store, sensor, model, config),
+        inputs=[
+            {"name": file.get("name"), "size": file.get("size"), "hash": file.get("xxh3_128", "")}
+            for file in sensor.identity.get("files", [])
+        ],
+        stages=list(stages),
+        missing=_missing(store.path.name, sensor, maps, ensemble, methods is not None),
+        methods=methods,
+        # several samples need other frames than one: see pchem plan
+        plan=None if sensor.samples else plan_section(maps, n_frames),
+        discrepancy=None if verdict is None else verdict_data(verdict, groups["discrepancy"]),
+        samples=_samples(sensor, groups["samples"], config),
+    )
+    return StoredRun(store, sensor, model, data)
+
+
+def _read_arrays(store: RunStore, searched: bool, threads: int) -> dict[str, dict[str, NDArray[Any]]]:
+    """Return the arrays of the report by group; those of a search only where there is a verdict."""
+    there = [
+        (group, name)
+        for group, names in _ARRAYS.items()
+        for name in names
+        if (group != "discrepancy" or searched) and store.has(f"{group}/{name}")
+    ]
+    arrays = call_all([functools.partial(store.read, f"{group}/{name}") for group, name in there], threads)
+    groups: dict[str, dict[str, NDArray[Any]]] = {group: {} for group in _ARRAYS}
+    for (group, name), values in zip(there, arrays, strict=True):
+        groups[group][name] = values
+    return groups
+
+
+def verdict_data(found: Verdict, arrays: Arrays) -> DiscrepancyData:
+    """Return a verdict with its arrays, but vectors of a search of other statistics, in another order."""
+    vectors = ("z_before", "z_after")  # a number for each statistic
+    known = {n: array for n, array in arrays.items() if n not in vectors or len(array) == len(STATISTICS)}
+    return DiscrepancyData(found, known)
+
+
+def plan_section(maps: Arrays, n_frames: int | None) -> dict[str, Any] | None:
+    """Return the frames that precisions need at the median pixel, or None where no pixel has a value.
+
+    Args:
+        maps: of the run.
+        n_frames: frames of the run, or None where pixels differ.
+    """
+    names = ("quanta_exposure", "read_noise_e", "conversion_gain")
+    medians = [median_of(maps[name]) for name in names if name in maps]
+    if len(medians) < len(names) or not np.isfinite(medians).all():
+        return None
+    exposure, noise, gain = medians
+    try:
+        point = Point(exposure, noise, gain)
+    except ConfigError:
+        return None
+    targets = ("conversion_gain=1%", "read_noise_e=1%", "quanta_exposure=1%", "bias=0.02e-")
+    rows = [
+        {"target": str(target), "name": target.name, "frames": frames_needed(target, point)}
+        for target in map(parse_target, targets)
+    ]
+    reached = {} if n_frames is None else precision(point, n_frames)
+    return {"rows": rows, "reached": reached, "exposure": exposure, "read_noise": noise}
+
+
+def _samples(sensor: SensorInfo, arrays: Arrays, config: RunConfig) -> Samples | None:
+    """Return the exposures of a run of several; None for a run of one."""
+    if not sensor.samples or "quanta_exposure" not in arrays:
+        return None
+    x = exposure_axis(config.input, sensor.samples)
+    places = [None if x is None or np.isnan(x[i]) else float(x[i]) for i in range(len(sensor.samples))]
+    samples = [
+        Sample(each.name, "bias" if each.bias else "exposed", place, each.n_frames)
+        for each, place in zip(sensor.samples, places, strict=True)
+    ]
+    return Samples(tuple(samples), config.input.against, arrays, sensor.shown)
+
+
+def _run_facts(store: RunStore, sensor: SensorInfo, model: FittedModel, config: RunConfig) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "store": store.path.name,
+        "input": _input_text(sensor),
+        "type of the data": sensor.dtype,
+        "bit depth": sensor.bit_depth,
+        "digest of the input": sensor.identity.get("digest", ""),
+    }
+    if config.simulate is not None:
+        facts["seed of the simulation"] = config.simulate.seed
+    version = model.version
+    if version is not None and version.effects:
+        facts["model"] = model_words(version.effects)
+    if version is not None:
+        source = "search for missing effects" if version.source == "verdict" else "configuration"
+        facts["version of the model"] = f"{version.number} (from the {source})"
+    record = store.records.read("report")
+    if record is not None:
+        facts["report made (UTC)"] = record.started
+        facts["versions"] = record.versions
+    return facts
+
+
+def _input_text(sensor: SensorInfo) -> str:
+    if sensor.samples:
+        return f"{len(sensor.samples)} samples; maps and ensemble show {sensor.samples[sensor.shown].name}"
+    if sensor.kind != "frames":
+        return "ready-made histograms"
+    return f"frames, {sensor.mode}" + (f", read as {sensor.reader}" if sensor.reader else "")
+
+
+def _missing(name: str, sensor: SensorInfo, maps: Arrays, ensemble: Arrays, compared: bool) -> dict[str, str]:
+    """Say why parts are left out."""
+    found: dict[str, str] = {}
+    if not set(CHARGE_RATES) & maps.keys():
+        found["charge_rate"] = (
+            "no charge rate: input.against is not integration_time" if sensor.samples else NO_TIME
+        )
+    if not any(np.isfinite(values).any() for values in maps.values()):
+        found["maps"] = "no pixel has a value"
+    why = "no pixel has parameters" if "maps" in found else "the stage ensemble has no result"
+    for part, array, what in (
+        ("ensemble", "density", "no ensemble prediction"),
+        ("nuced", "nuced_density", "no non-uniformity correction"),
+        ("electrons", "electron_mass", "no electron numbers"),
+        ("components", "component_variance", "no component widths"),
+    ):
+        if array not in ensemble:
+            found[part] = f"{what}: {why}"
+    if sensor.samples:
+        found["methods"] = "compare methods in the run of one sample (pchem methods RUN --with OTHER)"
+    elif not compared:
+        found["methods"] = f"to compare other methods: pchem methods {quoted(Path(name))}"
+    return found
 
 
 @dataclass(frozen=True)
@@ -57,83 +282,6 @@ class PixelHistograms:
     def of(self, part: slice) -> PixelHistograms:
         """Return the histograms of successive pixels."""
         return PixelHistograms(self.origin[part], self.counts[part], self.satellites[:, part])
-
-
-@dataclass(frozen=True)
-class StoredRun:
-    """All of a run but its histograms.
-
-    Attributes:
-        name: of the store.
-        sensor: its input.
-        maps: parameters, what is derived from them, and standard errors, (y, x).
-        fit: ``fit_status``, and of pixels with a value ``goodness_p``, ``goodness_q``, ... (y, x).
-        intervals: by quantity the ends of its profile intervals.
-        ensemble: group ``ensemble``.
-        truth: true maps of simulated data.
-        facts: group to its attributes, of ``maps`` and ``ensemble``.
-        model: of the fit.
-        verdict: on what the model is missing, or None.
-        discrepancy: group ``discrepancy``, the arrays that go with it.
-        samples: group ``samples``, of a run of several exposures.
-        methods: content of ``methods.json``, or None.
-        record: of the report that is being made, or None.
-    """
-
-    name: str
-    sensor: SensorInfo
-    maps: Mapping[str, NDArray[Any]]
-    fit: Mapping[str, NDArray[Any]]
-    intervals: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    truth: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    facts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    model: FittedModel = field(default_factory=FittedModel)
-    verdict: Verdict | None = None
-    discrepancy: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    samples: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    methods: Mapping[str, Any] | None = None
-    record: StageRecord | None = None
-
-
-def read_run(store: RunStore, threads: int = 1) -> StoredRun:
-    """Read all of a run but its histograms.
-
-    Args:
-        store: the run.
-        threads: that read an array each.
-
-    Raises:
-        StoreError: an array is missing or corrupt.
-    """
-    verdict, methods, model = read_verdict(store.path), read_methods(store), FittedModel.read(store)
-    sensor, record = SensorInfo.read(store), store.records.read("report")
-    there = [
-        (group, name)
-        for group, names in _ARRAYS.items()
-        for name in names
-        if (group != "discrepancy" or verdict is not None) and store.has(f"{group}/{name}")
-    ]
-    arrays = call_all([functools.partial(store.read, f"{group}/{name}") for group, name in there], threads)
-    groups: dict[str, dict[str, NDArray[Any]]] = {group: {} for group in _ARRAYS}
-    for (group, name), values in zip(there, arrays, strict=True):
-        groups[group][name] = values
-    facts = {group: store.attributes(group) for group in ("maps", "ensemble")}
-    maps, fit = groups.pop("maps"), groups["fit"]
-    if "goodness_q" in maps:
-        fit["goodness_q"] = maps.pop("goodness_q")
-    if "fit_status" in fit:
-        # only what has a value can agree with its model or not
-        failed = (fit["fit_status"] & int(FAILED)) != 0
-        for name in (name for name in fit if name.startswith("goodness_")):
-            fit[name][failed] = np.nan
-    ends = {name: interval_names(name) for name in (*INTERVALS, *CHARGE_RATES)}
-    found = {name: (maps[low], maps[high]) for name, (low, high) in ends.items() if low in maps}
-    shown = {name: values for name, values in maps.items() if not any(name in pair for pair in ends.values())}
-    return StoredRun(
-        store.path.name, sensor, shown, intervals=found, facts=facts, model=model, verdict=verdict,
-        methods=methods, record=record, **groups,
-    )  # fmt: skip
 
 
 def read_histograms(store: RunStore, index: IntArray, shape: tuple[int, int]) -> PixelHistograms:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from helpers.commands import invoke
 
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ConfigError, ExitCode, InputError, StoreError
@@ -38,25 +38,10 @@ def calls(monkeypatch):
     return seen
 
 
-def invoke(*arguments):
-    return CliRunner().invoke(app.app, list(arguments), catch_exceptions=False)
-
-
 @pytest.mark.parametrize("name", ["simulate", "histogram", "fit", "maps", "ensemble", "report", "electrons"])
 def test_a_stage_command_runs_its_stage(calls, name):
-    options = ["--force", "--roi", "0:8,8:16", "--workers", "3", "--backend", "serial"]
-    result = invoke(
-        name,
-        "run.zarr",
-        *options,
-        "--progress",
-        "off",
-        "--quiet",
-        "--log-json",
-        "l.json",
-        "--max-memory",
-        "900",
-    )
+    options = ["--force", "--roi", "0:8,8:16", "--workers", "3", "--backend", "serial", "--progress", "off"]
+    result = invoke(name, "run.zarr", *options, "--quiet", "--log-json", "l.json", "--max-memory", "900")
     assert result.exit_code == 0
     [(target, stages, command)] = calls
     assert stages == [name]
@@ -79,19 +64,30 @@ def test_run_does_every_stage(calls):
     assert result.stdout == "/x/run.zarr\n"  # there is no report in this folder
 
 
-def test_options_for_camera_files_do_not_fit_a_yaml(tmp_path):
-    with pytest.raises(ConfigError, match="--integration-time: only with camera files"):
-        find_or_start([tmp_path / "c.yaml"], None, {"integration_time": 1})
+@pytest.mark.parametrize(
+    ("name", "given", "error", "words"),
+    [
+        ("c.yaml", {"integration_time": 1}, ConfigError, "--integration-time: only with camera files"),
+        ("none.tif", {}, InputError, "does not exist"),
+    ],
+)
+def test_what_a_run_cannot_begin_with_is_named(tmp_path, name, given, error, words):
+    with pytest.raises(error, match=words):
+        find_or_start([tmp_path / name], None, given)
 
 
-def test_missing_files_are_named(tmp_path):
-    with pytest.raises(InputError, match="does not exist"):
-        find_or_start([tmp_path / "none.tif"], None, {})
+EMPTY = r"^--roi .* contains no pixel; write y0:y1,x0:x1"
 
 
-@pytest.mark.parametrize("text", ["1,2", "a:b,c:d", "0:1", "0:1,2:3,4:5"])
-def test_wrong_roi_shows_how(text):
-    with pytest.raises(ConfigError, match="y0:y1,x0:x1"):
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        *((text, "y0:y1,x0:x1") for text in ("1,2", "a:b,c:d", "0:1", "0:1,2:3,4:5")),
+        *((text, EMPTY) for text in ("4:2,0:5", "0:4,5:5", "-1:4,0:5")),
+    ],
+)
+def test_a_wrong_or_empty_roi_shows_how(text, words):
+    with pytest.raises(ConfigError, match=words):
         invoke("fit", "run.zarr", "--roi", text)
 
 
@@ -117,12 +113,6 @@ def test_help_has_a_short_name_and_the_package_is_the_command():
     assert answer.stdout == f"pchem {__version__}\n"
 
 
-@pytest.mark.parametrize("text", ["4:2,0:5", "0:4,5:5", "-1:4,0:5"])
-def test_an_empty_roi_is_told_in_the_words_of_the_option(text):
-    with pytest.raises(ConfigError, match=r"^--roi .* contains no pixel; write y0:y1,x0:x1"):
-        invoke("fit", "run.zarr", "--roi", text)
-
-
 def test_init_writes_a_valid_file_once(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert invoke("init", "c.yaml", "x.fits").stdout == "c.yaml\n"
@@ -136,11 +126,7 @@ def test_init_writes_a_valid_file_once(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("error", "code", "words"),
     [
-        (
-            InputError("frames.tif is truncated;\n copy it again"),
-            4,
-            "frames.tif is truncated; copy it again\n",
-        ),
+        (InputError("a.tif is truncated;\n copy it again"), 4, "a.tif is truncated; copy it again\n"),
         (MemoryError(), 1, ""),
         (KeyboardInterrupt(), 130, ""),
     ],
@@ -218,17 +204,17 @@ def test_simulated_frames_lie_on_this_machine():
         ({"width": "88 px"}, "--width '88 px': write a length such as 88mm"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted, words: str) -> None:
+def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted, words):
     with pytest.raises(ConfigError, match=words):
         figures_of_run(Path("nowhere.zarr"), Path("out"), **wanted)
 
 
 @pytest.mark.parametrize("option", ["--only", "--format"])
-def test_a_list_of_nothing_does_not_mean_all(option: str) -> None:
+def test_a_list_of_nothing_does_not_mean_all(option):
     with pytest.raises(ConfigError, match=f"{option}: ' ,' is no name"):
         invoke("figures", "run.zarr", option, " ,")
 
 
-def test_a_folder_without_a_run_is_told(tmp_path: Path) -> None:
+def test_a_folder_without_a_run_is_told(tmp_path):
     with pytest.raises(StoreError, match="there is no run at"):
         figures_of_run(tmp_path, tmp_path / "out")

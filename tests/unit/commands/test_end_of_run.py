@@ -15,7 +15,7 @@ from pchem_pipeline.runner.session import Command
 STAGES = ("maps", "report")
 
 
-def numbers(level: str) -> dict:
+def numbers(level):
     word = {"good": "Yes", "caution": "With caution", "serious": "No"}[level]
     return {
         "answers": [
@@ -33,7 +33,7 @@ def numbers(level: str) -> dict:
 
 
 @pytest.fixture
-def target(tmp_path, monkeypatch) -> Target:
+def target(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(first_screen, "run_stages", lambda *_: [])
     (tmp_path / "my run.zarr").mkdir()
@@ -41,7 +41,7 @@ def target(tmp_path, monkeypatch) -> Target:
     return Target(config, tmp_path, tmp_path / "my run.zarr", tmp_path / "my run.yaml")
 
 
-def run(target: Target, level: str, *, strict: bool = False, stages=STAGES, **options) -> list[str]:
+def run(target, level, *, strict=False, stages=STAGES, **options):
     (target.store / "report.json").write_text(json.dumps(numbers(level)))
     said: list[str] = []
     try:
@@ -51,7 +51,7 @@ def run(target: Target, level: str, *, strict: bool = False, stages=STAGES, **op
     return said
 
 
-def test_the_first_screen_is_told_and_the_path_alone_is_a_result(target, capsys) -> None:
+def test_the_first_screen_is_told_and_the_path_alone_is_a_result(target, capsys):
     run(target, "good")
     said = capsys.readouterr()
     assert said.out == ""
@@ -63,7 +63,7 @@ def test_the_first_screen_is_told_and_the_path_alone_is_a_result(target, capsys)
     assert lines[-1] == "  pchem view 'my run.yaml'"
 
 
-def test_a_serious_answer_is_one_line_even_where_quiet(target, capsys) -> None:
+def test_a_serious_answer_is_one_line_even_where_quiet(target, capsys):
     run(target, "serious", quiet=True)
     assert capsys.readouterr().err == "warning: To be believed? No: 60 % flagged: so.\n"
     for level in ("caution", "good"):
@@ -71,14 +71,14 @@ def test_a_serious_answer_is_one_line_even_where_quiet(target, capsys) -> None:
         assert capsys.readouterr().err == ""
 
 
-def test_strict_makes_it_exit_code_3(target, capsys) -> None:
+def test_strict_makes_it_exit_code_3(target, capsys):
     with pytest.raises(NotBelievedError, match="To be believed") as raised:
         run(target, "serious", quiet=True, strict=True)
     assert raised.value.exit_code == ExitCode.INCOMPLETE == 3
     assert capsys.readouterr().err == ""  # the error says it
 
 
-def test_an_incomplete_run_tells_what_it_has(target, capsys, monkeypatch) -> None:
+def test_an_incomplete_run_tells_what_it_has(target, capsys, monkeypatch):
     def fail(*_):
         raise IncompleteRunError("12 of 40 pixels")
 
@@ -88,7 +88,7 @@ def test_an_incomplete_run_tells_what_it_has(target, capsys, monkeypatch) -> Non
     assert "To be believed? No." in capsys.readouterr().err
 
 
-def test_without_a_report_the_store_is_told(target, capsys) -> None:
+def test_without_a_report_the_store_is_told(target, capsys):
     said: list[str] = []
     first_screen.run_to_first_screen(target, ("maps",), Command(), said.append, strict=True)
     assert said == [str(target.store)]
@@ -98,7 +98,7 @@ def test_without_a_report_the_store_is_told(target, capsys) -> None:
     assert capsys.readouterr().err == ""
 
 
-def test_a_json_log_has_the_answers(target) -> None:
+def test_a_json_log_has_the_answers(target):
     run(target, "serious", log_json=Path("log.jsonl"), quiet=True)
     events = [json.loads(line) for line in Path("log.jsonl").read_text().splitlines()]
     assert [event["event"] for event in events] == ["verdict", "warning"]

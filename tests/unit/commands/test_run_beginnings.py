@@ -6,10 +6,9 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
-from typer.testing import CliRunner
+from helpers.commands import invoke
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.cli.app import app
 from pchem_pipeline.commands.new_run import find_joint, find_or_start, first_try
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.store.records import StageRecord
@@ -21,6 +20,14 @@ def file(tmp_path):
     path = tmp_path / "f 1.tif"
     path.touch()
     return path
+
+
+def ingested(place, config=None):
+    """Leave a store whose frames are ingested, with the settings of a run."""
+    store = RunStore.create(place)
+    if config is not None:
+        store.write_config(dump_config(config))
+    store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
 
 
 @pytest.mark.parametrize(
@@ -45,7 +52,7 @@ def test_what_files_do_not_say_of_themselves_has_an_option(tmp_path, monkeypatch
         for name in ("dark", "light"):
             file[name] = rng.integers(100, 140, (20, 4, 4)).astype(np.uint16) << 4
     options = ["--dataset", "light", "--bit-shift", "4", "--bit-depth", "12", "--until", "histogram"]
-    CliRunner().invoke(app, ["run", "a.h5", *options], catch_exceptions=False)
+    invoke("run", "a.h5", *options)
     written = load_config(tmp_path / "run.yaml").input
     assert (written.dataset, written.bit_shift, written.bit_depth) == ("light", 4, 12)
     assert RunStore.open(tmp_path / "run.zarr").read("histogram/origin").min() < 140
@@ -61,7 +68,7 @@ def begun(find, *given, **more):
 def test_a_dry_run_writes_no_yaml(tmp_path, file, monkeypatch):
     tifffile.imwrite(file, np.full((9, 8, 8), 100, np.uint16), photometric="minisblack")
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["run", str(file), "--dry-run"], catch_exceptions=False)
+    result = invoke("run", file, "--dry-run")
     assert result.exit_code == 0
     assert "ingest: missing → would run" in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
@@ -74,8 +81,7 @@ def test_options_can_be_corrected_until_a_stage_is_finished(tmp_path, file):
     store.write_config(dump_config(target.config))
     again, _ = begun(find_or_start, [file], place, {"bit_depth": 14})
     assert load_config(tmp_path / "run.yaml") == again.config
-    store.write_config(dump_config(again.config))
-    store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+    ingested(place, again.config)
     with pytest.raises(ConfigError, match=r"exists with other settings.*'.*/run\.yaml'|run\.yaml"):
         find_or_start([file], place, {"bit_depth": 12})
 
@@ -92,9 +98,7 @@ def test_a_folder_of_files_is_one_pattern_wherever_the_store_is(tmp_path, monkey
         target, _ = begun(find_or_start, files, Path("new/run.zarr"), {})
         assert target.config.input.files == ("../frames 1/*.tif",)
     (tmp_path / "frames 1" / "f.tif").touch()
-    store = RunStore.create(target.store)
-    store.write_config(dump_config(target.config))
-    store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+    ingested(target.store, target.config)
     with pytest.raises(ConfigError, match=r"input\.files .* in the file, .* here") as refused:
         find_or_start(files, Path("new/run.zarr"), {})
     assert len(str(refused.value)) < 700  # twice the path of the test
@@ -116,7 +120,7 @@ def test_the_same_command_goes_on_with_a_yaml_that_says_more(tmp_path, file, mon
     monkeypatch.chdir(tmp_path)
     place = tmp_path / "run.zarr"
     begun(find_or_start, [file], place, {"bit_depth": 12}, (0, 8, 8, 16))
-    RunStore.create(place).records.write(StageRecord("ingest", 1, "f", {}, finished=True))
+    ingested(place)
     path = tmp_path / "run.yaml"
     effects = "effects: [{tag: row_noise, row_noise_dn: 1.0}]  # named"
     edited = path.read_text().replace("effects: []", effects).replace("tail_guard: 0.001", "tail_guard: 0")
@@ -155,12 +159,10 @@ def test_a_refusal_that_names_a_setting_says_where_settings_are(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     np.save("f.npy", np.full((9, 8, 8), (1 << 13) + 1, np.uint16))
     with pytest.raises(InputError, match=r"; for settings .*: pchem init 'my run.yaml' FILES, edit it"):
-        CliRunner().invoke(
-            app, ["run", "f.npy", "--store", "my run.zarr", "--bit-depth", "12"], catch_exceptions=False
-        )
+        invoke("run", "f.npy", "--store", "my run.zarr", "--bit-depth", "12")
     assert [path.name for path in tmp_path.iterdir()] == ["f.npy"]
     with pytest.raises(InputError) as refused:
-        CliRunner().invoke(app, ["run", "g.npy"], catch_exceptions=False)
+        invoke("run", "g.npy")
     assert "pchem init" not in str(refused.value)
 
 
@@ -171,12 +173,12 @@ def test_a_first_try_that_is_refused_leaves_nothing_behind(tmp_path, file, monke
         tifffile.imwrite(file, np.full((9, 8, 8), 100, np.uint16), photometric="minisblack")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError):
-        CliRunner().invoke(app, ["run", str(file), *options], catch_exceptions=False)
+        invoke("run", file, *options)
     assert sorted(tmp_path.rglob("*")) == before
     # a YAML of one's own stays
     (tmp_path / "own.yaml").write_text(f"input: {{files: [{file.name!r}], roi: [0, 99, 0, 4]}}\n")
     with pytest.raises(InputError):
-        CliRunner().invoke(app, ["run", "own.yaml"], catch_exceptions=False)
+        invoke("run", "own.yaml")
     assert sorted(path.name for path in tmp_path.iterdir()) == [file.name, "own.yaml"]
 
 

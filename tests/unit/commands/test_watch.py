@@ -4,9 +4,8 @@ import json
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from helpers.commands import invoke
 
-from pchem_pipeline.cli import app
 from pchem_pipeline.commands import watch as watch_module
 from pchem_pipeline.commands.watch import pace_words, rows, watch
 from pchem_pipeline.config.load import parse_config
@@ -19,7 +18,7 @@ PACE = {"stage": "fit", "unit": "tile", "done": 8, "total": 64, "rate": 2.0, "re
 DONE, PART = StageState("ingest", "complete"), StageState("fit", "partial", "", 8, 64, 2)
 
 
-def test_rows_tell_rate_and_remaining_time() -> None:
+def test_rows_tell_rate_and_remaining_time():
     assert rows([DONE, PART], None) == ["ingest      complete", "fit         partial 8 of 64  (with model 2)"]
     assert rows([DONE, PART], PACE)[1] == "fit         running 8 of 64 tiles, 2/s, 28 s left"
     both = {**PACE, "stage": "ingest and histogram", "unit": "MiB"}
@@ -35,13 +34,13 @@ def test_rows_tell_rate_and_remaining_time() -> None:
         ({"stage": "ingest: hash"}, "running (hash) 8 of 64 tiles, 2/s, 28 s left"),
     ],
 )
-def test_paces_in_words(change: dict[str, object], words: str) -> None:
+def test_paces_in_words(change, words):
     assert pace_words({**PACE, **change}) == words
     assert pace_words({"stage": ""}) == "running"
 
 
 @pytest.fixture
-def looks(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def looks(monkeypatch):
     """Three looks: at work, further, done."""
     paces = iter([PACE, {**PACE, "done": 16, "remaining": 24.0}, None])
     states = iter([[DONE, PART], [DONE, PART], [DONE, StageState("fit", "complete")]])
@@ -50,7 +49,7 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return []
 
 
-def test_watching_ends_with_the_work_and_tells_what_changed(looks: list[float]) -> None:
+def test_watching_ends_with_the_work_and_tells_what_changed(looks):
     written: list[str] = []
     watch(TARGET, written.append, follow=True, sleep=looks.append)
     assert len(looks) == 2
@@ -61,14 +60,14 @@ def test_watching_ends_with_the_work_and_tells_what_changed(looks: list[float]) 
     ]
 
 
-def test_a_terminal_is_drawn_over(looks: list[float]) -> None:
+def test_a_terminal_is_drawn_over(looks):
     written: list[str] = []
     watch(TARGET, written.append, follow=True, terminal=True, sleep=looks.append)
     assert written[1].startswith("\x1b[2A\x1b[Jingest      complete\nfit ")
 
 
-def test_json_lines_and_ctrl_c(looks: list[float]) -> None:
-    def stop(seconds: float) -> None:
+def test_json_lines_and_ctrl_c(looks):
+    def stop(seconds):
         raise KeyboardInterrupt
 
     written: list[str] = []
@@ -79,11 +78,11 @@ def test_json_lines_and_ctrl_c(looks: list[float]) -> None:
     assert content["stages"][1] == fit
 
 
-def test_the_command_looks_once_unless_asked(looks: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_looks_once_unless_asked(looks, monkeypatch):
     monkeypatch.setattr(target, "find_run", lambda path: TARGET)
-    result = CliRunner().invoke(app.app, ["status", "run.yaml"], catch_exceptions=False)
+    result = invoke("status", "run.yaml")
     assert result.stdout.splitlines() == rows([DONE, PART], PACE)
-    result = CliRunner().invoke(app.app, ["status", "run.yaml", "--json"], catch_exceptions=False)
+    result = invoke("status", "run.yaml", "--json")
     assert json.loads(result.stdout)["progress"]["done"] == 16
 
 

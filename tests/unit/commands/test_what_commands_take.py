@@ -1,7 +1,6 @@
 """What commands refuse before they write, which frames they take for the same, and tables for others."""
 
 import csv
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -60,20 +59,20 @@ def test_a_pixel_is_newly_hot_unless_its_exposure_agrees_within_the_errors_that_
         ("clipping", "has no typical strength"),
     ],
 )
-def test_what_cannot_be_hidden_is_refused(tmp_path: Path, asked: str, said: str) -> None:
+def test_what_cannot_be_hidden_is_refused(tmp_path, asked, said):
     with pytest.raises(ConfigError, match=said):
         run_demo(tmp_path / "x", hidden=asked, size=8, n_frames=60, seed=1)
     assert not (tmp_path / "x").exists()
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "mine.txt").touch()
     with pytest.raises(ConfigError, match="is not empty; choose another folder"):
         run_demo(tmp_path, hidden="row_noise", size=8, n_frames=60, seed=1)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_an_effect_can_be_hidden_in_a_place() -> None:
+def test_an_effect_can_be_hidden_in_a_place():
     effect = hidden_effect("row_noise@columns=2:5,frames=10:20", 12, 60)
     everywhere = hidden_effect("row_noise", 12, 60).model_dump()["row_noise_dn"]
     assert effect.model_dump()["row_noise_dn"] == pytest.approx(everywhere * (4 * 6) ** 0.5)

@@ -29,12 +29,9 @@ def die(number):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_every_backend_reports_values_and_errors_alike(backend):
-    executor = make_executor(ComputeSettings(backend=backend, workers=2))
     found = {}
-    try:
+    with contextlib.closing(make_executor(ComputeSettings(backend=backend, workers=2))) as executor:
         executor.map(reciprocal, [1, 2, 0, 4], lambda item, outcome: found.update({item: outcome}))
-    finally:
-        executor.close()
     assert {item: outcome.value for item, outcome in found.items()} == {1: 1.0, 2: 0.5, 0: None, 4: 0.25}
     assert isinstance(found[0].error, ZeroDivisionError)
     assert "reciprocal" in found[0].trace
@@ -45,11 +42,9 @@ def test_a_local_cluster_starts_beside_a_busy_dashboard_port_and_listens_on_loop
         with contextlib.suppress(OSError):  # whoever holds the port already serves as well
             other.bind(("127.0.0.1", 8787))
             other.listen()
-        executor = make_executor(ComputeSettings(backend="distributed", workers=1))
-        try:
+        made = make_executor(ComputeSettings(backend="distributed", workers=1))
+        with contextlib.closing(made) as executor:
             assert executor._cluster.scheduler.http_server.address == "127.0.0.1"
-        finally:
-            executor.close()
 
 
 @pytest.mark.parametrize("backend", BACKENDS[:2])
@@ -163,17 +158,18 @@ def test_without_shared_memory_there_are_no_worker_processes(monkeypatch):
         make_executor(ComputeSettings(backend="processes", workers=2)).map(abs, [1], lambda *_: None)
 
 
-def test_no_scheduler_at_the_address():
-    settings = ComputeSettings(backend="distributed", scheduler="no/such/file.json")
-    with pytest.raises(ConfigError, match="no scheduler at"):
-        make_executor(settings)
-
-
-def test_a_cluster_of_earlier_versions_is_not_started():
-    content = {"backend": "distributed", "cluster": {"class": "dask_jobqueue.SLURMCluster"}}
-    settings = ComputeSettings.model_validate(content)
-    with pytest.raises(ConfigError, match="start it, and give its address"):
-        make_executor(settings)
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"backend": "distributed", "scheduler": "no/such/file.json"}, "no scheduler at"),
+        # as earlier versions started it
+        ({"backend": "distributed", "cluster": {"class": "dask_jobqueue.SLURMCluster"}}, "give its address"),
+        ({"workers": 0}, "workers"),
+    ],
+)
+def test_settings_without_workers_are_refused(settings, words):
+    with pytest.raises(ConfigError, match=words):
+        make_executor(ComputeSettings.model_validate(settings))
 
 
 def test_a_configuration_of_dask_that_is_malformed_is_one_line(tmp_path):
@@ -190,11 +186,6 @@ def test_a_configuration_of_dask_that_is_malformed_is_one_line(tmp_path):
     assert "ConfigError: A dask config file at" in last
     assert str(tmp_path / "dask.yaml") in last
     assert last.endswith("; correct that file")
-
-
-def test_zero_workers_are_refused():
-    with pytest.raises(ConfigError, match="workers"):
-        make_executor(ComputeSettings(workers=0))
 
 
 def take_too_much(number):

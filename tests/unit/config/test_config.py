@@ -1,6 +1,6 @@
 import itertools
 import json
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
 import yaml
@@ -173,7 +173,7 @@ model:
 """
 
 
-def model(*effects: dict[str, Any], aside: Any = ()) -> ModelSettings:
+def model(*effects, aside=()):
     return ModelSettings.model_validate({"effects": list(effects), "set_aside_e": aside})
 
 
@@ -247,8 +247,8 @@ def test_every_effect_can_be_written(tmp_path):
         assert load_config(path).model == wanted, effect.tag
 
 
-def test_no_setting_is_called_what_yaml_takes_for_true_or_false() -> None:
-    def names(kind: type[BaseModel], seen: set[type]) -> set[str]:
+def test_no_setting_is_called_what_yaml_takes_for_true_or_false():
+    def names(kind, seen):
         seen.add(kind)
         found = set(kind.model_fields)
         for field in kind.model_fields.values():
@@ -257,7 +257,7 @@ def test_no_setting_is_called_what_yaml_takes_for_true_or_false() -> None:
                     found |= names(part, seen)
         return found
 
-    def parts(annotation: Any) -> list[type[BaseModel]]:
+    def parts(annotation):
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
             return [annotation]
         return [part for inner in get_args(annotation) for part in parts(inner)]

@@ -2,7 +2,7 @@
 
 import logging
 from importlib.metadata import EntryPoint
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import pytest
 from pydantic import ValidationError
@@ -20,7 +20,7 @@ class Shine(Effect):
     plane: ClassVar[Plane] = Plane.EXPOSURE
     extra: float = 0.5
 
-    def apply(self, values: Any, context: Any) -> Any:
+    def apply(self, values, context):
         return values + self.extra
 
 
@@ -30,21 +30,21 @@ class Impostor(Effect):
     tag: Literal["row_noise"] = "row_noise"
     plane: ClassVar[Plane] = Plane.ANALOG
 
-    def apply(self, values: Any, context: Any) -> Any:
+    def apply(self, values, context):
         return values
 
 
 class Tagless(Effect):
     plane: ClassVar[Plane] = Plane.ANALOG
 
-    def apply(self, values: Any, context: Any) -> Any:
+    def apply(self, values, context):
         return values
 
 
 class Planeless(Effect):
     tag: Literal["planeless"] = "planeless"
 
-    def apply(self, values: Any, context: Any) -> Any:
+    def apply(self, values, context):
         return values
 
 
@@ -56,7 +56,7 @@ class Idle(Effect):
 NOT_AN_EFFECT = 3
 
 
-def entry(name: str, value: str | None = None) -> EntryPoint:
+def entry(name, value=None):
     return EntryPoint(name, value or f"{__name__}:{name}", registry.ENTRY_POINT_GROUP)
 
 
@@ -64,7 +64,7 @@ def entry(name: str, value: str | None = None) -> EntryPoint:
 def installed(monkeypatch):
     """Pretend that packages with these entry points are installed."""
 
-    def install(*points: EntryPoint) -> None:
+    def install(*points):
         monkeypatch.setattr(registry, "entry_points", lambda group: points)
         registry._discover.cache_clear()
 
@@ -133,7 +133,7 @@ def test_effects_are_frozen_and_have_no_reach_by_default():
         shine.extra = 2.0
 
 
-def test_parameters_at_a_limit_are_told_and_defaults_are_not() -> None:
+def test_parameters_at_a_limit_are_told_and_defaults_are_not():
     """A search that drives a parameter to its limit may have taken one effect for another."""
     kind = registry.effect_class("interpixel_capacitance")
     stuck = kind.model_validate({"coupling": 0.008, "anisotropy": -1.0})
@@ -142,12 +142,10 @@ def test_parameters_at_a_limit_are_told_and_defaults_are_not() -> None:
     assert kind.model_validate({"coupling": 0.0}).at_limits() == {"coupling": 0.0}  # its strength, gone
 
 
-def test_limits_that_are_values_like_others_are_not_told() -> None:
+def test_limits_that_are_values_like_others_are_not_told():
     """Half a cycle per row is a frequency; a missing code is one of no width."""
-    pickup = registry.effect_class("periodic_pickup").model_validate(
-        {"amplitude_dn": 0.3, "cycles_per_row": 0.5}
-    )
-    assert pickup.at_limits() == {}
+    kind = registry.effect_class("periodic_pickup")
+    assert kind(amplitude_dn=0.3, cycles_per_row=0.5).at_limits() == {}
     every = [kind for kind in registry.effect_classes().values() if kind.may_be_at_bound]
     assert every
     assert all(set(kind.may_be_at_bound) <= set(kind.model_fields) for kind in every)

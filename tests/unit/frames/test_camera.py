@@ -3,8 +3,6 @@
 import itertools
 import json
 import struct
-from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -12,7 +10,7 @@ import pytest
 import tifffile
 import zarr
 from astropy.io import fits
-from helpers.camera_files import opened
+from helpers.camera_files import opened, write_fits, write_hdf5
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
@@ -33,26 +31,25 @@ STACK = np.random.default_rng(5).integers(0, 4096, (5, 6, 7)).astype(np.uint16)
 TAKEN = 1_769_860_800.0  # 2026-01-31T12:00:00 UTC
 
 
-def facts(path: Path, **settings: object) -> CameraFacts:
+def facts(path, **settings):
     with opened(path, **settings) as frames:
         np.testing.assert_array_equal(frames.read(), STACK)
         return frames.camera
 
 
-def test_fits(tmp_path: Path) -> None:
-    image = fits.PrimaryHDU(STACK)
-    image.header["INSTRUME"], image.header["SERIALNO"] = "qCMOS X", 1234
-    image.header["CCD-TEMP"], image.header["DATE-OBS"] = -19.5, "2026-01-31T12:00:00"
-    image.writeto(tmp_path / "a.fits")
-    assert facts(tmp_path / "a.fits") == CameraFacts("qCMOS X", "1234", -19.5, TAKEN)
-    image.header["CCD-TEMP"] = (253.15, "[K] of the detector")
-    image.header["DATE-OBS"], image.header["TIME-OBS"] = "2026-01-31", "12:00:00"
-    image.writeto(tmp_path / "b.fits")
-    found = facts(tmp_path / "b.fits")
-    assert (found.temperature, found.taken) == (pytest.approx(-20.0), TAKEN)
+@pytest.mark.parametrize(
+    "cards",
+    [
+        {"CCD-TEMP": -20.0, "DATE-OBS": "2026-01-31T12:00:00"},
+        {"CCD-TEMP": (253.15, "[K] of the detector"), "DATE-OBS": "2026-01-31", "TIME-OBS": "12:00:00"},
+    ],
+)
+def test_fits(tmp_path, cards):
+    path = write_fits(tmp_path / "a.fits", STACK, INSTRUME="qCMOS X", SERIALNO=1234, **cards)
+    assert facts(path) == CameraFacts("qCMOS X", "1234", pytest.approx(-20.0), TAKEN)
 
 
-def test_tiff_tags_and_records(tmp_path: Path) -> None:
+def test_tiff_tags_and_records(tmp_path):
     texts = {271: "Maker", 272: "Model 7", 306: "2026:01:31 12:00:00"}
     tags = [(number, "s", 0, text, True) for number, text in texts.items()]
     tifffile.imwrite(tmp_path / "tags.tif", STACK, photometric="minisblack", extratags=tags, metadata=None)
@@ -67,7 +64,7 @@ def test_tiff_tags_and_records(tmp_path: Path) -> None:
     assert facts(tmp_path / "m.tif") == CameraFacts("Andor", None, -60.0, None)
 
 
-def test_ome_tiff(tmp_path: Path) -> None:
+def test_ome_tiff(tmp_path):
     path = tmp_path / "a.ome.tif"
     tifffile.imwrite(path, STACK, metadata={"axes": "TYX", "AcquisitionDate": "2026-01-31T12:00:00"})
     text = tifffile.tiffcomment(path)
@@ -80,7 +77,7 @@ def test_ome_tiff(tmp_path: Path) -> None:
     assert (found.name, found.serial, found.temperature, found.taken) == ("A & B", "9", -10.0, TAKEN)
 
 
-def test_hdf5_and_zarr(tmp_path: Path) -> None:
+def test_hdf5_and_zarr(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         group = file.create_group("entry/detector")
         group["frames"] = STACK
@@ -95,7 +92,7 @@ def test_hdf5_and_zarr(tmp_path: Path) -> None:
     assert facts(tmp_path / "a.zarr") == CameraFacts("Z", None, 12.5, TAKEN)
 
 
-def test_a_free_text_is_no_camera(tmp_path: Path) -> None:
+def test_a_free_text_is_no_camera(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["frames"] = STACK
         file["frames"].attrs["description"] = "dark frames of Monday"
@@ -103,7 +100,7 @@ def test_a_free_text_is_no_camera(tmp_path: Path) -> None:
     assert facts(tmp_path / "a.h5") == CameraFacts()
 
 
-def test_ser_and_raw(tmp_path: Path) -> None:
+def test_ser_and_raw(tmp_path):
     ser.write_frames(tmp_path / "a.ser", iter([STACK]), StackFacts(STACK.shape, STACK.dtype, bit_depth=12))
     head = bytearray((tmp_path / "a.ser").read_bytes())
     head[82:122] = b"Planetary cam".ljust(40, b"\0")
@@ -116,13 +113,11 @@ def test_ser_and_raw(tmp_path: Path) -> None:
     assert facts(tmp_path / "a.raw", format="raw") == CameraFacts("R", None, -5.0, None)
 
 
-def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
+def test_several_files_share_what_they_state_alike(tmp_path):
     for i, temperature in enumerate((-20.0, -20.4, -17.0)):
-        image = fits.PrimaryHDU(STACK[i])
-        image.header["INSTRUME"], image.header["CCD-TEMP"] = "C", temperature
-        image.header["SERIALNO"] = f"{i}"  # counts the files
-        image.header["DATE-OBS"] = f"2026-01-31T12:00:0{i}"
-        image.writeto(tmp_path / f"{i}.fits")
+        cards = {"CCD-TEMP": temperature, "SERIALNO": f"{i}"}  # which counts the files
+        cards["DATE-OBS"] = f"2026-01-31T12:00:0{i}"
+        write_fits(tmp_path / f"{i}.fits", STACK[i], INSTRUME="C", **cards)
     with opened(tmp_path / "*.fits") as frames:
         assert frames.camera == CameraFacts("C", None, pytest.approx(-57.4 / 3), TAKEN)
         assert [note for note in frames.notes if "-20.4 to -17 °C" in note]
@@ -131,16 +126,14 @@ def test_several_files_share_what_they_state_alike(tmp_path: Path) -> None:
     assert shared_facts([CameraFacts(temperature=1.0), CameraFacts()])[0].temperature is None
 
 
-def test_files_of_two_cameras_are_no_stack(tmp_path: Path) -> None:
+def test_files_of_two_cameras_are_no_stack(tmp_path):
     for i, serial in enumerate(("A1", "A1", "B2", "B2")):
-        image = fits.PrimaryHDU(STACK[i])
-        image.header["SERIALNO"] = serial
-        image.writeto(tmp_path / f"{i}.fits")
+        write_fits(tmp_path / f"{i}.fits", STACK[i], SERIALNO=serial)
     words = r"different cameras: serial number A1 in 0\.fits, serial number B2 in 2\.fits; make one run"
     for files in (("*.fits",), ("1.fits", "2.fits")):
         with pytest.raises(InputError, match=words.replace("0", files[0][0].replace("*", "0"))):
             open_frames(InputSettings(files=files), tmp_path)
-    fits.PrimaryHDU(STACK[4]).writeto(tmp_path / "4.fits")  # says nothing, contradicts nothing
+    write_fits(tmp_path / "4.fits", STACK[4])  # says nothing, contradicts nothing
     with open_frames(InputSettings(files=("0.fits", "1.fits", "4.fits")), tmp_path) as frames:
         assert frames.camera.serial is None
 
@@ -159,11 +152,11 @@ def test_files_of_two_cameras_are_no_stack(tmp_path: Path) -> None:
         ("warm", "C", None),
     ],
 )
-def test_a_temperature_is_one_of_a_sensor_or_none(value: object, unit: str, found: float | None) -> None:
+def test_a_temperature_is_one_of_a_sensor_or_none(value, unit, found):
     assert celsius(value, unit) == (None if found is None else pytest.approx(found))
 
 
-def test_names_of_a_megabyte_in_every_format(tmp_path: Path) -> None:
+def test_names_of_a_megabyte_in_every_format(tmp_path):
     text = "日本語 кир עברית \u202e\x1b[31m<script>" * 35_000
     image = fits.PrimaryHDU(STACK)
     image.header["INSTRUME"] = "Z" * 100_000
@@ -180,12 +173,11 @@ def test_names_of_a_megabyte_in_every_format(tmp_path: Path) -> None:
     for name in ("a.fits", "a.h5", "a.zarr", "a.tif"):
         found = facts(tmp_path / name)
         assert found.temperature is None
-        assert found.name is not None
         assert 40 < len(found.name) <= 80, name
         assert found.name.isprintable()
 
 
-def test_xml_that_stands_for_a_billion_letters_is_not_read(tmp_path: Path) -> None:
+def test_xml_that_stands_for_a_billion_letters_is_not_read(tmp_path):
     names = "abcdefghij"
     more = "".join(f'<!ENTITY {b} "{f"&{a};" * 10}">' for a, b in itertools.pairwise(names))
     xml = f'<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "{"a" * 10}">{more}]><OME><Image Name="&j;"/></OME>'
@@ -193,11 +185,33 @@ def test_xml_that_stands_for_a_billion_letters_is_not_read(tmp_path: Path) -> No
     assert facts(tmp_path / "a.tif") == CameraFacts()
 
 
-def test_hostile_texts_become_one_short_line() -> None:
+def test_hostile_texts_become_one_short_line():
     assert text_of(b"a\x1b[31m\n<b>\0rest") == "a [31m <b>"
     assert text_of("x" * 1_000_000) == "x" * 80
     assert (text_of(b"\0\0"), text_of(None), text_of(True)) == (None, None, None)
     assert (seconds_of("yesterday"), seconds_of("1800-01-01"), seconds_of(5)) == (None, None, None)
+
+
+#: what the words beside a time of 100 make of it, s
+WORDS = {
+    0.1: (
+        "exposure time in ms", "EXPTIME (msec.)", "Exposure time, milliseconds", "exposure_ms", "m_sec",
+        "exposure time in milli-seconds",
+    ),
+    1e-4: ("[\u03bcs] shutter open", "exposure in us of the shutter"),
+    100.0: (
+        "exposure (shutter) time in seconds", "exposure time of the second frame",
+        "exposure time in the dark mode",
+    ),
+    None: (
+        "exposure time in ticks", "exposure time in clock cycles", "exposure time [ms/10]",
+        "exposure time, ticks", "[lines] exposure time", "[s] exposure time in ms",
+        "exposure in units of 10 us", "exposure in tenths of seconds", "tenths of a second",
+        "exposure time, tenths of a second", "exposure time (tenths of a second)",
+        "exposure of half seconds", "exposure time, deci-seconds", "exposure time, deciseconds",
+        "1/s", "frames per second",
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -208,69 +222,31 @@ def test_hostile_texts_become_one_short_line() -> None:
         (np.float32(2), None, 2.0),
         (1.5, b"min", 90.0),
         (3.0, "fortnights", None),
-        (0.0, "s", None),
-        (np.nan, "s", None),
-        (True, "s", None),
-        ([1.0, 2.0], "s", None),
-        (None, "s", None),
+        *((value, "s", None) for value in (0.0, np.nan, True, [1.0, 2.0], None)),
         ("100 ms", None, 0.1),
-        (100, "exposure time in ms", 0.1),
-        (100, "EXPTIME (msec.)", 0.1),
-        (100, "[\u03bcs] shutter open", 1e-4),
-        (100, "Exposure time, milliseconds", 0.1),
-        (100, "exposure (shutter) time in seconds", 100.0),
-        (100, "exposure time of the second frame", 100.0),
-        (100, "exposure time in the dark mode", 100.0),
-        (100, "exposure time in ticks", None),
-        (100, "exposure time in clock cycles", None),
-        (100, "exposure time in milli-seconds", 0.1),
-        (100, "exposure_ms", 0.1),
-        (100, "m_sec", 0.1),
-        (100, "exposure in us of the shutter", 1e-4),
-        (100, "exposure time [ms/10]", None),
         ("100ms", None, 0.1),
         ("1/30 s", None, None),
-        (100, "[lines] exposure time", None),
-        (100, "[s] exposure time in ms", None),
-        (100, "exposure in units of 10 us", None),
-        (100, "exposure in tenths of seconds", None),
-        (100, "exposure time, tenths of a second", None),
-        (100, "exposure time (tenths of a second)", None),
-        (100, "tenths of a second", None),
-        (100, "exposure of half seconds", None),
-        (100, "exposure time, deci-seconds", None),
-        (100, "exposure time, deciseconds", None),
-        (100, "exposure time, ticks", None),
-        (100, "1/s", None),
-        (100, "frames per second", None),
-        (2, "exposure time, kiloseconds", 2000.0),
-        (2, "kilo-seconds", 2000.0),
-        (2, "ks", 2000.0),
+        *((2, words, 2000.0) for words in ("exposure time, kiloseconds", "kilo-seconds", "ks")),
         (2, "exposure time (hours)", 7200.0),
+        *((100, words, seconds) for seconds, alike in WORDS.items() for words in alike),
     ],
 )
-def test_durations(value: Any, unit: Any, seconds: float | None) -> None:
+def test_durations(value, unit, seconds):
     comment = unit if isinstance(unit, str) and " " in unit else ""
     found = duration_of("exposure", value, None if comment else unit, comment=comment)
     assert (found and found.seconds) == (None if seconds is None else pytest.approx(seconds))
 
 
-def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) -> None:
-    image = fits.PrimaryHDU(STACK)
-    cards = {"plain": {}, "unit": {"TIMEUNIT": "ms"}, "doubt": {"TIMEUNIT": "ms"}}
-    for name, more in cards.items():
-        image.header["EXPTIME"] = (100, "exposure in s" if name == "doubt" else "exposure time")
-        image.header.update(more)
-        image.writeto(tmp_path / f"{name}.fits")
-    attributes = {"exposure_time": 100, "exposure_time_unit": "ms"}
-    zarr.create_array(tmp_path / "a.zarr", data=STACK, attributes=attributes)
-    named = {"exposure_time": 100, "time_unit": "ms"}
-    zarr.create_array(tmp_path / "b.zarr", data=STACK, attributes=named)
-    for name, unit in (("c", "ms"), ("d", "DN")):  # that of the samples says nothing about the time
-        attributes = {"exposure_time": 100, "unit": unit}
-        zarr.create_array(tmp_path / f"{name}.zarr", data=STACK, attributes=attributes)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["frames"], file["exposure_ms"] = STACK, 100
+def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path):
+    time = (100, "exposure time")
+    write_fits(tmp_path / "plain.fits", STACK, EXPTIME=time)
+    write_fits(tmp_path / "unit.fits", STACK, EXPTIME=time, TIMEUNIT="ms")
+    write_fits(tmp_path / "doubt.fits", STACK, EXPTIME=(100, "exposure in s"), TIMEUNIT="ms")
+    units = {"a": {"exposure_time_unit": "ms"}, "b": {"time_unit": "ms"}, "c": {"unit": "ms"}}
+    units["d"] = {"unit": "DN"}  # that of the samples says nothing about the time
+    for name, unit in units.items():
+        zarr.create_array(tmp_path / f"{name}.zarr", data=STACK, attributes={"exposure_time": 100, **unit})
+    write_hdf5(tmp_path / "a.h5", frames=STACK, exposure_ms=100)
     STACK.astype("<u2").tofile(tmp_path / "a.raw")
     side = {"shape": STACK.shape, "dtype": "uint16", "integration_time": 100, "integration_time_unit": "ms"}
     (tmp_path / "a.raw.json").write_text(json.dumps(side))
@@ -283,7 +259,7 @@ def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path: Path) ->
             assert "--integration-time" not in stack.time_words or right is None
 
 
-def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path: Path) -> None:
+def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path):
     cards = {
         "apart": ({"EXPTIME": (0.1, "[s]"), "EXPOSURE": (0.2, "[s]")}, None),
         "alike": ({"EXPTIME": (0.0333, "[s]"), "EXPOSURE": (33.3333, "[ms]")}, 0.0333),
@@ -291,13 +267,9 @@ def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path: 
         "alone": ({"TELAPSE": (12.0, "[s]")}, 12.0),
     }
     for name, (header, seconds) in cards.items():
-        image = fits.PrimaryHDU(STACK)
-        image.header.update(header)
-        image.writeto(tmp_path / f"{name}.fits")
-        with opened(tmp_path / f"{name}.fits") as stack:
+        with opened(write_fits(tmp_path / f"{name}.fits", STACK, **header)) as stack:
             assert stack.integration_time == seconds
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["frames"], file["exposure_ms"], file["integration_time"] = STACK, 100, 0.2
+    write_hdf5(tmp_path / "a.h5", frames=STACK, exposure_ms=100, integration_time=0.2)
     both_of = {"apart.fits": "EXPTIME = 0.1 ([s]), but EXPOSURE = 0.2 ([s])", "a.h5": "0.2 (s), but"}
     for name, both in both_of.items():
         with opened(tmp_path / name) as stack:
@@ -310,11 +282,11 @@ def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path: 
     ("value", "bits"),
     [(12, 12), (np.int16(16), 16), (0, None), (33, None), (12.0, None), ("12", None), (True, None)],
 )
-def test_bits(value: Any, bits: int | None) -> None:
+def test_bits(value, bits):
     assert bits_of(value) == bits
 
 
-def test_every_format_with_attributes_takes_the_same_names(tmp_path: Path) -> None:
+def test_every_format_with_attributes_takes_the_same_names(tmp_path):
     """HDF5 as a program that stores each number as an array of one; zarr with the unit beside."""
     frames = np.ones((2, 3, 4), np.uint16)
     with h5py.File(tmp_path / "a.h5", "w") as file:

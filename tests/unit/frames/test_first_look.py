@@ -1,7 +1,6 @@
 """Byte order, left-justified samples and a last axis that is time are seen in some samples at ingest."""
 
 import json
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 import zarr
 from helpers.camera_files import not_opened, opened
 from helpers.plain_camera import LAYOUTS, PlainCamera
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.first_look import limits_in
@@ -20,7 +18,7 @@ from pchem_pipeline.frames.settings import InputSettings
 SPREAD = (0.05, 0.005, 0.05, 1.0)
 
 
-def notes_on(path: Path, frames: NDArray[np.float64]) -> list[str]:
+def notes_on(path, frames):
     codes = np.rint(frames).clip(0, 65535).astype(np.uint16)
     if path.suffix == ".npy":
         np.save(path, codes)
@@ -32,7 +30,7 @@ def notes_on(path: Path, frames: NDArray[np.float64]) -> list[str]:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_time_is_told_from_columns(tmp_path: Path, layout: str) -> None:
+def test_time_is_told_from_columns(tmp_path, layout):
     frames = PlainCamera(0.3, 2.0, 10.0, (40, 48), 500, SPREAD, layout).frames(3).astype(np.float64)
     rng = np.random.default_rng(5)
     wandering = np.linspace(0.0, 4.0, 500)[:, None, None] + rng.normal(0.0, 0.5, (500, 1, 1))
@@ -47,7 +45,7 @@ def test_time_is_told_from_columns(tmp_path: Path, layout: str) -> None:
     )
 
 
-def test_it_is_said_of_hdf5_and_not_where_there_is_nothing_to_see(tmp_path: Path) -> None:
+def test_it_is_said_of_hdf5_and_not_where_there_is_nothing_to_see(tmp_path):
     frames = PlainCamera(0.3, 2.0, 10.0, (40, 48), 500, SPREAD).frames(3).astype(np.float64)
     path = tmp_path / "stack.h5"
     assert notes_on(path, frames) == []
@@ -66,7 +64,7 @@ def test_it_is_said_of_hdf5_and_not_where_there_is_nothing_to_see(tmp_path: Path
     assert notes == ["stack.h5: 1200 of 2000 chunks were not written; read as the fill value"]
 
 
-def camera(bias: float, noise: float, step: float, *, frames: int = 60) -> NDArray[np.uint16]:
+def camera(bias, noise, step, *, frames=60):
     rng = np.random.default_rng(8)
     electrons = rng.poisson(1.2, (frames, 20, 24)) + noise * rng.standard_normal((frames, 20, 24))
     return np.rint(bias + step * electrons).clip(0, 65535).astype(np.uint16)
@@ -82,7 +80,7 @@ CAMERAS = {
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_swapped_bytes_are_refused_with_their_cure_and_others_are_not(tmp_path: Path, name: str) -> None:
+def test_swapped_bytes_are_refused_with_their_cure_and_others_are_not(tmp_path, name):
     frames = CAMERAS[name]
     settings = {"files": ("a.raw",), "shape": frames.shape[1:], "dtype": "uint16"}
     frames.astype("<u2").tofile(tmp_path / "a.raw")
@@ -107,7 +105,7 @@ LEFT = [
 ]
 
 
-def test_codes_at_which_samples_pile_up_are_limits(tmp_path: Path) -> None:
+def test_codes_at_which_samples_pile_up_are_limits(tmp_path):
     frames = camera(180, 0.3, 30.0)
     for low, high in ((0, 250), (185, 65535), (185, 250), (0, 65535)):
         np.save(tmp_path / "a.npy", frames.clip(low, high))
@@ -124,13 +122,13 @@ def test_codes_at_which_samples_pile_up_are_limits(tmp_path: Path) -> None:
     assert opened(tmp_path / "a.npy").seen_limits == (None, None)
 
 
-def test_samples_in_the_high_byte_alone_are_one_of_two_things(tmp_path: Path) -> None:
+def test_samples_in_the_high_byte_alone_are_one_of_two_things(tmp_path):
     np.save(tmp_path / "a.npy", camera(30, 0.3, 5.0) << 8)
     not_opened(r"byte-swapped: .*, or, if they are left-justified, input.bit_shift: 8", tmp_path / "a.npy")
     assert opened(tmp_path / "a.npy", bit_shift=8).report.notes == []
 
 
-def test_what_was_never_written_is_counted_or_refused(tmp_path: Path) -> None:
+def test_what_was_never_written_is_counted_or_refused(tmp_path):
     for name, shards in (("a.zarr", None), ("b.zarr", (20, 20, 24))):
         array = zarr.create_array(
             tmp_path / name, shape=(60, 20, 24), chunks=(10, 20, 24), shards=shards, dtype="u2"

@@ -1,13 +1,10 @@
 """Ready-made histograms: layouts, refusals, and the measured SiPM spectra."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.histogram_files import HistogramInput, is_histogram_input, read_histograms
+from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.settings import InputSettings
 
 DN = np.array([100, 101, 102, 104])
@@ -15,7 +12,7 @@ COUNTS = np.array([3, 0, 7, 2])
 WANTED = [3, 0, 7, 0, 2]
 
 
-def read(folder: Path, *files: str, **settings: Any) -> HistogramInput:
+def read(folder, *files, **settings):
     return read_histograms(InputSettings(files=files, format="histogram", **settings), folder)
 
 
@@ -33,7 +30,7 @@ def read(folder: Path, *files: str, **settings: Any) -> HistogramInput:
         "DN,count,\n100,3,\n102,7,\n104,2,\n",
     ],
 )
-def test_csv(tmp_path: Path, text: str) -> None:
+def test_csv(tmp_path, text):
     (tmp_path / "a.csv").write_text(text, encoding="utf-8")
     found = read(tmp_path, "a.csv")
     assert found.counts.shape == (1, 1, 5)
@@ -45,7 +42,7 @@ def test_csv(tmp_path: Path, text: str) -> None:
     assert any("are taken as 0" in note for note in found.notes)
 
 
-def test_several_columns_are_several_channels(tmp_path: Path) -> None:
+def test_several_columns_are_several_channels(tmp_path):
     (tmp_path / "a.csv").write_text("DN,left,right\n10,1,0\n11,2,0\n12,0,5\n")
     found = read(tmp_path, "a.csv")
     assert found.names == ("a:left", "a:right")
@@ -54,7 +51,7 @@ def test_several_columns_are_several_channels(tmp_path: Path) -> None:
     assert found.notes == ()
 
 
-def test_numpy_files(tmp_path: Path) -> None:
+def test_numpy_files(tmp_path):
     np.save(tmp_path / "columns.npy", np.stack([DN, COUNTS], axis=1))
     np.save(tmp_path / "line.npy", np.array(WANTED, np.uint64))
     np.save(tmp_path / "channels.npy", np.array([WANTED, [0, 0, 0, 0, 9]]))
@@ -71,7 +68,7 @@ def test_numpy_files(tmp_path: Path) -> None:
     assert two.names == ("two:0", "two:1")
 
 
-def test_several_files_and_large_counts(tmp_path: Path) -> None:
+def test_several_files_and_large_counts(tmp_path):
     (tmp_path / "c2.csv").write_text("0,1\n1,2\n")
     (tmp_path / "c10.csv").write_text(f"-5,{2**40}\n-4,1\n-3,1\n")
     found = read(tmp_path, "c*.csv")
@@ -102,7 +99,7 @@ def test_several_files_and_large_counts(tmp_path: Path) -> None:
         ("1,1e300\n2,1\n", "too large to be exact"),
     ],
 )
-def test_refusals(tmp_path: Path, text: str, words: str) -> None:
+def test_refusals(tmp_path, text, words):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError, match=words) as caught:
         read(tmp_path, "a.csv")
@@ -111,37 +108,34 @@ def test_refusals(tmp_path: Path, text: str, words: str) -> None:
     assert caught.value.exit_code == 4
 
 
-def test_refusals_of_numpy_files(tmp_path: Path) -> None:
-    def refused(words: str, name: str) -> None:
-        with pytest.raises(InputError, match=words):
-            read(tmp_path, name)
-
-    np.save(tmp_path / "o.npy", np.array([{1: 2}], dtype=object), allow_pickle=True)
-    refused("pickles are never opened", "o.npy")
-    np.save(tmp_path / "d.npy", np.zeros((2, 3, 4)))
-    refused(r"an array of shape \(2, 3, 4\)", "d.npy")
-    np.save(tmp_path / "t.npy", np.array(["a", "b"]))
-    refused("numbers are needed", "t.npy")
-    np.savez(tmp_path / "n.npz", dn=DN, count=COUNTS)
-    refused("needs arrays dn and counts, has count, dn", "n.npz")
-    np.savez(tmp_path / "s.npz", dn=DN, counts=COUNTS[:2])
-    refused("do not match", "s.npz")
-    np.savez(tmp_path / "b.npz", dn=DN, counts=COUNTS)
-    data = (tmp_path / "b.npz").read_bytes()
-    (tmp_path / "b.npz").write_bytes(data[: len(data) // 2])
-    refused(r"b\.npz: ", "b.npz")
-    (tmp_path / "e.npy").write_bytes(b"")
-    refused(r"e\.npy: ", "e.npy")
-    (tmp_path / "x.csv").write_bytes(b"\xff\xfe\x00\x01")
-    refused("not a text file", "x.csv")
-    (tmp_path / "x.dat").write_text("1,2")
-    refused("give histograms as", "x.dat")
+@pytest.mark.parametrize(
+    ("name", "arrays", "words"),
+    [
+        ("o.npy", np.array([{1: 2}], dtype=object), "pickles are never opened"),
+        ("d.npy", np.zeros((2, 3, 4)), r"an array of shape \(2, 3, 4\)"),
+        ("t.npy", np.array(["a", "b"]), "numbers are needed"),
+        ("n.npz", {"dn": DN, "count": COUNTS}, "needs arrays dn and counts, has count, dn"),
+        ("s.npz", {"dn": DN, "counts": COUNTS[:2]}, "do not match"),
+        ("e.npy", b"", r"e\.npy: "),
+        ("b.npz", b"PK\x03\x04\x14\0\0\0", r"b\.npz: "),
+        ("x.csv", b"\xff\xfe\x00\x01", "not a text file"),
+        ("x.dat", b"1,2", "give histograms as"),
+    ],
+)
+def test_refusals_of_other_files(tmp_path, name, arrays, words):
+    if isinstance(arrays, bytes):
+        (tmp_path / name).write_bytes(arrays)
+    elif isinstance(arrays, dict):
+        np.savez(tmp_path / name, **arrays)
+    else:
+        np.save(tmp_path / name, arrays, allow_pickle=True)
+    with pytest.raises(InputError, match=words):
+        read(tmp_path, name)
 
 
-def test_all_bad_files_in_one_message(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("1,2\n2,3\n")
-    (tmp_path / "b.csv").write_text("1,-2\n")
-    (tmp_path / "c.csv").write_text("")
+def test_all_bad_files_in_one_message(tmp_path):
+    for name, text in (("a", "1,2\n2,3\n"), ("b", "1,-2\n"), ("c", "")):
+        (tmp_path / f"{name}.csv").write_text(text)
     with pytest.raises(InputError, match=r"b\.csv: negative.*c\.csv: no hist.*input\.on_bad_file: skip"):
         read(tmp_path, "*.csv")
     found = read(tmp_path, "*.csv", on_bad_file="skip")
@@ -153,24 +147,26 @@ def test_all_bad_files_in_one_message(tmp_path: Path) -> None:
         read(tmp_path)
 
 
-def test_what_is_a_histogram_input(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "format", "expected"),
+    [
+        ("a.csv", "auto", True),
+        ("*.csv", "auto", True),
+        ("a.csv", "raw", False),
+        ("a.npy", "auto", False),
+        ("a.npy", "histogram", True),
+        (".", "auto", False),
+    ],
+)
+def test_what_is_a_histogram_input(tmp_path, name, format, expected):
     (tmp_path / "a.csv").write_text("1,2\n2,3\n")
     np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), np.uint8))
-
-    def kind(*files: str, format: str = "auto") -> bool:
-        return is_histogram_input(InputSettings(files=files, format=format), tmp_path)
-
-    assert kind("a.csv")
-    assert kind("*.csv")
-    assert not kind("a.npy")
-    assert kind("a.npy", format="histogram")
-    assert not kind("a.csv", format="raw")
-    assert not kind(".")
+    assert is_histogram_input(InputSettings(files=(name,), format=format), tmp_path) == expected
     with pytest.raises(InputError, match="mixed"):
-        kind("a.csv", "a.npy")
+        is_histogram_input(InputSettings(files=("a.csv", "a.npy")), tmp_path)
 
 
-def test_tables_that_are_none(tmp_path: Path) -> None:
+def test_tables_that_are_none(tmp_path):
     wide = "DN," + ",".join(f"c{i}" for i in range(1000))
     cases = {
         "cell": ("DN,count\n1," + "9" * 131_073, "no table of numbers"),

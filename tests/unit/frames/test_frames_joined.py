@@ -11,7 +11,7 @@ import pytest
 import tifffile
 import zarr
 from astropy.io import fits
-from helpers.camera_files import not_opened, opened, write_hdf5
+from helpers.camera_files import not_opened, opened, write_fits, write_hdf5
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
@@ -26,19 +26,19 @@ from pchem_pipeline.frames.writing import write_frames
 STACK = np.random.default_rng(15).integers(0, 4096, (12, 17, 19)).astype(np.uint16)
 
 
-def test_natural_order() -> None:
+def test_natural_order():
     wanted = ["9", "10", "a9b9", "a9b10", "Frame1", "frame2", "frame10", "frame"]
     paths = [Path(f"{name}.tif") for name in wanted]
     assert sorted([*paths[4::-1], *paths[:4:-1]], key=natural_key) == paths
 
 
-def test_resolve(tmp_path: Path) -> None:
+def test_resolve(tmp_path):
     for name in ("d2/f1.npy", "d10/f1.npy", "d2/f10.npy", "d2/f9.npy", "d2/notes.txt", "d2/.hidden.npy"):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         np.save(path, STACK[0]) if path.suffix == ".npy" else path.write_text("x")
 
-    def names(*files: str) -> list[str]:
+    def names(*files):
         found = resolve_files(InputSettings(files=files), tmp_path)
         return [path.relative_to(tmp_path).as_posix() for path in found]
 
@@ -56,7 +56,7 @@ def test_resolve(tmp_path: Path) -> None:
     assert resolve_files(InputSettings(files=("*.npy",)), folder) == [folder / "f.npy"]
 
 
-def test_missing_and_empty(tmp_path: Path) -> None:
+def test_missing_and_empty(tmp_path):
     with pytest.raises(ConfigError, match=r"input\.files is empty"):
         open_frames(InputSettings(), tmp_path)
     not_opened(r"none\.tif: no such file or folder", tmp_path / "none.tif")
@@ -75,7 +75,7 @@ def test_missing_and_empty(tmp_path: Path) -> None:
         opened(tmp_path / "b.xyz", format="jpeg")
 
 
-def test_folder_of_several_formats(tmp_path: Path) -> None:
+def test_folder_of_several_formats(tmp_path):
     np.save(tmp_path / "a.npy", STACK)
     tifffile.imwrite(tmp_path / "a.tif", STACK + 1, photometric="minisblack")
     not_opened(r"several formats \(npy, tiff\); set input.format", tmp_path / ".")
@@ -83,12 +83,12 @@ def test_folder_of_several_formats(tmp_path: Path) -> None:
         np.testing.assert_array_equal(reader.read(), STACK + 1)
 
 
-def test_content_wins_over_suffix(tmp_path: Path) -> None:
+def test_content_wins_over_suffix(tmp_path):
     tifffile.imwrite(tmp_path / "really_tiff.fits", STACK, photometric="minisblack")
     np.testing.assert_array_equal(opened(tmp_path / "*").read(), STACK)
 
 
-def test_mixed_formats_are_concatenated(tmp_path: Path) -> None:
+def test_mixed_formats_are_concatenated(tmp_path):
     tifffile.imwrite(tmp_path / "p1.tif", STACK[:5], photometric="minisblack", compression="zlib")
     fits.PrimaryHDU(STACK[5]).writeto(tmp_path / "p2.fits")
     write_hdf5(tmp_path / "p3.h5", x=STACK[6:9])
@@ -100,14 +100,14 @@ def test_mixed_formats_are_concatenated(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(reader)).read(), STACK)
 
 
-def test_region_through_a_small_scratch_buffer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_region_through_a_small_scratch_buffer(tmp_path, monkeypatch):
     np.save(tmp_path / "a.npy", STACK)
     monkeypatch.setattr("pchem_pipeline.frames.sequence.SCRATCH_BYTES", 3 * 17 * 19 * 2)
     reader = opened(tmp_path / "a.npy", roi=(0, 17, 5, 6))
     np.testing.assert_array_equal(reader.read(), STACK[:, :, 5:6])
 
 
-def test_range_and_region_out_of_bounds(tmp_path: Path) -> None:
+def test_range_and_region_out_of_bounds(tmp_path):
     np.save(tmp_path / "a.npy", STACK)
     beyond = r"input\.roi \[0, 18, 0, 5\] exceeds .* \(--roi 0:18,0:5; all pixels: 0:\d+,0:\d+\)"
     not_opened(beyond, tmp_path / "a.npy", roi=(0, 18, 0, 5))
@@ -120,7 +120,7 @@ def test_range_and_region_out_of_bounds(tmp_path: Path) -> None:
             InputSettings(files=("a.npy",), **{name: value})
 
 
-def test_bit_shift(tmp_path: Path) -> None:
+def test_bit_shift(tmp_path):
     np.save(tmp_path / "a.npy", STACK << 4)
     reader = opened(tmp_path / "a.npy", bit_shift=4)
     np.testing.assert_array_equal(reader.read(), STACK)
@@ -136,7 +136,7 @@ def test_bit_shift(tmp_path: Path) -> None:
     not_opened("bit depth of 14 does not fit", tmp_path / "a.npy", bit_shift=4, bit_depth=14)
 
 
-def test_bit_depth_is_checked(tmp_path: Path) -> None:
+def test_bit_depth_is_checked(tmp_path):
     np.save(tmp_path / "a.npy", STACK)
     np.testing.assert_array_equal(opened(tmp_path / "a.npy", bit_depth=12).read(), STACK)
     reader = opened(tmp_path / "a.npy", bit_depth=11)
@@ -145,7 +145,7 @@ def test_bit_depth_is_checked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shift", [0, 2])
-def test_left_justified_values_above_the_bit_depth_say_their_shift(tmp_path: Path, shift: int) -> None:
+def test_left_justified_values_above_the_bit_depth_say_their_shift(tmp_path, shift):
     np.save(tmp_path / "a.npy", STACK << 4)  # 12 bits in 16
     reader = opened(tmp_path / "a.npy", bit_depth=12, bit_shift=shift)
     words = r"lowest 4 bits are all zero.*; set input\.bit_shift: 4 \(--bit-shift\)$"
@@ -153,18 +153,16 @@ def test_left_justified_values_above_the_bit_depth_say_their_shift(tmp_path: Pat
         reader.read()
 
 
-def test_files_that_contradict_each_other(tmp_path: Path) -> None:
+def test_files_that_contradict_each_other(tmp_path):
     for i, time in enumerate((1.5, 1.5, 2.0)):
-        hdu = fits.PrimaryHDU(STACK[i])
-        hdu.header["EXPTIME"] = time
-        hdu.writeto(tmp_path / f"f{i}.fits")
+        write_fits(tmp_path / f"f{i}.fits", STACK[i], EXPTIME=time)
     not_opened(r"different integration_time: 1\.5 in f0\.fits, 2\.0 in f2\.fits", tmp_path / "*.fits")
     assert opened(tmp_path / "*.fits", integration_time=3.0).integration_time == 3.0
     fits.PrimaryHDU(STACK[2]).writeto(tmp_path / "f2.fits", overwrite=True)
     assert opened(tmp_path / "*.fits").integration_time is None
 
 
-def test_zero_and_one_frame(tmp_path: Path) -> None:
+def test_zero_and_one_frame(tmp_path):
     np.save(tmp_path / "one.npy", STACK[0])
     not_opened(r"one\.npy: 1 frame of \d+ x \d+ pixels in total; at least 2 needed", tmp_path / "one.npy")
     np.save(tmp_path / "zero.npy", STACK[:0])
@@ -175,7 +173,7 @@ def test_zero_and_one_frame(tmp_path: Path) -> None:
     not_opened("no frames", tmp_path / "zero.h5")
 
 
-def make_bad_folder(folder: Path) -> None:
+def make_bad_folder(folder):
     """Write good files f0..f4, and one of each kind of bad file."""
     for i in range(5):
         tifffile.imwrite(folder / f"f{i}.tif", STACK[i], photometric="minisblack")
@@ -189,7 +187,7 @@ def make_bad_folder(folder: Path) -> None:
     (folder / "f11.tif").write_bytes(b"")
 
 
-def test_one_message_lists_all_bad_files(tmp_path: Path) -> None:
+def test_one_message_lists_all_bad_files(tmp_path):
     make_bad_folder(tmp_path)
     settings = InputSettings(files=("*.tif", str(tmp_path / "f2.tif")))
     with pytest.raises(InputError) as caught:
@@ -216,13 +214,13 @@ def test_one_message_lists_all_bad_files(tmp_path: Path) -> None:
     assert len(reader.report.bad) == 8
 
 
-def test_skip_with_nothing_left(tmp_path: Path) -> None:
+def test_skip_with_nothing_left(tmp_path):
     for name in ("a.tif", "b.tif"):
         (tmp_path / name).write_bytes(b"II*\0rubbish")
     not_opened("2 of 2 input files cannot be used", tmp_path / "*.tif", on_bad_file="skip")
 
 
-def test_duplicate_by_link_and_by_content(tmp_path: Path) -> None:
+def test_duplicate_by_link_and_by_content(tmp_path):
     np.save(tmp_path / "a.npy", STACK)
     (tmp_path / "b.npy").symlink_to(tmp_path / "a.npy")
     not_opened(r"b\.npy: is listed twice", tmp_path / "*.npy")
@@ -235,7 +233,7 @@ def test_duplicate_by_link_and_by_content(tmp_path: Path) -> None:
     assert opened(tmp_path / "*.npy").shape[0] == 24
 
 
-def test_large_files_that_differ_between_the_samples(tmp_path: Path) -> None:
+def test_large_files_that_differ_between_the_samples(tmp_path):
     """Equal beginning, middle and end is not equal content."""
     big = np.zeros((8, 200, 200), np.uint16)
     np.save(tmp_path / "a.npy", big)
@@ -244,7 +242,7 @@ def test_large_files_that_differ_between_the_samples(tmp_path: Path) -> None:
     assert opened(tmp_path / "*.npy").shape[0] == 16
 
 
-def test_gaps_in_the_numbers(tmp_path: Path) -> None:
+def test_gaps_in_the_numbers(tmp_path):
     for i in (1, 2, 3, 6, 7):
         np.save(tmp_path / f"frame_{i:04d}.npy", STACK[i])
     message = open_frames(InputSettings(files=(".",)), tmp_path).report.message()
@@ -254,7 +252,7 @@ def test_gaps_in_the_numbers(tmp_path: Path) -> None:
     assert open_frames(InputSettings(files=(".",)), tmp_path).report.message() == ""
 
 
-def test_read_into_checks_its_arguments(tmp_path: Path) -> None:
+def test_read_into_checks_its_arguments(tmp_path):
     np.save(tmp_path / "a.npy", STACK)
     reader = opened(tmp_path / "a.npy")
     good: NDArray[np.uint16] = np.empty((2, 17, 19), np.uint16)
@@ -270,7 +268,7 @@ def test_read_into_checks_its_arguments(tmp_path: Path) -> None:
         reader.read_into(good, 3, 5, 0, 18)
 
 
-def test_identity(tmp_path: Path) -> None:
+def test_identity(tmp_path):
     first, second = tmp_path / "one", tmp_path / "two"
     for folder in (first, second):
         write_frames("npy", folder / "a.npy", iter([STACK]), STACK.shape, "uint16", frames_per_file=4)
@@ -294,7 +292,7 @@ def test_identity(tmp_path: Path) -> None:
         there.quick_identity()
 
 
-def test_hash_of_a_file_is_that_of_its_bytes(tmp_path: Path) -> None:
+def test_hash_of_a_file_is_that_of_its_bytes(tmp_path):
     import xxhash
 
     data = np.random.default_rng(1).bytes((1 << 22) + 12345)
@@ -302,12 +300,12 @@ def test_hash_of_a_file_is_that_of_its_bytes(tmp_path: Path) -> None:
     assert hash_file(tmp_path / "a") == xxhash.xxh3_128(data).hexdigest()
 
 
-def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreadable_file(tmp_path, monkeypatch):
     """Without permission, whoever runs the tests."""
     np.save(tmp_path / "a.npy", STACK)
     real = Path.open
 
-    def deny(path: Path, *args: Any, **rest: Any) -> Any:
+    def deny(path, *args, **rest):
         if path.name == "a.npy":
             raise PermissionError(13, "Permission denied", str(path))
         return real(path, *args, **rest)
@@ -317,7 +315,7 @@ def test_unreadable_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     not_opened(r"a\.npy: cannot be read \(Permission denied\)", tmp_path / "a.npy", format="npy")
 
 
-def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path: Path) -> None:
+def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path):
     stack = np.random.default_rng(4).integers(100, 4096, (9, 6, 8)).astype(np.uint32)
     stack[:, 2, 3] = stack[4, 5, 5] = 2**32 - 1
     np.save(tmp_path / "a.npy", stack)
@@ -344,16 +342,14 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path: Path)
         not_opened(words, tmp_path / "a.npy", mask="mask.npy")
 
 
-def test_fits_adds_what_its_header_says(tmp_path: Path) -> None:
+def test_fits_adds_what_its_header_says(tmp_path):
     stack = np.random.default_rng(4).integers(0, 4096, (9, 6, 8)).astype(np.uint16)
-    image = fits.PrimaryHDU((stack.astype(np.int32) - 1000).astype(np.int16))
-    image.header["BZERO"] = 1000
-    image.writeto(tmp_path / "a.fits")
+    write_fits(tmp_path / "a.fits", (stack.astype(np.int32) - 1000).astype(np.int16), BZERO=1000)
     with opened(tmp_path / "a.fits") as frames:
         np.testing.assert_array_equal(frames.read(), stack)
 
 
-def test_files_with_names_that_are_special_and_files_that_are_none(tmp_path: Path) -> None:
+def test_files_with_names_that_are_special_and_files_that_are_none(tmp_path):
     for name in ("~root.npy", "~x.npy"):
         np.save(tmp_path / name, STACK)
         assert opened(tmp_path / name).paths == (tmp_path / name,)
@@ -381,6 +377,6 @@ def test_files_with_names_that_are_special_and_files_that_are_none(tmp_path: Pat
         ([f"f{1_706_700_000_123 + i}.npy" for i in (0, 97, 199, 295, 400, 602)], 0),
     ],
 )
-def test_numbers_that_are_missing_and_clocks(names: list[str], missing: int) -> None:
+def test_numbers_that_are_missing_and_clocks(names, missing):
     notes = _gaps([Path(name) for name in names])
     assert [note.split(" ")[0] for note in notes] == [str(missing)] * (missing > 0)

@@ -3,9 +3,6 @@
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -13,7 +10,6 @@ import pytest
 import tifffile
 import zarr
 from astropy.io import fits
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.frames.open import open_frames
@@ -23,13 +19,13 @@ from pchem_pipeline.frames.writing import WRITERS, write_frames
 SHAPE = (13, 9, 10)
 
 
-def make_stack(dtype: str) -> NDArray[Any]:
+def make_stack(dtype):
     stack = np.random.default_rng(5).integers(0, np.iinfo(dtype).max, SHAPE, dtype=dtype, endpoint=True)
     stack[0, 0, :2] = 0, np.iinfo(dtype).max
     return stack
 
 
-def blocks(stack: NDArray[Any], size: int) -> Iterator[NDArray[Any]]:
+def blocks(stack, size):
     for start in range(0, len(stack), size):
         yield stack[start : start + size]
 
@@ -37,7 +33,7 @@ def blocks(stack: NDArray[Any], size: int) -> Iterator[NDArray[Any]]:
 @pytest.mark.parametrize("format", WRITERS)
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "uint32"])
 @pytest.mark.parametrize(("size", "per_file"), [(4, None), (4, 1), (5, 3)])
-def test_round_trip(tmp_path: Path, format: str, dtype: str, size: int, per_file: int | None) -> None:
+def test_round_trip(tmp_path, format, dtype, size, per_file):
     stack = make_stack(dtype)
     if format == "ser" and dtype == "uint32":
         with pytest.raises(InputError, match="at most 16 bits"):
@@ -53,7 +49,7 @@ def test_round_trip(tmp_path: Path, format: str, dtype: str, size: int, per_file
     assert reader.integration_time == (None if format in ("npy", "ser") else 0.5)
 
 
-def test_own_libraries_read_what_we_write(tmp_path: Path) -> None:
+def test_own_libraries_read_what_we_write(tmp_path):
     stack = make_stack("uint16")
     written, facts = {}, {"integration_time": 4.87, "bit_depth": 16}
     for name in WRITERS:
@@ -74,7 +70,7 @@ def test_own_libraries_read_what_we_write(tmp_path: Path) -> None:
     assert array.metadata.dimension_names == ("frame", "y", "x")
 
 
-def test_big_files_become_bigtiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_big_files_become_bigtiff(tmp_path, monkeypatch):
     asked: list[bool] = []
     real = tifffile.imwrite
     monkeypatch.setattr(
@@ -85,7 +81,7 @@ def test_big_files_become_bigtiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
         assert file.is_bigtiff
 
-    def stop(*args: Any, bigtiff: bool, **rest: Any) -> None:
+    def stop(*args, bigtiff, **rest):
         asked.append(bigtiff)
         raise OSError(28, "No space left on device")
 
@@ -96,10 +92,10 @@ def test_big_files_become_bigtiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("format", WRITERS)
-def test_nothing_is_left_of_a_broken_write(tmp_path: Path, format: str) -> None:
+def test_nothing_is_left_of_a_broken_write(tmp_path, format):
     stack = make_stack("uint16")
 
-    def breaking() -> Iterator[NDArray[Any]]:
+    def breaking():
         yield stack[:4]
         raise RuntimeError("simulated mishap")
 
@@ -113,7 +109,7 @@ def test_nothing_is_left_of_a_broken_write(tmp_path: Path, format: str) -> None:
     assert sorted((p.name, p.stat().st_size) for p in tmp_path.rglob("*")) == before
 
 
-def test_blocks_must_make_up_the_shape(tmp_path: Path) -> None:
+def test_blocks_must_make_up_the_shape(tmp_path):
     stack = make_stack("uint16")
     with pytest.raises(ValueError, match="end 3 frames too early"):
         write_frames("npy", tmp_path / "a", iter([stack[:10]]), SHAPE, "uint16")
@@ -157,7 +153,7 @@ print(json.dumps(found))
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def found(tmp_path_factory):
     folder = tmp_path_factory.mktemp("full")
     command = [sys.executable, "-c", PROGRAM, str(folder), *WRITERS]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -166,7 +162,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_file_that_may_not_grow(found: dict[str, str], name: str) -> None:
+def test_a_file_that_may_not_grow(found, name):
     words = found[name]
     assert words.startswith("cannot use "), words
     if name == "tiff":  # numpy does not say why

@@ -10,9 +10,7 @@ import struct
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import h5py
 import hdf5plugin
@@ -34,7 +32,7 @@ BOMB = 1 << 24
 
 
 @contextmanager
-def refused_at_once(words: str) -> Iterator[None]:
+def refused_at_once(words):
     clock = time.process_time()
     with pytest.raises(InputError, match=words):
         yield
@@ -42,12 +40,12 @@ def refused_at_once(words: str) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def deflated() -> bytes:
+def deflated():
     return zlib.compress(bytes(BOMB), 9)
 
 
 @pytest.mark.parametrize("codec", ["zlib", "gzip", "zstd", "blosc", "bz2", "lz4", "lzma"])
-def test_zarr(tmp_path: Path, codec: str) -> None:
+def test_zarr(tmp_path, codec):
     path, new = tmp_path / "a.zarr", codec in ("gzip", "zstd", "blosc")
     coder = numcodecs.get_codec({"id": codec})
     coded = {"name": codec, "configuration": {}} if new else coder
@@ -58,25 +56,21 @@ def test_zarr(tmp_path: Path, codec: str) -> None:
         read(path)
 
 
-def test_zstd_of_many_frames(tmp_path: Path) -> None:
+def test_zarr_of_many_frames_and_compressed_twice(tmp_path):
+    gzip_, zstd = ({"name": name, "configuration": {}} for name in ("gzip", "zstd"))
     path, coder = tmp_path / "a.zarr", numcodecs.Zstd()
-    coded = {"name": "zstd", "configuration": {}}
-    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded)
+    zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=zstd)
     (path / "c/1/0/0").write_bytes(coder.encode(bytes(8)) + coder.encode(bytes(BOMB)))
     with refused_at_once(r"unpacks to more than"):
         read(path)
-
-
-def test_zarr_compressed_twice(tmp_path: Path) -> None:
-    coded = [{"name": "gzip", "configuration": {}}, {"name": "zstd", "configuration": {}}]
-    zarr.create_array(tmp_path / "a.zarr", data=STACK, chunks=(20, 16, 16), compressors=coded)
+    zarr.create_array(tmp_path / "b.zarr", data=STACK, chunks=(20, 16, 16), compressors=[gzip_, zstd])
     with refused_at_once(r"compressed twice, by \w+ and \w+; write it again with one of them"):
-        read(tmp_path / "a.zarr")
+        read(tmp_path / "b.zarr")
 
 
 @pytest.mark.parametrize("place", ["start", "end"])
 @pytest.mark.parametrize("codec", ["gzip", "zstd", "blosc"])
-def test_shards_are_many_pieces(tmp_path: Path, codec: str, place: str) -> None:
+def test_shards_are_many_pieces(tmp_path, codec, place):
     path, coded = tmp_path / "a.zarr", {"name": codec, "configuration": {}}
     shards = {"shape": (40, 16, 16), "index_location": place}
     zarr.create_array(path, data=STACK, chunks=(2, 16, 16), shards=shards, compressors=coded)
@@ -92,14 +86,14 @@ def test_shards_are_many_pieces(tmp_path: Path, codec: str, place: str) -> None:
         read(path)
 
 
-def test_another_array_of_the_store_is_no_piece(tmp_path: Path) -> None:
+def test_another_array_of_the_store_is_no_piece(tmp_path):
     group = zarr.create_group(tmp_path / "a.zarr")
     group.create_array("frames", data=STACK, chunks=(1, 4, 4))
     group.create_array("dark", data=STACK[0].repeat(50, axis=0))
     read(tmp_path / "a.zarr")
 
 
-def test_zarr_of_many_chunks_in_a_shard(tmp_path: Path) -> None:
+def test_zarr_of_many_chunks_in_a_shard(tmp_path):
     path = tmp_path / "a.zarr"
     zarr.create_array(path, shape=(80, 256, 256), chunks=(1, 8, 8), shards=(80, 256, 256), dtype="u2")
     (path / "c/0/0").mkdir(parents=True)
@@ -109,7 +103,7 @@ def test_zarr_of_many_chunks_in_a_shard(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("codec", ["bz2", "lz4", "bitshuffle", "zstd", "blosc"])
-def test_hdf5_filters(tmp_path: Path, codec: str) -> None:
+def test_hdf5_filters(tmp_path, codec):
     filters = {
         "bz2": (hdf5plugin.BZip2(), bz2.compress(bytes(BOMB >> 4))),
         "lz4": (hdf5plugin.LZ4(), struct.pack(">QI", BOMB, 1 << 12) + bytes(99)),
@@ -129,7 +123,7 @@ def test_hdf5_filters(tmp_path: Path, codec: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["deep", "twice", "claims"])
-def test_hdf5(tmp_path: Path, deflated: bytes, kind: str) -> None:
+def test_hdf5(tmp_path, deflated, kind):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         if kind == "claims":
@@ -153,7 +147,7 @@ def test_hdf5(tmp_path: Path, deflated: bytes, kind: str) -> None:
         read(path)
 
 
-def test_fits(tmp_path: Path) -> None:
+def test_fits(tmp_path):
     path = tmp_path / "a.fits"
     image = fits.CompImageHDU(STACK, compression_type="GZIP_1", tile_shape=(1, 16, 16))
     fits.HDUList([fits.PrimaryHDU(), image]).writeto(path)
@@ -173,7 +167,7 @@ def test_fits(tmp_path: Path) -> None:
         read(path)
 
 
-def test_tiff_of_many_pages(tmp_path: Path) -> None:
+def test_tiff_of_many_pages(tmp_path):
     size, n = 2 + 12 + 4, 300_000
     page = struct.pack("<HHHII", 1, 256, 4, 1, 1)
     with (tmp_path / "a.tif").open("wb") as stream:
@@ -183,7 +177,7 @@ def test_tiff_of_many_pages(tmp_path: Path) -> None:
         read(tmp_path / "a.tif")
 
 
-def test_npz(tmp_path: Path) -> None:
+def test_npz(tmp_path):
     member = io.BytesIO()
     np.save(member, np.zeros(8, np.int64))
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
@@ -196,14 +190,14 @@ def test_npz(tmp_path: Path) -> None:
 class Trap:
     """An object whose loading leaves a trace."""
 
-    def __init__(self, trace: Path) -> None:
+    def __init__(self, trace):
         self.trace = trace
 
-    def __reduce__(self) -> tuple[object, ...]:
+    def __reduce__(self):
         return os.mkdir, (str(self.trace),)
 
 
-def changed(path: Path, **content: object) -> None:
+def changed(path, **content):
     record = json.loads(path.read_text())
     path.write_text(json.dumps({**record, **content}))
 
@@ -219,7 +213,7 @@ def changed(path: Path, **content: object) -> None:
         {"compressor": {"id": "vlen-bytes"}},
     ],
 )
-def test_a_codec_that_may_run_code(tmp_path: Path, content: dict[str, object]) -> None:
+def test_a_codec_that_may_run_code(tmp_path, content):
     path = tmp_path / "a.zarr"
     zarr.create_array(path, data=frames(), zarr_format=2, compressors=None)
     read(path)
@@ -230,17 +224,22 @@ def test_a_codec_that_may_run_code(tmp_path: Path, content: dict[str, object]) -
     assert not (tmp_path / "trace").exists()
 
 
+def linked_out(path):
+    """Move a file or folder out of its store, and leave a link to it."""
+    moved = next(each for each in path.parents if each.suffix == ".zarr").with_name("elsewhere")
+    path.rename(moved)
+    path.symlink_to(moved)
+
+
 @pytest.mark.parametrize("link", ["c", "c/0/0/0"])
-def test_a_link_out_of_the_store(tmp_path: Path, link: str) -> None:
+def test_a_link_out_of_the_store(tmp_path, link):
     path = tmp_path / "a.zarr"
     zarr.create_array(path, data=frames(), chunks=(6, 8, 9))
-    moved = tmp_path / "elsewhere"
-    (path / link).rename(moved)
-    (path / link).symlink_to(moved)
+    linked_out(path / link)
     refused(f"{link} is a link out of the store; copy its files into the store", path)
 
 
-def test_a_link_within_the_store(tmp_path: Path) -> None:
+def test_a_link_within_the_store(tmp_path):
     path = tmp_path / "a.zarr"
     zarr.create_array(path, data=frames(), chunks=(3, 8, 9))
     (path / "c/1/0/0").unlink()
@@ -249,7 +248,7 @@ def test_a_link_within_the_store(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["../b.zarr", "..", "/etc", "x/../../b.zarr"])
-def test_a_path_out_of_the_store(tmp_path: Path, place: str) -> None:
+def test_a_path_out_of_the_store(tmp_path, place):
     zarr.create_array(tmp_path / "b.zarr", data=frames())
     group = zarr.create_group(tmp_path / "a.zarr")
     group.attrs["ome"] = {"multiscales": [{"datasets": [{"path": place}]}]}
@@ -258,7 +257,7 @@ def test_a_path_out_of_the_store(tmp_path: Path, place: str) -> None:
     refused(r"a\.zarr", tmp_path / "a.zarr", dataset=place)
 
 
-def test_a_run_with_a_codec_that_is_not_ours(tmp_path: Path) -> None:
+def test_a_run_with_a_codec_that_is_not_ours(tmp_path):
     store = RunStore.create(tmp_path / "run.zarr")
     store.create_array("fit/bias", (8, 8), chunks=(8, 8))
     store.write("fit/bias", (slice(0, 8), slice(0, 8)), np.ones((8, 8)))
@@ -274,22 +273,20 @@ def test_a_run_with_a_codec_that_is_not_ours(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("link", ["report.json", "fit", "fit/bias/c/0/0"])
-def test_a_run_with_a_link_out_of_it(tmp_path: Path, link: str) -> None:
+def test_a_run_with_a_link_out_of_it(tmp_path, link):
     """`pchem view` would show the file, and a stage that is done again would write into the folder."""
     path = tmp_path / "run.zarr"
     store = RunStore.create(path)
     store.write_array("fit/bias", np.ones((8, 8)))
     store.write_file("report.json", b"{}")
-    moved = tmp_path / "elsewhere"
-    (path / link).rename(moved)
-    (path / link).symlink_to(moved)
+    linked_out(path / link)
     _refuse_links.cache_clear()  # the links of a store are looked at once in a process
     for writable in (False, True):
         with pytest.raises(StoreError, match=f"run.zarr: {link} is a link out of the store"):
             RunStore.open(path, writable=writable)
 
 
-def test_a_link_to_a_run_and_one_within_it(tmp_path: Path) -> None:
+def test_a_link_to_a_run_and_one_within_it(tmp_path):
     store = RunStore.create(tmp_path / "far" / "run.zarr")
     store.write_array("fit/bias", np.ones((8, 8)))
     (store.path / "page.html").symlink_to("report.html")
@@ -301,7 +298,7 @@ SCRIPTS = "äöü Ελληνικά кириллица 日本語 한국어 عرب
 
 
 @pytest.mark.parametrize("name", [SCRIPTS, "a\nb", "\x1b[31mred", "x" * 200, " ", "-rf", "'; rm -rf ~"])
-def test_names_in_all_scripts(tmp_path: Path, name: str) -> None:
+def test_names_in_all_scripts(tmp_path, name):
     path = tmp_path / f"{name}.npy"
     np.save(path, frames())
     read(path)
@@ -315,7 +312,7 @@ def test_names_in_all_scripts(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     "text", ["µ" * 500_000, "\x1b]0;x\a" * 100_000, "{" * 1_000_000, '{"shape": [[' * 90_000]
 )
-def test_comments_of_a_megabyte(tmp_path: Path, text: str) -> None:
+def test_comments_of_a_megabyte(tmp_path, text):
     import tifffile
 
     path = tmp_path / "a.tif"

@@ -16,14 +16,8 @@ from pchem_pipeline.model.law.drawn_histograms import draw_histograms
 
 
 def sample(exposure, noise=0.3, n_pixels=3, n_frames=3000, seed=1, gain=1 / 11):
-    drawn = draw_histograms(
-        np.random.default_rng([seed, int(100 * exposure)]),
-        np.full(n_pixels, exposure),
-        gain,
-        100.3,
-        noise,
-        n_frames,
-    )
+    rng = np.random.default_rng([seed, int(100 * exposure)])
+    drawn = draw_histograms(rng, np.full(n_pixels, exposure), gain, 100.3, noise, n_frames)
     return Sample(drawn.counts, drawn.origin)
 
 
@@ -157,17 +151,18 @@ def test_no_pixel_stops_a_method(counts):
     one = Sample(counts, np.array([100]))
     for other in (one, sample(2.0, n_pixels=1)):
         for result in compare(PixelSamples((one, other, one)), None, MethodsSettings()):
-            assert result.missing == ""
+            assert result.facts["missing"] == ""
             assert result.estimates.shape == (1, 4)
 
 
 def test_methods_say_which_samples_they_lack():
-    results = {r.name: r for r in compare(PixelSamples((sample(1.0),)), None, MethodsSettings())}
-    assert results["photon_transfer"].missing == "needs a dark and a bright sample; this comparison has 1"
-    assert results["photon_transfer_series"].missing.startswith("needs a series")
-    assert results["pchem_em"].missing == ""
+    results = {r.facts["name"]: r for r in compare(PixelSamples((sample(1.0),)), None, MethodsSettings())}
+    missing = {name: result.facts["missing"] for name, result in results.items()}
+    assert missing["photon_transfer"] == "needs a dark and a bright sample; this comparison has 1"
+    assert missing["photon_transfer_series"].startswith("needs a series")
+    assert missing["pchem_em"] == ""
     assert results["photon_transfer"].estimates is None
-    told = results["pchem_em"].as_json()["medians"]
+    told = results["pchem_em"].facts["medians"]
     assert told["conversion_gain"] == pytest.approx(1 / 11, rel=0.05)
     assert told["read_noise_e"] == pytest.approx(0.3, rel=0.1)
 
@@ -197,6 +192,6 @@ def test_errors_are_relative_and_summed_up_over_answers():
     np.testing.assert_allclose(errors["bias"][:2], [0.2, 0.0], atol=1e-12)
     np.testing.assert_allclose(errors["read_noise_e"][:2], [0.0, -0.1], atol=1e-12)
     summary = summarise_errors(errors["conversion_gain"], np.full(3, 0.05))
-    assert (summary.n, summary.bound) == (2, pytest.approx(0.05))
-    assert summary.rmse == pytest.approx(0.1 / np.sqrt(2))
-    assert summarise_errors(np.full(2, np.nan), np.ones(2)).rmse is None
+    assert (summary["n"], summary["bound"]) == (2, pytest.approx(0.05))
+    assert summary["rmse"] == pytest.approx(0.1 / np.sqrt(2))
+    assert summarise_errors(np.full(2, np.nan), np.ones(2))["rmse"] is None

@@ -17,7 +17,7 @@ from pchem_pipeline.planning.targets import TARGET_NAMES, parse_target
 from pchem_pipeline.planning.verify import frames_simulated, verify
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.tables import result_tables
-from pchem_pipeline.stages.report.report import plan_section
+from pchem_pipeline.stages.report.stored import plan_section
 
 GAIN = 1 / 11
 ONE_PERCENT = parse_target("conversion_gain=1%")
@@ -118,11 +118,9 @@ def test_the_best_split_is_that_of_brute_force():
         assert sum(split.shares) == pytest.approx(1)
         assert split.frames == pytest.approx(1e4 * brute_force(informations, np.array(gradient)), rel=2e-3)
         assert split.frames <= split_frames([target], lights, [1 / 3] * 3, there)
-    both = best_split([ONE_PERCENT, parse_target("read_noise_e=1%")], lights, there)
-    alone = [
-        best_split([parse_target(t)], lights, there).frames for t in ("conversion_gain=1%", "read_noise_e=1%")
-    ]
-    assert max(alone) <= both.frames <= sum(alone)
+    targets = [ONE_PERCENT, parse_target("read_noise_e=1%")]
+    alone = [best_split([target], lights, there).frames for target in targets]
+    assert max(alone) <= best_split(targets, lights, there).frames <= sum(alone)
 
 
 def test_chosen_exposures_are_no_worse_than_given_ones():
@@ -141,14 +139,8 @@ def test_wrong_samples_get_their_line(lights):
 
 
 def one(targets, there, *, given=True, budget=None, max_frames=1e7):
-    return plan_one_sample(
-        [parse_target(t) for t in targets],
-        there,
-        exposure_given=given,
-        budget=budget,
-        max_exposure=10.0,
-        max_frames=max_frames,
-    )
+    limits = {"budget": budget, "max_exposure": 10.0, "max_frames": max_frames}
+    return plan_one_sample([parse_target(t) for t in targets], there, exposure_given=given, **limits)
 
 
 def test_out_of_reach_says_why_and_what_would_help():
@@ -160,29 +152,18 @@ def test_out_of_reach_says_why_and_what_would_help():
         one(["quanta_exposure=5%"], point(12.0, 0.305), max_frames=1000)
     # without a target the precision of the frames that there are
     assert one([], point(noise=0.8), given=False, budget=2000).frames == 2000
-    with pytest.raises(ConfigError, match="not reached within --max-frames"):
-        plan_samples([ONE_PERCENT], [0.0, 1e-4], point(), budget=None, max_exposure=1, max_frames=1e7)
-    with pytest.raises(ConfigError, match="choose from the shared parameters"):
-        plan_samples(
-            [parse_target("quanta_exposure=1%")],
-            [0.0, 1.0],
-            point(),
-            budget=None,
-            max_exposure=1,
-            max_frames=1e7,
-        )
+    limits = {"budget": None, "max_exposure": 1, "max_frames": 1e7}
+    for target, lights, words in (
+        ("conversion_gain=1%", [0.0, 1e-4], "not reached within --max-frames"),
+        ("quanta_exposure=1%", [0.0, 1.0], "choose from the shared parameters"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            plan_samples([parse_target(target)], lights, point(), **limits)
 
 
 def simulated(targets, there, frames, n_pixels=150, **options):
-    return verify(
-        [parse_target(t) for t in targets],
-        there,
-        [there.quanta_exposure],
-        [int(frames)],
-        n_pixels,
-        1,
-        **options,
-    )
+    asked = [parse_target(t) for t in targets]
+    return verify(asked, there, [there.quanta_exposure], [int(frames)], n_pixels, 1, **options)
 
 
 def test_electron_numbers_must_be_certain_for_bias_and_exposure_only():
@@ -242,10 +223,7 @@ def test_the_joint_fit_confirms_a_split():
 
 def test_the_command_in_words_and_files(tmp_path):
     request = PlanRequest(
-        read_noise_e=0.3,
-        quanta_exposure=2.0,
-        targets=("conversion_gain=1%",),
-        json=tmp_path / "plan.json",
+        read_noise_e=0.3, quanta_exposure=2.0, targets=("conversion_gain=1%",), json=tmp_path / "plan.json"
     )
     text = make_plan(request)
     content = json.loads((tmp_path / "plan.json").read_text())
@@ -320,6 +298,6 @@ def test_the_section_of_the_report_is_of_the_median_pixel():
     assert section["reached"]["conversion_gain"] == pytest.approx(0.0028, abs=5e-5)
     data = ReportData(title="a run", shape=(2, 2), plan=section)
     [table] = [table for table in result_tables(data) if table.section == "plan"]
-    assert table.rows[0][2] == "0.28 %"
-    assert {len(row) for row in table.rows} == {len(table.head)}
+    assert table.rows[0]["this run's"] == "0.28 %"
+    assert {tuple(row) for row in table.rows} == {table.head}
     assert plan_section({name: np.full((2, 2), np.nan) for name in maps}, 10) is None

@@ -1,18 +1,15 @@
 """The model of a run as an artefact: its versions, and the one in force."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from helpers.commands import arrays_of
+from helpers.commands import arrays_of, assert_equal_arrays, invoke
 from helpers.discrepancy_material import verdict_of
-from typer.testing import CliRunner
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
-from pchem_pipeline.cli import app
 from pchem_pipeline.commands.model import adopt_verdict, list_models, model_lines, use_model
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.config.tree import RunConfig
@@ -40,20 +37,20 @@ ROW: dict[str, Any] = {"tag": "row_noise", "row_noise_dn": 1.2}
 BLINK: dict[str, Any] = {"tag": "dark_current_rts", "fraction": 0.1}
 
 
-def settings(*effects: dict[str, Any], **more: Any) -> ModelSettings:
+def settings(*effects, **more):
     return ModelSettings.model_validate({"effects": list(effects), **more})
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> RunStore:
+def store(tmp_path):
     return RunStore.create(tmp_path / "run.zarr")
 
 
-def put(store: RunStore, model: ModelSettings) -> int:
+def put(store, model):
     return keep_in_force(store, model_in_force(store, model)).number
 
 
-def test_the_same_model_is_the_same_version(store: RunStore) -> None:
+def test_the_same_model_is_the_same_version(store):
     assert model_versions(store) == ()
     assert model_in_force(store, settings()).made == ""  # looked at, not written
     assert not (store.path / "model").exists()
@@ -71,9 +68,7 @@ def test_the_same_model_is_the_same_version(store: RunStore) -> None:
         version_with(store, 3)
 
 
-def test_a_verdict_makes_a_version_with_its_arrays_and_the_same_effects_without_them_are_another(
-    store: RunStore,
-) -> None:
+def test_a_verdict_makes_a_version_with_its_arrays_and_the_same_effects_without_them_are_another(store):
     store.create_array("histogram/origin", (4, 5), chunks=(4, 5))
     start = keep_in_force(store, model_in_force(store, settings()))
     plain = keep_in_force(store, model_in_force(store, settings(BLINK)))
@@ -85,7 +80,6 @@ def test_a_verdict_makes_a_version_with_its_arrays_and_the_same_effects_without_
     found = keep_in_force(store, found)
     assert (found.number, found.source, found.parent, found.closed_fraction) == (3, "verdict", 1, 0.97)
     kept = read_added_exposure(store, found)
-    assert kept is not None
     np.testing.assert_array_equal(kept.exposure_e, exposure)
     assert read_added_exposure(store, plain) is None
     # both are the same section of the YAML: the one in force stays
@@ -97,7 +91,7 @@ def test_a_verdict_makes_a_version_with_its_arrays_and_the_same_effects_without_
     assert store.array("model/0003/added_exposure").attrs["units"] == "e-"
 
 
-def test_what_a_killed_command_left_is_no_version(store: RunStore) -> None:
+def test_what_a_killed_command_left_is_no_version(store):
     put(store, settings())
     write_added_exposure(
         store, "model/0002", AddedExposure(*np.zeros((2, 1, 2, 2))), [], (0, 2), (0, 2)
@@ -109,12 +103,11 @@ def test_what_a_killed_command_left_is_no_version(store: RunStore) -> None:
         model_versions(store)
 
 
-def test_an_effect_of_a_package_that_is_gone_is_told_and_other_versions_can_be_used(store: RunStore) -> None:
+def test_an_effect_of_a_package_that_is_gone_is_told_and_other_versions_can_be_used(store):
     put(store, settings())
     put(store, settings(ROW))
     place = store.path / "model/0002.json"
     changed = read_record(place)
-    assert changed is not None
     write_record(place, json.loads(json.dumps(changed).replace("row_noise", "their_effect")))
     assert put(store, settings()) == 1
     with pytest.raises(ConfigError, match=r"model 2 of the run: .*their_effect"):
@@ -124,7 +117,7 @@ def test_an_effect_of_a_package_that_is_gone_is_told_and_other_versions_can_be_u
 # -- a run -------------------------------------------------------------------------------------
 
 
-def configured(folder: Path, **sections: Any) -> Path:
+def configured(folder, **sections):
     content = {
         "run": {"tile": 8},
         "simulate": {"shape": [8, 8], "n_frames": 700, "seed": 3, "format": "npy"},
@@ -136,7 +129,7 @@ def configured(folder: Path, **sections: Any) -> Path:
     return path
 
 
-def states(path: Path) -> dict[str, tuple[str, int | None]]:
+def states(path):
     return {state.stage: (state.words(), state.model) for state in run_status(find_run(path))}
 
 
@@ -144,7 +137,7 @@ DONE = ["simulate", "ingest", "histogram", "fit", "maps"]
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(tmp_path_factory):
     """A run up to its maps; do not change it."""
     path = configured(tmp_path_factory.mktemp("finished"))
     run_stages(find_run(path), DONE, QUIET)
@@ -152,7 +145,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def run(finished: Path, tmp_path: Path) -> Path:
+def run(finished, tmp_path):
     """A copy of that run."""
     import shutil
 
@@ -160,7 +153,7 @@ def run(finished: Path, tmp_path: Path) -> Path:
     return tmp_path / "copy" / "run.yaml"
 
 
-def verdict(path: Path, *effects: dict[str, Any], closed: float = 0.9) -> None:
+def verdict(path, *effects, closed=0.9):
     """Leave the result of a search that started from the model in force."""
     store = RunStore.open(path.parent / "run.zarr", writable=True)
     model = model_in_force(store, load_config(path).model)
@@ -170,7 +163,6 @@ def verdict(path: Path, *effects: dict[str, Any], closed: float = 0.9) -> None:
     )
     store.write_file(VERDICT_FILE, found.to_json().encode())
     ingested = store.records.read("ingest")
-    assert ingested is not None
     found = RunConfig.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
     content = {
         "stage": "discrepancy",
@@ -183,7 +175,7 @@ def verdict(path: Path, *effects: dict[str, Any], closed: float = 0.9) -> None:
     store.records.mark("discrepancy", fingerprint_of(content), "all", {})
 
 
-def test_status_tells_the_model_that_each_result_rests_on(run: Path) -> None:
+def test_status_tells_the_model_that_each_result_rests_on(run):
     assert states(run)["maps"] == ("complete", 1)
     assert states(run)["histogram"] == ("complete", None)
     path = configured(run.parent, model={"effects": [ROW]})
@@ -192,13 +184,13 @@ def test_status_tells_the_model_that_each_result_rests_on(run: Path) -> None:
     run_stages(find_run(path), ["fit"], QUIET)
     assert states(path)["fit"] == ("complete", 2)
     assert states(path)["maps"] == ("stale - fit was run again", 1)
-    shown = CliRunner().invoke(app.app, ["status", str(path)], catch_exceptions=False).stdout
+    shown = invoke("status", path).stdout
     assert "fit         complete  (with model 2)" in shown.splitlines()
-    shown = CliRunner().invoke(app.app, ["status", str(path), "--json"], catch_exceptions=False).stdout
+    shown = invoke("status", path, "--json").stdout
     assert [stage["model"] for stage in json.loads(shown)["stages"]][3:5] == [2, 1]
 
 
-def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
+def test_a_verdict_is_put_in_force_and_taken_back(run):
     before, text = arrays_of(run.parent / "run.zarr", ("fit", "maps")), run.read_text(encoding="utf-8")
     verdict(run, ROW)
     target, words = adopt_verdict(find_run(run))
@@ -206,7 +198,7 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
     held = f"model 2 is now in use: plain model + row_noise 1.2 DN (in {beside})"
     assert words == f"{held}; to go back: pchem model {run} --use 1"
     assert run.read_text(encoding="utf-8") == text
-    shown = CliRunner().invoke(app.app, ["fit", str(run)], catch_exceptions=False).stderr
+    shown = invoke("fit", run).stderr
     assert "the model is that of run.effects.yaml, instead of the one in run.yaml" in shown
     assert load_config(run).model == settings(ROW) == target.config.model
     assert states(run)["fit"] == ("complete", 2)
@@ -227,18 +219,16 @@ def test_a_verdict_is_put_in_force_and_taken_back(run: Path) -> None:
     # through the store, too, whose copy of the YAML goes with it
     assert find_run(run.parent / "run.zarr").config.model == settings()
     run_stages(find_run(run), DONE, QUIET)
-    for name, values in arrays_of(run.parent / "run.zarr", ("fit", "maps")).items():
-        np.testing.assert_array_equal(values, before[name], err_msg=name)
+    assert_equal_arrays(arrays_of(run.parent / "run.zarr", ("fit", "maps")), before)
     assert "is already in use" in use_model(find_run(run), 1)
     use_model(find_run(run.parent / "run.zarr"), 2)
     assert load_config(run).model == settings(ROW)
     run_stages(find_run(run), DONE, QUIET)
-    for name, values in arrays_of(run.parent / "run.zarr", ("fit", "maps")).items():
-        np.testing.assert_array_equal(values, after[name], err_msg=name)
+    assert_equal_arrays(arrays_of(run.parent / "run.zarr", ("fit", "maps")), after)
     assert [version.number for version in model_versions(RunStore.open(run.parent / "run.zarr"))] == [1, 2]
 
 
-def test_what_a_new_verdict_withdraws_leaves_the_model(run: Path) -> None:
+def test_what_a_new_verdict_withdraws_leaves_the_model(run):
     verdict(run, ROW)
     assert adopt_verdict(find_run(run))[1]
     assert not adopt_verdict(find_run(run))[1]  # the same once more
@@ -250,7 +240,7 @@ def test_what_a_new_verdict_withdraws_leaves_the_model(run: Path) -> None:
     assert load_config(run).model == settings()
 
 
-def test_a_model_edited_by_hand_is_kept_before_another_is_used(run: Path) -> None:
+def test_a_model_edited_by_hand_is_kept_before_another_is_used(run):
     run_stages(find_run(run), ["ingest"], QUIET)
     configured(run.parent, model={"effects": [BLINK]})
     # the command is given the store, which does not know yet what stands in the YAML
@@ -260,7 +250,7 @@ def test_a_model_edited_by_hand_is_kept_before_another_is_used(run: Path) -> Non
     assert load_config(run).model == settings()
 
 
-def test_the_yaml_of_another_run_stays(finished: Path, run: Path) -> None:
+def test_the_yaml_of_another_run_stays(finished, run):
     # the store of a copy remembers where the first one's YAML is
     text = finished.read_text(encoding="utf-8")
     verdict(run, ROW)
@@ -271,10 +261,8 @@ def test_the_yaml_of_another_run_stays(finished: Path, run: Path) -> None:
     assert find_run(run.parent / "run.zarr").config.model == settings(ROW)
 
 
-def test_a_model_that_cannot_be_written_leaves_all_as_it_is(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: Any) -> None:
+def test_a_model_that_cannot_be_written_leaves_all_as_it_is(run, monkeypatch):
+    def refuse(*_):
         raise StoreError("no permission to write there")
 
     verdict(run, ROW)
@@ -285,9 +273,9 @@ def test_a_model_that_cannot_be_written_leaves_all_as_it_is(
     assert states(run)["fit"] == ("complete", 1)
 
 
-def test_the_command_lists_and_refuses(run: Path) -> None:
-    shown = CliRunner().invoke(app.app, ["model", str(run), "--json"], catch_exceptions=False).stdout
+def test_the_command_lists_and_refuses(run):
+    shown = invoke("model", run, "--json").stdout
     [only] = json.loads(shown)["models"]
     assert (only["number"], only["current"], only["results"]) == (1, True, ["fit", "maps"])
     with pytest.raises(ConfigError, match="has no model 7"):
-        CliRunner().invoke(app.app, ["model", str(run), "--use", "7"], catch_exceptions=False)
+        invoke("model", run, "--use", "7")

@@ -22,13 +22,17 @@ from pchem_pipeline.run.progress import (
 from pchem_pipeline.store.run_store import RunStore
 
 
-def test_rate_and_remaining_time_are_means_of_this_run() -> None:
+def test_rate_and_remaining_time_are_means_of_this_run():
     pace = paced("fit", "tile", done=30, total=64, new=10, seconds=5.0)
     assert (pace["rate"], pace["remaining"]) == (2.0, 17.0)
     assert paced("fit", "tile", done=20, total=64, new=0, seconds=0.1)["remaining"] is None
 
 
-def test_json_lines_tell_the_pace(tmp_path: Path) -> None:
+def logged(folder):
+    return [json.loads(line) for line in (folder / "run.log").read_text().splitlines()]
+
+
+def test_json_lines_tell_the_pace(tmp_path):
     reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
     with reporter.progress("fit", 4, "tile", done=1) as advance:
         for _ in range(3):
@@ -36,7 +40,7 @@ def test_json_lines_tell_the_pace(tmp_path: Path) -> None:
     with reporter.progress("report", 1, hidden=True) as advance:
         advance()
     reporter.close()
-    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    events = logged(tmp_path)
     assert {event["stage"] for event in events} == {"fit"}
     first, last = events[0], events[-1]
     assert (first["done"], first["rate"], first["remaining"]) == (1, None, None)
@@ -44,7 +48,7 @@ def test_json_lines_tell_the_pace(tmp_path: Path) -> None:
     assert last["rate"] > 100
 
 
-def test_a_bar_moves_within_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bar_moves_within_a_unit(tmp_path, monkeypatch):
     clock = iter(range(1000))
     monkeypatch.setattr("pchem_pipeline.run.progress.time.monotonic", lambda: 2.0 * next(clock))
     reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
@@ -52,25 +56,23 @@ def test_a_bar_moves_within_a_unit(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert list(parts_told("abc")) == ["a", "b", "c"]
     assert list(parts_told("abc")) == ["a", "b", "c"]  # nobody listens
     reporter.close()
-    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    events = logged(tmp_path)
     assert [event["done"] for event in events] == [0, 0.33, 0.67, 1]
     assert events[1]["remaining"] > 0
 
 
-def test_the_time_of_compiling_is_no_part_of_the_rate(tmp_path: Path) -> None:
+def test_the_time_of_compiling_is_no_part_of_the_rate(tmp_path):
     reporter = Reporter("off", quiet=True, log=tmp_path / "run.log")
     with reporter.compilation("fit"), reporter.progress("fit", 1000, "tile") as advance:
         heard(("one", None), ("one", 1e4))
         for _ in range(1000):
             advance()
     reporter.close()
-    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    events = logged(tmp_path)
     assert [each["rate"] for each in events if each["event"] == "progress"][-1] == pytest.approx(1e6)
 
 
-def test_phases_are_named_and_named_again_where_nothing_else_is_heard(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_phases_are_named_and_named_again_where_nothing_else_is_heard(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("pchem_pipeline.run.progress._SILENCE", 0.5)
     run = RunStore.create(tmp_path / "run.zarr")
     store = run.path
@@ -80,7 +82,6 @@ def test_phases_are_named_and_named_again_where_nothing_else_is_heard(
         tell("comparing candidates")
         time.sleep(2.3)
         seen = read_progress(store)
-        assert seen is not None
         assert seen["stage"] == "discrepancy: comparing candidates"
     reporter.close()
     lines = capsys.readouterr().err.splitlines()
@@ -88,11 +89,11 @@ def test_phases_are_named_and_named_again_where_nothing_else_is_heard(
     assert lines[2:]
     assert all(line.startswith("discrepancy: comparing candidates, ") for line in lines[2:])
     assert lines[-1].endswith(" s so far")
-    events = [json.loads(line) for line in (tmp_path / "run.log").read_text().splitlines()]
+    events = logged(tmp_path)
     assert [event["event"] for event in events[:3]] == ["phase", "phase", "still"]
 
 
-def test_a_bar_shows_rate_and_remaining_time(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bar_shows_rate_and_remaining_time(capsys):
     reporter = Reporter("on")
     with reporter.progress("fit", 3, "tile") as advance:
         advance()
@@ -101,7 +102,7 @@ def test_a_bar_shows_rate_and_remaining_time(capsys: pytest.CaptureFixture[str])
     assert "0/3 [00:00<?, ? tile/s]" in shown
 
 
-def test_others_see_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
+def test_others_see_how_far_it_is_until_it_ends(tmp_path):
     run = RunStore.create(tmp_path / "run.zarr")
     store = run.path
     assert read_progress(store) is None
@@ -110,7 +111,6 @@ def test_others_see_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
         advance()
         advance()
         seen = read_progress(store)
-        assert seen is not None
         assert (seen["stage"], seen["done"], seen["total"], seen["pid"]) == ("fit", 2, 2, os.getpid())
     ProgressFile(store).remove()  # not its own file
     assert (store / ".pchem" / "progress.json").exists()
@@ -119,7 +119,7 @@ def test_others_see_how_far_it_is_until_it_ends(tmp_path: Path) -> None:
     assert [path.name for path in (store / ".pchem").iterdir()] == ["lock"]
 
 
-def test_what_a_killed_process_left_counts_as_nothing(tmp_path: Path) -> None:
+def test_what_a_killed_process_left_counts_as_nothing(tmp_path):
     """The lock decides, not a number of a process, which another one may have by now."""
     store = RunStore.create(tmp_path / "run.zarr")
     place = store.path / ".pchem" / "progress.json"
@@ -134,30 +134,20 @@ def test_what_a_killed_process_left_counts_as_nothing(tmp_path: Path) -> None:
             assert read_progress(store.path) is None
 
 
-def test_what_is_wrong_or_moves_the_cursor_does_not_get_through(tmp_path: Path) -> None:
+def test_what_is_wrong_or_moves_the_cursor_does_not_get_through(tmp_path):
     store = RunStore.create(tmp_path / "run.zarr")
-    content = {
-        "stage": "fit\x1b[2J\x07: now",
-        "unit": ["tile"],
-        "done": "5",
-        "total": None,
-        "rate": float("nan"),
-        "remaining": -3,
-        "elapsed": 1e300,
-        "more": 1,
-    }
+    content = {"stage": "fit\x1b[2J\x07: now", "unit": ["tile"], "done": "5", "total": None, "more": 1}
+    content |= {"rate": float("nan"), "remaining": -3, "elapsed": 1e300}
     with store.locked():
         (store.path / ".pchem" / "progress.json").write_text(json.dumps(content))
         seen = read_progress(store.path)
-    assert seen is not None
     assert seen.keys() == {"stage"}
     assert seen["stage"].isprintable()
-    assert rows([StageState("fit", "partial")], {"stage": "fit: now", "rate": 2.0}) == [
-        "fit         running (now)"
-    ]
+    told = rows([StageState("fit", "partial")], {"stage": "fit: now", "rate": 2.0})
+    assert told == ["fit         running (now)"]
 
 
-def test_a_folder_that_cannot_be_written_stops_nothing(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_stops_nothing(tmp_path):
     (tmp_path / "file").touch()
     ProgressFile(tmp_path / "file").show({"stage": "fit"})
     ProgressFile(tmp_path / "file").remove()

@@ -403,7 +403,6 @@ def test_record_keeps_what_was_used(make):
     context = make()
     execute("fit", context)
     record = context.store.records.read("fit")
-    assert record is not None
     assert record.content["settings"] == {"fit.gap_threshold": 5.0}
     assert record.versions["numpy"] == np.__version__
     assert record.seconds > 0

@@ -5,14 +5,13 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import pytest
+from helpers.small_sensors import a_uniform_sensor
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
-from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.settings import SimulateSettings
-from pchem_pipeline.simulate.truth import TruthMaps
 
 NOTHING = [
     {"tag": "exposure_drift", "drift": 0.0},
@@ -29,24 +28,21 @@ class Probe(Effect):
     model_config: ClassVar[Any] = {"arbitrary_types_allowed": True}
     function: Any
 
-    def apply(self, values: Any, context: EffectContext) -> Any:
+    def apply(self, values, context):
         return self.function(values, context)
 
 
-def probe_at(plane: Plane, function: Any) -> Probe:
+def probe_at(plane, function):
     kind = type("Probe", (Probe,), {"plane": plane, "__module__": __name__})
     return kind(function=function)
 
 
-def sensor(**changes) -> SimulateSettings:
+def sensor(**changes):
     return SimulateSettings.model_validate({"shape": [6, 7], "n_frames": 20, "seed": 11, **changes})
 
 
-def constant_truth(shape=(6, 7), *, exposure=2.0, gain=0.1, bias=100.0, noise=0.3) -> TruthMaps:
-    return TruthMaps(
-        *(np.full(shape, float(value)) for value in (exposure, gain, bias, noise)),
-        defect=np.zeros(shape, np.uint8),
-    )
+def constant_truth(shape=(6, 7), *, exposure=2.0, gain=0.1, bias=100.0, noise=0.3):
+    return a_uniform_sensor(shape, float(exposure), gain, float(bias), noise)
 
 
 def test_long_tables_of_hot_pixels_are_searched_right():
@@ -118,8 +114,8 @@ def test_a_truth_of_unequal_maps_is_refused():
 def test_effects_meet_the_signal_in_the_order_of_the_planes():
     seen: list[tuple[str, str]] = []
 
-    def note(name: str) -> Any:
-        def function(values: Any, context: EffectContext) -> Any:
+    def note(name):
+        def function(values, context):
             known = [n for n in ("exposure", "charge", "read_noise") if getattr(context, n) is not None]
             seen.append((name, f"{values.dtype} {','.join(known)}"))
             return values.copy()
@@ -139,7 +135,7 @@ def test_effects_meet_the_signal_in_the_order_of_the_planes():
 
 
 def test_effects_know_where_they_are_and_cannot_change_what_they_see():
-    def look(values: Any, context: EffectContext) -> Any:
+    def look(values, context):
         assert context.frames.tolist() == [3, 4]
         assert context.rows.tolist() == [2, 3, 4]
         assert (context.n_frames, context.shape, context.bit_depth) == (20, (6, 7), 14)
@@ -157,7 +153,7 @@ def test_effects_know_where_they_are_and_cannot_change_what_they_see():
     assert dn.shape == (2, 3, 7)
 
 
-def fails(values: Any, context: EffectContext) -> Any:
+def fails(values, context):
     raise KeyError("temperature")
 
 

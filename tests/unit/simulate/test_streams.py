@@ -21,11 +21,11 @@ KNOWN_ANSWERS = [
 ]
 
 
-def words(text: str) -> list[np.uint64]:
+def words(text):
     return [np.uint64(int(word, 16)) for word in text.split()]
 
 
-def streams(frames=(0, 5), rows=(0, 4), columns=6, *, seed=3, purpose="test") -> KeyedStreams:
+def streams(frames=(0, 5), rows=(0, 4), columns=6, *, seed=3, purpose="test"):
     return KeyedStreams(seed, purpose, np.arange(*frames), np.arange(*rows), np.arange(columns))
 
 
@@ -121,7 +121,7 @@ def test_poisson_numbers_follow_the_mean_given_and_the_position():
 
 
 def test_generators_depend_on_what_they_are_for_alone():
-    def first(source: KeyedStreams, **where: int) -> float:
+    def first(source, **where):
         return float(source.generator(**where).random())
 
     places = [

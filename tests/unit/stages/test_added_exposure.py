@@ -1,7 +1,5 @@
 """Exposure beside H: how effects give it, how it is put together, and how the store keeps it."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -25,11 +23,10 @@ MAPS = PixelMaps(*(np.full((6, 8), v) for v in (1.5, 0.1, 100.0, 3.0)), np.ones(
 GHOST = Persistence(peak_e=0.5, decay_frames=300.0, slow_decay_frames=2000.0, radius=0.3)
 
 
-def test_ghost_has_the_moments_of_its_course() -> None:
+def test_ghost_has_the_moments_of_its_course():
     numbers = np.arange(1000)
     frames = np.zeros((0, 6, 8), np.uint16)
     added = GHOST.added_exposure(frames, numbers, MAPS)
-    assert added is not None
     course = 0.25 * (np.exp(-numbers / 300) + np.exp(-numbers / 2000))
     pattern = GHOST.pattern(np.arange(6), (6, 8))
     for power in (1, 2, 3):
@@ -39,7 +36,7 @@ def test_ghost_has_the_moments_of_its_course() -> None:
     assert Persistence(peak_e=0.0, decay_frames=300.0).added_exposure(frames, numbers, MAPS) is None
 
 
-def test_effects_add_up_and_the_others_add_nothing() -> None:
+def test_effects_add_up_and_the_others_add_nothing():
     one = AddedExposure(np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[0.7, 1.0], [0.3, 0.0]]))
     two = AddedExposure(np.array([[0.1, 0.2], [0.4, 0.6]]), np.array([[0.5, 0.5], [0.5, 0.5]]))
     both = one.combined_with(two)
@@ -49,7 +46,6 @@ def test_effects_add_up_and_the_others_add_nothing() -> None:
     np.testing.assert_array_equal(both.of(np.array([1])).exposure_e[:, 0], both.exposure_e[:, 1])
     frames = np.zeros((1000, 6, 8), np.uint16)
     alone = added_exposures([RowNoise(row_noise_dn=1.0), GHOST], frames, np.arange(1000), MAPS)
-    assert alone is not None
     columns = [MAPS.quanta_exposure, MAPS.conversion_gain, MAPS.bias, MAPS.read_noise_dn]
     law = sample_law([RowNoise(row_noise_dn=1.0)], pixel_maps(columns, MAPS.usable), alone)
     assert law.added_exposure.shape == (48, 3)
@@ -57,9 +53,9 @@ def test_effects_add_up_and_the_others_add_nothing() -> None:
     assert added_exposures([RowNoise(row_noise_dn=1.0)], frames, np.arange(1000), MAPS) is None
 
 
-def test_an_effect_that_fails_is_named() -> None:
+def test_an_effect_that_fails_is_named():
     class Broken(RowNoise):
-        def added_exposure(self, *_: object) -> AddedExposure | None:
+        def added_exposure(self, *_):
             raise ZeroDivisionError("oh")
 
     frames = np.zeros((2, 6, 8), np.uint16)
@@ -67,9 +63,7 @@ def test_an_effect_that_fails_is_named() -> None:
         added_exposures([Broken(row_noise_dn=1.0)], frames, np.arange(2), MAPS)
 
 
-def test_a_version_of_the_model_gives_it_back_and_models_with_the_same_effect_take_it_over(
-    tmp_path: Path,
-) -> None:
+def test_a_version_of_the_model_gives_it_back_and_models_with_the_same_effect_take_it_over(tmp_path):
     store = RunStore.create(tmp_path / "run.zarr")
     store.create_array("histogram/origin", (8, 9), chunks=(8, 9))
     blinking, noise = DarkCurrentRts(fraction=0.1), RowNoise(row_noise_dn=1.0)
@@ -86,18 +80,15 @@ def test_a_version_of_the_model_gives_it_back_and_models_with_the_same_effect_ta
     found = keep_in_force(store, found)
     store.delete("discrepancy")  # the version has its own
     whole = read_added_exposure(store, found)
-    assert whole is not None
     assert whole.exposure_e.shape == (2, 8, 9)
     assert np.argwhere(whole.exposure_e[1] > 0).tolist() == [[3, 5]]
     np.testing.assert_array_equal(whole.weight.sum(axis=0), 1.0)
     # a model by hand with the same effect and another one beside
     both = keep_in_force(store, model_in_force(store, ModelSettings(effects=(blinking, noise))))
     part = read_added_exposure(store, both, (slice(3, 8), slice(4, 9)))
-    assert part is not None
     np.testing.assert_array_equal(part.exposure_e, whole.exposure_e[:, 3:8, 4:9])
     np.testing.assert_array_equal(part.weight, whole.weight[:, 3:8, 4:9])
     assert both.number == 3
-    assert both.added is not None
     assert both.added.group == "model/0002"
     # pixels that were not looked at, and models without the effect or with another of its kind
     assert read_added_exposure(store, both, (slice(5, 8), slice(None))) is None

@@ -1,10 +1,8 @@
 """Frames appended to a finished run: what all frames together give, without reading the old ones."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from helpers.commands import arrays_of
+from helpers.commands import arrays_of, assert_equal_arrays, assert_same_results
 from helpers.small_stacks import small_stack
 
 from pchem_pipeline.base.errors import InputError, StoreError
@@ -13,7 +11,7 @@ from pchem_pipeline.compute import memory
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.stage import Options
-from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import Command, run_stages, run_status
 from pchem_pipeline.stages.fit.fit import kept_fit
 from pchem_pipeline.store.run_store import RunStore
@@ -29,12 +27,16 @@ def frames():
     return stack
 
 
-def write(folder: Path, frames, cuts) -> None:
-    for number, part in enumerate(np.split(frames, cuts)):
-        np.save(folder / f"f{number}.npy", part)
+def begun(folder, frames, cut, stages=("ingest", "histogram"), **sections):
+    """Return a run of the first frames, to whose folder the others have come since."""
+    np.save(folder / "f0.npy", frames[:cut])
+    run = target(folder, "run.zarr", **sections)
+    run_stages(run, stages, QUIET)
+    np.save(folder / "f1.npy", frames[cut:])
+    return run
 
 
-def target(folder: Path, store: str, files: tuple[str, ...] = ("f*.npy",), **sections) -> Target:
+def target(folder, store, files=("f*.npy",), **sections):
     content = {"run": {"store": store, "tile": 32}, "input": {"files": list(files), "mode": "reference"}}
     content |= {"histogram": {"window_frames": 64, "block_frames": 96}, "compute": {"workers": 2}}
     for name, values in sections.items():
@@ -51,8 +53,8 @@ def target(folder: Path, store: str, files: tuple[str, ...] = ("f*.npy",), **sec
 def test_the_result_is_that_of_all_frames(tmp_path, monkeypatch, frames, cuts, mode, summaries):
     monkeypatch.setattr("pchem_pipeline.stages.ingest._CHUNK", (32, 16, 16))
     sections = {"input": {"mode": mode}, "histogram": {"summaries": summaries}}
-    write(tmp_path, frames[: cuts[0]], [])
-    extended = target(tmp_path, "extended.zarr", **sections)
+    np.save(tmp_path / "f0.npy", frames[: cuts[0]])
+    extended = target(tmp_path, "run.zarr", **sections)
     run_stages(extended, ["ingest", "histogram"], QUIET)
     for number, part in enumerate(np.split(frames, cuts)[1:], 1):
         np.save(tmp_path / f"f{number}.npy", part)
@@ -60,11 +62,8 @@ def test_the_result_is_that_of_all_frames(tmp_path, monkeypatch, frames, cuts, m
     assert append_frames(extended, QUIET) == []
     whole = target(tmp_path, "whole.zarr", **sections)
     run_stages(whole, ["ingest", "histogram"], QUIET)
-    expected, found = (arrays_of(tmp_path / name, GROUPS) for name in ("whole.zarr", "extended.zarr"))
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
-    one, other = (RunStore.open(tmp_path / name) for name in ("whole.zarr", "extended.zarr"))
+    assert_same_results(tmp_path / "run.zarr", tmp_path / "whole.zarr", groups=GROUPS)
+    one, other = (RunStore.open(tmp_path / name) for name in ("whole.zarr", "run.zarr"))
     assert one.attributes("frames") == other.attributes("frames")
     for stage in ("ingest", "histogram"):
         assert one.records.read(stage).fingerprint == other.records.read(stage).fingerprint
@@ -75,17 +74,10 @@ def test_odd_frames_among_old_and_new_ones_are_in_no_sum(tmp_path, frames):
     odd = frames.copy()
     odd[[40, 41, 610]] = 0
     odd[[250, 500]] += 300
-    write(tmp_path, odd, [301])
-    (tmp_path / "f1.npy").rename(tmp_path / "later")
-    extended, whole = target(tmp_path, "extended.zarr"), target(tmp_path, "whole.zarr")
-    run_stages(extended, ["ingest", "histogram"], QUIET)
-    (tmp_path / "later").rename(tmp_path / "f1.npy")
-    append_frames(extended, QUIET)
-    run_stages(whole, ["ingest", "histogram"], QUIET)
-    expected, found = (arrays_of(tmp_path / name, ("summary",)) for name in ("whole.zarr", "extended.zarr"))
-    for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
-    for name in ("whole.zarr", "extended.zarr"):
+    append_frames(begun(tmp_path, odd, 301), QUIET)
+    run_stages(target(tmp_path, "whole.zarr"), ["ingest", "histogram"], QUIET)
+    assert_same_results(tmp_path / "run.zarr", tmp_path / "whole.zarr", groups=("summary",))
+    for name in ("whole.zarr", "run.zarr"):
         store = RunStore.open(tmp_path / name)
         assert store.attributes("summary")["left_out"] == [40, 41, 250, 500, 610]
         counts = store.read("histogram/counts").sum(axis=2)
@@ -96,27 +88,15 @@ def test_odd_frames_among_old_and_new_ones_are_in_no_sum(tmp_path, frames):
 def test_moved_frames_are_found_among_old_and_new_ones(tmp_path, frames):
     moved = frames.copy()
     moved[[30, 290, 500, 699]] = np.roll(moved[[30, 290, 500, 699]], 1, axis=2)
-    write(tmp_path, moved[:301], [])
-    run = target(tmp_path, "run.zarr")
-    run_stages(run, ["ingest", "histogram"], QUIET)
-    np.save(tmp_path / "f1.npy", moved[301:])
-    append_frames(run, QUIET)
-    assert RunStore.open(tmp_path / "run.zarr").attributes("summary")["odd_frames"]["moved_x"] == [
-        30,
-        290,
-        500,
-        699,
-    ]
+    append_frames(begun(tmp_path, moved, 301), QUIET)
+    odd = RunStore.open(tmp_path / "run.zarr").attributes("summary")["odd_frames"]
+    assert odd["moved_x"] == [30, 290, 500, 699]
 
 
 def test_old_frames_are_not_read(tmp_path, frames, monkeypatch):
     from pchem_pipeline.frames import sequence
 
-    write(tmp_path, frames, [600])
-    (tmp_path / "f1.npy").rename(tmp_path / "later")
-    run = target(tmp_path, "run.zarr")
-    run_stages(run, ["ingest", "histogram"], QUIET)
-    (tmp_path / "later").rename(tmp_path / "f1.npy")
+    run = begun(tmp_path, frames, 600)
     assert [state.state for state in run_status(run)][:2] == ["stale", "stale"]  # a look changes nothing
     append_frames(run, Command(Options(dry_run=True), quiet=True))
     seen = []
@@ -132,12 +112,8 @@ def test_old_frames_are_not_read(tmp_path, frames, monkeypatch):
 
 
 def test_the_fit_starts_from_the_old_answer_and_ends_at_the_same_maximum(tmp_path, frames):
-    write(tmp_path, frames, [400])
-    (tmp_path / "f1.npy").rename(tmp_path / "later")
-    run = target(tmp_path, "run.zarr")
-    run_stages(run, ["ingest", "histogram", "fit"], QUIET)
+    run = begun(tmp_path, frames, 400, ("ingest", "histogram", "fit"))
     old = arrays_of(tmp_path / "run.zarr", ("fit",))
-    (tmp_path / "later").rename(tmp_path / "f1.npy")
     append_frames(run, QUIET)
     start = kept_fit(tmp_path / "run.zarr", (slice(None), slice(None)))
     good = old["fit/fit_status"] == 0
@@ -160,7 +136,7 @@ def test_the_fit_starts_from_the_old_answer_and_ends_at_the_same_maximum(tmp_pat
 
 
 def test_what_cannot_be_appended_is_said(tmp_path, frames, monkeypatch):
-    write(tmp_path, frames[:300], [])
+    np.save(tmp_path / "f0.npy", frames[:300])
     run = target(tmp_path, "run.zarr")
     with pytest.raises(StoreError, match="ingest is not complete"):
         append_frames(run, QUIET)
@@ -187,12 +163,8 @@ def test_what_cannot_be_appended_is_said(tmp_path, frames, monkeypatch):
 
 def test_more_frames_than_sixteen_bits_can_count(tmp_path):
     frames = np.random.default_rng(1).integers(100, 110, (70_000, 2, 3)).astype(np.uint16)
-    write(tmp_path, frames, [60_000])
-    (tmp_path / "f1.npy").rename(tmp_path / "later")
-    run = target(tmp_path, "run.zarr", histogram={"window_frames": 4096, "block_frames": 8192})
-    run_stages(run, ["ingest", "histogram"], QUIET)
+    run = begun(tmp_path, frames, 60_000, histogram={"window_frames": 4096, "block_frames": 8192})
     assert RunStore.open(tmp_path / "run.zarr").array("histogram/counts").dtype == np.uint16
-    (tmp_path / "later").rename(tmp_path / "f1.npy")
     append_frames(run, QUIET)
     counts = RunStore.open(tmp_path / "run.zarr").read("histogram/counts")
     assert counts.dtype == np.uint32
@@ -203,7 +175,8 @@ def test_more_frames_than_sixteen_bits_can_count(tmp_path):
 def of_all_frames(tmp_path_factory, frames):
     """The arrays of a run that had all frames from the start."""
     folder = tmp_path_factory.mktemp("whole")
-    write(folder, frames, [600])
+    for number, part in enumerate(np.split(frames, [600])):
+        np.save(folder / f"f{number}.npy", part)
     run_stages(target(folder, "whole.zarr"), ["ingest", "histogram"], QUIET)
     return arrays_of(folder / "whole.zarr", GROUPS)
 
@@ -224,11 +197,7 @@ _APPEND = "pchem_pipeline.commands.append"
     ],
 )
 def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, monkeypatch, frames, of_all_frames, places):
-    write(tmp_path, frames, [600])
-    (tmp_path / "f1.npy").rename(tmp_path / "later")
-    run = target(tmp_path, "run.zarr")
-    run_stages(run, ["ingest", "histogram", "fit"], QUIET)
-    (tmp_path / "later").rename(tmp_path / "f1.npy")
+    run = begun(tmp_path, frames, 600, ("ingest", "histogram", "fit"))
 
     def killed(*arguments, **named):
         raise KeyboardInterrupt
@@ -242,8 +211,5 @@ def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, monkeypatch, frames
         assert [state.why for state in run_status(run) if state.stage == "fit"] == ["the run has no input"]
     assert [state.state for state in append_frames(run, QUIET)] == ["complete", "complete"]
     assert append_frames(run, QUIET) == []
-    found = arrays_of(tmp_path / "run.zarr", GROUPS)
-    assert found.keys() == of_all_frames.keys()
-    for name, values in of_all_frames.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    assert_equal_arrays(arrays_of(tmp_path / "run.zarr", GROUPS), of_all_frames)
     assert kept_fit(tmp_path / "run.zarr", (slice(None), slice(None))) is not None

@@ -2,26 +2,23 @@
 
 import os
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
+from helpers.stage_runs import stage_context
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
+from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
-from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run import input as run_input
-from pchem_pipeline.run.fingerprint import StageState, status
+from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.input import open_source
-from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
-from pchem_pipeline.run.stage import Options, StageContext, open_store
+from pchem_pipeline.run.stage import Options, open_store
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.table import STAGES
@@ -32,44 +29,28 @@ STACK = np.random.default_rng(16).integers(0, 4096, (40, 30, 26)).astype(np.uint
 
 
 @pytest.fixture
-def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_chunks(monkeypatch):
     """Make many units of a small stack."""
     monkeypatch.setattr(ingest, "_CHUNK", (16, 8, 8))
     monkeypatch.setattr(ingest, "_UNIT_BYTES", 16 * 8 * 26 * 2)
 
 
-def write_stack(folder: Path, parts: int = 4) -> None:
+def write_stack(folder, parts=4):
     folder.mkdir(exist_ok=True)
     for i, part in enumerate(np.array_split(STACK, parts)):
         tifffile.imwrite(folder / f"f{i + 8}.tif", part, photometric="minisblack")
 
 
-def make_context(
-    folder: Path,
-    *,
-    executor: Executor | None = None,
-    options: Options | None = None,
-    stop: StopRequest | None = None,
-    **settings: Any,
-) -> StageContext:
-    given = {"files": ["cam"], **settings}
-    return StageContext(
-        RunConfig.model_validate({"input": given}),
-        folder,
-        RunStore.create(folder / "run.zarr"),
-        executor or SerialExecutor(),
-        Reporter("off", quiet=True),
-        stop or StopRequest(),
-        options=options or Options(),
-    )
+def make_context(folder, *, executor=None, options=None, stop=None, **settings):
+    return stage_context(folder, executor, options, stop, input={"files": ["cam"], **settings})
 
 
-def run(context: StageContext) -> StageState:
+def run(context):
     return execute("ingest", context)
 
 
 @pytest.mark.parametrize("backend", ["serial", "threads"])
-def test_copy(tmp_path: Path, small_chunks: None, backend: str) -> None:
+def test_copy(tmp_path, small_chunks, backend):
     write_stack(tmp_path / "cam")
     executor = make_executor(ComputeSettings(backend=backend, workers=2))
     context = make_context(tmp_path, executor=executor, integration_time=4.87, bit_depth=12)
@@ -87,7 +68,7 @@ def test_copy(tmp_path: Path, small_chunks: None, backend: str) -> None:
     assert run(context).state == "complete"
 
 
-def test_reference_copies_nothing(tmp_path: Path) -> None:
+def test_reference_copies_nothing(tmp_path):
     write_stack(tmp_path / "cam")
     context = make_context(tmp_path, mode="reference")
     assert run(context).state == "complete"
@@ -106,19 +87,19 @@ def test_reference_copies_nothing(tmp_path: Path) -> None:
             assert open_source(context).shape == STACK.shape
 
 
-def test_tiles_of_the_command_line_do_not_cut_the_input(tmp_path: Path) -> None:
+def test_tiles_of_the_command_line_do_not_cut_the_input(tmp_path):
     write_stack(tmp_path / "cam")
     context = make_context(tmp_path, options=Options(roi=(0, 1, 0, 1)))
     assert run(context).state == "complete"
     np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
 
 
-def test_stop_and_resume(tmp_path: Path, small_chunks: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_and_resume(tmp_path, small_chunks, monkeypatch):
     write_stack(tmp_path / "cam")
     stop, done = StopRequest(), []
     real = ingest._copy
 
-    def copy(unit: ingest.CopyUnit, store: RunStore, **rest: Any) -> None:
+    def copy(unit, store, **rest):
         done.append(unit.key)
         if len(done) == 5:
             stop.signal = 2
@@ -135,12 +116,12 @@ def test_stop_and_resume(tmp_path: Path, small_chunks: None, monkeypatch: pytest
     np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
 
 
-def test_identity_is_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identity_is_hashed_once(tmp_path, monkeypatch):
     write_stack(tmp_path / "cam")
     hashed: list[list[str]] = []
     real = run_input.content_identity
 
-    def content(paths: list[Path], advance: Any) -> dict[str, Any]:
+    def content(paths, advance):
         hashed.append([path.name for path in paths])
         return real(paths, advance)
 
@@ -165,7 +146,7 @@ def test_identity_is_hashed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert context.store.read("frames/dn", (slice(0, 1), slice(0, 1), slice(0, 1))).item() == changed[0, 0, 0]
 
 
-def test_moved_and_renamed_input_is_the_same(tmp_path: Path) -> None:
+def test_moved_and_renamed_input_is_the_same(tmp_path):
     write_stack(tmp_path / "cam")
     run(make_context(tmp_path))
     shutil.move(tmp_path / "cam", tmp_path / "elsewhere")
@@ -174,7 +155,7 @@ def test_moved_and_renamed_input_is_the_same(tmp_path: Path) -> None:
     assert status(STAGES["ingest"], make_context(tmp_path, files=["elsewhere/*.tif"])).state == "complete"
 
 
-def test_input_that_is_gone_leaves_the_copy_valid(tmp_path: Path) -> None:
+def test_input_that_is_gone_leaves_the_copy_valid(tmp_path):
     write_stack(tmp_path / "cam")
     run(make_context(tmp_path))
     shutil.rmtree(tmp_path / "cam")
@@ -197,7 +178,7 @@ def test_input_that_is_gone_leaves_the_copy_valid(tmp_path: Path) -> None:
         ("files", ["cam/*.tif"], False),
     ],
 )
-def test_which_settings_make_it_stale(tmp_path: Path, key: str, value: Any, stale: bool) -> None:
+def test_which_settings_make_it_stale(tmp_path, key, value, stale):
     write_stack(tmp_path / "cam")
     run(make_context(tmp_path))
     state = status(STAGES["ingest"], make_context(tmp_path, **{key: value}))
@@ -205,7 +186,7 @@ def test_which_settings_make_it_stale(tmp_path: Path, key: str, value: Any, stal
     assert (f"input.{key}" in state.why) == stale
 
 
-def test_stated_time_is_kept_apart_from_the_configured_one(tmp_path: Path) -> None:
+def test_stated_time_is_kept_apart_from_the_configured_one(tmp_path):
     (tmp_path / "cam").mkdir()
     tifffile.imwrite(
         tmp_path / "cam" / "a.tif", STACK, photometric="minisblack", metadata={"integration_time": 4.87}
@@ -219,7 +200,7 @@ def test_stated_time_is_kept_apart_from_the_configured_one(tmp_path: Path) -> No
     assert configured.sensor.integration_time == 2.0
 
 
-def test_small_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_disk_is_told(tmp_path, monkeypatch):
     write_stack(tmp_path / "cam")
     monkeypatch.setattr(RunStore, "free_bytes", lambda self: 1000)
     context = make_context(tmp_path)
@@ -227,7 +208,7 @@ def test_small_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert any("set input.mode: reference" in note for note in context.notes)
 
 
-def test_sidecar_belongs_to_the_content(tmp_path: Path) -> None:
+def test_sidecar_belongs_to_the_content(tmp_path):
     (tmp_path / "cam").mkdir()
     (tmp_path / "cam" / "a.raw").write_bytes(STACK.tobytes())
     side = tmp_path / "cam" / "a.raw.json"
@@ -246,7 +227,7 @@ def test_sidecar_belongs_to_the_content(tmp_path: Path) -> None:
     nx=st.integers(1, 9000),
     itemsize=st.sampled_from([1, 2, 4]),
 )
-def test_units_are_whole_chunks_within_memory(n: int, ny: int, nx: int, itemsize: int) -> None:
+def test_units_are_whole_chunks_within_memory(n, ny, nx, itemsize):
     shape = (n, ny, nx)
     chunk = ingest.chunk_shape(shape, itemsize)
     units = ingest.copy_units(shape, itemsize, chunk)
@@ -263,7 +244,7 @@ def test_units_are_whole_chunks_within_memory(n: int, ny: int, nx: int, itemsize
     assert (t, y) == (n, 0)
 
 
-def test_chunks_share_files_on_a_large_sensor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_share_files_on_a_large_sensor(tmp_path, monkeypatch):
     write_stack(tmp_path / "cam")
     monkeypatch.setattr(ingest, "_CHUNK", (16, 8, 8))
     monkeypatch.setattr(ingest, "_MANY_FILES", 24)
@@ -280,7 +261,7 @@ def test_chunks_share_files_on_a_large_sensor(tmp_path: Path, monkeypatch: pytes
 
 
 @given(n=st.integers(2, 20_000), ny=st.integers(1, 9000), nx=st.integers(1, 9000))
-def test_no_stack_has_many_files_that_could_be_fewer(n: int, ny: int, nx: int) -> None:
+def test_no_stack_has_many_files_that_could_be_fewer(n, ny, nx):
     chunk = ingest.chunk_shape((n, ny, nx), 2)
     shard = ingest.shard_shape((n, ny, nx), chunk) or chunk
     files = -(-n // shard[0]) * -(-ny // shard[1]) * -(-nx // shard[2])
@@ -289,7 +270,7 @@ def test_no_stack_has_many_files_that_could_be_fewer(n: int, ny: int, nx: int) -
     assert shard[2] % chunk[2] == 0
 
 
-def test_a_run_keeps_the_tiles_that_it_has(tmp_path: Path) -> None:
+def test_a_run_keeps_the_tiles_that_it_has(tmp_path):
     write_stack(tmp_path / "cam")
     context = make_context(tmp_path)
     run(context)

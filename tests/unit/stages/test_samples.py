@@ -62,7 +62,7 @@ def test_ranges_that_overlap_hold_the_same_frames():
 STACK = np.random.default_rng(8).integers(0, 4096, (6, 32, 48)).astype(np.uint16)
 
 
-def rows_per_read(path: Path, **settings: object) -> int:
+def rows_per_read(path, **settings):
     with open_frames(InputSettings(files=(path.name,), **settings), path.parent) as reader:
         return reader.rows_per_read
 
@@ -77,12 +77,12 @@ def rows_per_read(path: Path, **settings: object) -> int:
         ({"compression": "zlib", "tile": (64, 64)}, 32),
     ],
 )
-def test_strips_and_tiles_of_tiff(tmp_path: Path, options: dict[str, object], rows: int) -> None:
+def test_strips_and_tiles_of_tiff(tmp_path, options, rows):
     tifffile.imwrite(tmp_path / "a.tif", STACK, photometric="minisblack", **options)
     assert rows_per_read(tmp_path / "a.tif") == rows
 
 
-def test_the_largest_of_several_files_counts(tmp_path: Path) -> None:
+def test_the_largest_of_several_files_counts(tmp_path):
     for name, rows in (("a.tif", 4), ("b.tif", 16)):
         stack = STACK + (name == "b.tif")
         tifffile.imwrite(
@@ -95,19 +95,19 @@ def test_the_largest_of_several_files_counts(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("chunks", "rows"), [(None, 1), ((1, 32, 48), 1), ((2, 8, 48), 8), ((1, 32, 24), 32)]
 )
-def test_chunks_of_hdf5(tmp_path: Path, chunks: tuple[int, ...] | None, rows: int) -> None:
+def test_chunks_of_hdf5(tmp_path, chunks, rows):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("frames", data=STACK, chunks=chunks)
     assert rows_per_read(tmp_path / "a.h5") == rows
 
 
 @pytest.mark.parametrize(("tile", "rows"), [(None, 1), ((1, 8, 48), 8), ((1, 32, 48), 32)])
-def test_tiles_of_compressed_fits(tmp_path: Path, tile: tuple[int, ...] | None, rows: int) -> None:
+def test_tiles_of_compressed_fits(tmp_path, tile, rows):
     image = fits.CompImageHDU(STACK, compression_type="RICE_1", tile_shape=tile)
     fits.HDUList([fits.PrimaryHDU(), image]).writeto(tmp_path / "a.fits")
     assert rows_per_read(tmp_path / "a.fits") == rows
 
 
-def test_chunks_of_zarr(tmp_path: Path) -> None:
+def test_chunks_of_zarr(tmp_path):
     zarr.create_array(tmp_path / "a.zarr", data=STACK, chunks=(2, 16, 16))
     assert rows_per_read(tmp_path / "a.zarr") == 16

@@ -14,7 +14,7 @@ from pchem_pipeline.store import disk
 from pchem_pipeline.store.files import checked, whole_file, write_atomic
 
 
-def _fail(*_: object, **__: object) -> None:
+def _fail(*_, **__):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 
 from pchem_pipeline.base.errors import LockedError, StoreError
 from pchem_pipeline.store.files import fingerprint_of
@@ -66,24 +67,30 @@ def test_missing_array_names_the_cure(store):
         store.read("fit/bias")
 
 
-def test_another_schema_version_is_refused_with_both_numbers(store):
-    store._root.attrs["pchem_schema"] = 99
-    with pytest.raises(StoreError, match=r"version 99.* needs 1"):
-        RunStore.open(store.path)
+def of_another_schema(path):
+    RunStore.create(path)._root.attrs["pchem_schema"] = 99
 
 
-def test_other_zarr_stores_are_no_runs(tmp_path):
-    import zarr
-
-    zarr.create_group(str(tmp_path / "camera.zarr"), zarr_format=3)
-    with pytest.raises(StoreError, match=r"not a run; to read its frames: pchem run"):
-        RunStore.open(tmp_path / "camera.zarr")
+def half_written(path):
+    path.mkdir()
+    (path / "zarr.json").write_text("{")
 
 
-def test_a_half_written_store_is_refused(tmp_path):
-    (tmp_path / "run.zarr").mkdir()
-    (tmp_path / "run.zarr" / "zarr.json").write_text("{")
-    with pytest.raises(StoreError, match="damaged"):
+@pytest.mark.parametrize(
+    ("made", "words"),
+    [
+        (lambda path: None, "pchem run"),
+        (
+            lambda path: zarr.create_group(str(path), zarr_format=3),
+            "not a run; to read its frames: pchem run",
+        ),
+        (of_another_schema, r"version 99.* needs 1"),
+        (half_written, "damaged"),
+    ],
+)
+def test_what_is_no_run_is_refused_with_the_cure(tmp_path, made, words):
+    made(tmp_path / "run.zarr")
+    with pytest.raises(StoreError, match=words):
         RunStore.open(tmp_path / "run.zarr")
 
 
@@ -92,11 +99,6 @@ def test_no_store_is_made_over_other_files(tmp_path):
     with pytest.raises(StoreError, match="is not a run"):
         RunStore.create(tmp_path)
     assert (tmp_path / "thesis.txt").read_text() == "precious"
-
-
-def test_missing_store_names_the_cure(tmp_path):
-    with pytest.raises(StoreError, match="pchem run"):
-        RunStore.open(tmp_path / "nothing.zarr")
 
 
 def test_several_processes_that_make_the_same_store_at_once_have_it_all(tmp_path):
@@ -127,7 +129,7 @@ def test_several_processes_that_make_the_same_store_at_once_have_it_all(tmp_path
 def test_a_folder_that_another_process_makes_meanwhile_is_no_stranger(tmp_path, monkeypatch):
     asked, is_dir = [], Path.is_dir
 
-    def meanwhile(path: Path) -> bool:
+    def meanwhile(path):
         found = is_dir(path)
         if path.name == "run.zarr" and not found:
             asked.append(path)
@@ -149,7 +151,6 @@ def test_second_process_finds_the_run_locked_and_a_killed_one_frees_it(store):
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(store.path)], stdout=subprocess.PIPE, text=True
     )
-    assert process.stdout is not None
     assert process.stdout.readline() == "locked\n"
     with pytest.raises(LockedError, match="another pchem process"), store.locked():
         pass

@@ -75,9 +75,7 @@ def test_a_model_names_its_offsets():
 
 
 def test_pixels_without_calibration_tell_nothing():
-    rng = np.random.default_rng(52)
-    camera = KnownCamera.drawn(rng, SHAPE)
-    _, frames = camera.frames(rng, 1.0, 5)
+    _, camera, _, frames = KnownCamera.taken(52, SHAPE, 1.0, 5)
     calibration = camera.calibration()
     calibration.bias[0] = np.nan
     modes = CommonModes(("row_noise",), EVERYWHERE, np.array([[0.0, 1.0, 0.0]]))
@@ -178,7 +176,7 @@ class Stranger(RowNoise):
 
     says: ClassVar[SharedOffset] = SharedOffset("column", 4.0)
 
-    def shared_offset(self) -> SharedOffset:
+    def shared_offset(self):
         return self.says
 
 

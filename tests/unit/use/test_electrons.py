@@ -14,9 +14,7 @@ N = SHAPE[0] * SHAPE[1]
 
 
 def test_errors_of_samples_and_errors_common_to_all_frames():
-    rng = np.random.default_rng(40)
-    camera = KnownCamera.drawn(rng, SHAPE)
-    true, frames = camera.frames(rng, 3.0, N_FRAMES)
+    rng, camera, true, frames = KnownCamera.taken(40, SHAPE, 3.0, N_FRAMES)
     calibration = camera.calibration(rng, (1e-3, 0.3, 0.02))
     difference = electrons(frames, calibration).astype(np.float64) - true
     z = (difference - difference.mean(axis=0)) / read_stderr(calibration)
@@ -33,9 +31,7 @@ def test_errors_of_samples_and_errors_common_to_all_frames():
 
 
 def test_it_is_the_two_point_correction_in_single_precision():
-    rng = np.random.default_rng(41)
-    camera = KnownCamera.drawn(rng, (6, 7))
-    _, frames = camera.frames(rng, 5.0, 9)
+    _, camera, _, frames = KnownCamera.taken(41, (6, 7), 5.0, 9)
     calibration = camera.calibration()
     calibration.fit_status[2, 3] = 4
     found = electrons(frames, calibration)
@@ -47,9 +43,7 @@ def test_it_is_the_two_point_correction_in_single_precision():
 
 
 def test_offsets_of_rows_and_columns_are_taken_away():
-    rng = np.random.default_rng(42)
-    camera = KnownCamera.drawn(rng, (6, 7))
-    _, frames = camera.frames(rng, 5.0, 9)
+    rng, camera, _, frames = KnownCamera.taken(42, (6, 7), 5.0, 9)
     rows, columns = rng.normal(size=(9, 6)), rng.normal(size=(9, 7))
     found = electrons(
         frames, camera.calibration(), (rows[:, :, None] + columns[:, None, :]).astype(np.float32)

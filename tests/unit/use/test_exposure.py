@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.known_camera import KnownCamera
+from helpers.known_camera import KnownCamera, estimated
 from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.histogram.count import histogram_frames
@@ -64,23 +64,19 @@ def test_an_effect_of_the_law_is_in_the_estimate():
     electrons = rng.poisson(1.5 * flicker * np.ones(SHAPE))
     noise = camera.read_noise_e * rng.standard_normal(electrons.shape)
     frames = np.rint(camera.bias + (electrons + noise) / camera.gain).astype(np.uint16)
-    histograms = histogram_frames(frames)
     law = SampleLaw().with_exposures([0.2, 0.8], [2.0, 0.75])
     own = replace(camera.calibration(), law=law)
-    found = estimate_exposure(histograms.counts, histograms.origin, own)
-    plain = estimate_exposure(histograms.counts, histograms.origin, camera.calibration())
+    found = estimated(frames, own)
+    plain = estimated(frames, camera.calibration())
     assert np.median(found.counting) > 1.05 * np.median(plain.counting)
     assert abs(np.median(found.exposure) - 1.5) < 0.1
 
 
 def test_dark_and_unknown_pixels():
-    rng = np.random.default_rng(23)
-    camera = KnownCamera.drawn(rng, (4, 5))
-    _, frames = camera.frames(rng, 0.0, 200)
-    histograms = histogram_frames(frames)
+    rng, camera, _, frames = KnownCamera.taken(23, (4, 5), 0.0, 200)
     calibration = camera.calibration(rng, ERRORS)
     calibration.bias[1, 2] = np.nan
-    found = estimate_exposure(histograms.counts, histograms.origin, calibration)
+    found = estimated(frames, calibration)
     assert np.isnan(found.exposure[1, 2])
     assert np.isnan(found.stderr[1, 2])
     known = np.isfinite(calibration.bias)
@@ -93,29 +89,25 @@ def test_samples_at_the_top_of_the_adc_are_taken_as_a_limit():
     camera = KnownCamera(np.full(SHAPE, 0.1), np.full(SHAPE, 20.0), np.full(SHAPE, 0.25))
     _, frames = camera.frames(rng, 4.0, N_FRAMES)
     frames = np.minimum(frames, 63)  # 6 bits: more than 4.3 e- are cut
-    histograms = histogram_frames(frames)
     censored = replace(camera.calibration(), law=SampleLaw().with_clip(0, 63))
-    found = estimate_exposure(histograms.counts, histograms.origin, censored)
+    found = estimated(frames, censored)
     z = pulls(found, 4.0, found.stderr)
     assert abs(z.mean()) < 5 / np.sqrt(N) + 0.05
     assert abs(z.std() - 1) < 5 / np.sqrt(2 * N)
-    naive = estimate_exposure(histograms.counts, histograms.origin, camera.calibration())
+    naive = estimated(frames, camera.calibration())
     assert pulls(naive, 4.0, naive.stderr).mean() < -5
 
 
 def test_a_bias_that_may_be_an_electron_off_is_in_the_error():
     """Half an electron for certain would be a shift; a tenth of a chance of one electron is an error."""
-    rng = np.random.default_rng(25)
-    camera = KnownCamera.drawn(rng, (6, 8), read_noise=(0.15, 0.2))
-    _, frames = camera.frames(rng, 2.0, 200)
-    histograms = histogram_frames(frames)
+    _, camera, _, frames = KnownCamera.taken(25, (6, 8), 2.0, 200, read_noise=(0.15, 0.2))
     calibration = camera.calibration()
     off = np.stack([camera.gain, camera.bias - 1 / camera.gain, camera.sigma], axis=-1)
     rivals = np.zeros((6, 8, 2, 4))
     rivals[..., 0, 0], rivals[..., 0, 1:] = 0.1, off
-    found = estimate_exposure(histograms.counts, histograms.origin, replace(calibration, rivals=rivals))
+    found = estimated(frames, replace(calibration, rivals=rivals))
     np.testing.assert_allclose(found.calibration, np.sqrt(0.1), rtol=0.05)
-    alone = estimate_exposure(histograms.counts, histograms.origin, calibration)
+    alone = estimated(frames, calibration)
     np.testing.assert_array_equal(found.exposure, alone.exposure)
     assert (alone.calibration == 0).all()
 
@@ -123,14 +115,9 @@ def test_a_bias_that_may_be_an_electron_off_is_in_the_error():
 @pytest.mark.parametrize("n_frames", [1, 10, 1000])
 def test_the_error_of_no_exposure_is_that_of_its_likelihood(n_frames):
     """The mean square of H over its likelihood, by plain sums; the curvature at 0 would say anything."""
-    rng = np.random.default_rng(26)
-    camera = KnownCamera.drawn(rng, (10, 12), read_noise=(0.2, 0.45))
-    _, frames = camera.frames(rng, 0.0, n_frames)
-    histograms = histogram_frames(frames)
-    found = estimate_exposure(
-        histograms.counts, histograms.origin, camera.calibration(rng, (1e-4, 0.1, 0.02))
-    )
-    exact = estimate_exposure(histograms.counts, histograms.origin, camera.calibration())
+    rng, camera, _, frames = KnownCamera.taken(26, (10, 12), 0.0, n_frames, read_noise=(0.2, 0.45))
+    found = estimated(frames, camera.calibration(rng, (1e-4, 0.1, 0.02)))
+    exact = estimated(frames, camera.calibration())
     dark = np.argwhere(exact.exposure == 0)
     assert len(dark) > 30
     root = np.linspace(0, 1, 4001)[1:]  # fine where H is small

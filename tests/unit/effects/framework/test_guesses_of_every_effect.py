@@ -8,7 +8,6 @@ import pytest
 from helpers.small_sensors import drawn_truth, make, seen, taken
 
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 
 RELATIVES = {
@@ -37,7 +36,7 @@ EVERY = effect_classes()
 
 
 @functools.cache
-def evidence_of(hidden: str, seed: int = 22) -> Evidence:
+def evidence_of(hidden, seed=22):
     effects: tuple[Effect, ...] = ()
     if hidden:
         effects = (effect_class(hidden).model_validate({"tag": hidden, **RELATIVES[hidden]}),)

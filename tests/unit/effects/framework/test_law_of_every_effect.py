@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from helpers.small_sensors import make, taken
+from helpers.small_sensors import a_uniform_sensor, make, taken
 
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.truth import TruthMaps
 
 EXPOSURE, GAIN, BIAS, NOISE_E = 1.5, 0.1, 100.3, 0.3
 SHAPE, N_FRAMES = (34, 34), 400
@@ -31,12 +30,7 @@ EFFECTS = [
     make("adc_dnl", dnl_lsb=1.0, pattern="edges", first_code=108, edges=(1.0, 0.0, 0.5, -0.5)),
     make("adc_inl", inl_lsb=1.0, period_dn=37.0, phase=1.0),
     make(
-        "adc_inl",
-        inl_lsb=1.0,
-        form="curve",
-        first_dn=90.0,
-        spacing_dn=9.0,
-        curve=(0.0, 1.0, -0.5, 0.2, 0.8, 0.0),
+        "adc_inl", inl_lsb=1.0, form="curve", first_dn=90.0, spacing_dn=9.0, curve=(0, 1, -0.5, 0.2, 0.8, 0)
     ),
     make("clipping", low=98, high=141),
     make("gain_stitch", gain_change=0.05, level_dn=121.3),
@@ -60,15 +54,14 @@ EFFECTS = [
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=repr)
 def test_the_law_is_that_of_the_samples(effect):
-    parameters = (np.full(SHAPE, value) for value in (EXPOSURE, GAIN, BIAS, NOISE_E))
-    truth = TruthMaps(*parameters, np.zeros(SHAPE, np.uint8))
+    truth = a_uniform_sensor(SHAPE, EXPOSURE, GAIN, BIAS, NOISE_E)
     inside = taken(truth, effect, n_frames=N_FRAMES, seed=8)[:, 1:-1, 1:-1]  # fewer neighbours at the edge
     seen = np.bincount(inside.ravel(), minlength=CODES[-1] + 1)[CODES]
     assert seen.sum() == inside.size
     sigma = np.sqrt((NOISE_E / GAIN) ** 2 + 1 / 12)
     maps = PixelMaps.known([np.array([v]) for v in (EXPOSURE, GAIN, BIAS, sigma)], np.ones(1, bool))
 
-    def misfit(model: SampleLaw) -> float:
+    def misfit(model):
         expected = sample_mass(model, maps, CODES)[0] * inside.size
         some = expected > 10
         chi2 = ((seen - expected)[some] ** 2 / expected[some]).sum()

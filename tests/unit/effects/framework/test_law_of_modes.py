@@ -24,18 +24,18 @@ CODES = np.arange(60, 260)
 NORMAL = ndtri((np.arange(2000) + 0.5) / 2000)
 
 
-def maps_of(bias) -> PixelMaps:
+def maps_of(bias):
     bias = np.atleast_1d(np.asarray(bias, float))
     constant = [np.full(bias.shape, v) for v in (H, 1 / STEP, SIGMA)]
     return PixelMaps(constant[0], constant[1], bias, constant[2], np.ones(bias.shape, np.bool_))
 
 
-def law_of(effect) -> np.ndarray:
+def law_of(effect):
     maps = maps_of(MU)
     return sample_mass(effect.sample_law(SampleLaw(), maps), maps, CODES)[0]
 
 
-def smeared(added: np.ndarray) -> np.ndarray:
+def smeared(added):
     """Return the mean of the plain law over these offsets, DN."""
     return sample_mass(SampleLaw(), maps_of(MU + added.ravel()), CODES).mean(axis=0)
 

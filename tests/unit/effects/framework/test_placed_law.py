@@ -59,9 +59,8 @@ def test_laws_of_several_effects_join_in_any_order(other):
     first = EFFECTS[0] if other.tag == "overdispersed_counts" else EFFECTS[4]
     both = [first.at_place(Region(columns=((0, 3),))), other.at_place(REGION)]
     found = mass(both)
-    groups = [[], [first], [first, other], [other]]
-    for column, effects in zip(range(4), ([first], [first], [first, other], [other]), strict=True):
-        np.testing.assert_allclose(found[column], mass(effects)[column], atol=1e-12, err_msg=str(groups))
+    for column, effects in enumerate(([first], [first], [first, other], [other])):
+        np.testing.assert_allclose(found[column], mass(effects)[column], atol=1e-12, err_msg=str(effects))
     again = sample_law(both, maps(), places=places()).of(np.array([2, 7]))
     np.testing.assert_allclose(sample_mass(again, maps(2), CODES), found[[2, 7]], atol=1e-12)
 

@@ -13,11 +13,6 @@ from pchem_pipeline.effects.framework.region import Region, Taps, When, parse_pl
 SHAPE = (12, 20)
 
 
-def expected_mask(condition):
-    y, x = np.indices(SHAPE)
-    return condition(y, x)
-
-
 @pytest.mark.parametrize(
     ("given", "condition", "words"),
     [
@@ -51,7 +46,7 @@ def expected_mask(condition):
 )
 def test_region_holds_the_pixels_that_it_says(given, condition, words):
     region = Region.model_validate(given)
-    expected = expected_mask(condition)
+    expected = condition(*np.indices(SHAPE))
     np.testing.assert_array_equal(region.mask(SHAPE), expected)
     band = np.arange(2, 9)
     np.testing.assert_array_equal(region.mask(SHAPE, band), expected[2:9])

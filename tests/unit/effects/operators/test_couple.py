@@ -23,22 +23,25 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 def test_capacitance_moves_charge_without_losing_any():
     charge = np.zeros((3, 4, 5), int)
     charge[0, 1, 2] = charge[1, 0, 0] = 10
-    effect = InterpixelCapacitance(coupling=0.02, anisotropy=0.5)
-    after, _, _, r = analog(effect, charge.shape, charge=charge)
+    after, _, _, r = analog(InterpixelCapacitance(coupling=0.02, anisotropy=0.5), charge.shape, charge=charge)
     seen = after - r
-    assert seen[0, 1, 1] == pytest.approx(0.3)
-    assert seen[0, 1, 3] == pytest.approx(0.3)
-    assert seen[0, 0, 2] == pytest.approx(0.1)
-    assert seen[0, 2, 2] == pytest.approx(0.1)
-    assert seen[0, 1, 2] == pytest.approx(9.2)
+    around = [[0.0, 0.1, 0.0], [0.3, 9.2, 0.3], [0.0, 0.1, 0.0]]
+    np.testing.assert_allclose(seen[0, :3, 1:4], around, atol=1e-12)
     assert seen[1, 0, 0] == pytest.approx(9.6)  # a corner has two neighbours
     np.testing.assert_allclose(seen.sum(axis=(1, 2)), charge.sum(axis=(1, 2)), atol=1e-12)
 
 
-def test_memory_is_of_the_frame_before():
-    effect = AnalogMemory(memory=-0.1)
-    after, before, k, _ = analog(effect, (6, 3, 4))
-    np.testing.assert_allclose(after[1:] - before[1:], -0.1 * k[:-1], atol=1e-12)
+@pytest.mark.parametrize(
+    ("effect", "left"),
+    [
+        (AnalogMemory(memory=-0.1), lambda k: -0.1 * k),
+        (AnalogMemory(memory=0.1, saturation_e=5.0), lambda k: 0.5 * (1 - np.exp(-k / 5))),
+    ],
+    ids=["linear", "levels off"],
+)
+def test_memory_is_of_the_frame_before(effect, left):
+    after, before, k, _ = analog(effect, (6, 3, 4), charge=np.arange(6)[:, None, None] ** 3)
+    np.testing.assert_allclose(after[1:] - before[1:], left(k[:-1]), atol=1e-12)
 
 
 def test_memory_may_differ_from_pixel_to_pixel():
@@ -53,14 +56,6 @@ def test_memory_may_differ_from_pixel_to_pixel():
     within(logs.std(), 0.5, 0.5 / 60 / np.sqrt(2))
 
 
-def test_memory_levels_off():
-    after, before, _, _ = analog(
-        AnalogMemory(memory=0.1, saturation_e=5.0), (6, 1, 1), charge=np.arange(6)[:, None, None] ** 3
-    )
-    left = (after - before)[1:, 0, 0]
-    np.testing.assert_allclose(left, 0.5 * (1 - np.exp(-(np.arange(5) ** 3) / 5)), atol=1e-12)
-
-
 def test_the_code_before_moves_a_sample_one_after_the_other():
     values = np.random.default_rng(1).uniform(90, 140, (3, 4, 9))
     effect = BinaryOffset(offset_dn=2.0, bits=(1.0, 0.0, -0.5))
@@ -73,17 +68,14 @@ def test_the_code_before_moves_a_sample_one_after_the_other():
 
 
 def test_the_law_has_the_variance_of_all_bits():
-    maps = PixelMaps(np.array([1.5]), np.array([0.1]), np.array([100.0]), np.array([3.0]), np.ones(1, bool))
-    codes = np.arange(40, 300)
-    bits = (0.5, 0.2, 0.0, 1.0, -0.3)
-    law = BinaryOffset(offset_dn=1.6, bits=bits).sample_law(SampleLaw(), maps)
-    variances = []
-    for one in (SampleLaw(), law):
-        mass = sample_mass(one, maps, codes)[0]
-        variances.append(mass @ (codes - mass @ codes) ** 2)
-    assert variances[1] - variances[0] == pytest.approx(1.6**2 / 4 * np.sum(np.square(bits)), rel=1e-6)
+    codes, bits = np.arange(40, 300), (0.5, 0.2, 0.0, 1.0, -0.3)
+    law = BinaryOffset(offset_dn=1.6, bits=bits).sample_law(SampleLaw(), MAPS)
+    plain, wide = (sample_mass(each, MAPS, codes)[0] for each in (SampleLaw(), law))
+    added = wide @ (codes - wide @ codes) ** 2 - plain @ (codes - plain @ codes) ** 2
+    assert added == pytest.approx(1.6**2 / 4 * np.sum(np.square(bits)), rel=1e-6)
 
 
+MAPS = PixelMaps(*np.array([[1.5], [0.1], [100.0], [3.0]]), np.ones(1, bool))
 TRUE = BinaryOffset(offset_dn=-1.0, bits=(-0.3, -0.5, 0.0, 1.0))
 
 
@@ -141,10 +133,9 @@ def test_a_window_has_its_part_of_the_clamp():
 
 
 def test_the_law_has_the_variance_of_the_clamp():
-    maps = PixelMaps(np.array([2.0]), np.array([0.1]), np.array([100.0]), np.array([3.0]), np.ones(1, bool))
-    law = BlackClamp(follow=0.5, pixels=20).sample_law(SampleLaw(), maps)
-    assert law.extra_variance_dn2[0] == pytest.approx(0.25 * (9.0 + 200.0) / 20)
-    assert BlackClamp(follow=0.5).sample_law(SampleLaw(), maps).neutral
+    law = BlackClamp(follow=0.5, pixels=20).sample_law(SampleLaw(), MAPS)
+    assert law.extra_variance_dn2[0] == pytest.approx(0.25 * (9.0 + 150.0) / 20)
+    assert BlackClamp(follow=0.5).sample_law(SampleLaw(), MAPS).neutral
 
 
 # of the whole frame, of columns, of rows

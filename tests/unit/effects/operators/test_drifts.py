@@ -15,29 +15,27 @@ from pchem_pipeline.effects.operators.drifts import (
 )
 
 
-def test_linear_drift_ends_where_it_says_and_keeps_the_mean():
-    added = offsets(BiasDrift(drift_dn=-0.3), context_of(n_frames=101))
-    np.testing.assert_allclose(added[-1] - added[0], -0.3)
-    np.testing.assert_allclose(added.mean(axis=0), 0.0, atol=1e-12)
-    before = offsets(BiasDrift(drift_dn=-0.3), context_of(n_frames=101, frames=[-5, 0]))
-    np.testing.assert_array_equal(before[0], before[1])
-
-
-def test_a_bias_settles_by_an_exponential_and_keeps_the_mean():
-    effect = BiasDrift(drift_dn=2.0, shape="settling", settling_fraction=0.25)
-    added = offsets(effect, context_of(n_frames=401))[:, 0, 0]
-    assert added[-1] - added[0] == pytest.approx(2.0)
-    rest = (added[-1] - added) + 2.0 * np.exp(-4.0) / -np.expm1(-4.0)
-    np.testing.assert_allclose(rest[100] / rest[0], np.exp(-1.0))
-    assert abs(added.mean()) < 2.0 * 3 / 401
-
-
-def test_a_path_goes_through_its_nodes():
-    path = BiasDrift(drift_dn=2.0, shape="path", path=(0.0, 1.0, -1.0))
-    added = offsets(path, context_of(n_frames=201))[:, 0, 0]
-    np.testing.assert_allclose(added[[0, 100, 200]] - added[0], [0.0, 2.0, -2.0])
-    np.testing.assert_allclose(added[50] - added[0], 1.0)
+@pytest.mark.parametrize(
+    ("effect", "profile"),
+    [
+        (BiasDrift(drift_dn=-0.3), lambda t: -0.3 * t),
+        (
+            BiasDrift(drift_dn=2.0, shape="settling", settling_fraction=0.25),
+            lambda t: 2.0 * np.expm1(-4.0 * t) / np.expm1(-4.0),
+        ),
+        (
+            BiasDrift(drift_dn=2.0, shape="path", path=(0.0, 1.0, -1.0)),
+            lambda t: np.interp(t, [0.0, 0.5, 1.0], [0.0, 2.0, -2.0]),
+        ),
+    ],
+    ids=["linear", "settling", "path"],
+)
+def test_a_bias_drifts_along_its_profile_and_keeps_the_mean(effect, profile):
+    added = offsets(effect, context_of(n_frames=201))[:, 0, 0]
+    np.testing.assert_allclose(added - added[0], profile(np.linspace(0.0, 1.0, 201)), atol=1e-12)
     assert abs(added.mean()) < 2.0 * 3 / 201
+    before = offsets(effect, context_of(n_frames=201, frames=[-5, 0]))
+    np.testing.assert_array_equal(before[0], before[1])
 
 
 def test_a_walk_has_the_variance_of_its_end():

@@ -69,12 +69,8 @@ def test_crosstalk_correlates_neighbours_and_adds_its_electrons():
     # a Poisson count it stays
     assert abs(goodness(k.astype(int), stats.poisson.pmf(np.arange(40), mean))) < 5
     d = k - mean
-    pairs = {
-        "x": ((d[:, :, 1:] * d[:, :, :-1]), p / 2 * h),
-        "y": ((d[:, 1:] * d[:, :-1]), p / 2 * h),
-        "two apart": ((d[:, 2:] * d[:, :-2]), 0.0),
-    }
-    for products, wanted in pairs.values():
+    along_x, along_y, two_apart = d[:, :, 1:] * d[:, :, :-1], d[:, 1:] * d[:, :-1], d[:, 2:] * d[:, :-2]
+    for products, wanted in ((along_x, p / 2 * h), (along_y, p / 2 * h), (two_apart, 0.0)):
         error = mean * (1 + 2 * p) / np.sqrt(products.size)
         assert abs(products.mean() - wanted) < 5 * error
     assert p / 2 * h > 20 * error
@@ -89,13 +85,12 @@ def test_what_cannot_be_seen_leaves_independent_poisson_electrons(effect, mean):
     assert abs(goodness(k, stats.poisson.pmf(np.arange(40), mean))) < 5
     d = k - mean
     error = mean / np.sqrt(d.size)
-    for a, b in (
-        (d[1:], d[:-1]),
-        (d[:, 1:], d[:, :-1]),
-        (d[:, :, 1:], d[:, :, :-1]),
-        (d[1:, 1:], d[:-1, :-1]),
-    ):
-        assert abs((a * b).mean()) < 5 * error
+    # in time, along y, along x, and in time and along y
+    later, below, right = np.s_[1:], np.s_[:, 1:], np.s_[..., 1:]
+    before, above, left = np.s_[:-1], np.s_[:, :-1], np.s_[..., :-1]
+    pairs = (later, before), (below, above), (right, left), (np.s_[1:, 1:], np.s_[:-1, :-1])
+    for one, other in pairs:
+        assert abs((d[one] * d[other]).mean()) < 5 * error
     # it did something, and its opposite number, electrons made rather than moved, would be found
     assert (k != electrons(2.0, (50, 50), 400)[1:]).mean() > 0.2
     crosstalk = electrons(2.0, (50, 50), 400, OpticalCrosstalk(probability=0.3)) - 2.6
@@ -122,16 +117,10 @@ def test_diffusion_moves_electrons_and_loses_none():
         simulated(truth, *e, n_frames=50)[1].astype(float) for e in ((), (ChargeDiffusion(fraction=0.2),))
     )
     assert np.array_equal(plain.sum(axis=(1, 2)), moved.sum(axis=(1, 2)))
-    mean = moved.mean(axis=0)
-    for place, wanted in (
-        ((4, 4), 800),
-        ((3, 4), 50),
-        ((4, 5), 50),
-        ((0, 0), 900),
-        ((0, 1), 50),
-        ((3, 3), 0),
-    ):
-        assert abs(mean[place] - wanted) <= 5 * np.sqrt(wanted / 50)
+    wanted = np.zeros((9, 9))
+    wanted[4, 4], wanted[0, 0] = 800, 900
+    wanted[[3, 5, 4, 4, 0, 1], [4, 4, 3, 5, 1, 0]] = 50
+    assert (abs(moved.mean(axis=0) - wanted) <= 5 * np.sqrt(wanted / 50)).all()
 
 
 H, TRAP_FRAMES, TRAPS = 2.0, 2000, (30, 30)

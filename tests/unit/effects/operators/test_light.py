@@ -60,15 +60,8 @@ def test_an_image_in_a_part_of_the_sensor_stays_at_its_place():
 
 
 def test_the_ghost_of_an_image_fades():
-    effect = Persistence(
-        peak_e=2.0,
-        decay_frames=10.0,
-        slow_decay_frames=40.0,
-        slow_share=0.25,
-        centre_y=0.25,
-        centre_x=0.75,
-        radius=0.1,
-    )
+    place = {"centre_y": 0.25, "centre_x": 0.75, "radius": 0.1}
+    effect = Persistence(peak_e=2.0, decay_frames=10.0, slow_decay_frames=40.0, slow_share=0.25, **place)
     h = exposures(effect, np.zeros((40, 20)), 100)
     assert np.unravel_index(h[0].argmax(), h[0].shape) == (9, 14)
     assert np.allclose(h[20] / h[0], 0.75 * np.exp(-2.0) + 0.25 * np.exp(-0.5))
@@ -167,7 +160,7 @@ def test_bursts_so_bright_that_they_mislead_the_fits_keep_their_form(seed):
     assert found.radius == pytest.approx(0.2, rel=0.1)
 
 
-def test_a_spot_that_no_cell_shows_is_no_guess() -> None:
+def test_a_spot_that_no_cell_shows_is_no_guess():
     rng = np.random.default_rng(5)
     lost = np.full((4, 4), 0.01)
     lost[:2] = np.inf  # no usable pixel in the upper half

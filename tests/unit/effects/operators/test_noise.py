@@ -79,14 +79,8 @@ def test_a_slow_trap_is_a_markov_chain_of_two_levels(tau):
 
 
 def test_slow_traps_differ_in_their_times():
-    effect = RtsNoise(
-        fraction=1.0,
-        amplitude_e=2.0,
-        probability=0.5,
-        sampling="single",
-        correlation_frames=2.0,
-        times_spread=0.7,
-    )
+    times = {"sampling": "single", "correlation_frames": 2.0, "times_spread": 0.7}
+    effect = RtsNoise(fraction=1.0, amplitude_e=2.0, probability=0.5, **times)
     after, before, _, _ = analog(effect, (4000, 12, 12))
     up = (after - before).reshape(4000, -1) > 0
     full = up.mean(axis=0)
@@ -110,9 +104,7 @@ def test_exponential_steps_have_the_mean_that_is_stated():
     within(steps[0].std(), 2.0, 2.0 * np.sqrt(2) / 60 * 1.5)
 
 
-MAPS = PixelMaps(
-    np.array([1.5]), np.array([0.1]), np.array([100.0]), np.array([np.sqrt(9 + 1 / 12)]), np.array([True])
-)
+MAPS = PixelMaps(*np.array([[1.5], [0.1], [100.0], [np.sqrt(9 + 1 / 12)]]), np.ones(1, bool))
 
 
 def test_telegraph_noise_leaves_the_levels_to_the_pixels():

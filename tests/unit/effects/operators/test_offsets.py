@@ -78,9 +78,8 @@ def test_halves_jump_together():
 
 
 def test_pickup_is_the_sine_that_it_says():
-    effect = PeriodicPickup(
-        amplitude_dn=0.4, cycles_per_row=0.11, cycles_per_frame=-0.27, cycles_per_column=0.07, phase=0.6
-    )
+    cycles = {"cycles_per_row": 0.11, "cycles_per_frame": -0.27, "cycles_per_column": 0.07}
+    effect = PeriodicPickup(amplitude_dn=0.4, phase=0.6, **cycles)
     context = context_of((6, 7), 30, frames=np.arange(10, 30))
     t, y, x = np.ogrid[10:30, :6, :7]
     expected = 0.4 * np.sin(2 * np.pi * (0.11 * y - 0.27 * t + 0.07 * x) + 0.6)

@@ -1,13 +1,10 @@
 """Samples replaced by others: forward models, laws, and estimators."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from helpers.small_sensors import context_of, drawn_truth, seen, taken
 
 from pchem_pipeline.discrepancy.observe.misplaced import own_lines
-from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.neighbours import PREDICTORS, predicted
 from pchem_pipeline.effects.operators.offsets import RowNoise
@@ -28,7 +25,7 @@ from pchem_pipeline.simulate.settings import SimulateSettings
 N_FRAMES, SMALL = 14, (6, 5)
 
 
-def frames_of(*effects: Effect) -> Any:
+def frames_of(*effects):
     sensor = SimulateSettings(shape=SMALL, n_frames=N_FRAMES, seed=8, effects=effects)
     return simulate_block(drawn_truth(SMALL), sensor, (0, N_FRAMES))[0]
 
@@ -79,24 +76,23 @@ def test_a_stuck_bit_is_wrong_in_every_sample(bit, fault):
     assert found.dtype == BITS_FRAMES.dtype
 
 
-def test_a_share_of_the_samples_is_wrong():
-    found = BitErrors(share=0.02, bit=3, fault="flip").apply(BITS_FRAMES, context_of(BITS_SHAPE, 40))
+@pytest.mark.parametrize(
+    ("effect", "share"),
+    [
+        (BitErrors(share=0.02, bit=3, fault="flip"), 0.02),
+        (BitErrors(share=1.0, bit=14, fault="one"), 0.0),  # a bit that the converter lacks
+    ],
+)
+def test_a_share_of_the_samples_is_wrong(effect, share):
+    found = effect.apply(BITS_FRAMES, context_of(BITS_SHAPE, 40))
     n, wrong = BITS_FRAMES.size, int((found != BITS_FRAMES).sum())
-    assert abs(wrong - 0.02 * n) < 5 * np.sqrt(0.02 * 0.98 * n)
-
-
-def test_a_bit_that_the_converter_lacks_is_never_wrong():
-    found = BitErrors(share=1.0, bit=14, fault="one").apply(BITS_FRAMES, context_of(BITS_SHAPE, 40))
-    np.testing.assert_array_equal(found, BITS_FRAMES)
+    assert abs(wrong - share * n) <= 5 * np.sqrt(share * (1 - share) * n)
 
 
 @pytest.mark.parametrize("fault", ["zero", "one", "flip"])
 def test_the_law_has_as_many_moved_samples_and_their_mean(fault):
     effect = BitErrors(share=0.01, bit=3, fault=fault)
-    maps = PixelMaps(
-        np.array([0.8, 2.5]), np.array([0.1, 0.07]), np.array([100.3, 97.0]), np.array([3.0, 3.4]),
-        np.ones(2, bool),
-    )  # fmt: skip
+    maps = PixelMaps(*np.array([[0.8, 2.5], [0.1, 0.07], [100.3, 97.0], [3.0, 3.4]]), np.ones(2, bool))
     codes = np.arange(40, 400)
     plain = sample_mass(SampleLaw(), maps, codes)
     law = sample_mass(effect.sample_law(SampleLaw(), maps), maps, codes)
@@ -194,16 +190,12 @@ def test_the_share_replaces_some():
     assert abs(some.sum() - 0.3 * n) < 5 * np.sqrt(0.21 * n)
 
 
-def test_a_sensor_too_small_to_have_neighbours_stays_as_it_is():
-    frames = np.array([[[100, 5000]]], np.uint16)
-    np.testing.assert_array_equal(
-        PixelCorrection(threshold_dn=1).apply(frames, context_of((1, 2), 1)), frames
-    )
-
-
-def test_predictions_of_odd_dtypes_do_not_overflow():
-    frames = np.full((1, 3, 3), 250, np.uint8)
-    assert [int(predicted(frames, kind)[0, 0, 0]) for kind in PREDICTORS] == [250, 250, 250]
+def test_small_sensors_stay_as_they_are_and_small_dtypes_do_not_overflow():
+    frames = np.array([[[100, 5000]]], np.uint16)  # no pixel has neighbours
+    found = PixelCorrection(threshold_dn=1).apply(frames, context_of((1, 2), 1))
+    np.testing.assert_array_equal(found, frames)
+    bright = np.full((1, 3, 3), 250, np.uint8)
+    assert [int(predicted(bright, kind)[0, 0, 0]) for kind in PREDICTORS] == [250, 250, 250]
 
 
 CORRECTIONS = [
@@ -246,13 +238,6 @@ LINES_SHAPE, N_LINE_FRAMES = (9, 11), 300
 MOVES = ("swapped", "early", "late", "sample_lost", "sample_twice", "line_lost", "line_twice")
 
 
-def origins(shape, frames):
-    """Return frames whose values tell where in the frame they come from."""
-    return np.broadcast_to(
-        np.arange(shape[0] * shape[1], dtype=np.uint16).reshape(shape), (frames, *shape)
-    ).copy()
-
-
 def turned(frames, lines):
     """Return frames (frame, line, sample)."""
     return frames if lines == "rows" else frames.swapaxes(1, 2)
@@ -261,7 +246,9 @@ def turned(frames, lines):
 @pytest.mark.parametrize("lines", ["rows", "columns"])
 @pytest.mark.parametrize("move", MOVES)
 def test_every_sample_comes_from_where_the_move_says(move, lines):
-    frames, share = origins(LINES_SHAPE, N_LINE_FRAMES), 0.1
+    # values tell where in the frame they come from
+    places = np.arange(LINES_SHAPE[0] * LINES_SHAPE[1], dtype=np.uint16).reshape(LINES_SHAPE)
+    frames, share = np.tile(places, (N_LINE_FRAMES, 1, 1)), 0.1
     found = MisplacedLines(share=share, move=move, lines=lines).apply(
         frames, context_of(LINES_SHAPE, N_LINE_FRAMES)
     )

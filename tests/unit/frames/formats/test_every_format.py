@@ -3,13 +3,11 @@
 import os
 import pickle
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from helpers.camera_files import not_opened, opened, read, refused
-from helpers.layouts import LAYOUTS, Stack, write
+from helpers.layouts import LAYOUTS, write
 
 from pchem_pipeline.base.errors import InputError
 
@@ -26,7 +24,7 @@ KINDS = ("npy", "tiff", "tiff, zlib", "fits", "fits, RICE_1", "hdf5", "hdf5, gzi
 every_kind = pytest.mark.parametrize("layout", KINDS)
 
 
-def drawn(top: int, dtype: Any) -> Stack:
+def drawn(top, dtype):
     stack = np.random.default_rng(11).integers(0, top, SHAPE, dtype=dtype, endpoint=True)
     stack[0, 0, :2] = 0, top
     return stack
@@ -41,7 +39,7 @@ def drawn(top: int, dtype: Any) -> Stack:
         if not (dtype is np.uint32 and layout in AT_MOST_16)
     ],
 )
-def test_frames_are_read_exactly(tmp_path: Path, layout: str, dtype: type) -> None:
+def test_frames_are_read_exactly(tmp_path, layout, dtype):
     # beyond that HCOMPRESS loses
     stack = drawn(
         60_000 if (layout, dtype) == ("fits, HCOMPRESS_1", np.uint16) else np.iinfo(dtype).max, dtype
@@ -55,7 +53,7 @@ def test_frames_are_read_exactly(tmp_path: Path, layout: str, dtype: type) -> No
 
 
 @pytest.mark.parametrize("layout", ["npy", "tiff", "fits", "fits, RICE_1", "hdf5"])
-def test_single_frames_and_stacks_are_joined_in_natural_order(tmp_path: Path, layout: str) -> None:
+def test_single_frames_and_stacks_are_joined_in_natural_order(tmp_path, layout):
     stack = drawn(4095, np.uint16)
     for name, frames in (("f7", stack[0]), ("f9", stack[1]), ("f10", stack[2:5]), ("f11", stack[5])):
         write(tmp_path, layout, frames, name)
@@ -63,7 +61,7 @@ def test_single_frames_and_stacks_are_joined_in_natural_order(tmp_path: Path, la
 
 
 @every_kind
-def test_many_threads_read_one_stack_of_files(tmp_path: Path, layout: str) -> None:
+def test_many_threads_read_one_stack_of_files(tmp_path, layout):
     stack = drawn(65535, np.uint16)
     for name, part in (("a1", stack[:4]), ("a2", stack[4:])):
         write(tmp_path, layout, part, name)
@@ -73,7 +71,7 @@ def test_many_threads_read_one_stack_of_files(tmp_path: Path, layout: str) -> No
         for _ in range(60)
     ]
 
-    def task(window: tuple[int, int, int, int]) -> bool:
+    def task(window):
         t0, t1, y0, y1 = map(int, window)
         return bool((reader.read(t0, t1, y0, y1) == stack[t0:t1, y0:y1]).all())
 
@@ -82,7 +80,7 @@ def test_many_threads_read_one_stack_of_files(tmp_path: Path, layout: str) -> No
 
 
 @every_kind
-def test_a_file_that_vanishes(tmp_path: Path, layout: str) -> None:
+def test_a_file_that_vanishes(tmp_path, layout):
     path = write(tmp_path, layout, drawn(65535, np.uint16))
     reader = opened(path)
     path.rename(tmp_path / "gone")
@@ -91,7 +89,7 @@ def test_a_file_that_vanishes(tmp_path: Path, layout: str) -> None:
 
 
 @pytest.mark.parametrize("layout", [each for each in KINDS if not each.startswith(("hdf5", "zarr"))])
-def test_a_file_that_shrinks(tmp_path: Path, layout: str) -> None:
+def test_a_file_that_shrinks(tmp_path, layout):
     path = write(tmp_path, layout, drawn(65535, np.uint16))
     reader = opened(path)
     os.truncate(path, path.stat().st_size // 2)
@@ -108,7 +106,7 @@ def test_a_file_that_shrinks(tmp_path: Path, layout: str) -> None:
         "bigtiff pages, big-endian", "fits", "fits, RICE_1", "hdf5",
     ],
 )  # fmt: skip
-def test_a_file_that_was_cut_is_refused(tmp_path: Path, layout: str, kept: float) -> None:
+def test_a_file_that_was_cut_is_refused(tmp_path, layout, kept):
     path = write(tmp_path, layout, drawn(4095, np.uint16))
     data = path.read_bytes()
     path.write_bytes(data[: kept if kept > 1 else int(len(data) * kept)])
@@ -116,9 +114,7 @@ def test_a_file_that_was_cut_is_refused(tmp_path: Path, layout: str, kept: float
 
 
 @every_kind
-def test_signed_samples_are_read_with_an_offset_or_where_none_is_negative(
-    tmp_path: Path, layout: str
-) -> None:
+def test_signed_samples_are_read_with_an_offset_or_where_none_is_negative(tmp_path, layout):
     stack = drawn(65535, np.uint16)
     path = write(tmp_path, layout, (stack.astype(np.int32) - 32768).astype(np.int16))
     not_opened(r"signed samples .*--offset 32768", path)
@@ -143,9 +139,7 @@ def test_signed_samples_are_read_with_an_offset_or_where_none_is_negative(
 
 
 @pytest.mark.parametrize("layout", ["npy", "fits", "hdf5", "zarr, version 2"])
-def test_axes_before_rows_and_columns_are_frames_if_all_but_one_are_of_length_one(
-    tmp_path: Path, layout: str
-) -> None:
+def test_axes_before_rows_and_columns_are_frames_if_all_but_one_are_of_length_one(tmp_path, layout):
     stack = drawn(65535, np.uint16)
     for name, index in (("a", np.s_[:, None]), ("b", np.s_[None])):
         np.testing.assert_array_equal(read(write(tmp_path, layout, stack[index], name)), stack)

@@ -2,34 +2,29 @@
 
 import os
 import pickle
-from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import zarr
+from helpers import layouts
 from helpers.camera_files import opened, read, refused, write_hdf5
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.hdf5 import Hdf5Reader
 from pchem_pipeline.frames.formats.omezarr import ZarrReader
-from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 
 STACK = np.random.default_rng(13).integers(0, 65536, (7, 19, 22)).astype(np.uint16)
 WINDOWS = [(0, 1, 0, 19), (6, 7, 18, 19), (2, 7, 3, 11), (0, 7, 0, 19)]
 
 
-def check_windows(path: Path, stack: NDArray[Any], **settings: Any) -> None:
-    reader = open_frames(InputSettings(files=(str(path),), **settings), path.parent)
-    assert reader.shape == stack.shape
-    assert reader.dtype == stack.dtype.newbyteorder("=")
-    again = pickle.loads(pickle.dumps(reader))
-    for t0, t1, y0, y1 in WINDOWS:
-        np.testing.assert_array_equal(reader.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
-        np.testing.assert_array_equal(again.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
+def check_windows(path, stack, **settings):
+    reader = opened(path, **settings)
+    assert (reader.shape, reader.dtype) == (stack.shape, stack.dtype.newbyteorder("="))
+    for each in (reader, pickle.loads(pickle.dumps(reader))):
+        for t0, t1, y0, y1 in WINDOWS:
+            np.testing.assert_array_equal(each.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
 
 
 @pytest.mark.parametrize(
@@ -74,7 +69,7 @@ def test_hdf5_that_only_looks_plain(tmp_path):
         np.testing.assert_array_equal(reader.read(0, len(STACK)), expected)
 
 
-def test_nexus_facts_of_frames_that_are_linked(tmp_path: Path) -> None:
+def test_nexus_facts_of_frames_that_are_linked(tmp_path):
     """Most programs put one array into NXdata and NXdetector; what is said of it stands in the detector."""
     path = tmp_path / "linked.nxs"
     with h5py.File(path, "w") as file:
@@ -93,7 +88,7 @@ def test_nexus_facts_of_frames_that_are_linked(tmp_path: Path) -> None:
     assert reader.camera.name == "Maker Model"
 
 
-def write_parts(folder: Path, from_row: int = 0) -> Path:
+def write_parts(folder, from_row=0):
     """Write the stack as a virtual dataset of three files, maybe without their first rows."""
     _, rows, columns = STACK.shape
     layout = h5py.VirtualLayout((len(STACK), rows - from_row, columns), STACK.dtype)
@@ -107,7 +102,7 @@ def write_parts(folder: Path, from_row: int = 0) -> Path:
 
 
 @pytest.mark.parametrize("from_row", [0, 4])
-def test_hdf5_virtual_dataset(tmp_path: Path, from_row: int) -> None:
+def test_hdf5_virtual_dataset(tmp_path, from_row):
     """The library reads parts that it does not find as 0; they must not pass for frames."""
     path = write_parts(tmp_path, from_row)
     np.testing.assert_array_equal(read(path), STACK[:, from_row:])
@@ -119,7 +114,7 @@ def test_hdf5_virtual_dataset(tmp_path: Path, from_row: int) -> None:
     refused(words, path)
 
 
-def test_hdf5_virtual_dataset_without_an_end(tmp_path: Path) -> None:
+def test_hdf5_virtual_dataset_without_an_end(tmp_path):
     """A virtual dataset may grow with its source: it has as many frames as there are."""
     with h5py.File(tmp_path / "part.h5", "w") as file:
         file.create_dataset("data", data=STACK, maxshape=(None, *STACK.shape[1:]))
@@ -134,7 +129,7 @@ def test_hdf5_virtual_dataset_without_an_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("there", [True, False])
-def test_hdf5_links_into_other_files(tmp_path: Path, there: bool) -> None:
+def test_hdf5_links_into_other_files(tmp_path, there):
     """A master file names its data files, whose frames it does not hold; its masks are no frames."""
     path = tmp_path / "master.h5"
     with h5py.File(path, "w") as file:
@@ -149,7 +144,7 @@ def test_hdf5_links_into_other_files(tmp_path: Path, there: bool) -> None:
     np.testing.assert_array_equal(read(path), STACK)
 
 
-def test_hdf5_samples_in_a_raw_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hdf5_samples_in_a_raw_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with h5py.File("a.h5", "w") as file:
         file.create_dataset("frames", data=STACK, external=[("samples.bin", 0, STACK.nbytes)])
@@ -158,7 +153,7 @@ def test_hdf5_samples_in_a_raw_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     refused(r"a\.h5: the samples of /frames are in samples\.bin, which is not", tmp_path / "a.h5")
 
 
-def test_hdf5_samples_cut_or_of_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hdf5_samples_cut_or_of_others(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     other = tmp_path / "folder" / "a.h5"
     other.parent.mkdir()
@@ -173,14 +168,14 @@ def test_hdf5_samples_cut_or_of_others(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("case", ["itself", "by another", "outside", "fifo", "numbered"])
-def test_hdf5_virtual_dataset_of_what_it_must_not_have(tmp_path: Path, case: str) -> None:
+def test_hdf5_virtual_dataset_of_what_it_must_not_have(tmp_path, case):
     """The library crashes on a part of itself, waits for a pipe, and reads any file of this machine."""
     home = tmp_path / "home"
     home.mkdir()
     os.mkfifo(home / "fifo")
     names = {"by another": "b.h5", "outside": "../c.h5", "fifo": "fifo", "numbered": "fif%b"}
 
-    def virtual(path: Path, source: str) -> None:
+    def virtual(path, source):
         numbered = "%" in source
         shape = (1 if numbered else len(STACK), *STACK.shape[1:])
         layout = h5py.VirtualLayout(shape, STACK.dtype, maxshape=(None, *shape[1:]))
@@ -195,13 +190,12 @@ def test_hdf5_virtual_dataset_of_what_it_must_not_have(tmp_path: Path, case: str
     refused(words.get(case, "not a regular file"), home / "a.h5")
 
 
-def test_hdf5_where_files_cannot_be_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("frames", data=STACK, compression="gzip")
+def test_hdf5_where_files_cannot_be_locked(tmp_path, monkeypatch):
+    layouts.hdf5(tmp_path / "a.h5", STACK, compression="gzip")
     usual = h5py.File
     wrong = OSError("unable to lock file, errno = 38, error message = 'Function not implemented'")
 
-    def without_locks(path: Path, mode: str, locking: bool | None = None) -> h5py.File:
+    def without_locks(path, mode, locking=None):
         if locking is not False:
             raise wrong
         return usual(path, mode, locking=locking)
@@ -212,10 +206,9 @@ def test_hdf5_where_files_cannot_be_locked(tmp_path: Path, monkeypatch: pytest.M
     refused("is open for writing or was not closed; wait", tmp_path / "a.h5")
 
 
-def test_hdf5_filter_that_is_not_installed(tmp_path: Path) -> None:
+def test_hdf5_filter_that_is_not_installed(tmp_path):
     path = tmp_path / "a.h5"
-    with h5py.File(path, "w") as file:
-        file.create_dataset("frames", data=STACK, chunks=(1, 19, 22), compression="gzip")
+    layouts.hdf5(path, STACK, chunks=(1, 19, 22), compression="gzip")
     data = bytearray(path.read_bytes())
     place = data.index(b"deflate\0") - 8
     assert data[place : place + 2] == b"\1\0"
@@ -224,7 +217,7 @@ def test_hdf5_filter_that_is_not_installed(tmp_path: Path) -> None:
     refused(r"/frames needs HDF5 filter 40000 \(deflate\), which is not", path)
 
 
-def test_hdf5_left_open_by_its_writer(tmp_path: Path) -> None:
+def test_hdf5_left_open_by_its_writer(tmp_path):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w", libver="latest") as file:
         file["frames"] = STACK
@@ -235,7 +228,7 @@ def test_hdf5_left_open_by_its_writer(tmp_path: Path) -> None:
     refused(r"copy\.h5: is open for writing or was not closed; .*h5clear -s", copy)
 
 
-def test_matlab_file(tmp_path: Path) -> None:
+def test_matlab_file(tmp_path):
     """Version 7.3 is HDF5 behind a block of text, its axes in reverse order."""
     path = tmp_path / "frames.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
@@ -247,7 +240,7 @@ def test_matlab_file(tmp_path: Path) -> None:
     assert "last axis read as frames" in Hdf5Reader.open(path, InputSettings()).notes[0]
 
 
-def test_hdf5_candidates_are_listed(tmp_path: Path) -> None:
+def test_hdf5_candidates_are_listed(tmp_path):
     path = tmp_path / "two.h5"
     write_hdf5(path, **{"dark/frames": STACK}, **{"light/frames": STACK + 1})
     refused(r"several datasets: dark/frames \(7, 19, 22\), light/frames .*input.dataset", path)
@@ -261,7 +254,7 @@ def test_hdf5_candidates_are_listed(tmp_path: Path) -> None:
     refused("no dataset of frames", path)
 
 
-def test_hdf5_damaged_chunk(tmp_path: Path) -> None:
+def test_hdf5_damaged_chunk(tmp_path):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         dataset = file.create_dataset("frames", data=STACK, chunks=(1, 19, 22), compression="gzip")
@@ -279,7 +272,7 @@ def test_hdf5_damaged_chunk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_ome_zarr(tmp_path: Path, version: int) -> None:
+def test_ome_zarr(tmp_path, version):
     path = tmp_path / "image.ome.zarr"
     group = zarr.open_group(path, mode="w", zarr_format=version)
     group.create_array("full", data=STACK[:, None, None], chunks=(1, 1, 1, 19, 22))
@@ -295,7 +288,7 @@ def test_ome_zarr(tmp_path: Path, version: int) -> None:
 
 
 @pytest.mark.parametrize("axes", [["c", "y", "x"], [{"name": "c"}, {"name": "y"}, {"name": "x"}]])
-def test_channels_of_ome_zarr_are_reported(tmp_path: Path, axes: list[Any]) -> None:
+def test_channels_of_ome_zarr_are_reported(tmp_path, axes):
     path = tmp_path / "image.zarr"
     group = zarr.open_group(path, mode="w", zarr_format=2)
     group.create_array("0", data=STACK)
@@ -307,7 +300,7 @@ def test_channels_of_ome_zarr_are_reported(tmp_path: Path, axes: list[Any]) -> N
     assert not ZarrReader.open(path, InputSettings()).notes
 
 
-def test_zarr_damage(tmp_path: Path) -> None:
+def test_zarr_damage(tmp_path):
     path = tmp_path / "a.zarr"
     zarr.create_array(path, data=STACK, chunks=(3, 19, 22))
     reader = opened(tmp_path / "a.zarr")

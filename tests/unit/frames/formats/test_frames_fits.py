@@ -1,11 +1,9 @@
 """FITS: facts of its headers, what must be chosen, what is reported and what is refused."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from astropy.io import fits
-from helpers.camera_files import read, refused
+from helpers.camera_files import read, refused, write_fits
 
 from pchem_pipeline.frames.formats.fits import FitsReader
 from pchem_pipeline.frames.open import open_frames
@@ -16,7 +14,7 @@ STACK = np.random.default_rng(12).integers(0, 65536, (5, 18, 23)).astype(np.uint
 
 @pytest.mark.parametrize("keyword", ["EXPTIME", "EXPOSURE", "TELAPSE"])
 @pytest.mark.parametrize("extension", [False, True])
-def test_facts_are_taken_from_the_header(tmp_path: Path, keyword: str, extension: bool) -> None:
+def test_facts_are_taken_from_the_header(tmp_path, keyword, extension):
     primary = fits.PrimaryHDU() if extension else fits.PrimaryHDU(STACK)
     primary.header[keyword] = 4.87
     primary.header["BITDEPTH"] = 16
@@ -27,11 +25,9 @@ def test_facts_are_taken_from_the_header(tmp_path: Path, keyword: str, extension
     assert reader.bit_depth == 16
 
 
-def test_values_that_may_be_no_samples_are_reported(tmp_path: Path) -> None:
+def test_values_that_may_be_no_samples_are_reported(tmp_path):
     for i in range(3):
-        unit = fits.PrimaryHDU(STACK[i : i + 3])
-        unit.header["BLANK"] = -32768
-        unit.writeto(tmp_path / f"f{i}.fits")
+        write_fits(tmp_path / f"f{i}.fits", STACK[i : i + 3], BLANK=-32768)
     with open_frames(InputSettings(files=(str(tmp_path),)), tmp_path) as reader:
         assert reader.report.notes == [
             "f0.fits and 2 more: BLANK = -32768 marks pixels without a value; read as stored",
@@ -40,7 +36,7 @@ def test_values_that_may_be_no_samples_are_reported(tmp_path: Path) -> None:
         ]
 
 
-def test_compression_that_loses_is_reported(tmp_path: Path) -> None:
+def test_compression_that_loses_is_reported(tmp_path):
     path = tmp_path / "a.fits"
     for scale, notes in ((0, 0), (4, 1)):
         unit = fits.CompImageHDU(
@@ -52,7 +48,7 @@ def test_compression_that_loses_is_reported(tmp_path: Path) -> None:
         assert np.array_equal(reader.read(), STACK) == (scale == 0)
 
 
-def test_unsigned_plio_is_refused(tmp_path: Path) -> None:
+def test_unsigned_plio_is_refused(tmp_path):
     """The format's own library writes it, shifted by an offset that astropy does not take back."""
     path = tmp_path / "a.fits"
     fits.CompImageHDU((STACK & 0xFFF).astype(np.int16), compression_type="PLIO_1").writeto(path)
@@ -62,7 +58,7 @@ def test_unsigned_plio_is_refused(tmp_path: Path) -> None:
     refused("unsigned samples compressed by PLIO", path)
 
 
-def test_several_images_must_be_chosen_from(tmp_path: Path) -> None:
+def test_several_images_must_be_chosen_from(tmp_path):
     path = tmp_path / "two.fits"
     units = [fits.PrimaryHDU(), fits.ImageHDU(STACK, name="DARK"), fits.ImageHDU(STACK + 1, name="FLAT")]
     fits.HDUList(units).writeto(path)
@@ -72,15 +68,9 @@ def test_several_images_must_be_chosen_from(tmp_path: Path) -> None:
     refused("with this name: none", path, dataset="BIAS")
 
 
-def test_scaled(tmp_path: Path) -> None:
-    path = tmp_path / "f.fits"
-    scaled = fits.PrimaryHDU(STACK.astype(np.int16))
-    scaled.header["BSCALE"], scaled.header["BZERO"] = 0.5, 10.0
-    scaled.writeto(path)
-    refused(r"scaled data \(BSCALE 0.5", path)
-
-
-def test_no_image(tmp_path: Path) -> None:
+def test_scaled_values_and_no_image_are_refused(tmp_path):
+    scaled = write_fits(tmp_path / "f.fits", STACK.astype(np.int16), BSCALE=0.5, BZERO=10.0)
+    refused(r"scaled data \(BSCALE 0.5", scaled)
     path = tmp_path / "table.fits"
     fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU(np.zeros(3, [("a", "i4")]))]).writeto(path)
     refused("no image", path)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.camera_files import opened, read, refused
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.ser import SerReader
@@ -18,7 +17,7 @@ from pchem_pipeline.frames.settings import InputSettings
 STACK = np.random.default_rng(14).integers(0, 65536, (5, 11, 13)).astype(np.uint16)
 
 
-def raw_bytes(stack: NDArray[Any], dtype: str, header: int, padding: int, last_padding: bool = True) -> bytes:
+def raw_bytes(stack, dtype, header, padding, last_padding=True):
     """Lay frames out by hand."""
     frames = [frame.astype(dtype).tobytes() + b"\xaa" * padding for frame in stack]
     data = b"\x55" * header + b"".join(frames)
@@ -30,9 +29,7 @@ def raw_bytes(stack: NDArray[Any], dtype: str, header: int, padding: int, last_p
 @pytest.mark.parametrize(
     ("header", "padding", "last"), [(0, 0, True), (7, 0, True), (0, 5, True), (512, 3, False)]
 )
-def test_raw_by_settings(
-    tmp_path: Path, order: str, dtype: str, header: int, padding: int, last: bool
-) -> None:
+def test_raw_by_settings(tmp_path, order, dtype, header, padding, last):
     stack = np.random.default_rng(1).integers(0, np.iinfo(dtype).max, STACK.shape, dtype=dtype, endpoint=True)
     path = tmp_path / "a.raw"
     code = (">" if order == "big" else "<") + np.dtype(dtype).str[1:]
@@ -47,7 +44,7 @@ def test_raw_by_settings(
 
 
 @pytest.mark.parametrize("name", ["a.raw.json", "a.json", "a.raw.yaml", "a.yml"])
-def test_raw_by_sidecar(tmp_path: Path, name: str) -> None:
+def test_raw_by_sidecar(tmp_path, name):
     path = tmp_path / "a.raw"
     path.write_bytes(raw_bytes(STACK >> 4 << 4, ">u2", 16, 4))
     side: dict[str, Any] = {"shape": [11, 13], "dtype": "uint16", "byte_order": "big", "header_bytes": 16}
@@ -61,7 +58,7 @@ def test_raw_by_sidecar(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(read(path, bit_shift=0), STACK >> 4 << 4)
 
 
-def test_raw_needs_a_description(tmp_path: Path) -> None:
+def test_raw_needs_a_description(tmp_path):
     path = tmp_path / "a.raw"
     path.write_bytes(bytes(100))
     refused(r"raw frames need input.shape and input.dtype; .*sidecar a\.raw\.json", path)
@@ -79,7 +76,7 @@ def test_raw_needs_a_description(tmp_path: Path) -> None:
         ('{"shape": [5, 5], "dtype": "uint8", "header_bytes": -3}', "are invalid"),
     ],
 )
-def test_raw_with_a_bad_sidecar(tmp_path: Path, text: str, words: str) -> None:
+def test_raw_with_a_bad_sidecar(tmp_path, text, words):
     path = tmp_path / "a.raw"
     path.write_bytes(bytes(100))
     path.with_name("a.raw.json").write_text(text)
@@ -88,7 +85,7 @@ def test_raw_with_a_bad_sidecar(tmp_path: Path, text: str, words: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_raw_truncated_or_of_another_shape(tmp_path: Path) -> None:
+def test_raw_truncated_or_of_another_shape(tmp_path):
     path = tmp_path / "a.raw"
     path.write_bytes(raw_bytes(STACK, "<u2", 0, 0)[:-1])
     raw: dict[str, Any] = {"shape": (11, 13), "dtype": "uint16"}
@@ -98,7 +95,7 @@ def test_raw_truncated_or_of_another_shape(tmp_path: Path) -> None:
     refused("truncated, or not", path, shape=(11, 13), dtype="uint16", header_bytes=10_000)
 
 
-def test_raw_with_more_frames_than_stated(tmp_path: Path) -> None:
+def test_raw_with_more_frames_than_stated(tmp_path):
     path = tmp_path / "a.raw"
     path.write_bytes(raw_bytes(STACK, "<u2", 0, 0))
     reader = opened(tmp_path / "a.raw", shape=(3, 11, 13), dtype="uint16")
@@ -106,32 +103,32 @@ def test_raw_with_more_frames_than_stated(tmp_path: Path) -> None:
     assert "has 5 frames; the first 3 are used" in reader.report.message()
 
 
-def test_npy_refusals(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("array", "words"),
+    [
+        (np.array([[{"a": 1}, None]] * 2), "object array"),
+        (STACK.astype(np.complex64), "floating-point"),
+        (STACK.astype(bool), "samples of type bool"),
+        (STACK.astype(np.uint64), "samples of type uint64"),
+        (np.zeros(3, np.uint8), r"needed: \(frames"),
+        (np.zeros((2, 1, 6, 5, 3), np.uint8), "2 axes before rows and columns"),
+        (np.zeros((1, 6, 5, 3), np.uint8), "looks like colour"),
+        (np.asfortranarray(STACK), "Fortran order"),
+        (STACK, "input.dtype is uint8"),
+        (np.zeros((3, 4), np.dtype([("a", "u1"), ("b", "u2")])), "objects instead of numbers"),
+    ],
+)
+def test_npy_refusals(tmp_path, array, words):
     path = tmp_path / "a.npy"
-
-    def refused(array: NDArray[Any], words: str, **settings: Any) -> None:
-        np.save(path, array)
-        with pytest.raises(InputError, match=words) as caught:
-            read(path, **settings)
-        assert str(caught.value).startswith(str(path))
-
-    refused(np.array([[{"a": 1}, None]] * 2), "object array")
-    refused(STACK.astype(np.complex64), "floating-point")
-    refused(STACK.astype(bool), "samples of type bool")
-    refused(STACK.astype(np.uint64), "samples of type uint64")
-    refused(np.zeros(3, np.uint8), r"needed: \(frames")
-    refused(np.zeros((2, 1, 6, 5, 3), np.uint8), "2 axes before rows and columns")
-    refused(np.zeros((1, 6, 5, 3), np.uint8), "looks like colour")
-    refused(np.asfortranarray(STACK), "Fortran order")
-    refused(STACK, "input.dtype is uint8", dtype="uint8")
-    refused(np.zeros((3, 4), np.dtype([("a", "u1"), ("b", "u2")])), "objects instead of numbers")
+    np.save(path, array)
+    refused(f"^{path}.*{words}", path, **({"dtype": "uint8"} if array is STACK else {}))
 
 
-def test_npy_never_opens_a_pickle(tmp_path: Path) -> None:
+def test_npy_never_opens_a_pickle(tmp_path):
     """A file that would run code when unpickled."""
 
     class Trap:
-        def __reduce__(self) -> Any:
+        def __reduce__(self):
             return (Path.touch, (tmp_path / "sprung",))
 
     np.save(tmp_path / "a.npy", np.array([Trap(), Trap()], dtype=object), allow_pickle=True)
@@ -141,7 +138,7 @@ def test_npy_never_opens_a_pickle(tmp_path: Path) -> None:
     assert not (tmp_path / "sprung").exists()
 
 
-def ser_bytes(stack: NDArray[Any], depth: int, colour: int = 0, flag: int = 0, times: bool = False) -> bytes:
+def ser_bytes(stack, depth, colour=0, flag=0, times=False):
     """Build a SER file by hand, from the text of the format."""
     n, rows, columns = stack.shape
     head = b"LUCAM-RECORDER" + struct.pack("<7i", 0, colour, flag, columns, rows, depth, n) + bytes(120)
@@ -153,7 +150,7 @@ def ser_bytes(stack: NDArray[Any], depth: int, colour: int = 0, flag: int = 0, t
     return head + stack.tobytes() + tail
 
 
-def test_ser(tmp_path: Path) -> None:
+def test_ser(tmp_path):
     path = tmp_path / "a.ser"
     kinds = [("u1", 8, 0), ("<u2", 12, 0), ("<u2", 16, 0), (">u2", 16, 1)]
     for dtype, depth, flag in kinds:
@@ -168,26 +165,27 @@ def test_ser(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(path, byte_order="big"), STACK)
 
 
-def test_ser_times(tmp_path: Path) -> None:
+def test_ser_times(tmp_path):
     path = tmp_path / "a.ser"
     path.write_bytes(ser_bytes(STACK, 16, times=True))
     times = SerReader.open(path, InputSettings()).timestamps
-    assert times is not None
     np.testing.assert_allclose(np.diff(times), 0.5, atol=1e-6)
     assert np.datetime64(int(times[0]), "s").astype(str).startswith("2019-07-2")
     both = opened(tmp_path / "a.ser", frame_range=(2, 5))
-    assert both.timestamps is not None
     np.testing.assert_array_equal(both.timestamps, times[2:5])
 
 
-def test_ser_refusals(tmp_path: Path) -> None:
-    path = tmp_path / "a.ser"
-    for data, words in [
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
         (ser_bytes(STACK, 16, colour=8), r"colour video \(Bayer, ColorID 8\)"),
         (ser_bytes(STACK, 16, colour=100), r"colour video \(RGB"),
         (ser_bytes(STACK, 33), "damaged header"),
         (ser_bytes(STACK, 16)[:100], "truncated, or not SER"),
         (ser_bytes(STACK, 16)[:-1], r"truncated: 5 frames need 1608 bytes, the file has 1607 \(4 compl"),
-    ]:
-        path.write_bytes(data)
-        refused(words, path)
+    ],
+    ids=range(5),
+)
+def test_ser_refusals(tmp_path, data, words):
+    (tmp_path / "a.ser").write_bytes(data)
+    refused(words, tmp_path / "a.ser")

@@ -1,12 +1,12 @@
 """TIFF: stacks as cameras write them, facts of its tags, what is reported and what is refused."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
+from helpers import layouts
 from helpers.camera_files import opened, read, refused
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
@@ -17,7 +17,7 @@ from pchem_pipeline.frames.settings import InputSettings
 STACK = np.random.default_rng(11).integers(0, 4096, (6, 21, 34)).astype(np.uint16)
 
 
-def test_twelve_bits_packed(tmp_path: Path) -> None:
+def test_twelve_bits_packed(tmp_path):
     """Bits packed without gaps, as machine-vision recorders write them: two samples in three bytes."""
     path = tmp_path / "packed.tif"
     columns = 34
@@ -43,7 +43,7 @@ def test_twelve_bits_packed(tmp_path: Path) -> None:
     np.testing.assert_array_equal(reader.read(0, 1, 5, 9), STACK[:1, 5:9])
 
 
-def test_imagej_stack_with_one_directory(tmp_path: Path) -> None:
+def test_imagej_stack_with_one_directory(tmp_path):
     """ImageJ writes stacks above 4 GB with one directory, the number of images in its description."""
     path = tmp_path / "big_imagej.tif"
     description = f"ImageJ=1.53t\nimages={len(STACK)}\nframes={len(STACK)}\nhyperstack=true\n"
@@ -58,7 +58,7 @@ def test_imagej_stack_with_one_directory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(path), STACK)
 
 
-def test_metamorph_stack_with_one_directory(tmp_path: Path) -> None:
+def test_metamorph_stack_with_one_directory(tmp_path):
     """MetaMorph writes one directory, and counts the planes behind it by a tag of its own."""
     path = tmp_path / "a.stk"
     n = len(STACK)
@@ -70,13 +70,31 @@ def test_metamorph_stack_with_one_directory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(path), STACK)
 
 
-def test_volumes_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "volume.tif"
-    tifffile.imwrite(path, STACK, photometric="minisblack", volumetric=True, tile=(2, 16, 16))
-    refused("pages of 6 x 21 x 34 uint16 are volumes", path)
+RGB = np.zeros((2, 8, 9, 3), np.uint8)
+PALETTE = {"photometric": "palette", "colormap": np.zeros((3, 256), np.uint16)}
 
 
-def test_pages_are_frames_although_metadata_tell_several_series(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("data", "options", "words"),
+    [
+        (STACK, {"volumetric": True, "tile": (2, 16, 16)}, "pages of 6 x 21 x 34 uint16 are volumes"),
+        (
+            STACK,
+            {"planarconfig": "separate", "compression": "zlib"},
+            "one page of 6 compressed planes; write",
+        ),
+        (RGB, {"photometric": "rgb"}, r"a\.tif: colour or multi-channel images \(RGB, 3 samples per pixel\)"),
+        (np.moveaxis(RGB, -1, 1), {"photometric": "rgb", "planarconfig": "separate"}, "colour"),
+        (RGB[..., 0], PALETTE, "PALETTE"),
+    ],
+    ids=["volumes", "planes", "colour", "planes of colour", "palette"],
+)
+def test_volumes_planes_and_colour_are_refused(tmp_path, data, options, words):
+    layouts.tiff(tmp_path / "a.tif", data, **options)
+    refused(words, tmp_path / "a.tif")
+
+
+def test_pages_are_frames_although_metadata_tell_several_series(tmp_path):
     path = tmp_path / "series.tif"
     with tifffile.TiffWriter(path) as writer:
         for block in (STACK[:2], STACK[2:3], STACK[3:]):
@@ -86,7 +104,7 @@ def test_pages_are_frames_although_metadata_tell_several_series(tmp_path: Path) 
     np.testing.assert_array_equal(read(path), STACK)
 
 
-def test_pages_coded_differently(tmp_path: Path) -> None:
+def test_pages_coded_differently(tmp_path):
     path = tmp_path / "mixed.tif"
     codings: list[dict[str, Any]] = [
         {"compression": "zlib", "rowsperstrip": 5}, {}, {"compression": "lzw"}, {"tile": (16, 16)},
@@ -99,47 +117,43 @@ def test_pages_coded_differently(tmp_path: Path) -> None:
     np.testing.assert_array_equal(reader.read(0, 6, 7, 18), STACK[:, 7:18])
 
 
-def test_previews_are_left_out_and_reported(tmp_path: Path) -> None:
+def test_previews_are_left_out_and_reported(tmp_path):
     path = tmp_path / "preview.tif"
-    with tifffile.TiffWriter(path) as writer:
-        for frame in STACK:
-            writer.write(frame, photometric="minisblack", metadata=None)
-        writer.write(STACK[0, ::2, ::2], photometric="minisblack", metadata=None, subfiletype=1)
-    reader = opened(tmp_path / "preview.tif")
+    layouts.tiff_pages(path, STACK)
+    tifffile.imwrite(path, STACK[0, ::2, ::2], append=True, metadata=None, subfiletype=1)
+    reader = opened(path)
     np.testing.assert_array_equal(reader.read(), STACK)
     assert "1 reduced page" in reader.report.message()
 
 
-def test_facts_are_taken_from_the_file(tmp_path: Path) -> None:
-    exif = tmp_path / "exif.tif"
-    tifffile.imwrite(exif, STACK, photometric="minisblack", extratags=[(33434, "2I", 1, (487, 100), True)])
-    assert TiffReader.open(exif, InputSettings()).integration_time == pytest.approx(4.87)
-    ome = tmp_path / "a.ome.tif"
-    plane = {"ExposureTime": [4870.0] * 6, "ExposureTimeUnit": ["ms"] * 6}
-    tifffile.imwrite(ome, STACK, metadata={"axes": "TYX", "Plane": plane, "SignificantBits": 12})
-    reader = TiffReader.open(ome, InputSettings())
-    assert reader.integration_time == pytest.approx(4.87)
-    assert reader.bit_depth == 12
-    manager = tmp_path / "mm.tif"
-    record = json.dumps({"Exposure-ms": 12.5}).encode()
-    tifffile.imwrite(
-        manager, STACK, photometric="minisblack", extratags=[(51123, "s", len(record) + 1, record, True)]
-    )
-    assert TiffReader.open(manager, InputSettings()).integration_time == pytest.approx(0.0125)
-    plain = tmp_path / "plain.tif"
-    tifffile.imwrite(plain, STACK, photometric="minisblack")
-    assert TiffReader.open(plain, InputSettings()).integration_time is None
-    assert TiffReader.open(plain, InputSettings()).bit_depth is None
+RECORD = json.dumps({"Exposure-ms": 12.5}).encode()
+PLANE = {"ExposureTime": [4870.0] * 6, "ExposureTimeUnit": ["ms"] * 6}
 
 
-def test_exposure_in_the_exif_directory(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "options", "seconds", "bits"),
+    [
+        ("exif.tif", {"extratags": [(33434, "2I", 1, (487, 100), True)]}, 4.87, None),
+        ("a.ome.tif", {"metadata": {"axes": "TYX", "Plane": PLANE, "SignificantBits": 12}}, 4.87, 12),
+        ("mm.tif", {"extratags": [(51123, "s", len(RECORD) + 1, RECORD, True)]}, 0.0125, None),
+        ("plain.tif", {}, None, None),
+    ],
+)
+def test_facts_are_taken_from_the_file(tmp_path, name, options, seconds, bits):
+    layouts.tiff(tmp_path / name, STACK, **options)
+    reader = TiffReader.open(tmp_path / name, InputSettings())
+    assert reader.integration_time == (None if seconds is None else pytest.approx(seconds))
+    assert reader.bit_depth == bits
+
+
+def test_exposure_in_the_exif_directory(tmp_path):
     tags = ImageFileDirectory_v2()
     tags[34665] = {33434: IFDRational(487, 100)}
     Image.fromarray(STACK[0]).save(tmp_path / "a.tif", tiffinfo=tags)
     assert TiffReader.open(tmp_path / "a.tif", InputSettings()).integration_time == pytest.approx(4.87)
 
 
-def test_channels_beside_frames_are_refused(tmp_path: Path) -> None:
+def test_channels_beside_frames_are_refused(tmp_path):
     """Frames of two channels in turn are no samples of one law; frames called channels are frames."""
     imagej, ome = tmp_path / "imagej.tif", tmp_path / "a.ome.tif"
     mixed = STACK.reshape(3, 2, *STACK.shape[1:])
@@ -156,7 +170,7 @@ def test_channels_beside_frames_are_refused(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read(ome), STACK[:3])  # the other channel lies in another file
 
 
-def test_strips_that_were_never_written(tmp_path: Path) -> None:
+def test_strips_that_were_never_written(tmp_path):
     """GDAL leaves empty strips out: offset 0 and 0 bytes, where other bytes of the file must not be read."""
     path = tmp_path / "sparse.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", metadata=None)
@@ -171,7 +185,7 @@ def test_strips_that_were_never_written(tmp_path: Path) -> None:
     assert "1 of 6 strips or tiles was not written; read as the fill value" in reader.notes[0]
 
 
-def test_page_without_its_strips(tmp_path: Path) -> None:
+def test_page_without_its_strips(tmp_path):
     path = tmp_path / "unfinished.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", metadata=None, rowsperstrip=8, compression="lzw")
     with tifffile.TiffFile(path) as file:
@@ -182,13 +196,7 @@ def test_page_without_its_strips(tmp_path: Path) -> None:
     refused(r"unfinished\.tif: page 1 has 0 strips or tiles and 3 sizes", path)
 
 
-def test_compressed_planes_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "planes.tif"
-    tifffile.imwrite(path, STACK, photometric="minisblack", planarconfig="separate", compression="zlib")
-    refused("one page of 6 compressed planes; write one frame per page", path)
-
-
-def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path: Path) -> None:
+def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path):
     lossy = [Image.fromarray((frame >> 4).astype(np.uint8)) for frame in STACK]
     lossy[0].save(tmp_path / "jpeg.tif", save_all=True, append_images=lossy[1:], compression="jpeg")
     tifffile.imwrite(tmp_path / "white.tif", STACK, photometric="miniswhite")
@@ -198,27 +206,15 @@ def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path: Pat
         assert said in TiffReader.open(tmp_path / f"{name}.tif", InputSettings()).notes[0]
 
 
-def test_colour_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "rgb.tif"
-    rgb = np.zeros((2, 8, 9, 3), np.uint8)
-    tifffile.imwrite(path, rgb, photometric="rgb")
-    refused(r"rgb\.tif: colour or multi-channel images \(RGB, 3 samples per pixel\)", path)
-    tifffile.imwrite(path, np.moveaxis(rgb, -1, 1), photometric="rgb", planarconfig="separate")
-    refused("colour", path)
-    tifffile.imwrite(path, rgb[..., 0], photometric="palette", colormap=np.zeros((3, 256), np.uint16))
-    refused("PALETTE", path)
-
-
-def test_pages_of_another_shape_or_type(tmp_path: Path) -> None:
+def test_pages_of_another_shape_or_type(tmp_path):
     path = tmp_path / "odd.tif"
     for odd in (STACK[0, :5], STACK[0].astype(np.uint8)):
-        with tifffile.TiffWriter(path) as writer:
-            for frame in (STACK[0], STACK[1], odd):
-                writer.write(frame, photometric="minisblack", metadata=None)
+        layouts.tiff_pages(path, STACK[:2])
+        tifffile.imwrite(path, odd, append=True, metadata=None)
         refused(r"odd\.tif: page 2 is .* page 0 is 21 x 34 uint16", path)
 
 
-def test_damaged_strip_is_named(tmp_path: Path) -> None:
+def test_damaged_strip_is_named(tmp_path):
     path = tmp_path / "broken.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", compression="zlib")
     with tifffile.TiffFile(path) as file:

@@ -59,7 +59,7 @@ np.savez(sys.argv[2], table=table, total=fill(table), lanes=SIMD_WIDTH)
 
 
 @pytest.mark.parametrize(("kind", "lanes"), [("vector", 8), ("scalar", 1)])
-def test_the_operations_are_what_they_are_named_after(tmp_path: Path, kind: str, lanes: int) -> None:
+def test_the_operations_are_what_they_are_named_after(tmp_path, kind, lanes):
     environment = {
         **os.environ,
         "PYTHONPATH": str(Path(pchem_pipeline.__file__).parents[1]),

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.drawn_pixels import codes, histograms
 
 from pchem_pipeline.model.checks.run_differences import (
     BlockDifference,
-    MapDifference,
     common_fit_p,
     compare_blocks,
     compare_maps,
@@ -17,16 +17,15 @@ N = 10_000
 GOOD = np.ones(SHAPE, dtype=bool)
 
 
-def test_integers_are_equal_or_not() -> None:
-    a = np.array([[0, 5], [7, 65535]], dtype=np.uint16)
-    b = np.array([[1, 5], [7, 0]], dtype=np.uint16)
+def test_integers_are_equal_or_not():
+    a, b = np.array([[[0, 5], [7, 65535]], [[1, 5], [7, 0]]], dtype=np.uint16)
     assert compare_blocks(a, a, scale=1, tolerance=0.5) == BlockDifference(4, 0, 0, 0.0)
     # unsigned differences do not wrap round
     assert compare_blocks(a, b, scale=65535, tolerance=0.5) == BlockDifference(4, 2, 2, 65535.0)
     assert compare_blocks(a, b.astype(np.int64), scale=1, tolerance=0).n_beyond == 2
 
 
-def test_floats_are_equal_within_rounding_of_the_largest() -> None:
+def test_floats_are_equal_within_rounding_of_the_largest():
     a = np.array([1.0, 100.0, np.nan, np.inf, 0.0])
     b = np.array([1.0 + 5e-11, 100.0, np.nan, np.inf, -0.0])
     assert compare_blocks(a, b, scale=100, tolerance=1e-12).n_beyond == 0
@@ -36,12 +35,12 @@ def test_floats_are_equal_within_rounding_of_the_largest() -> None:
 
 
 @pytest.mark.parametrize("odd", [(np.nan, 1.0), (1.0, np.nan), (np.inf, 1.0), (np.inf, -np.inf)])
-def test_a_value_that_came_or_went_is_beyond_rounding(odd: tuple[float, float]) -> None:
+def test_a_value_that_came_or_went_is_beyond_rounding(odd):
     found = compare_blocks(np.array([odd[0]]), np.array([odd[1]]), scale=1e9, tolerance=0.1)
     assert found.n_beyond == 1
 
 
-def test_blocks_add_up() -> None:
+def test_blocks_add_up():
     rng = np.random.default_rng(1)
     a = rng.normal(size=(60, 7))
     b = a + rng.normal(size=a.shape) * (rng.random(a.shape) < 0.2)
@@ -53,12 +52,12 @@ def test_blocks_add_up() -> None:
     assert 0 < whole.n_beyond == int((a != b).sum())
 
 
-def compared(one: tuple, other: tuple, good: np.ndarray, *, same_data: bool) -> MapDifference:
+def compared(one, other, good, *, same_data):
     """The difference of one map."""
     return compare_maps([("bias", one, other)], good, same_data=same_data)["bias"]
 
 
-def two_captures(seed: int, *, shift: float = 0.0, scatter: float = 1.0) -> tuple:
+def two_captures(seed, *, shift=0.0, scatter=1.0):
     """Two measurements of one map, shift in standard errors of a difference."""
     rng = np.random.default_rng(seed)
     true, error = rng.normal(100, 5, SHAPE), rng.uniform(0.5, 2.0, SHAPE)
@@ -67,14 +66,14 @@ def two_captures(seed: int, *, shift: float = 0.0, scatter: float = 1.0) -> tupl
     return (one, error), (other, error)
 
 
-def test_two_captures_of_the_same_sensor_agree() -> None:
+def test_two_captures_of_the_same_sensor_agree():
     found = compared(*two_captures(2), GOOD, same_data=False)
     assert abs(found.median_z) < 5 * np.sqrt(np.pi / (2 * N))
     assert abs(found.spread_z - 1) < 5 * 1.166 / np.sqrt(N)
     assert not reasons_of_change(found)
 
 
-def test_a_shift_of_a_tenth_of_an_error_is_seen() -> None:
+def test_a_shift_of_a_tenth_of_an_error_is_seen():
     found = compared(*two_captures(3, shift=0.3), GOOD, same_data=False)
     # 0.3 errors are 24 standard errors of the median of 10,000 pixels: the test can fail
     assert found.median_z / np.sqrt(np.pi / (2 * N)) > 20
@@ -83,7 +82,7 @@ def test_a_shift_of_a_tenth_of_an_error_is_seen() -> None:
     assert found.median / found.median_stderr > 10
 
 
-def test_pixels_that_scatter_or_jump_are_seen() -> None:
+def test_pixels_that_scatter_or_jump_are_seen():
     reasons = reasons_of_change(compared(*two_captures(4, scatter=2.5), GOOD, same_data=False))
     assert reasons.spread
     one, other = two_captures(5)
@@ -101,7 +100,7 @@ def test_pixels_that_scatter_or_jump_are_seen() -> None:
     assert not reasons_of_change(compared(one, (jumped, other[1]), bad, same_data=False))
 
 
-def test_ten_pixels_of_five_errors_are_a_change() -> None:
+def test_ten_pixels_of_five_errors_are_a_change():
     """Fewer pixels than a count beyond five errors would need, in a sensor of 24 x 24."""
     rng = np.random.default_rng(7)
     error = np.ones((24, 24))
@@ -117,7 +116,7 @@ def test_ten_pixels_of_five_errors_are_a_change() -> None:
     assert not any(reasons_of_change(found[name]) for name in "acdef")
 
 
-def test_missing_values_are_counted_and_the_unit_follows_the_data() -> None:
+def test_missing_values_are_counted_and_the_unit_follows_the_data():
     (one, error), (other, _) = two_captures(6)
     lost, came = one.copy(), other.copy()
     lost[0, :3], came[0, 2:7] = np.nan, np.nan
@@ -128,22 +127,19 @@ def test_missing_values_are_counted_and_the_unit_follows_the_data() -> None:
     np.testing.assert_allclose(same.z, (other - one) / error, rtol=1e-12)
 
 
-def test_nothing_to_compare_is_no_change() -> None:
-    empty = np.full((2, 2), np.nan)
-    found = compared((empty, empty), (empty, empty), np.ones((2, 2), bool), same_data=False)
-    assert found.n_counted == 0
-    assert not reasons_of_change(found)
+def test_nothing_to_compare_is_no_change():
+    empty = np.full((2, 2), np.nan), np.full((2, 2), np.nan)
+    found = compared(empty, empty, np.ones((2, 2), bool), same_data=False)
+    assert (found.n_counted, bool(reasons_of_change(found))) == (0, False)
 
 
-def test_a_pixel_whose_likelihood_is_not_quadratic_is_no_change() -> None:
+def test_a_pixel_whose_likelihood_is_not_quadratic_is_no_change():
     """Read noise of 0.4 e-, 500 frames: some 1 in 1,000 pixels are 5 of their standard errors off."""
     rng = np.random.default_rng(1)
     runs = []
     for exposure in (0.5, 0.5, 0.65):
-        samples = 11.0 * (rng.poisson(exposure, (400, 500)) + 0.4 * rng.standard_normal((400, 500))) + 100.0
-        samples = np.rint(samples).astype(int)
-        counts = np.stack([np.bincount(row, minlength=300) for row in samples]).astype(np.uint32)
-        runs.append((counts[:, 40:], np.full(400, 40, np.int32)))
+        samples = codes(rng, (400, 500), exposure, 11.0, 0.4, bias=100.0)
+        runs.append(histograms(samples))
     same, brighter = (common_fit_p((0, 4095), *zip(runs[0], run, strict=True)) for run in runs[1:])
     # p-values of equal pixels are uniform, or larger where the likelihood is flat
     assert (same < 0.05).sum() <= 40
@@ -154,13 +150,9 @@ def test_a_pixel_whose_likelihood_is_not_quadratic_is_no_change() -> None:
     values, error = rng.standard_normal(shape), np.ones(shape)
     off = values.copy()
     off[3, 4] += 12.0
-
-    def maps() -> list:
-        return [("bias", (values, error), (off, error))]
-
-    assert compare_maps(maps(), np.ones(shape, bool), same_data=False)["bias"].n_changed == 1
-    found = compare_maps(
-        maps(), np.ones(shape, bool), same_data=False, confirm=lambda y, x: same[y * 20 + x]
-    )["bias"]
+    maps, good = [("bias", (values, error), (off, error))], np.ones(shape, bool)
+    assert compare_maps(maps, good, same_data=False)["bias"].n_changed == 1
+    confirm = lambda y, x: same[y * 20 + x]  # noqa: E731
+    found = compare_maps(maps, good, same_data=False, confirm=confirm)["bias"]
     assert found.n_changed == 0
     assert not reasons_of_change(found)

@@ -9,7 +9,7 @@ from pchem_pipeline.model.fit.settings import FitSettings
 SETTINGS = FitSettings()
 
 
-def pixels(noise: float, spread: float, error: float, gap: float, n: int = 4000, seed: int = 1) -> Judged:
+def pixels(noise, spread, error, gap, n=4000, seed=1):
     """Pixels whose read noises differ by ``spread``, estimated to ``error``; a quiet one has a larger gap."""
     rng = np.random.default_rng(seed)
     true = noise + spread * rng.standard_normal(n)
@@ -17,25 +17,35 @@ def pixels(noise: float, spread: float, error: float, gap: float, n: int = 4000,
     return Judged(found, np.full(n, error), gap * np.exp(-25.0 * (found - noise)))
 
 
-def weak(sensor: Judged) -> np.ndarray:
-    pool = NoisePool.of(sensor)
-    assert pool is not None
-    return pool.weak(sensor, SETTINGS)
+def weak(sensor):
+    return NoisePool.of(sensor).weak(sensor, SETTINGS)
 
 
-def test_lucky_pixels_of_a_poor_sensor_are_flagged() -> None:
-    sensor = pixels(0.46, 0.0, 0.02, gap=3.0)
-    assert (sensor.gap > 5.0).mean() > 0.1  # clear by themselves
-    assert weak(sensor).mean() > 0.99
+ROUGH = LOOSEST / (8 * np.pi**2 * 0.4)
 
 
-def test_unlucky_pixels_of_a_good_sensor_are_not() -> None:
-    sensor = pixels(0.42, 0.0, 0.015, gap=9.0)
-    assert (sensor.gap < 5.0).mean() > 0.05  # which their own word says
-    assert not weak(sensor).any()
+@pytest.mark.parametrize(
+    ("sensor", "least", "most"),
+    [
+        (pixels(0.46, 0.0, 0.02, gap=3.0), 0.99, 1.0),  # a poor sensor, of which some are clear by themselves
+        (pixels(0.42, 0.0, 0.015, gap=9.0), 0.0, 0.0),  # a good one, of which some are not
+        (pixels(0.52, 0.0, 0.02, gap=100.0), 1.0, 1.0),
+        (pixels(0.49, 0.0, 0.01, gap=100.0), 0.0, 0.0),
+        (pixels(0.4, 0.0, 1.15 * ROUGH, gap=1000.0), 0.99, 1.0),
+        (pixels(0.4, 0.0, 0.85 * ROUGH, gap=1000.0), 0.0, 0.02),
+        (Judged(np.full(40, 0.3), np.full(40, 0.005), np.full(40, 50.0)), 0.0, 0.0),  # all alike
+    ],
+)
+def test_equal_pixels_are_judged_in_common(sensor, least, most):
+    assert least <= weak(sensor).mean() <= most
 
 
-def test_pixels_that_really_differ_are_judged_by_themselves() -> None:
+def test_chance_alone_makes_pixels_of_either_sensor_clear_and_unclear():
+    assert (pixels(0.46, 0.0, 0.02, gap=3.0).gap > 5.0).mean() > 0.1
+    assert (pixels(0.42, 0.0, 0.015, gap=9.0).gap < 5.0).mean() > 0.05
+
+
+def test_pixels_that_really_differ_are_judged_by_themselves():
     sensor = pixels(0.42, 0.08, 0.01, gap=10.0)
     clear = sensor.gap > 5.0
     disagree = weak(sensor) != (~clear | (sensor.noise > 0.5))
@@ -43,21 +53,13 @@ def test_pixels_that_really_differ_are_judged_by_themselves() -> None:
     assert disagree.mean() < 0.03
 
 
-def test_read_noise_and_rough_errors_are_judged_in_common_too() -> None:
-    assert weak(pixels(0.52, 0.0, 0.02, gap=100.0)).all()
-    assert not weak(pixels(0.49, 0.0, 0.01, gap=100.0)).any()
-    rough = LOOSEST / (8 * np.pi**2 * 0.4)
-    assert weak(pixels(0.4, 0.0, 1.15 * rough, gap=1000.0)).mean() > 0.99
-    assert weak(pixels(0.4, 0.0, 0.85 * rough, gap=1000.0)).mean() < 0.02
-
-
-def test_one_pixel_far_rougher_than_its_like_is_flagged() -> None:
+def test_one_pixel_far_rougher_than_its_like_is_flagged():
     sensor = pixels(0.3, 0.0, 0.005, gap=500.0)
     sensor.stderr[7], sensor.noise[7] = 0.1, 0.3
     assert np.flatnonzero(weak(sensor)).tolist() == [7]
 
 
-def test_pixels_without_a_value_have_no_part_in_it() -> None:
+def test_pixels_without_a_value_have_no_part_in_it():
     sensor = pixels(0.46, 0.0, 0.02, gap=3.0)
     expected = weak(sensor)
     hole = np.array([np.nan])
@@ -68,17 +70,12 @@ def test_pixels_without_a_value_have_no_part_in_it() -> None:
     assert not found[-1]
 
 
-def test_few_pixels_make_no_pool() -> None:
+def test_few_pixels_make_no_pool():
     assert NoisePool.of(pixels(0.46, 0.0, 0.02, gap=3.0, n=29)) is None
     assert NoisePool.of(pixels(0.46, 0.0, 0.02, gap=3.0, n=30)) is not None
 
 
-def test_pixels_all_alike_do_no_harm() -> None:
-    same = Judged(np.full(40, 0.3), np.full(40, 0.005), np.full(40, 50.0))
-    assert not weak(same).any()
-
-
-def test_noise_in_electrons_by_the_delta_method() -> None:
+def test_noise_in_electrons_by_the_delta_method():
     values = (0.1, 3.0, 2e-3, 0.1, -0.5)
     noise, error = noise_of(*(np.array([value]) for value in values))
     assert noise[0] == pytest.approx(0.3)

@@ -26,25 +26,25 @@ CASES = [
 ]
 
 
-def membership_argmax(x: np.ndarray, h: float, g: float, mu: float, sigma: float) -> np.ndarray:
+def membership_argmax(x, h, g, mu, sigma):
     """Largest membership by trying all k, eq. gamma_nk, of the density."""
     k = np.arange(400)
     log_weight = poisson.logpmf(k, h) + norm.logpdf(x[:, None], mu + k / g, sigma)
     return np.asarray(log_weight.argmax(axis=1))
 
 
-def known(*columns: np.ndarray) -> KnownPixels:
+def known(*columns):
     return KnownPixels(columns, SampleLaw())
 
 
-def converted(frames: np.ndarray, pixels: KnownPixels) -> np.ndarray:
+def converted(frames, pixels):
     """Electron numbers of frames (frame, y, x) under their fitted exposure."""
     ends = frames.min(axis=0), frames.max(axis=0)
     return number_tables(*ends, pixels.exposure, pixels).convert(frames).number
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_thresholds_are_where_the_largest_membership_changes(case: tuple[float, ...]) -> None:
+def test_thresholds_are_where_the_largest_membership_changes(case):
     h, g, mu, sigma = case
     x = np.linspace(mu - 4 / g, mu + 60 / g, 4001)
     table = thresholds(h, g, mu, sigma, 399)
@@ -52,24 +52,24 @@ def test_thresholds_are_where_the_largest_membership_changes(case: tuple[float, 
     np.testing.assert_array_equal(np.searchsorted(table, x), membership_argmax(x, *case))
 
 
-def test_pixels_without_parameters_have_no_number() -> None:
-    frames = np.full((2, 1, 3), 130, dtype=np.uint16)
-    maps = [np.array([[v, v, v]]) for v in (2.0, 0.1, 100.0, 3.0)]
-    maps[1][0, 1] = np.nan
-    maps[0][0, 2] = np.inf
-    np.testing.assert_array_equal(converted(frames, known(*maps))[:, 0], [[3, NO_NUMBER, NO_NUMBER]] * 2)
+@pytest.mark.parametrize(
+    ("pixel", "dn", "numbers"),
+    [
+        ((2.0, 0.1, 100.0, 3.0), [130], [3]),
+        ((2.0, np.nan, 100.0, 3.0), [130], [NO_NUMBER]),
+        ((np.inf, 0.1, 100.0, 3.0), [130], [NO_NUMBER]),
+        ((0.0, 0.1, 50.0, 3.0), [100, 5000], [0, 0]),
+        ((1000.0, 2.0, 50.0, 0.1), [65535], [LARGEST_NUMBER]),
+        ((1.0, 0.125, 101.0, 3.0), [105, 106], [0, 1]),  # 105 is half-way at H = 1: the smaller number
+    ],
+)
+def test_numbers_of_odd_pixels_and_samples(pixel, dn, numbers):
+    maps = [np.full((1, 1), value) for value in pixel]
+    found = converted(np.array(dn, np.uint16)[:, None, None], known(*maps))
+    np.testing.assert_array_equal(found.ravel(), numbers)
 
 
-def test_no_exposure_means_no_electrons_and_huge_numbers_are_cut() -> None:
-    one = np.ones((1, 2))
-    frames = np.array([[[100, 5000]]], dtype=np.uint16)
-    np.testing.assert_array_equal(converted(frames, known(0 * one, 0.1 * one, 50 * one, 3 * one)), [[[0, 0]]])
-    frames = np.array([[[100, 65535]]], dtype=np.uint16)
-    large = converted(frames, known(1000 * one, 2.0 * one, 50 * one, 0.1 * one))
-    assert large[0, 0, 1] == LARGEST_NUMBER
-
-
-def test_codes_beyond_the_table_have_no_number() -> None:
+def test_codes_beyond_the_table_have_no_number():
     one = np.ones((1, 1))
     low, high = np.full((2, 1, 1), [[[90]], [[130]]])
     pixels = known(2 * one, 0.1 * one, 100 * one, 3 * one)
@@ -78,14 +78,7 @@ def test_codes_beyond_the_table_have_no_number() -> None:
     np.testing.assert_array_equal(tables.convert(frames).number.ravel(), [NO_NUMBER, 0, 3, NO_NUMBER])
 
 
-def test_a_tie_goes_to_the_smaller_number() -> None:
-    # H = 1: the boundary between 0 and 1 is exactly half-way, mu + 1/(2 g) = 105
-    frames = np.array([[[105, 106]]], dtype=np.uint16)
-    maps = [np.full((1, 2), v) for v in (1.0, 0.125, 101.0, 3.0)]
-    np.testing.assert_array_equal(converted(frames, known(*maps)), [[[0, 1]]])
-
-
-def test_histograms_and_frames_give_the_same_numbers() -> None:
+def test_histograms_and_frames_give_the_same_numbers():
     rng = np.random.default_rng(7)
     frames = rng.integers(60, 250, size=(300, 1, 5)).astype(np.uint16)
     rows = np.array(CASES).T[:, None, :]
@@ -102,7 +95,7 @@ def test_histograms_and_frames_give_the_same_numbers() -> None:
     assert beyond == everything[12:].sum()
 
 
-def test_errors_are_those_of_all_integers() -> None:
+def test_errors_are_those_of_all_integers():
     truth = np.array(CASES).T.copy()
     other = truth * np.array([1.1, 1.02, 1.0, 0.9])[:, None] + np.array([0, 0, 0.7, 0])[:, None]
     for used in (truth, other):
@@ -116,7 +109,7 @@ def test_errors_are_those_of_all_integers() -> None:
         np.testing.assert_allclose(found, errors, atol=1e-11)
 
 
-def test_tables_expect_what_all_integers_show() -> None:
+def test_tables_expect_what_all_integers_show():
     data, total, errors = known(*np.array(CASES).T), np.zeros(60), []
     for case in CASES:
         joint = joint_mass(np.arange(int(case[2]) - 150, int(case[2]) + 1500), *case, n_k=200)
@@ -128,7 +121,7 @@ def test_tables_expect_what_all_integers_show() -> None:
     np.testing.assert_allclose(found.error, errors, atol=1e-11)
 
 
-def test_numbers_are_decided_with_the_effects_of_the_law() -> None:
+def test_numbers_are_decided_with_the_effects_of_the_law():
     # side peaks of half of the weight at 0.5 e- above, and an exposure added to half of the frames
     h, g, mu, sigma = 0.8, 0.1, 100.0, 1.2
     law = SampleLaw().with_noise([0.5, 0.5], shift_e=[0.0, 0.5])
@@ -154,7 +147,7 @@ def test_numbers_are_decided_with_the_effects_of_the_law() -> None:
     assert wrong > result.error[0] + 0.02
 
 
-def test_comparison_with_the_truth() -> None:
+def test_comparison_with_the_truth():
     estimated = np.array([[3, 5, NO_NUMBER], [0, 9, 2]], dtype=np.uint16)
     true = np.array([[3, 6, 4], [0, 1, 2]], dtype=np.uint16)
     result = compare_electron_numbers(estimated, true, 3)

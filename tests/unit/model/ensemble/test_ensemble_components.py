@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.drawn_pixels import unlike_pixels
 from scipy.stats import poisson
 
 from pchem_pipeline.model.ensemble.components import (
@@ -18,20 +19,7 @@ from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
-def make_pixels(n: int, seed: int = 2) -> UsablePixels:
-    """All four parameters vary and depend on one another."""
-    rng = np.random.default_rng(seed)
-    z = rng.standard_normal((4, n))
-    g = 0.1 * np.exp(0.1 * z[0])
-    return UsablePixels(
-        2.0 * np.exp(0.4 * z[1] + 0.2 * z[0]),
-        g,
-        100.0 + 4.0 * z[2] + 2.0 * z[0],
-        3.0 * np.exp(0.1 * z[3] - 0.1 * z[1]),
-    )
-
-
-def brute_width(h: np.ndarray, g: np.ndarray, mu: np.ndarray, s2: np.ndarray, k: int) -> tuple[float, float]:
+def brute_width(h, g, mu, s2, k):
     """E and Var of E | K_e = k as the appendix writes them."""
     weight = np.exp(-h) * h**k
     first = np.mean(weight * (mu + k / g)) / np.mean(weight)
@@ -39,8 +27,8 @@ def brute_width(h: np.ndarray, g: np.ndarray, mu: np.ndarray, s2: np.ndarray, k:
     return float(first), float(second - first**2)
 
 
-def test_every_case_is_that_of_maps_held_constant() -> None:
-    pixels = make_pixels(500)
+def test_every_case_is_that_of_maps_held_constant():
+    pixels = unlike_pixels(500)
     result = component_widths(pixels, 12)
     h, g, mu, sigma = pixels.maps
     for row, case in enumerate(COMPONENT_CASES):
@@ -56,8 +44,8 @@ def test_every_case_is_that_of_maps_held_constant() -> None:
         assert result.nuced_variance[k] == pytest.approx(expected, rel=1e-11)
 
 
-def test_only_the_paper_s_five_cases_do_not_depend_on_k() -> None:
-    variance = component_widths(make_pixels(2000), 10).variance
+def test_only_the_paper_s_five_cases_do_not_depend_on_k():
+    variance = component_widths(unlike_pixels(2000), 10).variance
     constant = {
         case for case, row in zip(COMPONENT_CASES, variance, strict=True) if np.ptp(row) < 1e-9 * row[0]
     }
@@ -70,25 +58,19 @@ def test_only_the_paper_s_five_cases_do_not_depend_on_k() -> None:
     }
 
 
-def test_widths_survive_hot_pixels_and_many_electrons() -> None:
-    pixels = UsablePixels(
-        np.array([0.0, 2.0, 900.0]), np.array([0.1, 0.2, 0.1]), np.array([90.0, 100.0, 110.0]), np.ones(3)
-    )
-    result = component_widths(pixels, 1500)
+def test_widths_survive_hot_pixels_many_electrons_and_none():
+    columns = [0.0, 2.0, 900.0], [0.1, 0.2, 0.1], [90.0, 100.0, 110.0], [1.0, 1.0, 1.0]
+    result = component_widths(UsablePixels(*np.array(columns)), 1500)
     assert np.isfinite(result.variance).all()
     assert result.mean[0] == pytest.approx((90 + np.exp(-2) * 100) / (1 + np.exp(-2)))
     assert result.mean[1400] == pytest.approx(110 + 1400 / 0.1)
+    none = component_widths(UsablePixels(*np.outer((0.0, 0.1, 100.0, 3.0), np.ones(3))), 2)
+    assert none.variance[0, 0] == pytest.approx(9.0)
+    assert np.isnan(none.mean[1])
 
 
-def test_no_electrons_means_one_component() -> None:
-    ones = np.ones(3)
-    result = component_widths(UsablePixels(0 * ones, 0.1 * ones, 100 * ones, 3 * ones), 2)
-    assert result.variance[0, 0] == pytest.approx(9.0)
-    assert np.isnan(result.mean[1])
-
-
-def test_moments_are_those_of_the_mixture() -> None:
-    pixels = make_pixels(300)
+def test_moments_are_those_of_the_mixture():
+    pixels = unlike_pixels(300)
     h, g, mu, sigma = pixels.maps
     k = np.arange(120)
     weight = poisson.pmf(k, h[:, None]) / 300
@@ -107,8 +89,8 @@ def test_moments_are_those_of_the_mixture() -> None:
     assert found.variance == pytest.approx(terms)
 
 
-def test_pixels_whose_bias_may_be_an_electron_off_do_not_count() -> None:
-    pixels, doubtful = make_pixels(300), np.arange(300) < 60
+def test_pixels_whose_bias_may_be_an_electron_off_do_not_count():
+    pixels, doubtful = unlike_pixels(300), np.arange(300) < 60
     h, g, mu, sigma = pixels.maps
     wrong = UsablePixels(h + doubtful, g, mu - doubtful / g, sigma)
     weight = bias_weight(np.where(doubtful, 0.0, np.inf))
@@ -132,7 +114,7 @@ def test_pixels_whose_bias_may_be_an_electron_off_do_not_count() -> None:
     np.testing.assert_array_equal(bias_weight(np.zeros(3)), 1.0)  # nothing else to go by
 
 
-def test_moment_errors_of_equal_poisson_pixels() -> None:
+def test_moment_errors_of_equal_poisson_pixels():
     # g = 1 and hardly any noise: mean and variance of n Poisson(H) counts, known in closed form
     ones = np.ones(50)
     errors = moment_errors(UsablePixels(4.0 * ones, ones, 0.0 * ones, 1e-6 * ones), 200)
@@ -142,8 +124,8 @@ def test_moment_errors_of_equal_poisson_pixels() -> None:
     assert errors["nuced_variance"] == pytest.approx(errors["variance"])
 
 
-def test_moment_errors_are_those_of_repeated_captures() -> None:
-    pixels, rng, n = make_pixels(600), np.random.default_rng(14), 400
+def test_moment_errors_are_those_of_repeated_captures():
+    pixels, rng, n = unlike_pixels(600), np.random.default_rng(14), 400
     h, g, mu, sigma = pixels.maps
     moments = []
     for _ in range(n):
@@ -160,7 +142,7 @@ N, FRAMES = 40_000, 600
 
 
 @pytest.fixture(scope="module")
-def sensor() -> tuple[UsablePixels, PixelErrors]:
+def sensor():
     """Errors as the samples allow; of one pixel in 200 from ten to a hundred times larger."""
     rng = np.random.default_rng(11)
     h, g = rng.lognormal(0.7, 0.3, N), 0.09 * rng.lognormal(0.0, 0.05, N)
@@ -172,14 +154,14 @@ def sensor() -> tuple[UsablePixels, PixelErrors]:
     return pixels, PixelErrors(stderr, rng.uniform(-0.3, 0.3, (N, 6)), np.arange(N))
 
 
-def test_all_pixels_are_taken_where_they_are_few(sensor: tuple[UsablePixels, PixelErrors]) -> None:
+def test_all_pixels_are_taken_where_they_are_few(sensor):
     pixels, errors = sensor
     some, covariance = errors.sampled(pixels, np.full(N, FRAMES))
     assert some.all()
     np.testing.assert_array_equal(covariance, covariance_from(errors.stderr, errors.correlation))
 
 
-def test_some_pixels_give_the_same_errors_within_theirs(sensor: tuple[UsablePixels, PixelErrors]) -> None:
+def test_some_pixels_give_the_same_errors_within_theirs(sensor):
     pixels, errors = sensor
     law, axes = SampleLaw(), (DnAxis(80, 120), NucedAxis(0.09, -10, 120))
     exact = curve_errors(law, pixels, covariance_from(errors.stderr, errors.correlation), *axes)
@@ -203,7 +185,7 @@ def test_some_pixels_give_the_same_errors_within_theirs(sensor: tuple[UsablePixe
     assert np.abs(np.sqrt(raw[seen] / exact[0][seen]) - 1.0).max() > limit
 
 
-def test_which_pixels_are_taken_depends_on_no_tile(sensor: tuple[UsablePixels, PixelErrors]) -> None:
+def test_which_pixels_are_taken_depends_on_no_tile(sensor):
     pixels, errors = sensor
     few = PixelErrors(errors.stderr, errors.correlation, errors.place, 0.2)
     whole, _ = few.sampled(pixels, np.full(N, FRAMES))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.drawn_pixels import unlike_pixels
 from helpers.plain_law import joint_mass
 from scipy.stats import poisson
 
@@ -21,20 +22,9 @@ from pchem_pipeline.model.law.parameters import UsablePixels, usable_pixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
-def make_pixels(n: int, seed: int = 1, gain: float = 0.1) -> UsablePixels:
-    rng = np.random.default_rng(seed)
-    g = gain * np.exp(0.05 * rng.standard_normal(n))
-    return UsablePixels(
-        2.0 * np.exp(0.5 * rng.standard_normal(n)),
-        g,
-        100.0 + 4.0 * rng.standard_normal(n),
-        0.3 * np.exp(0.1 * rng.standard_normal(n)) / g,
-    )
-
-
-def test_weighted_mass_is_that_of_the_formula() -> None:
+def test_weighted_mass_is_that_of_the_formula():
     # the last one is narrow, at an integer + 0.3: its density at the integers does not add up to 1
-    wide = make_pixels(30)
+    wide = unlike_pixels(30)
     last = (0.0, 1.5), (0.1, 0.5), (100.2, 70.3), (3.0, 0.6)
     pixels = UsablePixels(*(np.append(own, more) for own, more in zip(wide.maps, last, strict=True)))
     dn, share = DnAxis(40, 300), np.random.default_rng(5).random(32)
@@ -44,14 +34,14 @@ def test_weighted_mass_is_that_of_the_formula() -> None:
     np.testing.assert_allclose(part, (share @ rows)[50:70], rtol=1e-10, atol=1e-13)
 
 
-def test_a_hot_pixel_keeps_its_mass() -> None:
+def test_a_hot_pixel_keeps_its_mass():
     pixels = UsablePixels(np.array([3000.0]), np.array([0.1]), np.array([100.0]), np.array([3.0]))
     density = weighted_mass(pixels, DnAxis(0, 60_000), np.ones(1))
     assert density.sum() == pytest.approx(1.0, abs=1e-10)
     assert density @ np.arange(60_000) == pytest.approx(100.0 + 30_000.0, rel=1e-10)
 
 
-def test_poisson_sums_are_those_of_all_pixels() -> None:
+def test_poisson_sums_are_those_of_all_pixels():
     exposure = np.array([0.4, 2e5, 0.0, 700.0, 1e-9, 8.0, 41.0])
     columns = np.random.default_rng(2).random((7, 2))
     found = poisson_sums(exposure, columns, 210_000)
@@ -59,9 +49,9 @@ def test_poisson_sums_are_those_of_all_pixels() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-20)
 
 
-def test_tally_is_that_of_the_samples() -> None:
+def test_tally_is_that_of_the_samples():
     rng = np.random.default_rng(3)
-    pixels, dn, axis = make_pixels(12), DnAxis(90, 40), NucedAxis(0.11, -3, 30)
+    pixels, dn, axis = unlike_pixels(12), DnAxis(90, 40), NucedAxis(0.11, -3, 30)
     samples = rng.integers(80, 150, size=(12, 500))
     origin = samples.min(axis=1)
     counts = np.stack([np.bincount(s - o, minlength=80) for s, o in zip(samples, origin, strict=True)])
@@ -76,14 +66,10 @@ def test_tally_is_that_of_the_samples() -> None:
     assert result.nuced_sum_square == pytest.approx((values**2).sum(), rel=1e-12)
 
 
-def test_axis_is_not_stretched_by_one_strange_gain() -> None:
-    pixels = make_pixels(1000)
-    strange = UsablePixels(
-        pixels.quanta_exposure,
-        np.where(np.arange(1000) == 7, 50.0, pixels.conversion_gain),
-        pixels.bias,
-        pixels.read_noise_dn,
-    )
+def test_axis_is_not_stretched_by_one_strange_gain():
+    pixels = unlike_pixels(1000)
+    h, g, mu, sigma = pixels.maps
+    strange = UsablePixels(h, np.where(np.arange(1000) == 7, 50.0, g), mu, sigma)
     axis, usual = nuced_axis(strange, DnAxis(60, 200)), nuced_axis(pixels, DnAxis(60, 200))
     assert axis.size < 1.2 * usual.size
     assert usual.width == pytest.approx(0.1, rel=0.01)
@@ -93,16 +79,14 @@ def test_axis_is_not_stretched_by_one_strange_gain() -> None:
     assert nuced_axis(pixels, DnAxis(60, 200), width=0.25).width == 0.25
 
 
-def test_electron_mass_is_the_mean_of_poisson_masses() -> None:
+@pytest.mark.parametrize("share", [None, np.array([0.1, 0.2, 0.3, 0.4])])
+def test_electron_mass_is_the_mean_of_poisson_masses(share):
     exposure = np.array([0.0, 0.3, 2.0, 60.0])
-    expected = poisson.pmf(np.arange(30), exposure[:, None]).mean(axis=0)
-    np.testing.assert_allclose(electron_pmf(exposure, 30), expected, rtol=1e-11, atol=1e-17)
-    share = np.array([0.1, 0.2, 0.3, 0.4])
-    expected = share @ poisson.pmf(np.arange(30), exposure[:, None])
+    expected = np.average(poisson.pmf(np.arange(30), exposure[:, None]), axis=0, weights=share)
     np.testing.assert_allclose(electron_pmf(exposure, 30, share), expected, rtol=1e-11, atol=1e-17)
 
 
-def test_parameters_must_be_usable() -> None:
+def test_parameters_must_be_usable():
     good = np.ones(3)
     with pytest.raises(ValueError, match="usable"):
         UsablePixels(good, good, good, np.array([1.0, np.nan, 1.0]))
@@ -118,7 +102,7 @@ def test_parameters_must_be_usable() -> None:
 
 
 @pytest.mark.parametrize(("place", "value"), [(0, 1e9), (1, 1e-12), (1, 1e9), (2, -1e300), (3, 1e12)])
-def test_absurd_parameters_are_not_usable(place: int, value: float) -> None:
+def test_absurd_parameters_are_not_usable(place, value):
     # a runaway fit must neither fill the memory nor overflow an index
     columns = [np.array([v, v]) for v in (2.0, 0.1, 100.0, 3.0)]
     columns[place][1] = value
@@ -126,8 +110,8 @@ def test_absurd_parameters_are_not_usable(place: int, value: float) -> None:
 
 
 @pytest.mark.parametrize("law", [SampleLaw(), SampleLaw().with_noise([0.5, 0.5], shift_e=[0.0, 0.5])])
-def test_masses_are_sorted_onto_both_axes(law: SampleLaw) -> None:
-    pixels, dn = make_pixels(8), DnAxis(40, 220)
+def test_masses_are_sorted_onto_both_axes(law):
+    pixels, dn = unlike_pixels(8), DnAxis(40, 220)
     axis = NucedAxis(0.1, -100, 400)
     known = KnownPixels(pixels, law)
     tables = number_tables(*known.codes(), known.exposure, known, detailed=True)

@@ -2,22 +2,15 @@
 
 import numpy as np
 import pytest
+from helpers.drawn_pixels import codes, histograms
 
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of
 
 
-def samples(rng, exposure, step, noise, frames, bias, pixels):
-    """Return whole DN of equal pixels, shape (pixel, frame)."""
-    electrons = rng.poisson(exposure, (pixels, frames)) + noise * rng.standard_normal((pixels, frames))
-    return np.rint(electrons * step + bias).astype(np.int64)
-
-
 def fitted(dn, **options):
     """Return the fit of samples of shape (pixel, frame)."""
-    first = int(dn.min())
-    counts = np.stack([np.bincount(row - first, minlength=np.ptp(dn) + 1) for row in dn])
-    return fit_histograms(counts, np.full(len(dn), first), **options)
+    return fit_histograms(*histograms(dn), **options)
 
 
 def good(found):
@@ -38,7 +31,7 @@ def good(found):
 def test_dark_and_clean_pixels_have_the_right_gain(exposure, noise, frames, step):
     """A comb of half the step has no sample at each second peak: its gain, H and read noise are twice too
     large."""
-    found = fitted(samples(np.random.default_rng(5), exposure, step, noise, frames, 100.3, 150))
+    found = fitted(codes(np.random.default_rng(5), (150, frames), exposure, step, noise))
     ratio = found.conversion_gain[good(found)] * step
     assert good(found).mean() > 0.9
     # n electrons give the step to s / sqrt(n); a share exp(-N H) of few of them is no fault
@@ -53,11 +46,8 @@ def test_dark_and_clean_pixels_have_the_right_gain(exposure, noise, frames, step
 def test_several_dark_or_blurred_exposures_have_the_right_gain_or_say_so(step, noise, exposures, least):
     """Half the step in half of the pixels, nats below the truth; gains of bright ones off by 100 errors."""
     rng = np.random.default_rng(9)
-    dn = [samples(rng, exposure, step, noise, 900, 100.3, 80) for exposure in exposures]
-    counts = [
-        np.stack([np.bincount(row - each.min(), minlength=np.ptp(each) + 1) for row in each]) for each in dn
-    ]
-    found = fit_histograms(counts, [np.full(len(each), each.min()) for each in dn])
+    series = [histograms(codes(rng, (80, 900), exposure, step, noise)) for exposure in exposures]
+    found = fit_histograms(*(list(each) for each in zip(*series, strict=True)))
     gain = (found.fit_status & int(FAILED | flags_of("conversion_gain"))) == 0
     pulls = (found.conversion_gain * step - 1.0) / (step * np.sqrt(found.covariance[:, 2, 2]))
     assert gain.mean() >= least
@@ -66,16 +56,16 @@ def test_several_dark_or_blurred_exposures_have_the_right_gain_or_say_so(step, n
 
 
 @pytest.mark.parametrize(
-    "codes",
+    "samples",
     [
         {98: 2, 99: 22, 100: 168, 101: 94, 102: 7, 105: 1, 106: 3, 107: 1, 108: 2},
         {99: 31, 100: 160, 101: 96, 102: 8, 105: 1, 106: 2, 107: 1, 113: 1},
         {99: 23, 100: 170, 101: 93, 102: 7, 105: 1, 106: 4, 108: 2},
     ],
 )
-def test_a_handful_of_electrons_has_the_right_step(codes):
+def test_a_handful_of_electrons_has_the_right_step(samples):
     """Electrons of 6 DN, spread over four codes, were taken for one and two of 4.6 DN, 10 nats behind."""
-    dn = np.repeat(list(codes), list(codes.values()))
+    dn = np.repeat(list(samples), list(samples.values()))
     assert fitted(dn[None]).conversion_gain[0] == pytest.approx(1 / 6.0, rel=0.1)
 
 
@@ -83,14 +73,12 @@ def test_a_handful_of_electrons_has_the_right_step(codes):
 @pytest.mark.parametrize("bias", [3, 6, 9])
 def test_samples_at_a_limit_are_censored(exposure, bias):
     """Of 1 to 26 % of the samples it is only known that they are 0 DN at most."""
-    dn = samples(np.random.default_rng(6), exposure, 14.0, 0.3, 5000, bias, 40).clip(0, 4095)
+    dn = codes(np.random.default_rng(6), (40, 5000), exposure, 14.0, 0.3, bias).clip(0, 4095)
     found = fitted(dn, adc_limits=(0, 4095))
     used = good(found)
     assert used.mean() > 0.9
     errors = np.sqrt(np.stack([found.covariance[used, i, i] for i in range(4)]))
-    values = np.stack([found.quanta_exposure, found.conversion_gain, found.bias, found.read_noise_dn])[
-        :, used
-    ]
+    values = found.columns[used].T
     truth = np.array([exposure, 1 / 14.0, bias, np.hypot(0.3 * 14.0, 12**-0.5)])
     pulls = (values - truth[:, None]) / errors
     assert (np.abs(pulls) < 5.0).all()
@@ -103,7 +91,7 @@ def test_samples_at_a_limit_are_censored(exposure, bias):
 )
 def test_two_combs_with_the_same_codes_are_flagged(exposure, step, noise, frames, least):
     """Whole numbers do not tell ``1/a`` from ``1 - 1/a``: near 2 DN per electron both combs fit."""
-    found = fitted(samples(np.random.default_rng(7), exposure, step, noise, frames, 100.3, 60))
+    found = fitted(codes(np.random.default_rng(7), (60, frames), exposure, step, noise))
     pulls = np.abs(found.conversion_gain * step - 1.0) / (step * np.sqrt(found.covariance[:, 1, 1]))
     assert (pulls > 5.0).any()  # some are wrong ...
     assert ((pulls > 5.0) & good(found)).sum() <= 1  # ... and say so
@@ -113,7 +101,7 @@ def test_two_combs_with_the_same_codes_are_flagged(exposure, step, noise, frames
 def test_a_comb_seen_by_chance_is_flagged():
     """1,000 samples with 0.43 e- of read noise have peaks of 1.6 % contrast: chance makes as much at other
     steps."""
-    found = fitted(samples(np.random.default_rng(8), 8.0, 9.3, 0.43, 1000, 100.3, 100))
+    found = fitted(codes(np.random.default_rng(8), (100, 1000), 8.0, 9.3, 0.43))
     assert good(found).mean() < 0.1
     assert (found.fit_status & int(FitStatus.GAIN_AMBIGUOUS) != 0).mean() > 0.8
 
@@ -146,17 +134,9 @@ def _draw(number):
 def _good_and_wrong(number):
     """Return how many pixels have values that are called good, and in how many one is off by 6 errors."""
     exposures, step, sigma, bias, clipped, samples = _draw(number)
-    origins = [sample.min() for sample in samples]
-    counts = [
-        np.stack([np.bincount(row - origin, minlength=np.ptp(sample) + 1) for row in sample])
-        for sample, origin in zip(samples, origins, strict=True)
-    ]
-    found = fit_histograms(
-        counts,
-        [np.full(_PIXELS, origin) for origin in origins],
-        dark=[h == 0 for h in exposures],
-        adc_limits=_LIMITS if clipped else None,
-    )
+    counts, origins = (list(each) for each in zip(*map(histograms, samples), strict=True))
+    limits = _LIMITS if clipped else None
+    found = fit_histograms(counts, origins, dark=[h == 0 for h in exposures], adc_limits=limits)
     names = [*["quanta_exposure"] * len(exposures), "conversion_gain", "bias", "read_noise_dn"]
     estimates = np.column_stack(
         [found.quanta_exposure, found.conversion_gain, found.bias, found.read_noise_dn]

@@ -5,8 +5,8 @@ import functools
 
 import numpy as np
 import pytest
+from helpers.drawn_pixels import codes, histograms
 from helpers.extended_reference import LAWS
-from numpy.typing import NDArray
 from scipy.optimize import root
 
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
@@ -33,34 +33,32 @@ def log_likelihood(counts, origin, parameters, law, satellites=None):
     return (counts * np.log(np.where(counts > 0, np.maximum(mass, 1e-300), 1.0))).sum(axis=1)
 
 
-def drawn(model: SampleLaw, truth: list[NDArray[np.float64]], seed: int = 3) -> NDArray[np.uint32]:
+def drawn(model, truth, seed=3):
     mass = np.maximum(sample_mass(model, truth, np.arange(FIRST, FIRST + N_CODES)), 0.0)
     counts = np.random.default_rng(seed).multinomial(FRAMES, mass / mass.sum(axis=1, keepdims=True))
     return counts.astype(np.uint32)
 
 
-def origins(n: int) -> NDArray[np.int64]:
+def origins(n):
     return np.full(n, FIRST)
 
 
-def columns(fit: FitResult) -> NDArray[np.float64]:
+def columns(fit):
     return np.stack([getattr(fit, name) for name in NAMES], axis=1)
 
 
-def stderr(fit: FitResult) -> NDArray[np.float64]:
+def stderr(fit):
     return np.asarray(np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)))
 
 
-def maximum(
-    counts: NDArray[np.uint32], model: SampleLaw, start: NDArray[np.float64], scale: NDArray[np.float64]
-):
+def maximum(counts, model, start, scale):
     """Where the gradient of the log-likelihood vanishes, in standard errors from ``start``, by scipy."""
 
-    def value(offset: NDArray[np.float64]) -> float:
+    def value(offset):
         here = [np.array([v]) for v in start + offset * scale]
         return float(log_likelihood(counts[None], origins(1), here, model)[0])
 
-    def gradient(offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient(offset):
         # fourth-order differences
         out = np.empty(4)
         for i in range(4):
@@ -79,7 +77,7 @@ def maximum(
 @pytest.mark.parametrize(
     "name", ["neutral", "negative_binomial", "skew", "variance", "edges", "clip", "everything"]
 )
-def test_fit_is_where_the_gradient_vanishes(name: str) -> None:
+def test_fit_is_where_the_gradient_vanishes(name):
     model = LAWS[name]
     if name == "clip":
         model = SampleLaw().with_clip(97, 180)
@@ -94,7 +92,7 @@ def test_fit_is_where_the_gradient_vanishes(name: str) -> None:
     )
 
 
-def test_pixels_do_not_influence_each_other() -> None:
+def test_pixels_do_not_influence_each_other():
     model = LAWS["variance"].with_free_satellites([1.0, 2.0])
     truth = [np.repeat(column, 2) for column in TRUTH]
     counts = drawn(model, truth)
@@ -112,7 +110,7 @@ def test_pixels_do_not_influence_each_other() -> None:
             )
 
 
-def test_a_pixel_without_plain_values_stays_without() -> None:
+def test_a_pixel_without_plain_values_stays_without():
     counts = drawn(SampleLaw(), TRUTH)
     counts[1] = 0
     counts[2] = 0
@@ -131,7 +129,7 @@ def test_a_pixel_without_plain_values_stays_without() -> None:
     assert found.fit_status[3] == FitStatus.NOT_CONVERGED
 
 
-def test_bits_about_the_data_are_kept_and_those_about_the_plain_fit_are_not() -> None:
+def test_bits_about_the_data_are_kept_and_those_about_the_plain_fit_are_not():
     model = SampleLaw().with_variance(per_electron=0.03)
     counts = drawn(model, TRUTH)
     plain = fit_histograms(counts, origins(5), over=np.array([0, 0, 0, 2, 0]), adc_limits=(0, 4000))
@@ -142,7 +140,7 @@ def test_bits_about_the_data_are_kept_and_those_about_the_plain_fit_are_not() ->
     assert extended.fit_status.tolist() == [0, 0, 0, FitStatus.OUTSIDE_WINDOW, 0]
 
 
-def test_neighbour_is_taken_where_it_is_likelier() -> None:
+def test_neighbour_is_taken_where_it_is_likelier():
     counts = drawn(SampleLaw(), TRUTH)
     right = fit_histograms(counts, origins(5))
     wrong = dataclasses.replace(
@@ -159,7 +157,7 @@ def test_neighbour_is_taken_where_it_is_likelier() -> None:
     assert (abs(stays.bias - right.bias)[1:] > 5).all()
 
 
-def test_exposure_that_is_added_leaves_h_as_it_is_without() -> None:
+def test_exposure_that_is_added_leaves_h_as_it_is_without():
     # half of the frames get 0.9 e- in the first three pixels, a third 1.4 e- in the fourth, none in the last
     added = [[0.0, 0.9]] * 3 + [[0.0, 1.4], [0.0, 0.0]]
     weights = [[0.5, 0.5]] * 3 + [[2 / 3, 1 / 3], [1.0, 0.0]]
@@ -180,7 +178,7 @@ def test_exposure_that_is_added_leaves_h_as_it_is_without() -> None:
     np.testing.assert_allclose(mean, columns(extended)[:, 0] + (np.array(added) * weights).sum(axis=1)[every])
 
 
-def test_free_satellites_are_found_where_they_are_and_nowhere_else() -> None:
+def test_free_satellites_are_found_where_they_are_and_nowhere_else():
     law = SampleLaw().with_free_satellites([0.5, 1.0, 1.5, 2.0, 3.0])
     truth = [np.tile(column, 8) for column in TRUTH]
     weight, amplitude = np.zeros(40), np.zeros(40)
@@ -212,13 +210,11 @@ def test_free_satellites_are_found_where_they_are_and_nowhere_else() -> None:
     np.testing.assert_allclose(mass.sum(axis=1), 1.0, atol=1e-6)
 
 
-def test_a_law_without_limits_is_cut_where_the_adc_cuts() -> None:
+def test_a_law_without_limits_is_cut_where_the_adc_cuts():
     """A third of the samples at 0 DN, and noise that a row shares: as the PCD, whose read noise has it in."""
     rng = np.random.default_rng(3)
-    samples = 10.0 * (rng.poisson(1.0, (12, 3000)) + 0.34 * rng.standard_normal((12, 3000))) - 3.0
-    samples = np.rint(samples).astype(np.int64).clip(0, 4095)
-    counts = np.stack([np.bincount(row, minlength=200) for row in samples]).astype(np.uint32)
-    fit = functools.partial(fit_histograms, counts, np.zeros(12, np.int32), adc_limits=(0, 4095))
+    samples = codes(rng, (12, 3000), 1.0, 10.0, 0.34, bias=-3.0).clip(0, 4095)
+    fit = functools.partial(fit_histograms, *histograms(samples), adc_limits=(0, 4095))
     plain, shared = fit(), fit(law=SampleLaw(extra_variance_dn2=np.array([4.0])))
     np.testing.assert_allclose(shared.log_likelihood, plain.log_likelihood, atol=1e-3)
     np.testing.assert_allclose(shared.bias, plain.bias, atol=1e-2)

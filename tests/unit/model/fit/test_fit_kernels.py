@@ -8,7 +8,6 @@ import pytest
 from helpers.drawn_pixels import draw, samples
 from helpers.em_trace import em_trace, evaluated, one_sample
 from helpers.reference_pchem import Theta, em, log_likelihood
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 from scipy.stats import norm, poisson
 
@@ -21,7 +20,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     INFORMATION,
     LOGLIK_ALONE,
     SCORE,
-    Histogram,
     Pixel,
     Scratch,
     histogram_of,
@@ -52,47 +50,40 @@ class Sample(NamedTuple):
     scratch: Scratch
 
     @property
-    def at(self) -> NDArray[np.float64]:
+    def at(self):
         """The evaluation."""
         return self.scratch.evaluations[AT, 0]
 
     @property
-    def histogram(self) -> Histogram:
+    def histogram(self):
         return histogram_of.py_func(self.pixel, 0)
 
     @property
-    def information(self) -> NDArray[np.float64]:
+    def information(self):
         lower = np.tril(self.at[INFORMATION : INFORMATION + 4, :4])
         return np.asarray(lower + np.tril(lower, -1).T)
 
 
-def prepare(
-    case: tuple[float, float, float], seed: int = 4
-) -> tuple[Sample, float, NDArray[np.float64], Theta]:
+def prepare(case, seed=4):
     """Histogram, centre in DN, raw sample and a theta that is off the truth."""
     counts, origin, truth = draw(np.random.default_rng(seed), *case, n_frames=N)
     pixel, scratch, centre = one_sample(counts[0])
     scratch.rows[:] = np.nan  # what was in memory before must not matter
-    h, g, mu, sigma = truth[0]
-    return (
-        Sample(pixel, scratch),
-        float(origin[0] + centre),
-        samples(counts[0], int(origin[0])),
-        Theta(1.04 * h, 0.985 * g, mu - 0.3, 1.05 * sigma),
-    )
+    theta = Theta(*(truth[0] * [1.04, 0.985, 1.0, 1.05] - [0, 0, 0.3, 0]))
+    return Sample(pixel, scratch), float(origin[0] + centre), samples(counts[0], int(origin[0])), theta
 
 
-def internal(theta: Theta, centre: float) -> NDArray[np.float64]:
+def internal(theta, centre):
     sigma = 2 * np.log(theta.sigma)
     return np.array([np.log(theta.exposure), 1 / theta.gain, theta.bias - centre, sigma, 0.0])
 
 
-def run(sample: Sample, theta: NDArray[np.float64]) -> float:
+def run(sample, theta):
     return evaluated(sample.pixel, theta, DERIVATIVES, density_likelihood(), sample.scratch)
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_score_is_the_gradient_and_information_minus_its_jacobian(case: tuple[float, float, float]) -> None:
+def test_score_is_the_gradient_and_information_minus_its_jacobian(case):
     histogram, centre, x, theta = prepare(case)
     point = internal(theta, centre)
     assert run(histogram, point) == pytest.approx(log_likelihood(x, theta), rel=1e-11)
@@ -102,10 +93,10 @@ def test_score_is_the_gradient_and_information_minus_its_jacobian(case: tuple[fl
     size = np.sqrt(np.abs(np.diag(information)))
     step = 1e-3 / size
 
-    def loglik(p: NDArray[np.float64]) -> float:
+    def loglik(p):
         return log_likelihood(x, Theta(float(np.exp(p[0])), 1 / p[1], p[2] + centre, float(np.exp(p[3] / 2))))
 
-    def score_at(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    def score_at(p):
         run(histogram, p)
         return histogram.at[SCORE, :4].copy()
 
@@ -121,7 +112,7 @@ def test_score_is_the_gradient_and_information_minus_its_jacobian(case: tuple[fl
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_em_iterates_follow_the_paper(case: tuple[float, float, float]) -> None:
+def test_em_iterates_follow_the_paper(case):
     counts, origin, truth = draw(np.random.default_rng(5), *case, n_frames=N)
     start = Theta(*(truth[0] * [1.1, 1.03, 1.002, 0.9]))
     trace = em_trace(counts[0], int(origin[0]), start, 25)
@@ -130,7 +121,7 @@ def test_em_iterates_follow_the_paper(case: tuple[float, float, float]) -> None:
     assert not np.allclose(trace.parameters[1], trace.parameters[0], rtol=1e-4)
 
 
-def test_large_electron_numbers_and_a_comb_finer_than_any() -> None:
+def test_large_electron_numbers_and_a_comb_finer_than_any():
     pixel, scratch, centre = one_sample(np.array([0, 3, 40, 180, 300, 180, 40, 3, 0], np.uint32))
     x = np.repeat(np.arange(-centre, 9.0 - centre), [0, 3, 40, 180, 300, 180, 40, 3, 0])
     for h in (40.0, 5000.0):  # with a table of factorials, and beyond it
@@ -144,7 +135,7 @@ def test_large_electron_numbers_and_a_comb_finer_than_any() -> None:
     assert evaluated(pixel, internal(finest, 0.0), DERIVATIVES, density_likelihood(), scratch) == -np.inf
 
 
-def test_far_values_have_the_density_of_the_nearest_component() -> None:
+def test_far_values_have_the_density_of_the_nearest_component():
     counts = np.zeros(400, np.uint32)
     counts[[0, 200, 211, 222, 399]] = 1, 300, 400, 200, 1
     pixel, scratch, centre = one_sample(counts)
@@ -157,17 +148,17 @@ def test_far_values_have_the_density_of_the_nearest_component() -> None:
         assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)
 
 
-def test_a_tied_step_leaves_the_noise_in_electrons() -> None:
+def test_a_tied_step_leaves_the_noise_in_electrons():
     sample, centre, _, theta = prepare(CASES[2])
     point = internal(theta, centre)
     at, h = sample.scratch.evaluations[AT], 1e-4
 
-    def score(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    def score(p):
         run(sample, p)
         climb_numba.tie_noise(p, at, 0.0)
         return sample.at[SCORE].copy()
 
-    def moved(step: float) -> NDArray[np.float64]:
+    def moved(step):
         p = point.copy()
         p[1] += step
         p[3] = point[3] + 2 * np.log(p[1] / point[1])
@@ -180,7 +171,7 @@ def test_a_tied_step_leaves_the_noise_in_electrons() -> None:
     assert information == pytest.approx(-(score(moved(h))[1] - score(moved(-h))[1]) / (2 * h), rel=1e-6)
 
 
-def test_no_kernel_lets_the_compiler_choose_the_bits() -> None:
+def test_no_kernel_lets_the_compiler_choose_the_bits():
     # numba optimises a kernel again in every kernel that calls it, and which copy runs depends on what the
     # process compiled or loaded before: with sums in any order, so would the last bits
     kernels = sorted(Path(pixel_numba.__file__).parents[1].rglob("*_numba.py"))

@@ -4,7 +4,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from helpers.drawn_pixels import codes, histograms
 
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.operators.noise import NoiseSkew
@@ -20,21 +20,15 @@ COMB = [
 ]  # fmt: skip
 
 
-def drawn(
-    rng: np.random.Generator, truth: NDArray[np.float64], n_frames: int, per_electron: float = 0.0
-) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+def drawn(rng, truth, n_frames, per_electron=0.0):
     """Return histograms of pixels with (H, g, mu, analog read noise in DN), and DN of bin 0."""
     h, g, mu, sigma = (column[:, None] for column in truth.T)
     k = rng.poisson(h, (truth.shape[0], n_frames))
     signal = k + np.sqrt(per_electron * k) * rng.standard_normal(k.shape)
-    values = np.rint(mu + signal / g + sigma * rng.standard_normal(k.shape)).astype(np.int64)
-    origin = values.min(axis=1) - 1
-    width = int((values.max(axis=1) - origin).max()) + 2
-    counts = [np.bincount(each - first, minlength=width) for each, first in zip(values, origin, strict=True)]
-    return np.array(counts, np.uint16), origin
+    return histograms(np.rint(mu + signal / g + sigma * rng.standard_normal(k.shape)).astype(np.int64))
 
 
-def test_a_comb_that_fits_whole_numbers_is_no_answer() -> None:
+def test_a_comb_that_fits_whole_numbers_is_no_answer():
     # 2 DN per electron: peaks as narrow as a DN, at whole numbers, are 0.14 nats likelier than the truth, but
     # their width says nothing of the read noise
     counts = np.array([COMB], np.uint16)
@@ -44,7 +38,7 @@ def test_a_comb_that_fits_whole_numbers_is_no_answer() -> None:
     assert np.isfinite(found.covariance[0]).all()
 
 
-def test_read_noise_at_its_floor_converges() -> None:
+def test_read_noise_at_its_floor_converges():
     # the law has more noise than the pixels: nothing is left for their own, and its floor is in e-, so it
     # moves with the gain
     rng = np.random.default_rng(1)
@@ -54,7 +48,7 @@ def test_read_noise_at_its_floor_converges() -> None:
     assert np.count_nonzero(found.fit_status & int(FitStatus.NOT_CONVERGED)) <= 1
 
 
-def test_an_ambiguous_pixel_gets_the_likeliest_gain_of_the_law() -> None:
+def test_an_ambiguous_pixel_gets_the_likeliest_gain_of_the_law():
     # where the peaks are not resolved, the density and the law rank the maxima differently
     rng = np.random.default_rng(2)
     n, extra = 150, 0.09**2
@@ -78,7 +72,7 @@ def test_an_ambiguous_pixel_gets_the_likeliest_gain_of_the_law() -> None:
     assert (both & lower).sum() <= 8  # 14 by the maxima of the density alone, one by 17 nats
 
 
-def test_a_misfit_of_the_model_calls_for_no_other_starts() -> None:
+def test_a_misfit_of_the_model_calls_for_no_other_starts():
     # noise that grows with the signal: the fit is poor, the peaks are resolved, and no other gain is likelier
     rng = np.random.default_rng(3)
     n = 60
@@ -99,7 +93,7 @@ def test_a_misfit_of_the_model_calls_for_no_other_starts() -> None:
         assert not (again.log_likelihood[poor] > found.log_likelihood[poor] + 1e-6).any()
 
 
-def test_of_two_maxima_on_one_comb_the_higher_one_is_kept() -> None:
+def test_of_two_maxima_on_one_comb_the_higher_one_is_kept():
     # three exposures and a bias: two gains 4 % apart give the same bias and nearly the same brightest mean;
     # the one that is climbed to first is 0.055 nats lower
     rng = np.random.default_rng(9)
@@ -110,56 +104,43 @@ def test_of_two_maxima_on_one_comb_the_higher_one_is_kept() -> None:
         rng = np.random.default_rng(10 + seed)
         electrons = rng.poisson(scale * exposure, (1200, 12, 12))
         dn = np.rint(bias + step * (electrons + noise * rng.standard_normal(electrons.shape)))
-        values = dn[:, 9, 11].astype(np.int64)
-        origins.append(values.min(keepdims=True))
-        counts.append(np.bincount(values - values.min())[None].astype(np.uint16))
+        of_pixel = histograms(dn[None, :, 9, 11].astype(np.int64))
+        counts.append(of_pixel[0])
+        origins.append(of_pixel[1])
     found = fit_histograms(counts, origins, dark=[False, False, False, True])
     assert found.log_likelihood[0] == pytest.approx(-18261.2198, abs=1e-3)
     assert found.conversion_gain[0] == pytest.approx(0.1093, abs=1e-4)
 
 
 @pytest.mark.timeout(120)
-def test_steps_out_of_bounds_end_a_climb() -> None:
+def test_steps_out_of_bounds_end_a_climb():
     # a gain that moves from frame to frame, under a law that cannot follow it: all noise is a one-sided tail
     rng = np.random.default_rng(4)
     n, frames = 300, 990
     electrons, noise = rng.poisson(0.94, (n, frames)), 4.8 * rng.standard_normal((n, frames))
     gain = 17.0 * (1.0 + 0.15 * rng.standard_normal((1, frames)))
     samples = np.rint(200.0 + gain * electrons + noise).astype(np.int64)
-    low = int(samples.min())
-    counts = np.array([np.bincount(x - low, minlength=samples.max() - low + 1) for x in samples])
     near = np.tile([0.94, 1.0 / 17.0, 200.0, 4.8], (n, 1))
     law = sample_law([NoiseSkew(share=1.0)], pixel_maps(near.T, np.ones(n, np.bool_)))
-    fit = fit_histograms(counts, np.full(n, low), law=law, start=near)
+    fit = fit_histograms(*histograms(samples), law=law, start=near)
     assert np.all(fit.n_iterations > 0)
     assert np.all(np.isfinite(fit.log_likelihood) | (fit.fit_status > 0))
 
 
-N_FRAMES, REPEATS = 4000, 5
 #: A search after the first that starts anew from everywhere takes as many evaluations as the first.
 MOST_EVALUATIONS = 1.5
 
 
 @pytest.fixture(scope="module")
-def histograms() -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
-    """Pixels whose frames come five times each: no law of single frames fits them."""
+def repeated():
+    """Histograms of pixels whose frames come five times each: no law of single frames fits them."""
     rng = np.random.default_rng(90210)
-    values = []
-    for _ in range(40):
-        signal = rng.poisson(rng.uniform(0.5, 6.0), N_FRAMES // REPEATS) + rng.normal(
-            0.0, rng.uniform(0.2, 0.5), N_FRAMES // REPEATS
-        )
-        values.append(np.repeat(np.rint(100.0 + 11.0 * signal).astype(np.int64), REPEATS))
-    first = np.array([each.min() - 1 for each in values])
-    width = max(int(each.max() - low) for each, low in zip(values, first, strict=True)) + 2
-    counts = [np.bincount(each - low, minlength=width) for each, low in zip(values, first, strict=True)]
-    return np.array(counts, np.uint16), first
+    exposure, noise = rng.uniform(0.5, 6.0, (40, 1)), rng.uniform(0.2, 0.5, (40, 1))
+    return histograms(np.repeat(codes(rng, (40, 800), exposure, 11.0, noise, bias=100.0), 5, axis=1))
 
 
-def test_a_misfit_without_outliers_has_the_fit_of_all_samples_and_costs_little_more(
-    histograms: tuple[NDArray[np.uint16], NDArray[np.int64]],
-) -> None:
-    counts, origin = histograms
+def test_a_misfit_without_outliers_has_the_fit_of_all_samples_and_costs_little_more(repeated):
+    counts, origin = repeated
     guarded = fit_histograms(counts, origin)
     plain = fit_histograms(counts, origin, settings=FitSettings(tail_guard=0.0))
     whole = guarded.outlier_share == 0.0
@@ -175,10 +156,8 @@ def test_a_misfit_without_outliers_has_the_fit_of_all_samples_and_costs_little_m
     assert guarded.n_iterations[whole & poor].min() > plain.n_iterations[whole & poor].min()
 
 
-def test_outliers_of_a_misfit_are_still_left_out(
-    histograms: tuple[NDArray[np.uint16], NDArray[np.int64]],
-) -> None:
-    counts, origin = histograms
+def test_outliers_of_a_misfit_are_still_left_out(repeated):
+    counts, origin = repeated
     struck = np.concatenate([counts, np.zeros((counts.shape[0], 400), np.uint16)], axis=1)
     struck[:, -20] = 3
     found, plain = fit_histograms(struck, origin), fit_histograms(counts, origin)

@@ -1,7 +1,5 @@
 """Parameters that all pixels share, with one or several samples of each: slopes, recovery, coverage."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -20,12 +18,12 @@ LAYOUTS = [
 ]
 
 
-def law(shared: Any, own: Any) -> Any:
+def law(shared, own):
     effect = effect_class("signal_dependent_noise")(noise_e=float(np.sqrt(abs(shared[0]))))
     return sample_law([effect], pixel_maps(list(own.T), np.ones(own.shape[0], np.bool_)))
 
 
-def problem(samples: Samples, n_pixels: int, n: int, seed: int) -> tuple[SharedProblem, Any, Any]:
+def problem(samples, n_pixels, n, seed):
     """Histograms of pixels at known parameters, the variance per electron shared by all."""
     rng = np.random.default_rng(seed)
     theta = np.empty((n_pixels, samples.n_exposures + 3))
@@ -46,7 +44,7 @@ def problem(samples: Samples, n_pixels: int, n: int, seed: int) -> tuple[SharedP
 
 
 @pytest.mark.parametrize("samples", LAYOUTS)
-def test_the_score_is_the_slope_of_the_log_likelihood(samples: Samples) -> None:
+def test_the_score_is_the_slope_of_the_log_likelihood(samples):
     whole, theta, shared = problem(samples, 3, 400, 1)
     slopes = Tangent.at(whole, theta, shared).slopes(whole.counts)
     for index in range(theta.shape[1]):
@@ -59,7 +57,7 @@ def test_the_score_is_the_slope_of_the_log_likelihood(samples: Samples) -> None:
 
 
 @pytest.mark.parametrize("samples", LAYOUTS)
-def test_rows_and_own_parameters_are_each_others_inverse(samples: Samples) -> None:
+def test_rows_and_own_parameters_are_each_others_inverse(samples):
     _, theta, _ = problem(samples, 4, 10, 2)
     h, step, mu, variance = samples.rows(theta).T
     parameters = np.stack([np.exp(h), np.exp(-step), mu, np.sqrt(np.exp(variance) + 1 / 12)], axis=1)
@@ -70,7 +68,7 @@ def test_rows_and_own_parameters_are_each_others_inverse(samples: Samples) -> No
 
 
 @pytest.mark.parametrize("samples", LAYOUTS[1:4])
-def test_pulls_of_own_and_shared_parameters_have_unit_spread(samples: Samples) -> None:
+def test_pulls_of_own_and_shared_parameters_have_unit_spread(samples):
     """Twelve sensors of six pixels: pulls within five standard errors of N(0, 1)."""
     own, common = [], []
     for seed in range(12):

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.model.histogram.count import choose_bins, counts_dtype, histogram_frames, pixels_by_range
 
 
-def pcd_like(seed: int, shape: tuple[int, int, int], dtype: type = np.uint16) -> NDArray[np.unsignedinteger]:
+def pcd_like(seed, shape, dtype=np.uint16):
     rng = np.random.default_rng(seed)
     bias = rng.normal(100, 6, shape[1:])
     return np.rint(bias + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype(dtype)
@@ -68,7 +67,7 @@ def test_counts_are_wide_enough():
 
 class TestChoiceOfBins:
     @staticmethod
-    def pixels(ranges: dict[int, int], max_bins: int = 1024) -> NDArray[np.int64]:
+    def pixels(ranges, max_bins=1024):
         out = np.zeros(max_bins + 2, np.int64)
         for width, number in ranges.items():
             out[min(width, max_bins + 1)] += number

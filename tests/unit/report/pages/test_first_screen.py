@@ -60,9 +60,9 @@ def test_a_bias_an_electron_off_leaves_gain_and_read_noise() -> None:
     assert data.summary("conversion_gain").n_left_out == 0
     assert data.summary("quanta_exposure").n_left_out == 1800
     assert any("gain and read noise are known" in flag.text for flag in flags(data))
-    row = next(row for row in table(data, "flagged").rows if row[0].startswith("quanta exposure"))
-    assert row[-1] == "1,800"
-    assert not [row for row in table(data, "flagged").rows if row[0].startswith("read noise")]
+    row = next(row for row in table(data, "flagged").rows if row["parameter"].startswith("quanta exposure"))
+    assert list(row.values())[-1] == "1,800"
+    assert not [row for row in table(data, "flagged").rows if row["parameter"].startswith("read noise")]
 
 
 def test_just_below_half_is_a_caution_and_says_that_the_rest_is_a_selection() -> None:
@@ -118,8 +118,8 @@ def test_flagged_pixels_leave_medians_maxima_and_the_truth_table(bit: FitStatus,
     assert (table(data, "flagged") is not None) == left_out
     assert ("100 flagged pixels excluded" in table(data, "parameters").caption) == left_out
     if left_out:
-        row = next(row for row in table(data, "flagged").rows if row[0] == "read noise (e⁻)")
-        assert row[1:] == ("0.9000",) * 5 + ("100",)
+        row = next(row for row in table(data, "flagged").rows if row["parameter"] == "read noise (e⁻)")
+        assert list(row.values())[1:] == ["0.9000"] * 5 + ["100"]
 
 
 def test_criteria_stand_with_their_numbers_and_limits() -> None:
@@ -283,7 +283,7 @@ def test_a_negative_correlation_is_no_resemblance(data: ReportData) -> None:
     words = "Correlation of successive samples"
     assert any(flag.text.startswith(f"{words}: −0.2") for flag in flags(found))
     [table] = [each for each in result_tables(found) if each.id == "quick-look"]
-    assert table.rows[0][0] == words
+    assert table.rows[0]["check"] == words
 
 
 def test_several_exposures_come_first_and_are_taken_apart_next(data: ReportData) -> None:
@@ -304,7 +304,7 @@ def test_several_exposures_come_first_and_are_taken_apart_next(data: ReportData)
 def test_table_and_json_hold_all_checks(data: ReportData) -> None:
     found = looked(data, 1e-30, 1.0)
     [table] = [each for each in result_tables(found) if each.id == "quick-look"]
-    assert [row[1] for row in table.rows] == ["yes", "no"]
+    assert [row["found"] for row in table.rows] == ["yes", "no"]
     assert "Not tested: codes (too few pixels)." in table.caption
     numbers = report_numbers(found)["quick_look"]
     assert numbers["checks"][0]["share"] == pytest.approx(1 / 3)

@@ -4,7 +4,6 @@ import contextlib
 import json
 import signal
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -271,15 +270,13 @@ def test_the_limits_of_the_run_are_in_the_model_of_the_search_once():
 
 
 @pytest.mark.parametrize("error", [InterruptedRunError(signal.SIGINT), StoreError("no space left")])
-def test_a_stop_in_the_middle_of_a_comparison_makes_no_verdict(
-    monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
+def test_a_stop_in_the_middle_of_a_comparison_makes_no_verdict(monkeypatch, error):
     """Not even where the search takes whatever a candidate raises for a defect of the candidate."""
 
-    def run_units(*_: Any, **__: Any) -> None:
+    def run_units(*_, **__):
         raise error
 
-    def search(context: Any, *_: Any) -> None:
+    def search(context, *_):
         try:
             discrepancy._Mapper(context)([])
         except Exception:

@@ -3,21 +3,19 @@
 import csv
 import re
 import shutil
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from helpers import written_fit
 from helpers.pickled_tasks import PickledTasks
+from helpers.stage_runs import completed, stage_context
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.base.variables import PARAMETERS, variables_of
 from pchem_pipeline.commands.export import export_run
-from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
+from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import dump_config
-from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.electrons.electrons import NO_NUMBER
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.ensemble.ensemble import DnAxis
@@ -25,12 +23,10 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.report.pages.summary import key_numbers, sentence
 from pchem_pipeline.run.fingerprint import status
-from pchem_pipeline.run.stage import Options, StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
 from pchem_pipeline.stages.ensemble.ensemble import on_axis
 from pchem_pipeline.stages.fit.fit import code_sums
-from pchem_pipeline.stages.report.report import report_data
 from pchem_pipeline.stages.report.stored import read_run
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.records import StageRecord
@@ -41,29 +37,13 @@ HISTOGRAM = ("counts", "origin", "under", "over")
 FAILED_PIXEL = (3, 5)
 
 
-def make_context(
-    folder: Path,
-    *,
-    tile: int = 16,
-    executor: Executor | None = None,
-    options: Options | None = None,
-    store: str = "run.zarr",
-    input: dict[str, object] | None = None,
-    **ensemble: object,
-) -> StageContext:
-    config = RunConfig.model_validate(
-        {
-            "run": {"tile": tile, "store": store},
-            "simulate": {"shape": [NY, NX], "n_frames": FRAMES, "truth_frames": 120, "format": "npy"},
-            "input": input or {},
-            "ensemble": ensemble,
-        }
-    )
-    place = RunStore.create(folder / store)
-    return StageContext(config, folder, place, executor or SerialExecutor(), options=options or Options())
+def make_context(folder, *, tile=16, executor=None, store="run.zarr", input=None, **ensemble):
+    simulate = {"shape": [NY, NX], "n_frames": FRAMES, "truth_frames": 120, "format": "npy"}
+    sections = {"run": {"tile": tile, "store": store}, "simulate": simulate, "input": input or {}}
+    return stage_context(folder, executor, **sections, ensemble=ensemble)
 
 
-def write_fit(context: StageContext, *, tiles: list[str] | None = None, failed: bool = True) -> None:
+def write_fit(context, *, tiles=None, failed=True):
     """What the fit stage leaves behind, with the truth as its estimate."""
     status = np.zeros(context.sensor.shape, dtype=np.uint16)
     if failed:
@@ -72,36 +52,42 @@ def write_fit(context: StageContext, *, tiles: list[str] | None = None, failed: 
     written_fit.write_fit(context, status, status == int(FitStatus.NOT_CONVERGED), tiles)
 
 
+BEFORE, AFTER = ("simulate", "ingest", "histogram"), ("maps", "ensemble", "electrons")
+
+
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def prepared(tmp_path_factory):
     """A run up to the histograms, at tiles of 16."""
-    folder = tmp_path_factory.mktemp("sensor")
-    context = make_context(folder)
-    for stage in ("simulate", "ingest", "histogram"):
-        assert execute(stage, context).state == "complete"
-    return folder
+    return completed(make_context(tmp_path_factory.mktemp("sensor")), *BEFORE).base_dir
 
 
-def fresh_copy(prepared: Path, folder: Path) -> None:
-    shutil.copytree(prepared, folder, dirs_exist_ok=True)
+@pytest.fixture
+def sensor(prepared, tmp_path):
+    """Return the context of a copy of that run with its fit, and with settings of the ensemble."""
+    shutil.copytree(prepared, tmp_path, dirs_exist_ok=True)
+
+    def make(tiles=None, failed=True, **settings):
+        context = make_context(tmp_path, **settings)
+        write_fit(context, tiles=tiles, failed=failed)
+        return context
+
+    return make
 
 
 @pytest.fixture(scope="module")
-def finished(prepared: Path, tmp_path_factory: pytest.TempPathFactory) -> StageContext:
+def finished(prepared, tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
-    fresh_copy(prepared, folder)
+    shutil.copytree(prepared, folder, dirs_exist_ok=True)
     context = make_context(folder, frames=250)
     write_fit(context)
-    for stage in ("maps", "ensemble", "electrons"):
-        assert execute(stage, context).state == "complete"
-    return context
+    return completed(context, *AFTER)
 
 
-def ensemble_of(store: RunStore) -> dict[str, np.ndarray]:
+def ensemble_of(store):
     return {v.name: store.read(v.path) for v in variables_of("ensemble") if store.has(v.path)}
 
 
-def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+def assert_same(found, expected):
     for name, values in expected.items():
         if values.dtype.kind == "f":
             # far tails of a curve are sums of numbers below rounding; residuals are small differences
@@ -111,7 +97,7 @@ def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -
             np.testing.assert_array_equal(found[name], values, err_msg=name)
 
 
-def test_maps_are_the_fit_and_what_follows(finished: StageContext) -> None:
+def test_maps_are_the_fit_and_what_follows(finished):
     store = finished.store
     truth = {name: store.read(f"truth/{name}") for name in PARAMETERS}
     for name in PARAMETERS:
@@ -130,42 +116,38 @@ def test_maps_are_the_fit_and_what_follows(finished: StageContext) -> None:
     assert store.array("maps/charge_rate").attrs["units"] == "e-/px/s"
 
 
-def test_no_integration_time_means_no_charge_rate(prepared: Path, tmp_path: Path) -> None:
-    fresh_copy(prepared, tmp_path)
-    context = make_context(tmp_path)
-    write_fit(context)
+def test_no_integration_time_means_no_charge_rate(sensor, tmp_path):
+    context = sensor()
     sensor = context.sensor
     type(sensor)(**{**vars(sensor), "integration_time": None}).write(context.store)
     context.config = context.config.model_copy(
         update={"input": context.config.input.model_copy(update={"integration_time": None})}
     )
-    assert execute("maps", context).state == "complete"
+    completed(context, "maps")
     assert not context.store.has("maps/charge_rate")
     assert "integration_time" in context.notes[0]
 
 
 @pytest.mark.parametrize("kind", ["dark", "light", "unknown"])
-def test_dark_current_is_of_the_dark_alone(prepared: Path, tmp_path: Path, kind: str) -> None:
-    fresh_copy(prepared, tmp_path)
-    write_fit(make_context(tmp_path))
-    execute("maps", make_context(tmp_path))
+def test_dark_current_is_of_the_dark_alone(sensor, tmp_path, kind):
+    completed(sensor(), "maps")
     context = make_context(tmp_path, input={"kind": kind})
     wanted, other = ("dark_current", "charge_rate") if kind == "dark" else ("charge_rate", "dark_current")
     state = status(STAGES["maps"], context)
     assert state.words() == (
         "stale - input.rate charge_rate -> dark_current" if kind == "dark" else "complete"
     )
-    assert execute("maps", context).state == "complete"
+    completed(context, "maps")
     assert context.store.has(f"maps/{wanted}")
     assert not context.store.has(f"maps/{other}")
     assert wanted in context.store.attributes("maps")["summary"]
-    data = report_data(read_run(context.store), context.config, [])
+    data = read_run(context.store, context.config).data
     words = wanted.replace("_", " ")
     assert words in sentence(data)
     assert [number.label for number in key_numbers(data) if number.name == wanted] == [words]
 
 
-def test_ensemble_is_that_of_the_chosen_frames(finished: StageContext) -> None:
+def test_ensemble_is_that_of_the_chosen_frames(finished):
     frames = np.load(finished.base_dir / "frames" / "frames.npy")
     use = np.ones((NY, NX), dtype=bool)
     use[FAILED_PIXEL] = False
@@ -184,13 +166,11 @@ def test_ensemble_is_that_of_the_chosen_frames(finished: StageContext) -> None:
     assert found["nuced_density"].sum() * step == pytest.approx(1.0, abs=1e-3)
 
 
-def test_copies_and_empty_frames_are_in_no_ensemble(prepared: Path, tmp_path: Path) -> None:
-    fresh_copy(prepared, tmp_path)
-    context = make_context(tmp_path, frames=250)
-    write_fit(context)
+def test_copies_and_empty_frames_are_in_no_ensemble(sensor, tmp_path):
+    context = sensor(frames=250)
     odd = {"copied": list(range(1, 200, 2)), "empty": [6, 399]}
     context.store.set_attributes("summary", {"odd_frames": odd})
-    assert execute("ensemble", context).state == "complete"
+    completed(context, "ensemble")
     kept = np.delete(np.load(tmp_path / "frames" / "frames.npy")[:250], [*odd["copied"], 6], 0)
     found = ensemble_of(context.store)
     expected = np.bincount(np.delete(kept.reshape(len(kept), -1), 3 * NX + 5, 1).ravel())[found["dn"][0] :]
@@ -199,7 +179,7 @@ def test_copies_and_empty_frames_are_in_no_ensemble(prepared: Path, tmp_path: Pa
     assert (facts["n_frames"], facts["n_frames_all"]) == (149, FRAMES - 102)
 
 
-def test_the_true_parameters_predict_to_the_noise(finished: StageContext) -> None:
+def test_the_true_parameters_predict_to_the_noise(finished):
     facts = finished.store.attributes("ensemble")
     error = facts["rmse"]
     # the mean square has some tens of independent terms: its root scatters by about a tenth
@@ -213,7 +193,7 @@ def test_the_true_parameters_predict_to_the_noise(finished: StageContext) -> Non
     assert facts["component_cases"] == [list(case) for case in COMPONENT_CASES]
 
 
-def test_error_rate_against_the_truth(finished: StageContext) -> None:
+def test_error_rate_against_the_truth(finished):
     store = finished.store
     facts = store.attributes("ensemble")
     true = store.read("truth/electron_number")
@@ -228,13 +208,11 @@ def test_error_rate_against_the_truth(finished: StageContext) -> None:
     assert facts["least_error_rate"] == pytest.approx(facts["expected_error_rate"])
 
 
-def test_error_rate_of_a_fit_that_is_off(prepared: Path, tmp_path: Path) -> None:
-    fresh_copy(prepared, tmp_path)
-    context = make_context(tmp_path)
-    write_fit(context, failed=False)
+def test_error_rate_of_a_fit_that_is_off(sensor, tmp_path):
+    context = sensor(failed=False)
     bias = context.store.read("fit/bias")
     context.store.write_array("fit/bias", bias + 2.0)
-    assert execute("ensemble", context).state == "complete"
+    completed(context, "ensemble")
     facts = context.store.attributes("ensemble")
     expected, error = facts["expected_error_rate_from_truth"], facts["error_rate_stderr"]
     assert abs(facts["error_rate"] - expected) < 5 * error
@@ -243,7 +221,7 @@ def test_error_rate_of_a_fit_that_is_off(prepared: Path, tmp_path: Path) -> None
     assert facts["least_error_rate"] == pytest.approx(facts["expected_error_rate"], rel=0.02)
 
 
-def test_electron_stack(finished: StageContext) -> None:
+def test_electron_stack(finished):
     frames = np.load(finished.base_dir / "frames" / "frames.npy")
     maps = [finished.store.read(f"fit/{name}") for name in PARAMETERS]
     found = finished.store.read("electrons/electron_number")
@@ -267,44 +245,29 @@ def test_electron_stack(finished: StageContext) -> None:
     [(64, make_executor(ComputeSettings(backend="threads", workers=3))), (32, PickledTasks())],
     ids=["threads", "pickled"],
 )
-def test_result_depends_on_neither_tile_nor_backend(
-    finished: StageContext, tmp_path: Path, tile: int, executor: Executor
-) -> None:
+def test_result_depends_on_neither_tile_nor_backend(finished, tmp_path, tile, executor):
     shutil.copytree(finished.base_dir / "frames", tmp_path / "frames")
-    context = make_context(tmp_path, tile=tile, executor=executor, frames=250)
-    for stage in ("simulate", "ingest", "histogram"):
-        execute(stage, context)
+    context = completed(make_context(tmp_path, tile=tile, executor=executor, frames=250), *BEFORE)
     write_fit(context)
-    for stage in ("maps", "ensemble", "electrons"):
-        assert execute(stage, context).state == "complete"
+    completed(context, *AFTER)
     assert_same(ensemble_of(context.store), ensemble_of(finished.store))
     for name in ("maps/read_noise_e", "maps/quality", "electrons/electron_number"):
         np.testing.assert_array_equal(context.store.read(name), finished.store.read(name))
 
 
-def test_tiles_that_the_fit_finishes_later_are_added(
-    finished: StageContext, prepared: Path, tmp_path: Path
-) -> None:
-    fresh_copy(prepared, tmp_path)
-    context = make_context(tmp_path, frames=250)
-    write_fit(context, tiles=["0.0", "0.1", "0.2"])
+def test_tiles_that_the_fit_finishes_later_are_added(finished, sensor, tmp_path):
+    context = sensor(tiles=["0.0", "0.1", "0.2"], frames=250)
     state = execute("ensemble", context)
     assert state.state == "failed"
     assert re.search(r"fit of \S+ is not finished", state.why)
     facts = context.store.attributes("ensemble")
     assert (facts["n_pixels"], facts["tiles_missing"]) == (16 * NX - 1, 6)
-    write_fit(context)
-    again = make_context(tmp_path, frames=250)
-    assert execute("ensemble", again).state == "complete"
+    again = completed(sensor(frames=250), "ensemble")
     assert_same(ensemble_of(again.store), ensemble_of(finished.store))
 
 
-def test_samples_that_the_fit_counted_need_no_histograms(
-    finished: StageContext, prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fresh_copy(prepared, tmp_path)
-    context = make_context(tmp_path, frames=250)
-    write_fit(context)
+def test_samples_that_the_fit_counted_need_no_histograms(finished, sensor, tmp_path, monkeypatch):
+    context = sensor(frames=250)
     store = context.store
     for tile in context.tiles():
         read = {name: store.read(f"histogram/{name}", tile.region) for name in HISTOGRAM}
@@ -312,19 +275,19 @@ def test_samples_that_the_fit_counted_need_no_histograms(
         store.records.mark("fit", "truth", tile.key, {"codes": code_sums(read, list(fit.values()))})
     plain_read = RunStore.read
 
-    def read_little(self: RunStore, name: str, *region: Any) -> Any:
+    def read_little(self, name, *region):
         assert name != "histogram/counts"
         return plain_read(self, name, *region)
 
-    assert execute("maps", context).state == "complete"
+    completed(context, "maps")
     monkeypatch.setattr(RunStore, "read", read_little)
-    assert execute("ensemble", context).state == "complete"
+    completed(context, "ensemble")
     assert_same(ensemble_of(store), ensemble_of(finished.store))
     found, expected = (each.attributes("ensemble") for each in (store, finished.store))
     assert found["samples_beyond_dn_all_frames"] == expected["samples_beyond_dn_all_frames"]
 
 
-def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis() -> None:
+def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis():
     counts = np.arange(12, dtype=np.uint16).reshape(1, 3, 4)
     origin = np.array([[100, 100, 102]], np.int32)
     outside = {"under": np.array([[1, 10, 100]], np.uint32), "over": np.array([[0, 1, 0]], np.uint32)}
@@ -336,13 +299,11 @@ def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis()
     assert beyond == 101 + 1 + 11
 
 
-def test_all_frames_need_no_frames(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fresh_copy(prepared, tmp_path)
-    context = make_context(tmp_path, frames="all")
-    write_fit(context)
+def test_all_frames_need_no_frames(sensor, tmp_path, monkeypatch):
+    context = sensor(frames="all")
     context.store.delete("truth/electron_number")
     monkeypatch.setattr(ensemble_stage, "open_source", lambda *_: pytest.fail("frames were opened"))
-    assert execute("ensemble", context).state == "complete"
+    completed(context, "ensemble")
     found = ensemble_of(context.store)
     np.testing.assert_array_equal(found["counts"], found["counts_all"])
     facts = context.store.attributes("ensemble")
@@ -351,32 +312,25 @@ def test_all_frames_need_no_frames(prepared: Path, tmp_path: Path, monkeypatch: 
     assert "truth" in facts["missing"]
 
 
-def test_region_and_range_of_frames_find_their_truth(finished: StageContext, tmp_path: Path) -> None:
+def test_region_and_range_of_frames_find_their_truth(finished, tmp_path):
     shutil.copytree(finished.base_dir / "frames", tmp_path / "frames")
     crop = {"roi": [8, 32, 4, 48], "frame_range": [20, 300]}
-    context = make_context(tmp_path, input=crop, frames=150, first_frame=10)
-    for stage in ("simulate", "ingest", "histogram"):
-        execute(stage, context)
+    context = completed(make_context(tmp_path, input=crop, frames=150, first_frame=10), *BEFORE)
     write_fit(context, failed=False)
-    assert execute("ensemble", context).state == "complete"
+    completed(context, "ensemble")
     facts = context.store.attributes("ensemble")
     # frames 30 to 180 of the simulation, of which 120 have their truth
     assert facts["samples_compared"] == 90 * 24 * 44
     assert abs(facts["error_rate"] - facts["expected_error_rate"]) < 5 * facts["error_rate_stderr"]
 
 
-def test_frames_that_do_not_exist(prepared: Path, tmp_path: Path) -> None:
-    fresh_copy(prepared, tmp_path)
-    context = make_context(tmp_path, first_frame=1000)
-    write_fit(context)
+def test_frames_that_do_not_exist(sensor):
     with pytest.raises(ConfigError, match="first_frame: 1000, but the run has frames 0 to 399"):
-        execute("ensemble", context)
+        execute("ensemble", sensor(first_frame=1000))
 
 
-def test_no_pixel_with_a_value(prepared: Path, tmp_path: Path) -> None:
-    fresh_copy(prepared, tmp_path)
-    context = make_context(tmp_path)
-    write_fit(context)
+def test_no_pixel_with_a_value(sensor, tmp_path):
+    context = sensor()
     for name in PARAMETERS:
         context.store.write_array(f"fit/{name}", np.full((NY, NX), np.nan))
     state = execute("ensemble", context)
@@ -386,11 +340,9 @@ def test_no_pixel_with_a_value(prepared: Path, tmp_path: Path) -> None:
     assert execute("ensemble", context) == state
 
 
-def test_no_pixel_with_a_value_so_far(prepared: Path, tmp_path: Path) -> None:
+def test_no_pixel_with_a_value_so_far(sensor, tmp_path):
     """Tiles that the fit is not finished are no reason to call the ensemble done."""
-    fresh_copy(prepared, tmp_path)
-    context = make_context(tmp_path)
-    write_fit(context, tiles=["0.0"])
+    context = sensor(tiles=["0.0"])
     good = {name: context.store.read(f"fit/{name}") for name in PARAMETERS}
     for name in PARAMETERS:
         context.store.write_array(f"fit/{name}", np.full((NY, NX), np.nan))
@@ -404,7 +356,7 @@ def test_no_pixel_with_a_value_so_far(prepared: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("n_samples", [(20_000, 20_000), (5_000, 80_000)])
-def test_ready_made_histograms(tmp_path: Path, n_samples: tuple[int, int]) -> None:
+def test_ready_made_histograms(tmp_path, n_samples):
     rng = np.random.default_rng(8)
     truth = np.array([[0.8, 0.1, 100.0, 3.0], [2.5, 0.1, 104.0, 3.2]])
     counts = np.zeros((2, 250), dtype=np.int64)
@@ -412,17 +364,15 @@ def test_ready_made_histograms(tmp_path: Path, n_samples: tuple[int, int]) -> No
         dn = np.rint(mu + rng.poisson(h, n) / g + np.sqrt(sigma**2 - 1 / 12) * rng.standard_normal(n))
         row += np.bincount(dn.astype(int), minlength=250)
     np.savez(tmp_path / "spectra.npz", dn=np.arange(250), counts=counts)
-    config = RunConfig.model_validate({"input": {"files": ["spectra.npz"], "format": "histogram"}})
-    context = StageContext(config, tmp_path, RunStore.create(tmp_path / "run.zarr"))
-    for stage in ("ingest", "histogram"):
-        assert execute(stage, context).state == "complete"
+    context = stage_context(tmp_path, input={"files": ["spectra.npz"], "format": "histogram"})
+    completed(context, "ingest", "histogram")
     for i, name in enumerate(PARAMETERS):
         context.store.write_array(f"fit/{name}", truth[None, :, i])
     context.store.write_array("fit/likelihood_gap", np.full((1, len(truth)), 50.0))
     context.store.write_array("fit/fit_status", np.zeros((1, len(truth)), np.uint32))
     context.store.records.write(StageRecord("fit", 1, "truth", {}, keys=1))
     context.store.records.mark("fit", "truth", "0.0", {})
-    assert execute("ensemble", context).state == "complete"
+    completed(context, "ensemble")
     found = ensemble_of(context.store)
     shares = counts / np.array(n_samples)[:, None]
     first = found["dn"][0]
@@ -438,7 +388,7 @@ def test_ready_made_histograms(tmp_path: Path, n_samples: tuple[int, int]) -> No
         execute("electrons", context)
 
 
-def test_export(finished: StageContext, tmp_path: Path) -> None:
+def test_export(finished, tmp_path):
     from astropy.io import fits
     from tifffile import imread
 
@@ -463,7 +413,7 @@ def test_export(finished: StageContext, tmp_path: Path) -> None:
         assert {row["fit_status"]: row["pixels"] for row in csv.DictReader(file)}["poor_fit"] == "1"
 
 
-def test_export_says_what_is_wrong(finished: StageContext, tmp_path: Path) -> None:
+def test_export_says_what_is_wrong(finished, tmp_path):
     run = finished.store.path
     finished.store.write_config(dump_config(finished.config))
     with pytest.raises(ConfigError, match="xlsx cannot be written; choose from fits, tiff, npz, csv"):

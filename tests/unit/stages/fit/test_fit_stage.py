@@ -1,49 +1,31 @@
 """The stage fit: a tile, tiles of several samples, and the sensor as a whole."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
+from helpers.drawn_pixels import codes, histograms
+from helpers.stage_runs import completed, stage_context
 
 from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS, interval_names, variables_of
-from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.operators.fate import BranchingCounts
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.fit import together
 from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
-from pchem_pipeline.store.run_store import RunStore
 
 WEAK = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED))
 
 
-def sensor(folder: Path, noise: float, steps: float, n_frames: int, tile: int) -> StageContext:
+def sensor(folder, noise, steps, n_frames, tile):
     """A run up to its fit: H = 2, equal pixels."""
     values = {"quanta_exposure": 2.0, "dn_per_electron": steps, "analog_read_noise_e": noise}
     constant = {name: {"kind": "constant", "value": value} for name, value in values.items()}
-    simulate = {
-        "shape": [12, 14],
-        "n_frames": n_frames,
-        "format": "npy",
-        "parameters": {**constant, "correlations": [], "hot_pixels": {"fraction": 0}},
-    }
-    return fitted(folder, "simulate", run={"tile": tile, "store": f"run{tile}.zarr"}, simulate=simulate)
+    parameters = {**constant, "correlations": [], "hot_pixels": {"fraction": 0}}
+    simulate = {"shape": [12, 14], "n_frames": n_frames, "format": "npy", "parameters": parameters}
+    context = stage_context(folder, run={"tile": tile, "store": f"run{tile}.zarr"}, simulate=simulate)
+    return completed(context, "simulate", "ingest", "histogram", "fit")
 
 
-def fitted(folder: Path, *before: str, **sections: dict[str, Any]) -> StageContext:
-    """A run up to its fit, and what comes before it."""
-    config = RunConfig.model_validate(sections)
-    store = RunStore.create(folder / config.run.store)
-    context = StageContext(config, folder, store)
-    for stage in (*before, "ingest", "histogram", "fit"):
-        assert execute(stage, context).state == "complete"
-    return context
-
-
-def test_words_given_in_common_depend_on_no_tiling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_words_given_in_common_depend_on_no_tiling(tmp_path, monkeypatch):
     contexts = [sensor(tmp_path, 0.48, 7.0, 2000, tile) for tile in (8, 64)]
     words = [context.store.read("fit/fit_status") for context in contexts]
     np.testing.assert_array_equal(*words)
@@ -63,22 +45,21 @@ def test_words_given_in_common_depend_on_no_tiling(tmp_path: Path, monkeypatch: 
     np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0] & ~WEAK)
 
 
-def test_a_good_sensor_keeps_its_words(tmp_path: Path) -> None:
+def test_a_good_sensor_keeps_its_words(tmp_path):
     words = sensor(tmp_path, 0.3, 7.0, 4000, 64).store.read("fit/fit_status")
     assert not (words & WEAK).any()
     assert (words == 0).mean() > 0.95
 
 
 @pytest.mark.parametrize(("low", "high"), [(0, 200), (90, 255)])
-def test_samples_cut_off_at_a_code_that_no_file_states_are_censored(
-    tmp_path: Path, low: int, high: int
-) -> None:
+def test_samples_cut_off_at_a_code_that_no_file_states_are_censored(tmp_path, low, high):
     """A fifth of the samples at 200 DN, in 16 bits: the gain came out twelve times too large."""
     rng = np.random.default_rng(3)
-    electrons = rng.poisson(1.5, (1500, 12, 14)) + 0.3 * rng.standard_normal((1500, 12, 14))
-    dn = 100.0 + 2.0 * rng.standard_normal((12, 14)) + 40.0 * electrons
-    np.save(tmp_path / "frames.npy", np.rint(dn).clip(low, high).astype(np.uint16))
-    context = fitted(tmp_path, input={"files": ["frames.npy"]}, run={"store": "run.zarr"})
+    dn = codes(rng, (1500, 12, 14), 1.5, 40.0, 0.3, 100.0 + 2.0 * rng.standard_normal((12, 14)))
+    np.save(tmp_path / "frames.npy", dn.clip(low, high).astype(np.uint16))
+    context = completed(
+        stage_context(tmp_path, input={"files": ["frames.npy"]}), "ingest", "histogram", "fit"
+    )
     assert context.sensor.adc_limits == (low, high)
     for name, truth in (("quanta_exposure", 1.5), ("conversion_gain", 1 / 40.0)):
         value, error = (context.store.read(f"fit/{each}") for each in (name, f"{name}_stderr"))
@@ -99,16 +80,11 @@ def histogram(rng, exposure, branching=0.0):
     while born.any():
         born = rng.poisson(branching * born)
         electrons += born
-    codes = np.rint(BIAS + (electrons + NOISE * rng.standard_normal(born.shape)) / GAIN).astype(int)
-    origin, width = codes.min(), int(np.ptp(codes)) + 1
-    counts = np.apply_along_axis(lambda x: np.bincount(x - origin, minlength=width), 0, codes)
+    dn = np.rint(BIAS + (electrons + NOISE * rng.standard_normal(born.shape)) / GAIN).astype(int)
+    counts, origin = histograms(dn.reshape(FRAMES, -1).T)
     nothing = np.zeros(SHAPE, np.uint32)
-    return {
-        "counts": np.ascontiguousarray(np.moveaxis(counts, 0, -1)).astype(np.uint32),
-        "origin": np.full(SHAPE, origin, np.int32),
-        "under": nothing,
-        "over": nothing,
-    }
+    tile = {"counts": counts.reshape(*SHAPE, -1), "origin": origin.reshape(SHAPE).astype(np.int32)}
+    return {**tile, "under": nothing, "over": nothing}
 
 
 def tile(branching=0.0):

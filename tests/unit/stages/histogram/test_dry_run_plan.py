@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,7 +37,7 @@ print(json.dumps([peak_rss_bytes(), *[state.state for state in states]]))
 def camera(tmp_path):
     """Write a raw file of some frames of 256 x 256 pixels, repeated; return its YAML."""
 
-    def write(n_frames: int, **sections: object) -> Path:
+    def write(n_frames, **sections):
         rng = np.random.default_rng(5)
         shape = (32, 256, 256)
         block = np.rint(100 + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype("<u2")
@@ -56,7 +55,7 @@ def camera(tmp_path):
     return write
 
 
-def _run(path: Path) -> list:
+def _run(path):
     outcome = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(path)], capture_output=True, text=True, timeout=300
     )
@@ -146,13 +145,28 @@ def test_bands_are_sound(ny, tile, most, workers, together, data):
             assert (band.y0 <= t.y0 < t.y1 <= band.y1) == (t.key in band.keys)
 
 
-def test_memory_and_workers_decide_the_height():
-    tiles = tile_grid((512, 512), 64)
+@pytest.mark.parametrize(
+    ("most", "workers", "rows_per_read", "n_bands"),
+    [
+        (10_000, 1, 1, 1),
+        (10_000, 2, 1, 2),
+        (130, 2, 1, 4),
+        (1, 2, 1, 8),
+        # rows that are decoded together stay together
+        (10_000, 8, 128, 4),
+        (10_000, 8, 512, 1),
+        (10_000, 2, 500, 1),
+        # odd strips: each worker keeps its band, at the price of a few strips decoded twice
+        (10_000, 4, 27, 4),
+        (10_000, 4, 96, 4),
+        # unless memory forbids
+        (64, 8, 512, 8),
+    ],
+)
+def test_memory_workers_and_strips_decide_the_height(most, workers, rows_per_read, n_bands):
+    tiles = tile_grid((512, 128), 64)
     everything = {tile.key for tile in tiles}
-    assert len(plan_bands(tiles, everything, 10_000, 1)) == 1
-    assert len(plan_bands(tiles, everything, 10_000, 2)) == 2
-    assert len(plan_bands(tiles, everything, 130, 2)) == 4
-    assert len(plan_bands(tiles, everything, 1, 2)) == 8
+    assert len(plan_bands(tiles, everything, most, workers, rows_per_read=rows_per_read)) == n_bands
 
 
 def test_only_pending_rows_are_joined():
@@ -160,18 +174,6 @@ def test_only_pending_rows_are_joined():
     bands = plan_bands(tiles, {"2.0", "3.1", "4.0"}, 10_000, 1)
     assert [(band.y0, band.y1) for band in bands if "2.0" in band.keys] == [(128, 320)]
     assert len(bands) == 6
-
-
-def test_rows_that_are_decoded_together_stay_together():
-    tiles = tile_grid((512, 128), 64)
-    everything = {tile.key for tile in tiles}
-    assert len(plan_bands(tiles, everything, 10_000, 8, rows_per_read=128)) == 4
-    assert len(plan_bands(tiles, everything, 10_000, 8, rows_per_read=512)) == 1
-    # odd strips: each worker keeps its band, at the price of a few strips decoded twice
-    assert len(plan_bands(tiles, everything, 10_000, 4, rows_per_read=27)) == 4
-    assert len(plan_bands(tiles, everything, 10_000, 2, rows_per_read=500)) == 1
-    # unless memory forbids
-    assert len(plan_bands(tiles, everything, 64, 8, rows_per_read=512)) == 8
 
 
 def test_row_sums_of_tall_sensors_are_read_in_smaller_pieces():

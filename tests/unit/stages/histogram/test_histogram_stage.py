@@ -1,40 +1,38 @@
 """The histogram stage on a store: exact arrays, whatever the tiles, the memory and the workers."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from helpers.commands import assert_equal_arrays as assert_equal
+from helpers.drawn_pixels import codes
 from helpers.pickled_tasks import PickledTasks
-from numpy.typing import NDArray
+from helpers.stage_runs import completed, stage_context
 
 from pchem_pipeline.base.errors import StoreError
-from pchem_pipeline.compute.executor import Executor, SerialExecutor, make_executor
+from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
-from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.histogram.summaries import SummaryAccumulator
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.stage import Options, StageContext
+from pchem_pipeline.run.stage import Options
 from pchem_pipeline.runner.execute import execute
+from pchem_pipeline.stages.bands import plan_bands
 from pchem_pipeline.stages.histogram import arrays, histogram
 from pchem_pipeline.store.records import StageRecord
-from pchem_pipeline.store.run_store import RunStore
 
 FRAMES, NY, NX = 300, 150, 40
 
 
 @pytest.fixture(scope="module")
-def frames() -> NDArray[np.uint16]:
+def frames():
     rng = np.random.default_rng(30)
     bias = rng.normal(100, 6, (NY, NX))
-    shape = (FRAMES, NY, NX)
-    dn = np.rint(bias + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype(np.uint16)
+    dn = codes(rng, (FRAMES, NY, NX), 1.5, 11, 0.3, bias).astype(np.uint16)
     dn[250, 3, 4] = 60000  # glitches
     dn[100, 140, 39] = 4000
     return dn
 
 
-def ingest(store: RunStore, info: SensorInfo, frames: NDArray[np.uint16] | None) -> None:
+def ingest(store, info, frames):
     """What the ingest stage leaves behind."""
     info.write(store)
     if frames is not None:
@@ -44,35 +42,20 @@ def ingest(store: RunStore, info: SensorInfo, frames: NDArray[np.uint16] | None)
     store.records.mark("ingest", "abc", "all", {})
 
 
-def make_context(
-    folder: Path,
-    frames: NDArray[np.uint16],
-    *,
-    mode: str = "reference",
-    executor: Executor | None = None,
-    options: Options | None = None,
-    tile: int = 64,
-    **settings: object,
-) -> StageContext:
+def make_context(folder, frames, *, mode="reference", executor=None, options=None, tile=64, **settings):
     folder.mkdir(exist_ok=True)
-    source = folder / "frames.npy"
-    if not source.exists():
-        np.save(source, frames)
-    store = RunStore.create(folder / "run.zarr")
-    config = RunConfig.model_validate(
-        {
-            "run": {"tile": tile},
-            "input": {"files": ["frames.npy"], "mode": mode},
-            "histogram": {"block_frames": 128, "window_frames": 64, **settings},
-        }
-    )
-    if not store.records.read("ingest"):
+    if not (folder / "frames.npy").exists():
+        np.save(folder / "frames.npy", frames)
+    sections = {"run": {"tile": tile}, "input": {"files": ["frames.npy"], "mode": mode}}
+    sections["histogram"] = {"block_frames": 128, "window_frames": 64, **settings}
+    context = stage_context(folder, executor, options, **sections)
+    if not context.store.records.read("ingest"):
         info = SensorInfo("frames", *frames.shape, str(frames.dtype), None, None, mode, {})
-        ingest(store, info, frames if mode == "copy" else None)
-    return StageContext(config, folder, store, executor or SerialExecutor(), options=options or Options())
+        ingest(context.store, info, frames if mode == "copy" else None)
+    return context
 
 
-def contents(store: RunStore) -> dict[str, NDArray]:
+def contents(store):
     names = [
         *(f"histogram/{name}" for name in ("counts", *arrays.MAPS)),
         *(f"summary/{name}" for name in arrays.COVARIANCES),
@@ -83,15 +66,8 @@ def contents(store: RunStore) -> dict[str, NDArray]:
 
 
 @pytest.fixture(scope="module")
-def expected(tmp_path_factory: pytest.TempPathFactory, frames: NDArray[np.uint16]) -> dict[str, NDArray]:
-    context = make_context(tmp_path_factory.mktemp("expected"), frames)
-    assert execute("histogram", context).state == "complete"
-    return contents(context.store)
-
-
-def assert_equal(found: dict[str, NDArray], expected: dict[str, NDArray]) -> None:
-    for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+def expected(tmp_path_factory, frames):
+    return contents(completed(make_context(tmp_path_factory.mktemp("expected"), frames), "histogram").store)
 
 
 def test_arrays_are_right(frames, expected):
@@ -120,8 +96,7 @@ def test_arrays_are_right(frames, expected):
     ("mode", "tile", "memory"), [("copy", 64, 384), ("copy", 256, 16), ("reference", 8, 16), ("copy", 32, 16)]
 )
 def test_result_depends_on_neither_tile_nor_memory_nor_mode(tmp_path, frames, expected, mode, tile, memory):
-    context = make_context(tmp_path, frames, mode=mode, tile=tile, band_memory=memory)
-    assert execute("histogram", context).state == "complete"
+    context = completed(make_context(tmp_path, frames, mode=mode, tile=tile, band_memory=memory), "histogram")
     assert_equal(contents(context.store), expected)
     # large tiles are one file each, and read in parts
     counts = context.store.array("histogram/counts")
@@ -138,8 +113,7 @@ def test_result_depends_on_neither_tile_nor_memory_nor_mode(tmp_path, frames, ex
     ],
 )
 def test_tasks_can_go_to_threads_and_other_processes(tmp_path, frames, expected, mode, executor):
-    context = make_context(tmp_path, frames, mode=mode, executor=executor)
-    assert execute("histogram", context).state == "complete"
+    context = completed(make_context(tmp_path, frames, mode=mode, executor=executor), "histogram")
     assert_equal(contents(context.store), expected)
 
 
@@ -152,7 +126,7 @@ def test_tiles_then_the_rest(tmp_path, frames, expected):
         part.store.read("histogram/counts")[64:128], expected["histogram/counts"][64:128]
     )
     rest = make_context(tmp_path, frames)
-    assert execute("histogram", rest).state == "complete"
+    completed(rest, "histogram")
     assert_equal(contents(rest.store), expected)
 
 
@@ -166,21 +140,16 @@ def test_a_failed_band_leaves_the_others_and_resumes(tmp_path, frames, expected,
         return real(source, rows, step, threads=threads)
 
     monkeypatch.setattr(histogram, "FrameStream", breaks)
-    monkeypatch.setattr(histogram, "plan_bands", lambda *a: [*_single_bands(context)])
+    single = plan_bands(context.tiles(), {t.key for t in context.tiles()}, 1, 1)
+    monkeypatch.setattr(histogram, "plan_bands", lambda *a: single)
     state = execute("histogram", context)
     assert state.state == "failed"
     assert "odd rows" in state.why
     monkeypatch.undo()
     again = make_context(tmp_path, frames)
-    assert execute("histogram", again).state == "complete"
+    completed(again, "histogram")
     assert_equal(contents(again.store), expected)
     assert any("2 pixels have samples outside" in note for note in again.notes)
-
-
-def _single_bands(context: StageContext) -> list[histogram.Band]:
-    from pchem_pipeline.stages.bands import plan_bands
-
-    return plan_bands(context.tiles(), {t.key for t in context.tiles()}, 1, 1)
 
 
 def test_band_memory_does_not_make_it_stale(tmp_path, frames):
@@ -192,8 +161,7 @@ def test_band_memory_does_not_make_it_stale(tmp_path, frames):
 
 
 def test_without_summaries(tmp_path, frames, expected):
-    context = make_context(tmp_path, frames, summaries=False)
-    assert execute("histogram", context).state == "complete"
+    context = completed(make_context(tmp_path, frames, summaries=False), "histogram")
     np.testing.assert_array_equal(context.store.read("histogram/counts"), expected["histogram/counts"])
     assert not context.store.has("summary/row_sum")
     assert "summaries" in context.store.attributes("summary")["missing"]
@@ -201,8 +169,7 @@ def test_without_summaries(tmp_path, frames, expected):
 
 def test_too_little_memory_is_said(tmp_path, frames):
     wide = np.zeros((70, 3, 12000), np.uint8)
-    context = make_context(tmp_path, wide, tile=256, band_memory=16, window_frames=70)
-    assert execute("histogram", context).state == "complete"
+    context = completed(make_context(tmp_path, wide, tile=256, band_memory=16, window_frames=70), "histogram")
     assert any("more than histogram.band_memory" in note for note in context.notes)
 
 
@@ -216,11 +183,10 @@ def test_incomplete_input_is_refused(tmp_path, frames):
 def test_ready_made_histograms_are_copied(tmp_path):
     (tmp_path / "a.csv").write_text("DN,count\n10,5\n11,0\n12,7\n")
     (tmp_path / "b.csv").write_text("DN,count\n-3,1\n5,70000\n")
-    store = RunStore.create(tmp_path / "run.zarr")
-    config = RunConfig.model_validate({"input": {"files": ["a.csv", "b.csv"], "format": "histogram"}})
+    context = stage_context(tmp_path, input={"files": ["a.csv", "b.csv"], "format": "histogram"})
+    store = context.store
     ingest(store, SensorInfo("histograms", 70001, 1, 2, "uint32", None, None, "copy", {}), None)
-    context = StageContext(config, tmp_path, store)
-    assert execute("histogram", context).state == "complete"
+    completed(context, "histogram")
     counts = store.read("histogram/counts")
     assert counts.dtype == np.uint32
     np.testing.assert_array_equal(counts.sum(axis=2), [[12, 70001]])
@@ -238,7 +204,7 @@ def test_odd_frames_are_in_no_sums_and_empty_ones_in_no_histogram(tmp_path, fram
     odd[290, 3, 4:9] = 60_000  # the track of a particle is no odd frame
     context = make_context(tmp_path / "odd", odd)
     for _ in range(2):
-        assert execute("histogram", context).state == "complete"
+        completed(context, "histogram")
         left_out = [0, 1, 130, 131, 132]
         assert context.store.attributes("summary")["left_out"] == left_out
         found = contents(context.store)
@@ -272,7 +238,7 @@ def test_copies_are_in_no_histogram_and_odd_frames_in_no_spectrum(tmp_path, fram
         for each in (doubled, single)
     )
     for context in (found, expected):
-        assert execute("histogram", context).state == "complete"
+        completed(context, "histogram")
     odd = found.store.attributes("summary")["odd_frames"]
     assert (odd["copied"], odd["far"]) == (list(range(1, 200, 2)), [40, 42])
     one, other = (context.store.attributes("summary")["spectrum"] for context in (found, expected))
@@ -282,16 +248,15 @@ def test_copies_are_in_no_histogram_and_odd_frames_in_no_spectrum(tmp_path, fram
     np.testing.assert_array_equal(found.store.read("histogram/maximum"), doubled[::2].max(axis=0))
 
 
-def test_frames_that_are_all_equal_are_no_copies(tmp_path):
-    context = make_context(tmp_path, np.full((64, 16, 16), 7, np.uint16))
-    assert execute("histogram", context).state == "complete"
-    assert (context.store.read("histogram/counts").sum(axis=2) == 64).all()
-
-
-def test_a_sensor_that_is_often_at_one_level_has_no_empty_frames(tmp_path):
-    """Four quiet pixels: all at 100 DN in a third of the frames, as their histograms say."""
-    frames = 100 + (np.random.default_rng(4).random((400, 2, 2)) < 0.25).astype(np.uint16)
-    context = make_context(tmp_path, frames)
-    assert execute("histogram", context).state == "complete"
-    assert context.store.attributes("summary")["left_out"] == []
-    assert (context.store.read("histogram/counts").sum(axis=2) == 400).all()
+@pytest.mark.parametrize(
+    "frames",
+    [
+        np.full((400, 16, 16), 7, np.uint16),  # all equal: no copies
+        # four quiet pixels, all at 100 DN in a third of the frames, as their histograms say
+        100 + (np.random.default_rng(4).random((400, 2, 2)) < 0.25).astype(np.uint16),
+    ],
+)
+def test_frames_of_a_quiet_sensor_are_neither_copies_nor_empty(tmp_path, frames):
+    store = completed(make_context(tmp_path, frames), "histogram").store
+    assert store.attributes("summary")["left_out"] == []
+    assert (store.read("histogram/counts").sum(axis=2) == 400).all()

@@ -3,44 +3,33 @@
 import json
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
 import pytest
-import tifffile
-from astropy.io import fits
-from helpers.commands import arrays_of
-from numpy.typing import NDArray
+from helpers import layouts
+from helpers.commands import arrays_of, assert_equal_arrays
+from helpers.drawn_pixels import codes
+from helpers.stage_runs import completed, stage_context
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import make_executor
-from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
-from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.bands import cut_rows
 from pchem_pipeline.stages.histogram import memory, single_pass
-from pchem_pipeline.store.run_store import RunStore
 
 FRAMES, NY, NX = 300, 150, 40
 
 
 @pytest.fixture(scope="module")
-def frames() -> NDArray[np.uint16]:
+def frames():
     rng = np.random.default_rng(31)
-    shape = (FRAMES, NY, NX)
-    bias = rng.normal(100, 6, shape[1:])
-    dn = np.rint(bias + 11 * (rng.poisson(1.5, shape) + rng.normal(0, 0.3, shape))).astype(np.uint16)
+    dn = codes(rng, (FRAMES, NY, NX), 1.5, 11, 0.3, rng.normal(100, 6, (NY, NX))).astype(np.uint16)
     dn[200:, 7, 7] += 900  # a pixel that outgrows its window after the first block
     return dn
 
 
-def _npy(folder: Path, frames: NDArray[np.uint16]) -> None:
-    np.save(folder / "a.npy", frames)
-
-
-def _raw(folder: Path, frames: NDArray[np.uint16]) -> None:
+def _raw(folder, frames):
     """Big-endian raw frames, left-justified, behind a header, with padding, in two files."""
     for name, part in (("a.raw", frames[:140]), ("b.raw", frames[140:])):
         padded = b"".join((frame << 2).astype(">u2").tobytes() + b"-" * 10 for frame in part)
@@ -50,66 +39,51 @@ def _raw(folder: Path, frames: NDArray[np.uint16]) -> None:
         (folder / f"{name}.json").write_text(json.dumps(facts))
 
 
-def _tiff(folder: Path, frames: NDArray[np.uint16]) -> None:
-    for i, part in enumerate(np.array_split(frames, 5)):
-        tifffile.imwrite(folder / f"f{i}.tif", part, photometric="minisblack")
-
-
-def _zlib(folder: Path, frames: NDArray[np.uint16]) -> None:
-    tifffile.imwrite(folder / "f.tif", frames, photometric="minisblack", compression="zlib", rowsperstrip=50)
-
-
-def _fits(folder: Path, frames: NDArray[np.uint16]) -> None:
-    fits.PrimaryHDU(frames).writeto(folder / "f.fits")
-
-
-def _hdf5(folder: Path, frames: NDArray[np.uint16]) -> None:
-    with h5py.File(folder / "f.h5", "w") as file:
-        file.create_dataset("frames", data=frames, chunks=(10, NY, NX), compression="gzip")
-
-
-WRITERS = {"npy": _npy, "raw": _raw, "tiff": _tiff, "zlib": _zlib, "fits": _fits, "hdf5": _hdf5}
+WRITERS = {
+    "npy": lambda folder, frames: layouts.npy(folder / "a.npy", frames),
+    "raw": _raw,
+    "tiff": lambda folder, frames: [
+        layouts.tiff(folder / f"f{i}.tif", part) for i, part in enumerate(np.array_split(frames, 5))
+    ],
+    "zlib": lambda folder, frames: layouts.tiff(
+        folder / "f.tif", frames, compression="zlib", rowsperstrip=50
+    ),
+    "fits": lambda folder, frames: layouts.fits_image(folder / "f.fits", frames),
+    "hdf5": lambda folder, frames: layouts.hdf5(
+        folder / "f.h5", frames, chunks=(10, NY, NX), compression="gzip"
+    ),
+}
 #: suffixes of the files, without the sidecars
 SUFFIXES = (".npy", ".raw", ".tif", ".fits", ".h5")
 
 
-def make_context(folder: Path, store: str, *, workers: int = 2, **sections: dict[str, Any]) -> StageContext:
+def make_context(folder, store, *, workers=2, **sections):
     files = sorted(str(path) for path in folder.iterdir() if path.suffix in SUFFIXES)
-    content = {name: dict(values) for name, values in sections.items()}
-    content["input"] = {"files": files, "mode": "reference", **content.get("input", {})}
-    content["histogram"] = {"block_frames": 96, "window_frames": 64, **content.get("histogram", {})}
-    content["compute"] = {"workers": workers, **content.get("compute", {})}
-    config = RunConfig.model_validate(content)
-    return StageContext(config, folder, RunStore.create(folder / store), make_executor(config.compute))
+    content = {"input": {"files": files, "mode": "reference"}, "compute": {"workers": workers}}
+    content |= {"histogram": {"block_frames": 96, "window_frames": 64}, "run": {"store": store}}
+    content = {name: values | sections.get(name, {}) for name, values in content.items()}
+    return stage_context(folder, make_executor(ComputeSettings(**content["compute"])), **content)
 
 
-def run_both(context: StageContext) -> StageContext:
-    assert execute("ingest", context).state == "complete"
-    assert execute("histogram", context).state == "complete"
-    return context
+def run_both(context):
+    return completed(context, "ingest", "histogram")
 
 
-def contents(context: StageContext) -> dict[str, NDArray[Any]]:
-    return arrays_of(context.store.path, ("frames", "histogram", "summary"))
-
-
-def compare(folder: Path, **sections: dict[str, Any]) -> tuple[StageContext, StageContext]:
+def compare(folder, **sections):
     """Run both ways and compare everything that they leave."""
     apart = run_both(make_context(folder, "apart.zarr", **sections))
     once = make_context(folder, "once.zarr", **sections)
     single_pass.count_in_one_pass(once)
     assert set(once.prepared) == {"ingest", "histogram"}
     run_both(once)
-    expected, found = contents(apart), contents(once)
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
+    groups = ("frames", "histogram", "summary")
+    expected, found = (arrays_of(context.store.path, groups) for context in (apart, once))
+    assert_equal_arrays(found, expected)
+    for name in expected:
         assert once.store.array(name).chunks == apart.store.array(name).chunks
     assert once.sensor == apart.sensor
     for stage in ("ingest", "histogram"):
         left, right = apart.store.records.read(stage), once.store.records.read(stage)
-        assert left is not None
-        assert right is not None
         assert (left.fingerprint, left.content, left.notes) == (right.fingerprint, right.content, right.notes)
     return apart, once
 
@@ -138,7 +112,7 @@ def test_settings_change_nothing_in_that(tmp_path, frames, monkeypatch, name, se
     compare(tmp_path, **sections)
 
 
-def _bytes_read() -> int:
+def _bytes_read():
     facts = dict(line.split(": ") for line in Path("/proc/self/io").read_text().splitlines())
     return int(facts["rchar"])
 
@@ -163,7 +137,7 @@ def test_every_byte_is_read_once(tmp_path, frames, name):
 
 
 def test_where_memory_is_short_the_stages_do_it(tmp_path, frames, monkeypatch):
-    _npy(tmp_path, frames)
+    WRITERS["npy"](tmp_path, frames)
     context = make_context(tmp_path, "run.zarr", compute={"max_memory": 64})
     single_pass.count_in_one_pass(context)
     assert not context.prepared
@@ -204,7 +178,7 @@ def test_a_stopped_or_killed_pass_leaves_nothing_half_done(tmp_path, frames, nam
 
 
 def test_a_file_that_shrinks_meanwhile_is_said(tmp_path, frames, monkeypatch):
-    _npy(tmp_path, frames)
+    WRITERS["npy"](tmp_path, frames)
     context = make_context(tmp_path, "run.zarr")
     whole = (tmp_path / "a.npy").read_bytes()
     real = single_pass._create
@@ -220,7 +194,7 @@ def test_a_file_that_shrinks_meanwhile_is_said(tmp_path, frames, monkeypatch):
 
 
 def test_a_known_input_is_left_to_the_stages(tmp_path, frames):
-    _npy(tmp_path, frames)
+    WRITERS["npy"](tmp_path, frames)
     context = make_context(tmp_path, "run.zarr")
     run_both(context)
     context.store.records.forget("histogram")

@@ -1,7 +1,5 @@
 """What the inspector is given: which maps, which pixels, and how much of a large sensor."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from helpers.inspector_material import inspector_of, page_without_pictures, write_run
@@ -10,28 +8,26 @@ from helpers.report_material import report_data
 from pchem_pipeline.base import variables
 from pchem_pipeline.base.variables import Variable
 from pchem_pipeline.model.fit.status import MEANINGS
-from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages import report as page_report
 from pchem_pipeline.report.pages.page import Section
 from pchem_pipeline.stages.report import inspector
 from pchem_pipeline.stages.report.inspector import listed_maps
 from pchem_pipeline.stages.report.pixels import choose_inspected
-from pchem_pipeline.store.run_store import RunStore
 
 SHAPE = (12, 16)
 
 
 @pytest.fixture(scope="module")
-def data() -> ReportData:
+def data():
     return report_data(SHAPE, failed=0.1)
 
 
 @pytest.fixture
-def store(tmp_path: Path, data: ReportData) -> RunStore:
+def store(tmp_path, data):
     return write_run(tmp_path, data, n_frames=30)
 
 
-def test_the_list_is_that_of_the_store(store: RunStore) -> None:
+def test_the_list_is_that_of_the_store(store):
     store.write_array("summary/lag1_covariance", np.zeros(SHAPE))
     store.write_array("discrepancy/goodness", np.zeros((4, 4), np.float32))
     store.write_array("fit/bias", np.zeros(SHAPE))
@@ -45,9 +41,7 @@ def test_the_list_is_that_of_the_store(store: RunStore) -> None:
 
 
 @pytest.mark.parametrize("group", ["fit", "samples"])
-def test_a_new_array_appears_by_itself(
-    store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch, group: str
-) -> None:
+def test_a_new_array_appears_by_itself(store, data, monkeypatch, group):
     new = Variable(f"{group}/far_share", ("y", "x"), "float64", "DN", "share of samples far away")
     monkeypatch.setitem(variables.VARIABLES, new.path, new)
     store.write_array(new.path, np.full(SHAPE, 0.25))
@@ -58,7 +52,7 @@ def test_a_new_array_appears_by_itself(
     assert (shown.sample.exact[new.path] == 0.25).all()
 
 
-def test_words_and_kinds(store: RunStore) -> None:
+def test_words_and_kinds(store):
     store.write_array("maps/quality", np.zeros(SHAPE, np.uint8))
     store.write_array("truth/defect", np.zeros(SHAPE, np.uint8))
     entries = {each.path: each for each in listed_maps(store, SHAPE)}
@@ -71,9 +65,7 @@ def test_words_and_kinds(store: RunStore) -> None:
     assert entries["fit/goodness_p"].label == "goodness of fit p"
 
 
-def test_what_does_not_fit_is_left_to_the_server(
-    store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_does_not_fit_is_left_to_the_server(store, data, monkeypatch):
     monkeypatch.setattr(inspector, "_MAPS_BUDGET", 1500.0)
     shown = inspector_of(store, data.maps, data.fit)
     here = [each.path for each in shown.maps if each.packed is not None]
@@ -86,9 +78,7 @@ def test_what_does_not_fit_is_left_to_the_server(
     assert set(shown.sample.exact) == {*here, *alike}
 
 
-def test_of_many_pixels_a_page_holds_few_megabytes_and_little_is_tried(
-    store: RunStore, data: ReportData, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_many_pixels_a_page_holds_few_megabytes_and_little_is_tried(store, data, monkeypatch):
     monkeypatch.setattr(inspector, "_MOST_BYTES", 1500.0)
     monkeypatch.setattr(inspector, "_MANY_PIXELS", 0)
     tried = []
@@ -103,7 +93,7 @@ def test_of_many_pixels_a_page_holds_few_megabytes_and_little_is_tried(
     assert inspector._coarse(512 * 512)[1].startswith("a sixteenth")
 
 
-def test_the_charge_rate_costs_nothing(store: RunStore, data: ReportData) -> None:
+def test_the_charge_rate_costs_nothing(store, data):
     shown = inspector_of(store, data.maps, data.fit)
     entry = next(each for each in shown.maps if each.path == "maps/charge_rate")
     assert entry.packed is None
@@ -113,27 +103,27 @@ def test_the_charge_rate_costs_nothing(store: RunStore, data: ReportData) -> Non
 # -- which pixels ----------------------------------------------------------------------------
 
 
-def test_a_small_sensor_is_there_whole(data: ReportData) -> None:
-    chosen = choose_inspected(data.maps, data.fit, [(3, 4)], everything=4096, most=100)
-    assert chosen.index[0] == 3 * 16 + 4
-    assert sorted(chosen.index.tolist()) == list(range(12 * 16))
+def test_a_small_sensor_is_there_whole(data):
+    index, _ = choose_inspected(data.maps, data.fit, [(3, 4)], everything=4096, most=100)
+    assert index[0] == 3 * 16 + 4
+    assert sorted(index.tolist()) == list(range(12 * 16))
 
 
-def test_of_wide_histograms_fewer_pixels_are_there() -> None:
+def test_of_wide_histograms_fewer_pixels_are_there():
     data = report_data((60, 60))
-    assert choose_inspected(data.maps, data.fit, [], bins=2048).index.size == 3600
-    assert choose_inspected(data.maps, data.fit, [], bins=16384).index.size == 512
+    assert choose_inspected(data.maps, data.fit, [], bins=2048)[0].size == 3600
+    assert choose_inspected(data.maps, data.fit, [], bins=16384)[0].size == 512
 
 
-def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
+def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample():
     data = report_data((100, 120), failed=0.01)
     p = np.array(data.fit["goodness_p"])
     p[40, 50] = 1e-12
-    chosen = choose_inspected(
+    index, found = choose_inspected(
         data.maps, {**data.fit, "goodness_p": p}, [(1, 2)], [(5, 6)], everything=4096, most=1500
     )
-    reasons = dict(chosen.reasons)
-    assert chosen.index.size == np.unique(chosen.index).size == 1500
+    reasons = {each.words: each.pixels for each in found}
+    assert index.size == np.unique(index).size == 1500
     assert reasons["shown in the report"] == (1 * 120 + 2,)
     assert reasons["from the search for missing effects"] == (5 * 120 + 6,)
     assert reasons["poorest goodness of fit"][0] == 40 * 120 + 50
@@ -142,12 +132,13 @@ def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
     status = data.fit["fit_status"].ravel()
     for bit, words in MEANINGS.items():
         where = set(np.flatnonzero(status & int(bit)).tolist())
-        found = reasons.get(words, ())
-        assert set(found) <= where
-        assert len(found) == min(len(where), 40)
-    assert {i for _, where in chosen.reasons for i in where} <= set(chosen.index.tolist())
+        flagged = reasons.get(words, ())
+        assert set(flagged) <= where
+        assert len(flagged) == min(len(where), 40)
+    assert {i for where in reasons.values() for i in where} <= set(index.tolist())
+    assert {each.path for each in found if "bias" in each.words} >= {"maps/bias", "maps/bias_stderr"}
     # every tenth of the rows and columns has its share of the sample
-    for line, n in ((chosen.index // 120, 100), (chosen.index % 120, 120)):
+    for line, n in ((index // 120, 100), (index % 120, 120)):
         parts = np.histogram(line, bins=10, range=(0, n))[0]
         assert parts.min() > 100
 
@@ -155,13 +146,12 @@ def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample() -> None:
 # -- the first screen and the sections -------------------------------------------------------
 
 
-def test_a_new_section_is_one_entry_in_one_list(data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
-    def mine(material: page_report.Material) -> Section:
-        text = f"{material.data.title} & more"
-        return Section(id="mine", title="My <section>", kind="text", content=text)
-
-    monkeypatch.setattr(page_report, "PAGE", (*page_report.PAGE, mine, lambda _: None))
+def test_a_new_section_is_one_entry_in_one_list(data, monkeypatch):
+    mine, empty = Section("mine", "My <section>", kind="text"), Section("without", "content", empty="")
+    monkeypatch.setattr(page_report, "PAGE", (*page_report.PAGE, mine, empty))
+    monkeypatch.setitem(page_report.CONTENT, "text", lambda data: f"{data.title} & more")
     page = page_without_pictures(data)
     assert '<li><a href="#mine">My &lt;section&gt;</a></li>' in page
     assert '<h2 id="mine-heading">My &lt;section&gt;</h2>' in page
     assert "demo sensor &amp; more" in page
+    assert 'id="without"' not in page

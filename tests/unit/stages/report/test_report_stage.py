@@ -2,67 +2,52 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.inspector_material import page_without_pictures
+from helpers.stage_runs import completed, stage_context
 from helpers.written_fit import write_fit
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.compute.executor import beside
 from pchem_pipeline.config.load import dump_config
-from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.pages.report_json import report_numbers
 from pchem_pipeline.report.pages.summary import flags
 from pchem_pipeline.run.fingerprint import status
-from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.report.pixels import choose_pixels
 from pchem_pipeline.stages.report.report import gather
 from pchem_pipeline.stages.table import STAGES
-from pchem_pipeline.store.run_store import RunStore
 
 NY, NX, FRAMES = 16, 24, 200
 
 
-def make_context(folder: Path, settings: dict[str, object] | None = None, **run: object) -> StageContext:
-    config = RunConfig.model_validate(
-        {
-            "run": {"tile": 8, **run},
-            "simulate": {"shape": [NY, NX], "n_frames": FRAMES, "format": "npy"},
-            "report": settings or {},
-        }
-    )
-    return StageContext(config, folder, RunStore.create(folder / "run.zarr"))
+def make_context(folder, settings=None, **run):
+    simulate = {"shape": [NY, NX], "n_frames": FRAMES, "format": "npy"}
+    return stage_context(folder, run={"tile": 8, **run}, simulate=simulate, report=settings or {})
 
 
 @pytest.fixture(scope="module")
-def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def base(tmp_path_factory):
     """A run up to the ensemble; 3 pixels failed."""
-    folder = tmp_path_factory.mktemp("base")
-    context = make_context(folder)
-    for name in ("simulate", "ingest", "histogram"):
-        assert execute(name, context).state == "complete"
+    context = completed(make_context(tmp_path_factory.mktemp("base")), "simulate", "ingest", "histogram")
     status_map = np.zeros((NY, NX), dtype=np.uint16)
     status_map[2, :3] = int(FitStatus.TOO_FEW_BINS)
     status_map[5, 5] = int(FitStatus.POOR_FIT)
     write_fit(context, status_map, status_map == int(FitStatus.TOO_FEW_BINS))
-    for name in ("maps", "ensemble"):
-        assert execute(name, context).state == "complete"
-    return folder
+    return completed(context, "maps", "ensemble").base_dir
 
 
 @pytest.fixture
-def folder(base: Path, tmp_path: Path) -> Path:
+def folder(base, tmp_path):
     shutil.copytree(base, tmp_path / "run")
     return tmp_path / "run"
 
 
-def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
-    context = make_context(folder, title="My <sensor>")
-    assert execute("report", context).state == "complete"
+def test_a_run_gets_page_numbers_and_figures(folder):
+    context = completed(make_context(folder, title="My <sensor>"), "report")
     store = folder / "run.zarr"
     numbers = json.loads((store / "report.json").read_text())
     median = float(np.nanmedian(context.store.read("maps/read_noise_e")))
@@ -70,14 +55,8 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     assert numbers["ensemble"]["rmse"] == pytest.approx(context.store.attributes("ensemble")["rmse"])
     assert numbers["fit_status"]["n_failed"] == 3
     assert numbers["fit_status"]["reasons"]["poor_fit"]["pixels"] == 1
-    assert [row["stage"] for row in numbers["stages"]] == [
-        "simulate",
-        "ingest",
-        "histogram",
-        "fit",
-        "maps",
-        "ensemble",
-    ]
+    stages = ["simulate", "ingest", "histogram", "fit", "maps", "ensemble"]
+    assert [row["stage"] for row in numbers["stages"]] == stages
     assert numbers["inputs"][0]["name"].endswith(".npy")
     assert len(numbers["moments"]) >= 4
     html = (store / "report.html").read_text(encoding="utf-8")
@@ -86,7 +65,7 @@ def test_a_run_gets_page_numbers_and_figures(folder: Path) -> None:
     assert status(STAGES["report"], context).state == "complete"
 
 
-def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder: Path) -> None:
+def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder):
     context = make_context(folder, {"pixels": [[2, 1], [15, 23]]})
     data = gather(context.store, context.config, [])
     assert [(pixel.y, pixel.x) for pixel in data.pixels] == [(2, 1), (15, 23)]
@@ -96,7 +75,7 @@ def test_chosen_pixels_are_shown_and_wrong_ones_refused(folder: Path) -> None:
         execute("report", make_context(folder, {"pixels": [[16, 0]]}))
 
 
-def test_a_report_is_the_same_whoever_works_on_it(folder: Path) -> None:
+def test_a_report_is_the_same_whoever_works_on_it(folder):
     context = make_context(folder)
     context.store.write_config(dump_config(context.config))
     pages = []
@@ -110,7 +89,7 @@ def test_a_report_is_the_same_whoever_works_on_it(folder: Path) -> None:
     assert len(set(pages)) == 1  # without pytest's comparison
 
 
-def test_a_histogram_is_that_of_its_pixel(folder: Path) -> None:
+def test_a_histogram_is_that_of_its_pixel(folder):
     context = make_context(folder)
     pixel = gather(context.store, context.config, []).pixels[0]
     frames = np.load(next(folder.rglob("*.npy")))[:, pixel.y, pixel.x]
@@ -118,7 +97,7 @@ def test_a_histogram_is_that_of_its_pixel(folder: Path) -> None:
     np.testing.assert_array_equal(shown, np.sort(frames))
 
 
-def test_what_a_run_lacks_is_said(folder: Path) -> None:
+def test_what_a_run_lacks_is_said(folder):
     context = make_context(folder)
     context.store.delete("ensemble")
     for name in ("maps/charge_rate", "maps/charge_rate_stderr"):
@@ -128,7 +107,7 @@ def test_what_a_run_lacks_is_said(folder: Path) -> None:
     assert "input.integration_time" in data.missing["charge_rate"]
 
 
-def test_pixels_of_unfinished_tiles_are_not_called_good(folder: Path) -> None:
+def test_pixels_of_unfinished_tiles_are_not_called_good(folder):
     context = make_context(folder)
     for name in ("maps/conversion_gain", "maps/read_noise_e"):
         values = context.store.read(name)
@@ -141,10 +120,8 @@ def test_pixels_of_unfinished_tiles_are_not_called_good(folder: Path) -> None:
     assert (counted["n_unfitted"], counted["n_failed"]) == (64, 3 + 64)
 
 
-def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(figure: object) -> None:
+def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(folder, monkeypatch):
+    def fail(figure):
         raise MemoryError("no room to draw")
 
     monkeypatch.setattr("pchem_pipeline.stages.report.report.draw_figure", fail)
@@ -154,7 +131,7 @@ def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(
     assert not (folder / "run.zarr" / "report.html").exists()
 
 
-def test_the_good_pixel_nearest_to_a_corner_of_all_good_ones_is_chosen() -> None:
+def test_the_good_pixel_nearest_to_a_corner_of_all_good_ones_is_chosen():
     rng = np.random.default_rng(2)
     noise = rng.standard_normal((80, 70))
     exposure = np.exp(
@@ -174,7 +151,7 @@ def test_the_good_pixel_nearest_to_a_corner_of_all_good_ones_is_chosen() -> None
         assert distance[(y - 20) * 70 + x] == pytest.approx(distance.min())
 
 
-def test_few_or_no_pixels_to_choose_from() -> None:
+def test_few_or_no_pixels_to_choose_from():
     nan, one = np.full((2, 2), np.nan), np.array([[0.3, np.nan], [0.2, np.nan]])
     words = np.array([[2, 2], [8, 2]], dtype=np.uint16)
     assert choose_pixels(nan, nan, words) == [("no fit", 0, 0), ("no fit", 1, 0)]
