@@ -24,8 +24,8 @@ _ASKED = 2.0e-6
 _AMBIGUOUS = 4.0
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
 _LEAST, _OF_NULL = 170.0, 6.0
-#: Shares of that which are kept for measuring what no effect explains, and for the choice among the sets.
-_KEPT, _FOR_CHOICE = 0.25, 0.2
+#: Shares of that: kept for measuring what no effect explains, and besides for the choice among the sets.
+_KEPT, _FOR_CHOICE = 0.25, 0.3
 #: The same that is left for fits, whatever it cost to find out what candidates would do.
 _FOR_FITS = 0.4
 
@@ -79,7 +79,7 @@ class Effort:
         """Set the limit, now that the null distribution has been paid."""
         limit = math.inf if self.share is None else self.share * max(_LEAST, _OF_NULL * self.spent)
         self.kept, self.for_choice = _KEPT * limit, _FOR_CHOICE * limit
-        self.most = self.spent + (1.0 - _KEPT - _FOR_CHOICE) * limit
+        self.most = self.spent + (1.0 - _KEPT) * limit
         # one that was asked to be short is as short as that
         short = self.share is not None and self.share < 1.0
         self.for_fits = 0.0 if short else _FOR_FITS * limit

@@ -30,8 +30,8 @@ def test_work_is_counted_and_refused_once_the_limit_is_reached():
     with pytest.raises(EffortSpentError, match="b"):
         effort.check("b")
     assert effort.tried == {"row_noise"}
-    # a quarter is kept for what is measured, a fifth for the choice
-    effort.spent = null + 0.6 * 6.0 * null
+    # a quarter is kept for what is measured
+    effort.spent = null + 0.8 * 6.0 * null
     with pytest.raises(EffortSpentError):
         effort.check("c")
     effort.measure()
@@ -63,9 +63,9 @@ def test_however_much_the_candidates_cost_some_is_left_to_fit_them():
     """Of a strong glow in bursts 115 guesses were simulated, and none was fitted."""
     effort = Effort(1.0)
     effort.begin()
-    limit = effort.most + effort.kept + effort.for_choice
+    limit = effort.most + effort.kept
     effort.leave_for_fits()
-    assert effort.most + effort.kept + effort.for_choice == limit  # enough is left
+    assert effort.most + effort.kept == limit  # enough is left
     effort.spent = effort.most + 50.0
     effort.leave_for_fits()
     effort.check("a candidate was fitted")
