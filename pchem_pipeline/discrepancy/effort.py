@@ -93,7 +93,7 @@ class Effort:
         self.most, self.kept = max(self.most, self.spent) + self.kept, 0.0
 
     def choose(self) -> None:
-        """Likewise for the choice: a set that is not found for it would have cost all of the search."""
+        """Let what was kept for the choice among the sets be spent, all of it."""
         self.most, self.for_choice = max(self.most, self.spent) + self.for_choice, 0.0
 
     def simulate(self, samples: int, pixels: int, fits: int) -> None:

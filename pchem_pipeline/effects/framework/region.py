@@ -36,7 +36,6 @@ from pydantic import (
 from pchem_pipeline.base.settings import Section
 
 if TYPE_CHECKING:
-    pass
     from pchem_pipeline.base.arrays import BoolArray, IntArray
 
 Quadrant = Literal["top left", "top right", "bottom left", "bottom right"]

@@ -112,7 +112,8 @@ class Simulations:
             NotFittedError: hardly a pixel can be fitted with the model.
         """
         if model not in self.known:
-            fit, (first, sensor), seen = self.refit(model), self._first, self.frames.seen_stack[:1]
+            (first, sensor), seen = self._first, self.frames.seen_stack[:1]
+            fit = first if model == self.given else self.refit(model)
             others = tuple(effect for effect in model if effect.replacement(seen) is None)
             if others != model:
                 sensor = self._of_replaced(fit, model, others)
