@@ -1,0 +1,85 @@
+"""The numbers of an effect that single pixels show: levels beside their peaks, as of a trap.
+
+Such an effect is in few pixels, each with an amplitude and a weight of its own
+(:attr:`~pchem_pipeline.model.law.sample_law.SampleLaw.free_satellites`). The pixels that the model does not
+fit are fitted with levels of every amplitude; what is found in them tells the amplitudes and weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
+from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.histogram.count import histogram_frames
+
+#: Amplitudes that are tried, e-: a fit refines the best one.
+_AMPLITUDES = tuple(0.35 * 1.35**i for i in range(10))
+_MOST_PIXELS = 256
+_FAR_SHARE = 0.1  # of what the likeliest pattern explains, by which another one is far behind it
+
+
+def with_pixel_levels(
+    frames: NDArray[np.unsignedinteger],
+    maps: PixelMaps,
+    present: Sequence[Effect],
+    guesses: Mapping[str, Sequence[Effect]],
+) -> dict[str, list[Effect]]:
+    """Return effects with the numbers that the levels of single pixels tell, by tag, the likeliest first.
+
+    Those without any levels in the pixels' law are left out.
+
+    Args:
+        frames: (frame, y, x), DN.
+        maps: of their pixels under the model.
+        present: effects of the model, which act everywhere.
+        guesses: effects by tag.
+    """
+    usable = np.flatnonzero(maps.usable.ravel())
+    start = np.stack([values.ravel()[usable] for values in maps.maps], axis=1)
+    near = pixel_maps(list(start.T), np.ones(usable.size, np.bool_))
+    laws = {}
+    for guess in (g for own in guesses.values() for g in own):
+        try:
+            law = sample_law((*present, guess), near)
+        except ConfigError:
+            continue
+        if law.free_satellites:
+            laws[guess] = replace(law, free_satellites=_AMPLITUDES)
+    if not laws:
+        return {}
+    histograms = histogram_frames(frames.reshape(len(frames), 1, -1)[:, :, usable])
+    counts, origin = histograms.counts[0], histograms.origin[0]
+    plain = fit_histograms(counts, origin, law=sample_law(present, near), start=start)
+    poor = np.flatnonzero(plain.goodness_p < SIGNIFICANCE)
+    if not poor.size:
+        return {}
+    some = poor[:: -(-poor.size // _MOST_PIXELS)]
+    found: dict[str, list[tuple[float, Effect]]] = {}
+    fits = {}
+    for guess, law in laws.items():
+        if law.free_satellite_pattern not in fits:
+            own = law.of(some)
+            fits[law.free_satellite_pattern] = fit_histograms(
+                counts[some], origin[some], law=own, start=start[some]
+            )
+        fit = fits[law.free_satellite_pattern]
+        has = fit.satellite_weight > 0.0
+        if has.any():
+            rise = float(np.nansum(fit.log_likelihood - plain.log_likelihood[some]))
+            share = float(has.mean()) * poor.size / usable.size
+            levels = fit.satellite_amplitude_e[has], fit.satellite_weight[has]
+            found.setdefault(guess.tag, []).append((rise, guess.with_levels(*levels, share)))
+    least = (1.0 - _FAR_SHARE) * max((rise for own in found.values() for rise, _ in own), default=0.0)
+    return {
+        tag: [effect for rise, effect in sorted(own, key=lambda one: -one[0]) if rise >= least]
+        for tag, own in found.items()
+    }
