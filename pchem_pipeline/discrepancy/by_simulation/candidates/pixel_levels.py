@@ -13,12 +13,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.histogram.count import histogram_frames
 
 #: Amplitudes that are tried, e-: a fit refines the best one.
@@ -32,6 +33,7 @@ def with_pixel_levels(
     maps: PixelMaps,
     present: Sequence[Effect],
     guesses: Mapping[str, Sequence[Effect]],
+    effort: Effort,
 ) -> dict[str, list[Effect]]:
     """Return effects with the numbers that the levels of single pixels tell, by tag, the likeliest first.
 
@@ -42,6 +44,7 @@ def with_pixel_levels(
         maps: of their pixels under the model.
         present: effects of the model, which act everywhere.
         guesses: effects by tag.
+        effort: counts the work.
     """
     usable = np.flatnonzero(maps.usable.ravel())
     start = np.stack([values.ravel()[usable] for values in maps.maps], axis=1)
@@ -50,7 +53,8 @@ def with_pixel_levels(
     for guess in (g for own in guesses.values() for g in own):
         try:
             law = sample_law((*present, guess), near)
-        except ConfigError:
+        # one of a plug-in may raise anything, which is noted where it is fitted
+        except Exception:
             continue
         if law.free_satellites:
             laws[guess] = replace(law, free_satellites=_AMPLITUDES)
@@ -64,14 +68,13 @@ def with_pixel_levels(
         return {}
     some = poor[:: -(-poor.size // _MOST_PIXELS)]
     found: dict[str, list[tuple[float, Effect]]] = {}
-    fits = {}
+    fits: dict[tuple[tuple[float, float], ...], FitResult] = {}
     for guess, law in laws.items():
-        if law.free_satellite_pattern not in fits:
-            own = law.of(some)
-            fits[law.free_satellite_pattern] = fit_histograms(
-                counts[some], origin[some], law=own, start=start[some]
-            )
-        fit = fits[law.free_satellite_pattern]
+        fit = fits.get(law.free_satellite_pattern)
+        if fit is None:
+            fit = fit_histograms(counts[some], origin[some], law=law.of(some), start=start[some])
+            effort.refit(some.size, law.components, float(fit.n_iterations.mean()), ())
+            fits[law.free_satellite_pattern] = fit
         has = fit.satellite_weight > 0.0
         if has.any():
             rise = float(np.nansum(fit.log_likelihood - plain.log_likelihood[some]))

@@ -274,7 +274,9 @@ class Histograms:
             }
             by, samples = self._of(place) if told else None, self._samples(place)
             numbers = {} if by is None else _likeliest(by, told)
-            levels = {} if samples is None else with_pixel_levels(*samples, self.present, anywhere)
+            levels = (
+                {} if samples is None else with_pixel_levels(*samples, self.present, anywhere, self.effort)
+            )
             for tag, effects in (numbers | levels).items():
                 likely[tag, place] = [e.at_place(place.region, place.when) for e in effects]
                 self.told += likely[tag, place] if tag in numbers else []
