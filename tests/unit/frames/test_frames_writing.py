@@ -40,10 +40,8 @@ def test_round_trip(tmp_path, format, dtype, size, per_file):
             write_frames(format, tmp_path / "a", blocks(stack, size), SHAPE, dtype)
         return
     paths = [
-        write_frames(
-            format, tmp_path / "new" / f"{i:02d}", blocks(part, size), part.shape, dtype, integration_time=0.5
-        )
-        for i, part in enumerate(blocks(stack, per_file))
+        write_frames(format, tmp_path / f"new/{i:02d}", blocks(p, size), p.shape, dtype, integration_time=0.5)
+        for i, p in enumerate(blocks(stack, per_file))
     ]
     assert not list(tmp_path.rglob(".partial*"))
     reader = open_frames(InputSettings(files=tuple(str(path) for path in paths)), tmp_path)
