@@ -191,14 +191,13 @@ def regions_of(data: DiscrepancyData) -> dict[str, Region]:
 
 
 def largest_maps(
-    arrays: Mapping[str, NDArray[Any]], regions: Mapping[str, Region] | None = None, most: int = 3
+    arrays: Mapping[str, NDArray[Any]], regions: Mapping[str, Region] | None = None
 ) -> list[PixelMap]:
-    """Return the maps with a deviating region, then goodness of fit, then the most deviating ones.
+    """Return three maps: those with a deviating region, then goodness of fit, then the most deviating ones.
 
     Args:
         arrays: group ``discrepancy`` of the store.
         regions: deviating part of the sensor by map.
-        most: largest number of maps.
     """
     regions = regions or {}
     named = _named_maps(arrays)
@@ -207,7 +206,7 @@ def largest_maps(
     first = [maps.pop("goodness")] if "goodness" in maps else []
     # of neighbours only maps with a region: uniform correlations show better in rows and columns
     others = [each for name, each in maps.items() if np.isfinite(each.far) and name not in PAIRS]
-    return (placed + first + sorted(others, key=lambda each: -each.far))[:most]
+    return (placed + first + sorted(others, key=lambda each: -each.far))[:3]
 
 
 def _named_maps(arrays: Mapping[str, NDArray[Any]]) -> dict[str, tuple[str, NDArray[Any]]]:

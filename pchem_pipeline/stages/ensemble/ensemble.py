@@ -189,7 +189,7 @@ def run(context: StageContext) -> None:
     codes = {} if frames is None or everything else _codes(context)
     job = _Job(context.config, sensor, axes, numbered, frames, codes, source, truth, effects, limits)
     rows = max(1, BAND_BYTES // (sensor.nx * fitted.bins * 4))
-    bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
+    bands = tiles if source is None else tile_bands(context, rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
     counted = fitted.bins * store.array("histogram/counts").dtype.itemsize
     held = context.tile_pixels * (2 * counted + 40 * 8)  # with the maps of a tile
