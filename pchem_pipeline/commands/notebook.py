@@ -264,11 +264,10 @@ class Run:
         """
         from pchem_pipeline.commands.apply.apply import apply_to_frames
         from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
-        from pchem_pipeline.run.stage import Options
-        from pchem_pipeline.runner.session import Command
+        from pchem_pipeline.run.stage import Command
 
         files = [frames] if isinstance(frames, (str, os.PathLike)) else list(frames)
-        command = Command(Options(force=force), quiet=True, progress="off")
+        command = Command(force=force, quiet=True, progress="off")
         wanted = ApplySettings(kinds_of(what), prior)
         [place] = apply_to_frames(self._target, [str(f) for f in files], Path(output), wanted, command)
         return lazy_dataset(RunStore.open(place), "applied")
@@ -295,7 +294,7 @@ class Run:
             PchEmError: the frames are gone or too few, or another command works on the run.
         """
         from pchem_pipeline.commands.discrepancy import find_and_add
-        from pchem_pipeline.runner.session import Command
+        from pchem_pipeline.run.stage import Command
 
         command = Command(progress=progress, quiet=progress == "off")
         find_and_add(self._target, command, refit=refit, effort=effort)

@@ -28,7 +28,7 @@ from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, S
 from pchem_pipeline.compute.memory import BASE_BYTES, affordable
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.model_versions import ModelVersion, model_in_force
-from pchem_pipeline.run.progress import Reporter, telling_parts
+from pchem_pipeline.run.progress import ProgressMode, Reporter, telling_parts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.store.files import is_fatal
@@ -77,20 +77,32 @@ Task = Callable[[AnyUnit, RunStore], Mapping[str, Any] | None]
 
 
 @dataclass(frozen=True)
-class Options:
-    """What the command line adds to the configuration.
+class Command:
+    """What the command line asked for, beside the configuration.
 
     Attributes:
         force: do it again.
         dry_run: say what would be done.
         roi: only the tiles of this region.
         settings: of a stage on demand, in place of those of its section; None: those of its last result.
+        workers: overrides ``compute.workers``.
+        backend: overrides ``compute.backend``.
+        progress: auto | on | off.
+        quiet: say warnings only.
+        log_json: file for JSON lines.
+        max_memory: overrides ``compute.max_memory``, MiB.
     """
 
     force: bool = False
     dry_run: bool = False
     roi: tuple[int, int, int, int] | None = None
     settings: tuple[tuple[str, Any], ...] | None = None
+    workers: int | None = None
+    backend: str | None = None
+    progress: ProgressMode = "auto"
+    quiet: bool = False
+    log_json: Path | None = None
+    max_memory: int | None = None
 
 
 @functools.lru_cache(maxsize=8)
@@ -178,7 +190,7 @@ class StageContext:
         executor: who does the work.
         reporter: where to say what happens.
         stop: raised signals; checked between units.
-        options: of the command line.
+        command: of the command line.
         stage: name of the running stage.
         fingerprint: of the running stage.
         fresh: True where the stage starts anew and must create its arrays.
@@ -199,7 +211,7 @@ class StageContext:
     executor: Executor = field(default_factory=SerialExecutor)
     reporter: Reporter = field(default_factory=lambda: Reporter("off", quiet=True))
     stop: StopRequest = field(default_factory=StopRequest)
-    options: Options = field(default_factory=Options)
+    command: Command = field(default_factory=Command)
     stage: str = ""
     fingerprint: str = ""
     fresh: bool = True
@@ -309,9 +321,9 @@ class StageContext:
 
     def selected(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:
         """Return the units that ``--roi`` chooses (all of them without it)."""
-        if self.options.roi is None:
+        if self.command.roi is None:
             return list(units)
-        chosen = {tile.key for tile in roi_tiles(self.options.roi, self.tiles())}
+        chosen = {tile.key for tile in roi_tiles(self.command.roi, self.tiles())}
         return [unit for unit in units if unit is WHOLE or chosen & set(markers(unit))]
 
     def pending(
@@ -323,7 +335,7 @@ class StageContext:
         """
         done = self.store.records.done(self.stage, self.fingerprint)
         chosen = self.selected(units) if by_tiles else list(units)
-        if self.options.force and not resumes and (by_tiles or self.options.roi is None):
+        if self.command.force and not resumes and (by_tiles or self.command.roi is None):
             return chosen
         return [unit for unit in chosen if not set(markers(unit)) <= done]
 

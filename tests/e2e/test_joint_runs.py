@@ -15,14 +15,14 @@ from pchem_pipeline.commands.new_run import find_joint
 from pchem_pipeline.commands.notebook import open_run
 from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.discrepancy.verdict import read_verdict
-from pchem_pipeline.run.stage import Options
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages, run_status, up_to
+from pchem_pipeline.runner.session import run_stages, run_status, up_to
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.stages.table import pipeline, pipeline_of
 from pchem_pipeline.store.run_store import RunStore
 
-QUIET = Command(Options(), quiet=True, progress="off")
+QUIET = Command(quiet=True, progress="off")
 PIPELINE = pipeline()[1:]
 
 CAMERA = """

@@ -44,8 +44,8 @@ from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import stop_on_signals
-from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.runner.session import Command, with_overrides
+from pchem_pipeline.run.stage import Command, StageContext
+from pchem_pipeline.runner.session import with_overrides
 from pchem_pipeline.store.files import fingerprint_of
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import local_path, place_of
@@ -105,7 +105,7 @@ def apply_to_frames(
         if wanted.format != "zarr" and _is_done(output, made.content, command):
             reporter.info(f"apply: {output} is up to date")
             return sorted(output.iterdir())
-        store, fresh = _output_store(place, made.content, force=command.options.force)
+        store, fresh = _output_store(place, made.content, force=command.force)
         stack.enter_context(store.locked())
         stop = stack.enter_context(stop_on_signals())
         executor = make_executor(target.config.compute, reporter.warning, stop.check)
@@ -221,9 +221,9 @@ def _is_done(output: Path, content: dict[str, Any], command: Command) -> bool:
     if output.is_dir() and not any(output.iterdir()):
         return False
     there = read_json(output / "provenance.json") if output.is_dir() else None
-    if there == content and not command.options.force:
+    if there == content and not command.force:
         return True
-    if not command.options.force or (there or {}).get("product") != _PRODUCT:
+    if not command.force or (there or {}).get("product") != _PRODUCT:
         raise _exists(output, ours=(there or {}).get("product") == _PRODUCT)
     return False
 
