@@ -334,10 +334,7 @@ class Run:
         for y, x in places:
             if not (0 <= y < ny and 0 <= x < nx):
                 raise ConfigError(f"pixel y = {y}, x = {x} is outside the sensor of {ny} x {nx} pixels")
-        maps = self._arrays(
-            "maps", [f"{n}{end}" for n in (*PARAMETERS, "read_noise_e") for end in ("", "_stderr")]
-        )
-        fit = self._arrays("fit", ["fit_status", "goodness_p"])
+        maps, fit = self.group("maps"), self.group("fit")  # which read the pixels asked for alone
         chosen = [("", int(y), int(x)) for y, x in places]
         index = pixel_index(chosen, self.shape)
         histograms = read_histograms(self._store, index, self.shape)
@@ -346,11 +343,6 @@ class Run:
         masses = bin_masses(columns, histograms, FittedModel.read(self._store).at(index))
         found = pixel_fits(chosen, maps, fit, histograms, masses, channel=channel)
         return [Pixel(**vars(each)) for each in found]
-
-    def _arrays(self, group: str, names: Sequence[str]) -> Mapping[str, Any]:
-        """Return arrays of the store that read the pixels asked for alone."""
-        found = self.group(group)
-        return {name: found[name] for name in names}
 
     # -- figures ------------------------------------------------------------------------------
 

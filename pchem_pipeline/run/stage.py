@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
+from pchem_pipeline.base.arrays import Arrays
 from pchem_pipeline.base.errors import InputError, StoreError, error_words
 from pchem_pipeline.base.variables import LENGTHS, VARIABLES
 from pchem_pipeline.compute.environment import available_memory
@@ -122,7 +123,7 @@ class MarkedTask:
     store: Path
     stage: str
     fingerprint: str
-    task: Task[Any]
+    task: Task[Any] | None
     tell: Callable[[str, float], None] | None = None
     overtaken: bool = False
 
@@ -131,7 +132,7 @@ class MarkedTask:
         store = open_store(self.store)
         with working(store.records, self.stage, self.fingerprint if self.overtaken else None):
             with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
-                summary = dict(self.task(unit, store) or {})
+                summary = {} if self.task is None else dict(self.task(unit, store) or {})
             check_work(self.store)
             for key in markers(unit):
                 store.records.mark(self.stage, self.fingerprint, key, summary)
@@ -149,10 +150,6 @@ class Prepared:
 
     frames: FrameSequence
     clock: tuple[float, float] | None = None
-
-
-def nothing_left(unit: Any, store: RunStore) -> None:
-    """Do nothing: the task of units whose work was done beforehand."""
 
 
 def allowed_bytes(config: RunConfig, workers: int) -> int:
@@ -319,6 +316,12 @@ class StageContext:
                     attributes=attributes,
                 )
 
+    def create_like(self, arrays: Arrays) -> None:
+        """Make arrays over the sensor that are, beside y and x, as those of some of its pixels, by path."""
+        for path, values in arrays.items():
+            lengths = dict(zip(VARIABLES[path].dims, values.shape, strict=True))
+            self.create(path, lengths={dim: n for dim, n in lengths.items() if dim not in ("y", "x")})
+
     def selected(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:
         """Return the units that ``--roi`` chooses (all of them without it)."""
         if self.command.roi is None:
@@ -342,7 +345,7 @@ class StageContext:
     def run_units(
         self,
         units: Sequence[AnyUnit],
-        task: Task[AnyUnit],
+        task: Task[AnyUnit] | None = None,
         *,
         unit_name: str = "tile",
         needs: str | None = None,
@@ -350,7 +353,7 @@ class StageContext:
         total: int | None = None,
         unit_bytes: int = 0,
     ) -> dict[str, dict[str, Any]]:
-        """Run ``task`` on every unit that is chosen and not done yet, and mark each.
+        """Run ``task`` on every unit that is chosen and not done yet, and mark each; None: only mark them.
 
         Units that raise are kept in :attr:`failed` and stop nothing, except errors that would hit
         every unit (a full disk, vanished camera files). With ``needs``, an upstream stage of the same

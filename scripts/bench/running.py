@@ -101,8 +101,7 @@ from pathlib import Path
 from typing import Any
 from pchem_pipeline.compute.environment import prepare_environment
 prepare_environment()
-from pchem_pipeline.run.stage import Command
-from pchem_pipeline.runner.session import run_stages
+from pchem_pipeline.runner.session import Command, run_stages
 from pchem_pipeline.run.target import find_run
 run_stages(find_run(Path(sys.argv[1])), sys.argv[2:], Command(quiet=True))
 """

@@ -32,7 +32,7 @@ from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.model.histogram.odd_frames import frame_words
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
-from pchem_pipeline.run.stage import WHOLE, Named, StageContext, nothing_left
+from pchem_pipeline.run.stage import WHOLE, Named, StageContext
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import (
@@ -257,7 +257,7 @@ def _run_histograms(context: StageContext, before: Sequence[Effect], tell: Calla
         samples, context.config.discrepancy, width=context.sensor.nx, model=model, tell=tell
     )
     _write(context, found, before)
-    context.run_units([WHOLE], nothing_left, by_tiles=False)
+    context.run_units([WHOLE], by_tiles=False)
 
 
 def _samples(context: StageContext) -> list[SampleHistograms]:

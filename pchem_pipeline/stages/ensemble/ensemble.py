@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import PARAMETERS
@@ -34,7 +34,7 @@ from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.progress import parts_told
-from pchem_pipeline.run.stage import StageContext, markers, nothing_left
+from pchem_pipeline.run.stage import StageContext, markers
 from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
 from pchem_pipeline.stages.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
@@ -182,7 +182,7 @@ def run(context: StageContext) -> None:
     if axes is None:
         if ready:
             context.note("no pixel has a value, so there is no ensemble; for the reasons see fit_status")
-        context.run_units(tiles, nothing_left, needs="fit")
+        context.run_units(tiles, needs="fit")
         return
     _create(context, axes, len(tiles))
     numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
@@ -286,16 +286,16 @@ def _sum_tile(
         job: what is summed.
         chosen: histograms of the chosen frames; None: all frames.
     """
-    maps = [store.read(f"fit/{name}", tile.region) for name in PARAMETERS]
-    origin, low, high = _ranges(store, tile.region)
+    fit, histogram = (store.at(tile.region, group) for group in ("fit", "histogram"))
+    maps = [fit[name] for name in PARAMETERS]
+    origin, low, high = (histogram[name].astype(np.int64) for name in _HISTOGRAM)
     codes = None if chosen is None else job.codes.get(tile.key)
     if codes is None:
-        read = store.read_arrays("histogram", ("counts", "under", "over"), tile.region)
-        counted = PixelHistograms(read["counts"], origin, read["under"] + read["over"])
+        counted = PixelHistograms(histogram["counts"], origin, histogram["under"] + histogram["over"])
     else:  # only the number of the samples matters
         outside = np.full(origin.shape, job.sensor.n_frames, np.uint32)
         counted = PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
-    errors = _errors(store, tile)
+    errors = _errors(fit, tile, job.sensor.shape)
     rows = []
     for part in parts_told(tile.parts(store.array("histogram/counts").shape[2])):
         everything = counted.of(part).cut(low[part], high[part])
@@ -330,19 +330,13 @@ def on_axis(content: dict[str, Any], axis: DnAxis) -> tuple[IntArray, int]:
     return found, int(samples[~inside].sum()) + int(content["outside"])
 
 
-def _ranges(store: RunStore, region: tuple[slice, slice]) -> list[IntArray]:
-    """Return DN of bin 0, smallest and largest DN of the pixels of a region, (y, x)."""
-    found = store.read_arrays("histogram", _HISTOGRAM, region)
-    return [values.astype(np.int64) for values in found.values()]
-
-
-def _errors(store: RunStore, tile: Tile) -> PixelErrors | None:
+def _errors(fit: Arrays, tile: Tile, shape: tuple[int, int]) -> PixelErrors | None:
     """Return the errors of the pixels of a tile in C order; None where they are not known."""
-    if not store.has("fit/correlation"):
+    if "correlation" not in fit:
         return None
-    ny, nx = store.array("fit/correlation").shape[:2]
-    stderr = [store.read(f"fit/{name}_stderr", tile.region).ravel() for name in PARAMETERS]
-    correlation = store.read("fit/correlation", tile.region)
+    ny, nx = shape
+    stderr = [fit[f"{name}_stderr"].ravel() for name in PARAMETERS]
+    correlation = fit["correlation"]
     place = np.arange(tile.y0, tile.y1)[:, None] * nx + np.arange(tile.x0, tile.x1)
     share = min(1.0, WANTED / (ny * nx))
     flat = correlation.reshape(-1, correlation.shape[2])
@@ -366,7 +360,8 @@ def _count(store: RunStore, job: _Job, band: Band | Tile) -> PixelHistograms:
     """Histogram the chosen frames of a band; the same samples lie outside as in the stored histograms."""
     assert job.frames is not None
     like = store.array("histogram/counts")
-    origin, low, high = _ranges(store, (slice(band.y0, band.y1), slice(None)))
+    histogram = store.at((slice(band.y0, band.y1), slice(None)), "histogram")
+    origin, low, high = (histogram[name].astype(np.int64) for name in _HISTOGRAM)
     first, size = occupied(origin, low, high, like.shape[2])
     origin += first
     counts = np.zeros((*origin.shape, size), like.dtype)

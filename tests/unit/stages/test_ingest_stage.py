@@ -233,12 +233,13 @@ def test_units_are_whole_chunks_within_memory(n, ny, nx, itemsize):
     units = ingest.copy_units(shape, itemsize, chunk)
     t = y = 0
     for number, unit in enumerate(units):
-        assert (unit.t0, unit.y0) == (t, y)
-        assert unit.t0 % chunk[0] == unit.y0 % chunk[1] == 0
-        assert unit.t1 == n or unit.t1 % chunk[0] == 0
-        assert unit.y1 == ny or unit.y1 % chunk[1] == 0
-        assert (unit.t1 - unit.t0) * (unit.y1 - unit.y0) * nx * itemsize <= 128 << 20
-        t, y = (unit.t0, unit.y1) if unit.y1 < ny else (unit.t1, 0)
+        t0, t1, y0, y1 = unit.content
+        assert (t0, y0) == (t, y)
+        assert t0 % chunk[0] == y0 % chunk[1] == 0
+        assert t1 == n or t1 % chunk[0] == 0
+        assert y1 == ny or y1 % chunk[1] == 0
+        assert (t1 - t0) * (y1 - y0) * nx * itemsize <= 128 << 20
+        t, y = (t0, y1) if y1 < ny else (t1, 0)
         if number > 200:
             return
     assert (t, y) == (n, 0)
