@@ -95,7 +95,7 @@ class _Fitted:
 
     Attributes:
         pixels: their parameters.
-        mask: which pixels of the tiles have a value.
+        place: which pixels of the sensor they are, (y, x).
         origin: DN of bin 0.
         low: smallest DN.
         high: largest DN.
@@ -103,7 +103,7 @@ class _Fitted:
     """
 
     pixels: UsablePixels
-    mask: BoolArray
+    place: BoolArray
     origin: NDArray[np.int32]
     low: NDArray[np.int32]
     high: NDArray[np.int32]
@@ -112,11 +112,13 @@ class _Fitted:
     @classmethod
     def read(cls, store: RunStore, tiles: list[Tile]) -> _Fitted:
         """Read them from the run."""
-        bins = store.array("histogram/counts").shape[2]
-        paths = [*(f"fit/{n}" for n in PARAMETERS), *(f"histogram/{n}" for n in _HISTOGRAM)]
-        *maps, origin, low, high = (_pixels_of(store, path, tiles) for path in paths)
-        pixels, mask = UsablePixels.from_maps(maps)
-        return cls(pixels, mask, origin[mask], low[mask], high[mask], bins)
+        fit, histogram = store.at(group="fit"), store.at(group="histogram")
+        maps, place = [fit[name] for name in PARAMETERS], np.zeros(store.array("fit/bias").shape, np.bool_)
+        for tile in tiles:
+            place[tile.region] = True
+        pixels, place[place] = UsablePixels.from_maps([values[place] for values in maps])
+        origin, low, high = (histogram[name][place] for name in _HISTOGRAM)
+        return cls(pixels, place, origin, low, high, store.array("histogram/counts").shape[2])
 
     def limits(self, known: tuple[int, int] | None) -> tuple[int, int] | None:
         """Return the known limits of the codes where samples lie at one of them; else None."""
@@ -136,27 +138,6 @@ class _Fitted:
         mass = electron_pmf(self.pixels.quanta_exposure, int(largest + 12 * math.sqrt(largest) + 40))
         n_k = int(np.searchsorted(np.cumsum(mass), 1.0 - 1e-7)) + 2
         return EnsembleAxes(dn, nuced, n_k)
-
-
-def _pixels_of(
-    store: RunStore, name: str, tiles: list[Tile], region: tuple[slice, slice] | None = None
-) -> NDArray[Any]:
-    """Return the pixels of a map that lie in some tiles, in the order of the map.
-
-    Args:
-        store: the run.
-        name: an array whose first dimensions are (y, x).
-        tiles: the tiles.
-        region: part of the array that is the sensor; None: all of it.
-
-    Returns:
-        The values, pixels along the first axis.
-    """
-    whole = store.read(name, region)
-    inside = np.zeros(whole.shape[:2], dtype=bool)
-    for tile in tiles:
-        inside[tile.region] = True
-    return np.asarray(whole[inside])
 
 
 def run(context: StageContext) -> None:
@@ -204,7 +185,7 @@ def run(context: StageContext) -> None:
             fitted = _Fitted.read(store, finished)
         made = {"tiles": len(finished), "tiles_missing": context.n_keys - len(finished)}
         totals = _totals(store, job, [numbered[tile.key][0] for tile in finished])
-        _write_result(store, totals, finished, fitted, job, made)
+        _write_result(store, totals, fitted, job, made)
 
 
 def _codes(context: StageContext) -> dict[str, dict[str, Any]]:
@@ -422,7 +403,6 @@ def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
 def _write_result(
     store: RunStore,
     totals: EnsembleTotals,
-    tiles: list[Tile],
     fitted: _Fitted,
     job: _Job,
     facts: dict[str, Any],
@@ -436,8 +416,7 @@ def _write_result(
     Args:
         store: the run.
         totals: sums over the tiles.
-        tiles: the finished tiles.
-        fitted: their pixels.
+        fitted: pixels of the finished tiles.
         job: what the ensemble is of.
         facts: further attributes.
     """
@@ -445,17 +424,14 @@ def _write_result(
     pixels = fitted.pixels
     per_pixel: int | NDArray[Any] = totals.samples[0]
     if frames is None:
-        counts = _pixels_of(store, "histogram/counts", tiles)
-        per_pixel = counts.sum(axis=1, dtype=np.int64)[fitted.mask]
+        per_pixel = store.read("histogram/counts")[fitted.place].sum(axis=1, dtype=np.int64)
     weight = np.ones(len(pixels))
     if store.has("fit/likelihood_gap"):
-        gap, words = (
-            _pixels_of(store, f"fit/{name}", tiles)[fitted.mask] for name in ("likelihood_gap", "fit_status")
-        )
+        gap, words = (store.read(f"fit/{name}")[fitted.place] for name in ("likelihood_gap", "fit_status"))
         with np.errstate(divide="ignore"):  # one whose H, or gain, is more open may be off by any number
             wide = np.minimum(2.0 * pixels.maps[0] ** 2 / per_pixel, 0.5 / gap) > 0.25
         weight = bias_weight(np.where(wide | (words & int(flags_of("conversion_gain")) != 0), 0.0, gap))
-    true = _true_pixels(store, job, tiles, fitted.mask)
+    true = _true_pixels(store, job, fitted.place)
     arrays, found = curves(totals, pixels, settings, job.limits)
     numbers, electron_facts = electron_numbers_of(totals, pixels, settings)
     arrays |= numbers | components(pixels, numbers["electron_pmf"], weight)
@@ -481,7 +457,7 @@ def _write_result(
     store.set_attributes("ensemble", plain(found | facts))
 
 
-def _true_pixels(store: RunStore, job: _Job, tiles: list[Tile], mask: BoolArray) -> UsablePixels | None:
+def _true_pixels(store: RunStore, job: _Job, place: BoolArray) -> UsablePixels | None:
     """Return the true parameters of the pixels with a value, if they are all that made the frames."""
     simulated = job.config.simulate
     if job.truth is None or simulated is None or simulated.effects:
@@ -489,7 +465,7 @@ def _true_pixels(store: RunStore, job: _Job, tiles: list[Tile], mask: BoolArray)
     y0, x0, _ = job.truth
     ny, nx = job.sensor.shape
     region = (slice(y0, y0 + ny), slice(x0, x0 + nx))
-    maps = [_pixels_of(store, f"truth/{name}", tiles, region)[mask] for name in PARAMETERS]
+    maps = [store.read(f"truth/{name}", region)[place] for name in PARAMETERS]
     true, known = UsablePixels.from_maps(maps)
     return true if known.all() else None
 
