@@ -323,22 +323,20 @@ class StageContext:
             self.create(path, lengths={dim: n for dim, n in lengths.items() if dim not in ("y", "x")})
 
     def selected(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:
-        """Return the units that ``--roi`` chooses (all of them without it)."""
-        if self.command.roi is None:
+        """Return the units that ``--roi`` chooses: all of them without it, and all that are no tiles.
+
+        Raises:
+            ConfigError: the sensor has no such region.
+        """
+        if self.command.roi is None or (units and all(isinstance(unit, Named) for unit in units)):
             return list(units)
         chosen = {tile.key for tile in roi_tiles(self.command.roi, self.tiles())}
-        return [unit for unit in units if unit is WHOLE or chosen & set(markers(unit))]
+        return [unit for unit in units if isinstance(unit, Named) or chosen & set(markers(unit))]
 
-    def pending(
-        self, units: Sequence[AnyUnit], *, by_tiles: bool = True, resumes: bool = False
-    ) -> list[AnyUnit]:
-        """Return the chosen units that are not done; with ``--force`` all, unless the stage ``resumes``.
-
-        Units that are no tiles (``by_tiles=False``) are always chosen, and not forced by a choice of tiles.
-        """
-        done = self.store.records.done(self.stage, self.fingerprint)
-        chosen = self.selected(units) if by_tiles else list(units)
-        if self.command.force and not resumes and (by_tiles or self.command.roi is None):
+    def pending(self, units: Sequence[AnyUnit], *, resumes: bool = False) -> list[AnyUnit]:
+        """Return the chosen units that are not done; with ``--force`` all, unless the stage ``resumes``."""
+        done, chosen = self.store.records.done(self.stage, self.fingerprint), self.selected(units)
+        if self.command.force and not resumes:
             return chosen
         return [unit for unit in chosen if not set(markers(unit)) <= done]
 
@@ -349,7 +347,6 @@ class StageContext:
         *,
         unit_name: str = "tile",
         needs: str | None = None,
-        by_tiles: bool = True,
         total: int | None = None,
         unit_bytes: int = 0,
     ) -> dict[str, dict[str, Any]]:
@@ -357,8 +354,7 @@ class StageContext:
 
         Units that raise are kept in :attr:`failed` and stop nothing, except errors that would hit
         every unit (a full disk, vanished camera files). With ``needs``, an upstream stage of the same
-        tiles, units that it has not finished are failures too. ``by_tiles=False`` is for units that
-        ``--roi`` does not choose, such as blocks of frames. A stage that learns only on its way
+        tiles, units that it has not finished are failures too. A stage that learns only on its way
         what its units are calls this several times and says in ``total`` how many markers that makes so far;
         it resumes also under ``--force``, which has made it start anew. ``unit_bytes`` is the memory that a
         worker takes for a unit: fewer work at once where ``compute.max_memory`` says so. Returns the
@@ -372,12 +368,12 @@ class StageContext:
         """
         self.begin()
         self._know_total(sum(len(markers(unit)) for unit in units) if total is None else total)
-        todo = self._ready(self.pending(units, by_tiles=by_tiles, resumes=total is not None), needs)
+        todo = self._ready(self.pending(units, resumes=total is not None), needs)
         self.store.records.unmark(
             self.stage, self.fingerprint, (key for unit in todo for key in markers(unit))
         )
         fatal: list[BaseException] = []
-        shown = len(self.selected(units) if by_tiles else units)
+        shown = len(self.selected(units))
         undivided = list(units) == [WHOLE]
         # what is not divided is done here, and tells its own steps
         executor = SerialExecutor() if undivided else self.executor

@@ -81,7 +81,7 @@ def run(context: StageContext) -> None:
         task = functools.partial(_copy, reader=reader)
     # the frames of a row of chunks, those that the reader holds, and the compressed ones
     held = 0 if done else 3 * chunk[0] * chunk[1] * reader.shape[2] * reader.dtype.itemsize
-    context.run_units(units, task, unit_name="block", by_tiles=False, unit_bytes=held)
+    context.run_units(units, task, unit_name="block", unit_bytes=held)
 
 
 def sensor_of(reader: FrameSequence, context: StageContext, identity: dict[str, Any]) -> SensorInfo:
@@ -167,7 +167,7 @@ def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:
 
 def _run_whole(context: StageContext) -> None:
     """Finish the stage where nothing is copied."""
-    context.run_units([WHOLE], unit_name="input", by_tiles=False)
+    context.run_units([WHOLE], unit_name="input")
 
 
 # -- ready-made histograms ----------------------------------------------------------------------

@@ -138,7 +138,7 @@ def run(context: StageContext) -> None:
         settings=settings,
         adc_limits=context.sensor.adc_limits,
     )
-    found = context.run_units(units, task, unit_name="part", by_tiles=False)
+    found = context.run_units(units, task, unit_name="part")
     if not {unit.key for unit in units} <= found.keys():
         return
     result = {

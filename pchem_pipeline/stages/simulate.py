@@ -91,7 +91,7 @@ def run(context: StageContext) -> None:
         alone=len(_frame_units(files)) == 1,
     )
     # frames are made whole: tiles and regions mean the sensor that is read
-    context.run_units(units, task, unit_name="part", by_tiles=False)
+    context.run_units(units, task, unit_name="part")
 
 
 def frames_tile(truth: TruthMaps, settings: SimulateSettings, frames: tuple[int, int]) -> NDArray[Any]:

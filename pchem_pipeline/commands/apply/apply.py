@@ -320,7 +320,7 @@ def _do_pieces(
     Raises:
         IncompleteRunError: some failed; the others are kept.
     """
-    done = context.run_units(pieces, task, by_tiles=False, **how)
+    done = context.run_units(pieces, task, **how)
     if context.failed:
         key, reason = next(iter(context.failed.items()))
         raise IncompleteRunError(
