@@ -124,6 +124,29 @@ def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageSt
 
 
 @contextlib.contextmanager
+def at_work(target: Target, store: RunStore, reporter: Reporter, command: Command) -> Iterator[StageContext]:
+    """Lock a store, and yield what those need who work on it; signals are requests to stop meanwhile.
+
+    Raises:
+        LockedError: another process works on it.
+        PchEmError: the workers cannot be had.
+    """
+    with store.locked(), stop_on_signals() as stop:
+        executor = make_executor(target.config.compute, reporter.warning, stop.check)
+        with contextlib.closing(executor):
+            yield StageContext(
+                target.config,
+                target.base_dir,
+                store,
+                executor,
+                reporter,
+                stop,
+                command,
+                config_path=target.config_path,
+            )
+
+
+@contextlib.contextmanager
 def working_run(target: Target, command: Command) -> Iterator[StageContext]:
     """Open and lock the run, and yield what its stages need; a new one that is refused is taken away again.
 
@@ -141,31 +164,19 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
             command.progress, quiet=command.quiet, log=command.log_json, progress_file=progress_file
         )
         stack.callback(reporter.close)
-        stack.enter_context(store.locked())
+        context = stack.enter_context(at_work(target, store, reporter, command))
         if (path := target.config_path) is not None:
             found = found_model(path)
             if found is not None and found.model == target.config.model:
                 file = effects_file(path).name
                 reporter.info(f"the model is that of {file}, instead of the one in {path.name}")
         progress_file.show({"stage": ""})
-        stop = stack.enter_context(stop_on_signals())
         store.write_config(dump_config(own))  # what a single command was given is no setting of the run
         keep_in_force(store, model_in_force(store, target.config.model))
         yaml = {} if target.config_path is None else {"config": str(target.config_path)}
         location = {"base_dir": str(target.base_dir), **yaml}  # to which its paths refer
         write_record(store.path / ".pchem" / "location.json", location)
-        executor = make_executor(target.config.compute, reporter.warning, stop.check)
-        stack.callback(executor.close)
-        yield StageContext(
-            target.config,
-            target.base_dir,
-            store,
-            executor,
-            reporter,
-            stop,
-            command=command,
-            config_path=target.config_path,
-        )
+        yield context
 
 
 def run_status(target: Target, command: Command | None = None) -> list[StageState]:

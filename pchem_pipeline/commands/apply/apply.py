@@ -6,7 +6,7 @@ import contextlib
 import functools
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,15 +31,13 @@ from pchem_pipeline.commands.apply.tasks import (
     moments_piece,
     offsets_piece,
 )
-from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import Command, StageContext, Task
-from pchem_pipeline.runner.session import with_overrides
+from pchem_pipeline.runner.session import at_work, with_overrides
 from pchem_pipeline.store.files import fingerprint_of
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import local_path, place_of
@@ -75,7 +73,7 @@ def apply_to_frames(
         files: camera files, globs, folders or URLs.
         output: a zarr store, or a folder of TIFF or FITS files.
         wanted: what to write.
-        command: of the command line; ``options.force`` replaces an output that is there.
+        command: of the command line; ``force`` replaces an output that is there.
 
     Returns:
         What was written.
@@ -92,51 +90,31 @@ def apply_to_frames(
     with contextlib.ExitStack() as stack:
         stack.callback(reporter.close)
         stack.enter_context(reporter.compilation(STAGE, target.config.compute.max_memory))
-        made = _make_job(run, target, files, wanted)
+        job, calibration, content, remarks = _make_job(run, target, files, wanted)
         output = place_of(output) if wanted.format == "zarr" else local_path(output)
         place = output if wanted.format == "zarr" else output.with_name(f".{output.name}.unfinished.zarr")
-        if wanted.format != "zarr" and _is_done(output, made.content, command):
+        if wanted.format != "zarr" and _is_done(output, content, command):
             reporter.info(f"apply: {output} is up to date")
             return sorted(output.iterdir())
-        store, fresh = _output_store(place, made.content, force=command.force)
-        stack.enter_context(store.locked())
-        stop = stack.enter_context(stop_on_signals())
-        executor = make_executor(target.config.compute, reporter.warning, stop.check)
-        stack.callback(executor.close)
-        context = StageContext(
-            target.config, target.base_dir, store, executor, reporter, stop, stage=STAGE, fresh=fresh
-        )
-        context.fingerprint = fingerprint_of(made.content)
-        for remark in made.remarks:
+        store, fresh = _output_store(place, content, force=command.force)
+        context = stack.enter_context(at_work(target, store, reporter, command))
+        context.stage, context.fresh, context.fingerprint = STAGE, fresh, fingerprint_of(content)
+        for remark in remarks:
             reporter.warning(remark)
-        _do(context, made)
+        _do(context, job, calibration)
         if wanted.format == "zarr":
             how = f'xarray.open_zarr("{output}", group="applied", consolidated=False)'
             reporter.info(f"apply: open it with {how}")
             return [output]
-        written = write_files(store, output, wanted.format, made.content)
+        written = write_files(store, output, wanted.format, content)
     shutil.rmtree(place, ignore_errors=True)
     return written
 
 
-@dataclass(frozen=True)
-class _Made:
-    """All that is known before anything is written.
-
-    Attributes:
-        job: of the workers.
-        content: what decides the result, as JSON data.
-        remarks: for the user.
-        calibration: of all pixels.
-    """
-
-    job: Job
-    content: dict[str, Any]
-    remarks: list[str]
-    calibration: Calibration
-
-
-def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted: ApplySettings) -> _Made:
+def _make_job(
+    run: RunStore, target: Target, files: Sequence[str | Path], wanted: ApplySettings
+) -> tuple[Job, Calibration, dict[str, Any], list[str]]:
+    """Return the job of the workers, the calibration, what decides the result, as JSON data, and remarks."""
     digest = check_run(run)
     sensor = SensorInfo.read(run)
     frames = open_like_run(target, sensor, files, wanted.dataset)
@@ -193,7 +171,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         "frames": frames.quick_identity()["files"],
         "settings": {**settings, "kinds": list(wanted.kinds)},
     }
-    return _Made(job, content, remarks, calibration)
+    return job, calibration, content, remarks
 
 
 # -- the output ------------------------------------------------------------------------------------
@@ -288,7 +266,7 @@ def _create_converted(context: StageContext, job: Job, n_segments: int) -> None:
 # -- the work --------------------------------------------------------------------------------------
 
 
-def _do(context: StageContext, made: _Made) -> None:
+def _do(context: StageContext, job: Job, calibration: Calibration) -> None:
     """Bring the output up to date.
 
     Raises:
@@ -299,7 +277,7 @@ def _do(context: StageContext, made: _Made) -> None:
         context.store.delete("applied_parts")  # what a failure after the last step may have left
         context.reporter.info(f"apply: {context.store.path} is up to date")
         return
-    job, calibration = _with_moments(context, made.job, made.calibration)
+    job, calibration = _with_moments(context, job, calibration)
     if job.removed:
         job = _with_offsets(context, job, calibration)
     if job.counts:
