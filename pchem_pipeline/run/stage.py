@@ -116,8 +116,8 @@ def open_store(path: Path) -> RunStore:
 class MarkedTask:
     """A task that sets the markers of its unit once it is done, in the worker.
 
-    ``tell`` hears by key what share of a unit is done, where the worker shares the memory. Where it does not,
-    it may be ``overtaken`` by a later command, and writes no more then.
+    ``tell`` hears by key what share of a unit is done, where the worker shares the memory. Where it does not
+    (None), the worker may be overtaken by a later command, and writes no more then.
     """
 
     store: Path
@@ -125,12 +125,11 @@ class MarkedTask:
     fingerprint: str
     task: Task[Any] | None
     tell: Callable[[str, float], None] | None = None
-    overtaken: bool = False
 
     def __call__(self, unit: Unit) -> Mapping[str, Any]:
         """Do the unit, then mark it."""
         store = open_store(self.store)
-        with working(store.records, self.stage, self.fingerprint if self.overtaken else None):
+        with working(store.records, self.stage, self.fingerprint if self.tell is None else None):
             with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
                 summary = {} if self.task is None else dict(self.task(unit, store) or {})
             check_work(self.store)
@@ -397,9 +396,8 @@ class StageContext:
                     raise Stop
 
             self.stop.check()
-            here = executor.shares_memory
-            heard = tell if here else None
-            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard, not here)
+            heard = tell if executor.shares_memory else None
+            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard)
             try:
                 with self.stop.at_once() if undivided else contextlib.nullcontext():
                     executor.map(marked, todo, on_result)
