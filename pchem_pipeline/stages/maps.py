@@ -100,7 +100,7 @@ def run(context: StageContext) -> None:
         line=line,
         n_frames=None if sensor.samples else sensor.n_frames,
     )
-    of_none = arrays(context.store, (slice(0), slice(0)))
+    of_none = arrays(context.store, (slice(0), slice(0)))  # of no pixel, with all names
     context.create_like(of_none)
     context.create("maps/goodness_q")
     if not sensor.samples:
@@ -108,8 +108,8 @@ def run(context: StageContext) -> None:
     held = context.tile_pixels * 80 * 8  # arrays that are read and made
     task = functools.partial(_do_tile, arrays=arrays)
     context.run_units(context.tiles(), task, needs="fit", unit_bytes=held)
-    maps = [path.removeprefix("maps/") for path in of_none if f"{path}_stderr" in of_none]
-    _summarise(context, [name for name in maps if "/" not in name])
+    with_error = [path.removesuffix("_stderr") for path in of_none if path.endswith("_stderr")]
+    _summarise(context, [path.removeprefix("maps/") for path in with_error if path.startswith("maps/")])
 
 
 @dataclass(frozen=True)

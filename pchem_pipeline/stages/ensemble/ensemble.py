@@ -116,7 +116,8 @@ class _Fitted:
         maps, place = [fit[name] for name in PARAMETERS], np.zeros(store.array("fit/bias").shape, np.bool_)
         for tile in tiles:
             place[tile.region] = True
-        pixels, place[place] = UsablePixels.from_maps([values[place] for values in maps])
+        pixels, known = UsablePixels.from_maps([values[place] for values in maps])
+        place[place] = known
         origin, low, high = (histogram[name][place] for name in _HISTOGRAM)
         return cls(pixels, place, origin, low, high, store.array("histogram/counts").shape[2])
 
