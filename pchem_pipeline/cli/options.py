@@ -8,14 +8,11 @@ import re
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from pchem_pipeline.base.errors import ConfigError
-
-if TYPE_CHECKING:
-    pass
 
 
 def on_this_machine(path: Path | None) -> Path | None:
