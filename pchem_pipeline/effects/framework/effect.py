@@ -346,7 +346,7 @@ class Effect(Section):
         """
         return ()
 
-    def with_levels(self, amplitude_e: FloatArray, weight: FloatArray, share: float) -> Self:
+    def with_satellites(self, amplitude_e: FloatArray, weight: FloatArray, share: float) -> Self:
         """Return it with the numbers that free satellites of single pixels tell; by default as it is.
 
         Args:

@@ -485,7 +485,7 @@ class RtsNoise(Effect, tag="rts_noise"):
             *(one for one in slow if one.sampling == "single"),
         ]
 
-    def with_levels(self, amplitude_e: FloatArray, weight: FloatArray, share: float) -> Self:
+    def with_satellites(self, amplitude_e: FloatArray, weight: FloatArray, share: float) -> Self:
         """Return it with the steps of these traps, as often full, in such a share of the pixels."""
         scatter = float(np.std(np.log(amplitude_e)))
         spread = next((name for name, most in _SPREADS.items() if scatter < most), "exponential")

@@ -20,7 +20,7 @@ from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import LARGEST_FACTOR, Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.candidates.pixel_levels import with_pixel_levels
+from pchem_pipeline.discrepancy.by_simulation.candidates.satellites import with_satellites
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, multistart, shift_bias_by_electrons
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.places import Part
@@ -274,9 +274,7 @@ class Histograms:
             }
             by, samples = self._of(place) if told else None, self._samples(place)
             numbers = {} if by is None else _likeliest(by, told)
-            levels = (
-                {} if samples is None else with_pixel_levels(*samples, self.present, anywhere, self.effort)
-            )
+            levels = {} if samples is None else with_satellites(*samples, self.present, anywhere, self.effort)
             for tag, effects in (numbers | levels).items():
                 likely[tag, place] = [e.at_place(place.region, place.when) for e in effects]
                 self.told += likely[tag, place] if tag in numbers else []

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.pixel_levels import with_pixel_levels
+from pchem_pipeline.discrepancy.by_simulation.candidates.satellites import with_satellites
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -41,7 +41,7 @@ def test_steps_and_weights_of_traps_are_those_of_the_pixels_that_have_one(
     heights = np.concatenate([np.arange(1, reads + 1), np.arange(reads - 1, 0, -1)]) / reads
     jumps = rng.choice(heights, (FRAMES, n)) * rng.choice([-1.0, 1.0], (FRAMES, n))
     frames = frames_of(steps * np.where(rng.random((FRAMES, n)) < weight, jumps, 0.0), 5)
-    found = with_pixel_levels(frames, maps(), (), GUESSES, Effort(None))
+    found = with_satellites(frames, maps(), (), GUESSES, Effort(None))
     assert list(found) == ["rts_noise"]
     best = found["rts_noise"][0]
     assert (best.sampling, best.samples) == ("correlated", reads)  # type: ignore[attr-defined]
@@ -56,4 +56,4 @@ def test_steps_and_weights_of_traps_are_those_of_the_pixels_that_have_one(
 
 def test_pixels_without_levels_tell_nothing() -> None:
     frames = frames_of(np.zeros((FRAMES, int(WITH_TRAP.sum()))), 6)
-    assert with_pixel_levels(frames, maps(), (), GUESSES, Effort(None)) == {}
+    assert with_satellites(frames, maps(), (), GUESSES, Effort(None)) == {}

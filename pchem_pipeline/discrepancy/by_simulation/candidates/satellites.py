@@ -1,8 +1,9 @@
-"""The numbers of an effect that single pixels show: levels beside their peaks, as of a trap.
+"""The numbers of an effect that gives single pixels satellite peaks, such as a trap in the source follower.
 
-Such an effect is in few pixels, each with an amplitude and a weight of its own
-(:attr:`~pchem_pipeline.model.law.sample_law.SampleLaw.free_satellites`). The pixels that the model does not
-fit are fitted with levels of every amplitude; what is found in them tells the amplitudes and weights.
+It is in few pixels, and differs from one to the other; no one number of the sensor tells what it is like. The
+pixels that the model does not fit are fitted with free satellites
+(:attr:`~pchem_pipeline.model.law.sample_law.SampleLaw.free_satellites`) of amplitudes over a wide range: what
+is found in them is a sample of amplitudes and weights.
 """
 
 from __future__ import annotations
@@ -22,22 +23,22 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.histogram.count import histogram_frames
 
-#: Amplitudes that are tried, e-: a fit refines the best one.
+#: Amplitudes that are tried, 0.35 to 5 e-: a fit refines the best one.
 _AMPLITUDES = tuple(0.35 * 1.35**i for i in range(10))
 _MOST_PIXELS = 256
-_FAR_SHARE = 0.1  # of what the likeliest pattern explains, by which another one is far behind it
+_FAR_SHARE = 0.1  # of what the likeliest pattern explains, by which another one is left out
 
 
-def with_pixel_levels(
+def with_satellites(
     frames: NDArray[np.unsignedinteger],
     maps: PixelMaps,
     present: Sequence[Effect],
     guesses: Mapping[str, Sequence[Effect]],
     effort: Effort,
 ) -> dict[str, list[Effect]]:
-    """Return effects with the numbers that the levels of single pixels tell, by tag, the likeliest first.
+    """Return effects with the numbers that free satellites of the pixels tell, by tag, the likeliest first.
 
-    Those without any levels in the pixels' law are left out.
+    Effects whose law has no free satellites are left out, and so are all where no pixel has any.
 
     Args:
         frames: (frame, y, x), DN.
@@ -51,9 +52,9 @@ def with_pixel_levels(
     near = pixel_maps(list(start.T), np.ones(usable.size, np.bool_))
     laws = {}
     for guess in (g for own in guesses.values() for g in own):
+        # one of a plug-in may raise anything, which is noted where it is fitted
         try:
             law = sample_law((*present, guess), near)
-        # one of a plug-in may raise anything, which is noted where it is fitted
         except Exception:
             continue
         if law.free_satellites:
@@ -67,8 +68,8 @@ def with_pixel_levels(
     if not poor.size:
         return {}
     some = poor[:: -(-poor.size // _MOST_PIXELS)]
-    found: dict[str, list[tuple[float, Effect]]] = {}
     fits: dict[tuple[tuple[float, float], ...], FitResult] = {}
+    found: list[tuple[float, Effect]] = []
     for guess, law in laws.items():
         fit = fits.get(law.free_satellite_pattern)
         if fit is None:
@@ -78,11 +79,11 @@ def with_pixel_levels(
         has = fit.satellite_weight > 0.0
         if has.any():
             rise = float(np.nansum(fit.log_likelihood - plain.log_likelihood[some]))
-            share = float(has.mean()) * poor.size / usable.size
-            levels = fit.satellite_amplitude_e[has], fit.satellite_weight[has]
-            found.setdefault(guess.tag, []).append((rise, guess.with_levels(*levels, share)))
-    least = (1.0 - _FAR_SHARE) * max((rise for own in found.values() for rise, _ in own), default=0.0)
-    return {
-        tag: [effect for rise, effect in sorted(own, key=lambda one: -one[0]) if rise >= least]
-        for tag, own in found.items()
-    }
+            own = fit.satellite_amplitude_e[has], fit.satellite_weight[has]
+            found.append((rise, guess.with_satellites(*own, float(has.mean()) * poor.size / usable.size)))
+    least = (1.0 - _FAR_SHARE) * max((rise for rise, _ in found), default=0.0)
+    likely: dict[str, list[Effect]] = {}
+    for rise, effect in sorted(found, key=lambda one: -one[0]):
+        if rise >= least:
+            likely.setdefault(effect.tag, []).append(effect)
+    return likely
