@@ -242,13 +242,13 @@ def _parameters(data: DiscrepancyData) -> Table:
             {
                 "parameter": f"{tag}: {name}",
                 "value": value,
-                "effect": f"{data.title(tag)}{place}{_how(step, data.found)}",
-                "source": effects[tag].source if tag in effects else "",
+                "effect": f"{data.title(tag)}{place}{_how(step, data.found)}" if i == 0 else "",
+                "source": effects[tag].source if i == 0 and tag in effects else "",
             }
             for step in data.found.steps
             for tag, place in [(step.likeliest, f", in {step.place}" if step.place else "")]
             if tag and (step.effect or step.verdict == "described" or data.found.verdict == "ambiguous")
-            for name, value in _values(step).items()
+            for i, (name, value) in enumerate(_values(step).items())
         ],
     )
 
