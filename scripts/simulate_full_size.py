@@ -17,8 +17,9 @@ from pathlib import Path
 
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages
+from pchem_pipeline.runner.session import run_stages
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,3 +14,5 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 #: Samples of frames or their counts: unsigned, of any size.
 CodeArray = NDArray[np.unsignedinteger[Any]]
+#: Arrays by their names: of a group of the store, or its :class:`~pchem_pipeline.store.run_store.Part`.
+Arrays = Mapping[str, NDArray[Any]]

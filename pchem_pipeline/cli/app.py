@@ -10,6 +10,7 @@ import os
 import sys
 import threading
 import traceback
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
@@ -32,7 +33,7 @@ from pchem_pipeline.cli.options import (
 from pchem_pipeline.stages.table import STAGES, pipeline, pipeline_of
 
 if TYPE_CHECKING:
-    from pchem_pipeline.runner.session import Command
+    from pchem_pipeline.run.stage import Command
 
 app = typer.Typer(
     name="pchem",
@@ -138,7 +139,7 @@ def run(
     from pchem_pipeline.commands.new_run import find_or_start
     from pchem_pipeline.runner.session import cropped, up_to
 
-    target, is_new = find_or_start(targets, store, given, command.options.roi)
+    target, is_new = find_or_start(targets, store, given, command.roi)
     if is_new:
         target, command = cropped(target, command)
     stages = up_to(until, pipeline_of(target.config))
@@ -173,7 +174,7 @@ def discrepancy(
     from pchem_pipeline.commands.discrepancy import find_and_add
     from pchem_pipeline.run.target import find_run
 
-    command = command.choosing(roi=region_of(roi))
+    command = replace(command, roi=region_of(roi))
     text = find_and_add(find_run(target), command, refit=refit, effort=effort)
     if text:
         say(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,7 +13,7 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.cli.options import Target, on_this_machine, say, takes_command
 
 if TYPE_CHECKING:
-    from pchem_pipeline.runner.session import Command
+    from pchem_pipeline.run.stage import Command
 
 
 @takes_command(without=("force", "dry_run", "roi"))
@@ -55,7 +56,7 @@ def apply(
     from pchem_pipeline.run.target import find_run
 
     wanted = ApplySettings(kinds_of(what), prior, not keep_modes, format, dataset)
-    for path in apply_to_frames(find_run(target), frames, output, wanted, command.choosing(force=force)):
+    for path in apply_to_frames(find_run(target), frames, output, wanted, replace(command, force=force)):
         typer.echo(path)
 
 

@@ -8,14 +8,11 @@ import re
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from pchem_pipeline.base.errors import ConfigError
-
-if TYPE_CHECKING:
-    from pchem_pipeline.runner.session import Command
 
 
 def on_this_machine(path: Path | None) -> Path | None:
@@ -130,10 +127,13 @@ def takes_command(
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(function)
         def wrapper(**given: Any) -> None:
+            from pchem_pipeline.run.stage import Command
+
             options = {name: given.pop(name) for name, _, _ in common}
             if reads_files:
                 given["given"] = _settings_of_input({name: given.pop(name) for name, _, _ in of_input})
-            function(**given, command=_command(**options))
+            command = Command(**{**options, "roi": region_of(options.get("roi"))})
+            function(**given, command=command)
 
         hints = typing.get_type_hints(
             function, localns={"Command": object, "Mapping": Mapping}, include_extras=True
@@ -200,17 +200,3 @@ def say(text: str) -> None:
     from pchem_pipeline.base.units import typeset
 
     typer.echo(typeset(text))
-
-
-def _command(
-    *,
-    force: bool = False,
-    dry_run: bool = False,
-    roi: str | None = None,
-    **rest: Any,
-) -> Command:
-    """Return what the common options ask for."""
-    from pchem_pipeline.run.stage import Options
-    from pchem_pipeline.runner.session import Command
-
-    return Command(Options(force=force, dry_run=dry_run, roi=region_of(roi)), **rest)

@@ -18,9 +18,9 @@ from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
 from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.input import ingested_identity, keep_identity, known_identity
-from pchem_pipeline.run.stage import allowed_bytes
+from pchem_pipeline.run.stage import Command, allowed_bytes
 from pchem_pipeline.runner.execute import execute
-from pchem_pipeline.runner.session import Command, run_stages, run_status, working_run
+from pchem_pipeline.runner.session import run_stages, run_status, working_run
 from pchem_pipeline.stages.fit.fit import keep_fit
 from pchem_pipeline.stages.histogram.arrays import extend_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
@@ -56,7 +56,7 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
         StoreError: the run is not finished as far as its histograms, or was made with other settings.
     """
     begun = target.store / _BEGUN
-    if command.options.dry_run:
+    if command.dry_run:
         return run_stages(target, PREPARED, command)
     if begun.exists() and any(state.state != "complete" for state in run_status(target)[: len(PREPARED)]):
         states = run_stages(target, PREPARED, command)

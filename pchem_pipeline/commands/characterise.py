@@ -26,8 +26,9 @@ from pchem_pipeline.commands.notebook import open_run, require_xarray
 from pchem_pipeline.config.load import dump_config, make_config, write_config
 from pchem_pipeline.frames.writing import write_frames
 from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
-from pchem_pipeline.runner.session import Command, run_stages, up_to
+from pchem_pipeline.runner.session import run_stages, up_to
 from pchem_pipeline.stages.table import pipeline_of
 
 if TYPE_CHECKING:

@@ -20,8 +20,9 @@ from pchem_pipeline.discrepancy.verdict import read_verdict
 from pchem_pipeline.effects.framework.compose import effect_words
 from pchem_pipeline.effects.framework.region import GRAMMAR, parse_place
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages
+from pchem_pipeline.runner.session import run_stages
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.run_store import RunStore

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
@@ -9,8 +11,9 @@ from pchem_pipeline.report.pages.summary import KEY_MAPS
 from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
-from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.runner.session import run_stages, run_status
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 
 
@@ -35,7 +38,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
         run_stages(target, ["ingest"], command)
     counted = ["histogram"] if "histogram" in missing and _of_histograms(target) else []
     run_stages(target, [*counted, "discrepancy"], command)
-    if command.options.dry_run:
+    if command.dry_run:
         return ""
     words, before = "", _medians(target)
     if add:
@@ -47,7 +50,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
         stages = [name for name in ("fit", "maps", "ensemble", "report") if name in done]
         if stages:
             # --force and --roi were meant for the search alone
-            run_stages(target, stages, command.choosing(force=False, roi=None))
+            run_stages(target, stages, replace(command, force=False, roi=None))
     found = read_verdict(target.store)
     if found is None:
         raise StoreError(f"{target.store / VERDICT_FILE} is missing; run pchem discrepancy again")

@@ -13,7 +13,6 @@ from pchem_pipeline.commands.figures import check_formats, warn_if_old
 from pchem_pipeline.frames.formats.map_files import MapImage, write_fits, write_npz, write_tiff
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.report.pages.emva import COLUMNS as EMVA_COLUMNS
-from pchem_pipeline.report.pages.emva import MAPS as EMVA_MAPS
 from pchem_pipeline.report.pages.emva import emva_rows
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.store.files import write_atomic
@@ -107,8 +106,8 @@ def _write_csv(folder: Path, store: RunStore) -> list[Path]:
 def _write_emva(folder: Path, target: Target, store: RunStore) -> Path:
     """Write what an EMVA 1288 data sheet can take of the run."""
     config = target.config
-    maps = {name: store.read(f"maps/{name}") for name in EMVA_MAPS if store.has(f"maps/{name}")}
-    found = emva_rows(maps, store.read("fit/fit_status"), config.input.kind, config.maps.outlier_sigmas)
+    maps, status = store.at(group="maps"), store.read("fit/fit_status")
+    found = emva_rows(maps, status, config.input.kind, config.maps.outlier_sigmas)
     return _table(folder / "emva1288.csv", [list(EMVA_COLUMNS), *(row.cells() for row in found)])
 
 

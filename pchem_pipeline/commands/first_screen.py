@@ -12,8 +12,9 @@ from typing import Any
 from pchem_pipeline.base.errors import IncompleteRunError, NotBelievedError, quoted
 from pchem_pipeline.commands.new_run import first_try
 from pchem_pipeline.run.progress import Reporter
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
-from pchem_pipeline.runner.session import Command, run_stages
+from pchem_pipeline.runner.session import run_stages
 from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.remote_path import RemotePath
 
@@ -45,7 +46,7 @@ def run_to_first_screen(
         NotBelievedError: ``strict``, and an answer is serious.
         PchEmError: the stages raised it; the first screen is told all the same where there is a report.
     """
-    if command.options.dry_run:
+    if command.dry_run:
         run_stages(target, stages, command)
         return
     with first_try(target) if is_new else contextlib.nullcontext():

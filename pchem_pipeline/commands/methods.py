@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.report.pages.tables import methods_text
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
-from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.runner.session import run_stages, run_status
 from pchem_pipeline.stages.methods import METHODS_FILE, open_other_runs, read_methods
 
 
@@ -31,12 +33,12 @@ def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) 
     # before anything of an earlier comparison is given up
     if store.has("histogram/counts"):
         open_other_runs(store, target.base_dir, changed.config.methods.with_runs)
-    run_stages(target, ["methods"], command.choosing(settings=tuple(values.items())))
-    if command.options.dry_run:
+    run_stages(target, ["methods"], replace(command, settings=tuple(values.items())))
+    if command.dry_run:
         return ""
     reported = {state.stage: state.state for state in run_status(target)}["report"] != "missing"
     if reported:
-        run_stages(target, ["report"], command.choosing(force=False))
+        run_stages(target, ["report"], replace(command, force=False))
     result = read_methods(target.stored())
     if result is None:
         return ""

@@ -264,11 +264,10 @@ class Run:
         """
         from pchem_pipeline.commands.apply.apply import apply_to_frames
         from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
-        from pchem_pipeline.run.stage import Options
-        from pchem_pipeline.runner.session import Command
+        from pchem_pipeline.run.stage import Command
 
         files = [frames] if isinstance(frames, (str, os.PathLike)) else list(frames)
-        command = Command(Options(force=force), quiet=True, progress="off")
+        command = Command(force=force, quiet=True, progress="off")
         wanted = ApplySettings(kinds_of(what), prior)
         [place] = apply_to_frames(self._target, [str(f) for f in files], Path(output), wanted, command)
         return lazy_dataset(RunStore.open(place), "applied")
@@ -295,7 +294,7 @@ class Run:
             PchEmError: the frames are gone or too few, or another command works on the run.
         """
         from pchem_pipeline.commands.discrepancy import find_and_add
-        from pchem_pipeline.runner.session import Command
+        from pchem_pipeline.run.stage import Command
 
         command = Command(progress=progress, quiet=progress == "off")
         find_and_add(self._target, command, refit=refit, effort=effort)
@@ -335,10 +334,7 @@ class Run:
         for y, x in places:
             if not (0 <= y < ny and 0 <= x < nx):
                 raise ConfigError(f"pixel y = {y}, x = {x} is outside the sensor of {ny} x {nx} pixels")
-        maps = self._arrays(
-            "maps", [f"{n}{end}" for n in (*PARAMETERS, "read_noise_e") for end in ("", "_stderr")]
-        )
-        fit = self._arrays("fit", ["fit_status", "goodness_p"])
+        maps, fit = self.group("maps"), self.group("fit")  # which read the pixels asked for alone
         chosen = [("", int(y), int(x)) for y, x in places]
         index = pixel_index(chosen, self.shape)
         histograms = read_histograms(self._store, index, self.shape)
@@ -347,11 +343,6 @@ class Run:
         masses = bin_masses(columns, histograms, FittedModel.read(self._store).at(index))
         found = pixel_fits(chosen, maps, fit, histograms, masses, channel=channel)
         return [Pixel(**vars(each)) for each in found]
-
-    def _arrays(self, group: str, names: Sequence[str]) -> Mapping[str, Any]:
-        """Return arrays of the store that read the pixels asked for alone."""
-        found = self.group(group)
-        return {name: found[name] for name in names}
 
     # -- figures ------------------------------------------------------------------------------
 

@@ -30,12 +30,7 @@ from pchem_pipeline.report.inspector import MapEntry, packed_facts, served_page
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
-from pchem_pipeline.stages.report.inspector import (
-    StoredMaps,
-    deciding_parameters,
-    listed_maps,
-    packed_map,
-)
+from pchem_pipeline.stages.report.inspector import deciding_parameters, listed_maps, packed_map
 from pchem_pipeline.stages.report.pixels import bin_masses
 from pchem_pipeline.stages.report.stored import read_histograms
 from pchem_pipeline.store.run_store import RunStore
@@ -186,7 +181,7 @@ class RunView:
         asked = query.get("path", [])
         if len(query) != 1 or len(asked) != 1 or asked[0] not in self._maps:
             return _text(HTTPStatus.NOT_FOUND, "this run has no such map")
-        packed = packed_map(StoredMaps(self.store), asked[0])
+        packed = packed_map(self.store.at(), asked[0])
         return _json({**packed_facts(packed), "data": base64.b64encode(packed.data).decode("ascii")})
 
 

@@ -51,7 +51,7 @@ class Addition:
         before, after: gap on the final samples without and with it.
         described: whether it is an empirical description without a cause.
         certain: whether its strength is significant.
-        candidates, rivals, placebo, pulls, moved: see :class:`~pchem_pipeline.discrepancy.verdict.Step`.
+        candidates, rivals, pulls, moved: see :class:`~pchem_pipeline.discrepancy.verdict.Step`.
     """
 
     effect: Effect
@@ -62,7 +62,6 @@ class Addition:
     before: Gap
     after: Gap
     rivals: tuple[schema.Rival, ...]
-    placebo: schema.Rival | None
     pulls: tuple[schema.Pull, ...]
     moved: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     described: bool = False
@@ -109,7 +108,6 @@ class Addition:
             families=schema.Families(before=dict(self.before.families), after=dict(self.after.families)),
             size=size,
             rivals=self.rivals,
-            placebo=self.placebo,
             moved={name: schema.Moved(**change) for name, change in self.moved.items()},
             separate=self._separate(),
             pulls=self.pulls,
@@ -375,11 +373,11 @@ def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> st
     if found.before.at_floor:
         return f"The model was missing {_and(titles)}, too small to show in the final {data} alone."
     if state == "named_in_part":
-        words = f"{_rest(found)}{_shown(found)}{_nearest(found)}{_left(added)}{_doubts(added)}"
+        words = f"{_rest(found)}{_shown(found)}{_nearest(found)}{_left(added)}"
         return f"The model was missing {_and(titles)}{words}{_broken(found)}."
     return (
         f"The model was missing {_and(titles)}; with {'them' if len(titles) > 1 else 'it'}, data and model "
-        f"agree within sampling noise{_left(added)}{_doubts(added)}."
+        f"agree within sampling noise{_left(added)}."
     )
 
 
@@ -482,20 +480,6 @@ def _shown(found: Findings) -> str:
     name = found.last.names[worst]
     says = STATISTICS[name].says(float(pulls[worst]))
     return f"; one statistic still disagrees: {says} ({schema.sigma_text(pulls[worst])})"
-
-
-def _doubts(added: Added) -> str:
-    """Warn if an unrelated control closes much of the gap that a named effect closes."""
-    words = ""
-    for each in added.additions:
-        closed = each.before.value - each.after.value
-        if each.named and each.placebo is not None and closed > 0.0:
-            share = (each.before.value - max(each.placebo.gap_after, 0.0)) / closed
-            if share > schema.CONVINCING_PLACEBO:
-                control, part = _title(each.placebo.effect), schema.share_text(min(share, 1.0))
-                words += f"; an unrelated control, {control}, explains {part} of that, too: "
-                words += f"{_title(each.effect.tag)} is doubtful"
-    return words
 
 
 def _left(added: Added) -> str:

@@ -31,8 +31,6 @@ SCHEMA_VERSION = 3
 #: Share of changed samples below which the size of an effect is its rms over the changed samples only.
 RARE = 0.5
 _TIMES = 2.0  # read noises from which a size is given as a multiple instead of in per cent
-#: Share of the reduction of the gap above which an unrelated control casts doubt on a name.
-CONVINCING_PLACEBO = 0.25
 #: Largest number of statistics whose pulls before and after are stored and drawn.
 MOST_PULLS = 12
 #: File of the verdict in the folder of a run.
@@ -377,11 +375,13 @@ class Step(_Part):
         size: size of the effect; None if unknown.
         families: the gap by family of statistics.
         rivals: the next best effects, the best first, each fitted instead of it.
-        placebo: best unrelated control, fitted instead of it; None if none reduces the gap.
         moved: change of each parameter map by the refit with the effect.
         separate: by effect, the measurement that would distinguish it.
         pulls: the statistics that change most.
     """
+
+    # a key that only older files have is left out
+    model_config = ConfigDict(extra="ignore")
 
     effect: str | None
     verdict: State
@@ -396,7 +396,6 @@ class Step(_Part):
     size: Size | None = None
     families: Families = Families()
     rivals: tuple[Rival, ...] = ()
-    placebo: Rival | None = None
     moved: dict[str, Moved] = {}
     separate: dict[str, str] = {}
     pulls: tuple[Pull, ...] = ()

@@ -1,1 +1,1 @@
-"""What the PCD leaves out: a file per effect or family, in a folder per plane of the signal chain."""
+"""What the PCD leaves out: a file for each operator, with the effects that it makes."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable, Iterator
-from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,23 +55,20 @@ def write_frames(
     *,
     integration_time: float | None = None,
     bit_depth: int | None = None,
-    frames_per_file: int | None = None,
-) -> list[Path]:
-    """Write a stream of frames; each file appears only when it is whole.
+) -> Path:
+    """Write a stream of frames; the file appears only when it is whole.
 
     Args:
         format: tiff, fits, hdf5, npy, raw, zarr or ser.
-        path: the file; without a suffix the format's own is added. With ``frames_per_file``, parts are named
-            ``<stem>_00001<suffix>`` and so on.
+        path: the file; without a suffix the format's own is added.
         blocks: arrays (any number of frames, rows, columns), in order, together ``shape``.
         shape: (frames, rows, columns).
         dtype: uint8, uint16 or uint32.
         integration_time: s, recorded where the format has a place for it.
         bit_depth: bits of the ADC, recorded likewise.
-        frames_per_file: frames of a part (1: a sequence of single frames); None: all in one file.
 
     Returns:
-        The files written, in order.
+        The file written.
 
     Raises:
         ConfigError: an unknown format, or an optional library is missing.
@@ -87,50 +83,22 @@ def write_frames(
     module, suffix = WRITERS[format]
     writer = importlib.import_module(f"pchem_pipeline.frames.formats.{module}").write_frames
     path = path if path.suffix else path.with_suffix(suffix)
-    stream = _Stream(blocks, shape)
-    written: list[Path] = []
-    for part, count in _parts(path, shape[0], frames_per_file):
-        stack = StackFacts((count, *shape[1:]), kind.newbyteorder("="), integration_time, bit_depth)
-        writer(part, stream.take(count), stack)
-        written.append(part)
-    stream.finish()
-    return written
+    stream = _checked(blocks, shape)
+    writer(path, stream, StackFacts(shape, kind.newbyteorder("="), integration_time, bit_depth))
+    for _ in stream:  # a writer may stop when it has what it was told of
+        pass
+    return path
 
 
-def _parts(path: Path, n: int, frames_per_file: int | None) -> list[tuple[Path, int]]:
-    """Return (file, frames) of each part."""
-    if frames_per_file is None:
-        return [(path, n)]
-    starts = range(0, n, frames_per_file)
-    width = max(5, len(str(len(starts))))
-    return [
-        (path.with_name(f"{path.stem}_{i:0{width}d}{path.suffix}"), min(frames_per_file, n - start))
-        for i, start in enumerate(starts, 1)
-    ]
-
-
-class _Stream:
-    """Blocks cut at the borders of the parts."""
-
-    def __init__(self, blocks: Iterable[NDArray[Any]], shape: tuple[int, int, int]) -> None:
-        self._blocks = iter(blocks)
-        self._shape = shape
-
-    def take(self, count: int) -> Iterator[NDArray[Any]]:
-        """Yield blocks that make up the next ``count`` frames."""
-        while count > 0:
-            block = next(self._blocks, None)
-            if block is None:
-                raise ValueError(f"the blocks end {count} frames too early")
-            if block.ndim != 3 or block.shape[1:] != self._shape[1:]:
-                raise ValueError(f"a block of shape {block.shape} for frames of {self._shape[1:]}")
-            if len(block) > count:
-                self._blocks = chain([block[count:]], self._blocks)
-                block = block[:count]
-            count -= len(block)
-            yield block
-
-    def finish(self) -> None:
-        """Check that nothing is left over."""
-        if any(len(block) for block in self._blocks):
+def _checked(blocks: Iterable[NDArray[Any]], shape: tuple[int, int, int]) -> Iterator[NDArray[Any]]:
+    """Yield the blocks, which must make up the shape."""
+    left = shape[0]
+    for block in blocks:
+        if block.ndim != 3 or block.shape[1:] != shape[1:]:
+            raise ValueError(f"a block of shape {block.shape} for frames of {shape[1:]}")
+        left -= len(block)
+        if left < 0:
             raise ValueError("the blocks hold more frames than the shape says")
+        yield block
+    if left:
+        raise ValueError(f"the blocks end {left} frames too early")

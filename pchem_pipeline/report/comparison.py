@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
-from numpy.typing import NDArray
-
+from pchem_pipeline.base.arrays import Arrays
 from pchem_pipeline.model.checks.run_differences import MapDifference, Reasons
 
 #: How an array of two runs compares: to the bit; within rounding; not; absent in one of them.
@@ -37,7 +36,7 @@ class RunFacts:
     n_frames: int | None
     digest: str
     summary: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
-    ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    ensemble: Arrays = field(default_factory=dict)
     rmse: Mapping[str, float] = field(default_factory=dict)
     pixels: tuple[int, int, int] = (0, 0, 0)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -105,7 +105,7 @@ class DiscrepancyData:
     """
 
     found: Verdict
-    arrays: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    arrays: Arrays = field(default_factory=dict)
 
     @cached_property
     def statistics(self) -> dict[str, tuple[str, str]]:
@@ -154,7 +154,7 @@ class Samples:
 
     samples: tuple[Sample, ...]
     against: str
-    arrays: Mapping[str, NDArray[Any]]
+    arrays: Arrays
     shown: int = 0
 
     @property
@@ -215,10 +215,10 @@ class ReportData:
     integration_time: float | None = None
     camera: str = ""
     maps: Mapping[str, FloatArray] = field(default_factory=dict)
-    fit: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    fit: Arrays = field(default_factory=dict)
     criteria: Criteria = field(default_factory=Criteria)
     pixels: Sequence[PixelFit] = ()
-    ensemble: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    ensemble: Arrays = field(default_factory=dict)
     ensemble_facts: Mapping[str, Any] = field(default_factory=dict)
     component_cases: Sequence[str] = ()
     moments: Sequence[Mapping[str, Any]] = ()

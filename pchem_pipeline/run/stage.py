@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
+from pchem_pipeline.base.arrays import Arrays
 from pchem_pipeline.base.errors import InputError, StoreError, error_words
 from pchem_pipeline.base.variables import LENGTHS, VARIABLES
 from pchem_pipeline.compute.environment import available_memory
@@ -28,7 +29,7 @@ from pchem_pipeline.compute.executor import Executor, Outcome, SerialExecutor, S
 from pchem_pipeline.compute.memory import BASE_BYTES, affordable
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.model_versions import ModelVersion, model_in_force
-from pchem_pipeline.run.progress import Reporter, telling_parts
+from pchem_pipeline.run.progress import ProgressMode, Reporter, telling_parts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.store.files import is_fatal
@@ -77,20 +78,32 @@ Task = Callable[[AnyUnit, RunStore], Mapping[str, Any] | None]
 
 
 @dataclass(frozen=True)
-class Options:
-    """What the command line adds to the configuration.
+class Command:
+    """What the command line asked for, beside the configuration.
 
     Attributes:
         force: do it again.
         dry_run: say what would be done.
         roi: only the tiles of this region.
         settings: of a stage on demand, in place of those of its section; None: those of its last result.
+        workers: overrides ``compute.workers``.
+        backend: overrides ``compute.backend``.
+        progress: auto | on | off.
+        quiet: say warnings only.
+        log_json: file for JSON lines.
+        max_memory: overrides ``compute.max_memory``, MiB.
     """
 
     force: bool = False
     dry_run: bool = False
     roi: tuple[int, int, int, int] | None = None
     settings: tuple[tuple[str, Any], ...] | None = None
+    workers: int | None = None
+    backend: str | None = None
+    progress: ProgressMode = "auto"
+    quiet: bool = False
+    log_json: Path | None = None
+    max_memory: int | None = None
 
 
 @functools.lru_cache(maxsize=8)
@@ -103,23 +116,22 @@ def open_store(path: Path) -> RunStore:
 class MarkedTask:
     """A task that sets the markers of its unit once it is done, in the worker.
 
-    ``tell`` hears by key what share of a unit is done, where the worker shares the memory. Where it does not,
-    it may be ``overtaken`` by a later command, and writes no more then.
+    ``tell`` hears by key what share of a unit is done, where the worker shares the memory. Where it does not
+    (None), the worker may be overtaken by a later command, and writes no more then.
     """
 
     store: Path
     stage: str
     fingerprint: str
-    task: Task[Any]
+    task: Task[Any] | None
     tell: Callable[[str, float], None] | None = None
-    overtaken: bool = False
 
     def __call__(self, unit: Unit) -> Mapping[str, Any]:
         """Do the unit, then mark it."""
         store = open_store(self.store)
-        with working(store.records, self.stage, self.fingerprint if self.overtaken else None):
+        with working(store.records, self.stage, self.fingerprint if self.tell is None else None):
             with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
-                summary = dict(self.task(unit, store) or {})
+                summary = {} if self.task is None else dict(self.task(unit, store) or {})
             check_work(self.store)
             for key in markers(unit):
                 store.records.mark(self.stage, self.fingerprint, key, summary)
@@ -137,10 +149,6 @@ class Prepared:
 
     frames: FrameSequence
     clock: tuple[float, float] | None = None
-
-
-def nothing_left(unit: Any, store: RunStore) -> None:
-    """Do nothing: the task of units whose work was done beforehand."""
 
 
 def allowed_bytes(config: RunConfig, workers: int) -> int:
@@ -178,7 +186,7 @@ class StageContext:
         executor: who does the work.
         reporter: where to say what happens.
         stop: raised signals; checked between units.
-        options: of the command line.
+        command: of the command line.
         stage: name of the running stage.
         fingerprint: of the running stage.
         fresh: True where the stage starts anew and must create its arrays.
@@ -199,7 +207,7 @@ class StageContext:
     executor: Executor = field(default_factory=SerialExecutor)
     reporter: Reporter = field(default_factory=lambda: Reporter("off", quiet=True))
     stop: StopRequest = field(default_factory=StopRequest)
-    options: Options = field(default_factory=Options)
+    command: Command = field(default_factory=Command)
     stage: str = ""
     fingerprint: str = ""
     fresh: bool = True
@@ -307,43 +315,45 @@ class StageContext:
                     attributes=attributes,
                 )
 
+    def create_like(self, arrays: Arrays) -> None:
+        """Make arrays over the sensor that are, beside y and x, as those of some of its pixels, by path."""
+        for path, values in arrays.items():
+            lengths = dict(zip(VARIABLES[path].dims, values.shape, strict=True))
+            self.create(path, lengths={dim: n for dim, n in lengths.items() if dim not in ("y", "x")})
+
     def selected(self, units: Sequence[AnyUnit]) -> list[AnyUnit]:
-        """Return the units that ``--roi`` chooses (all of them without it)."""
-        if self.options.roi is None:
-            return list(units)
-        chosen = {tile.key for tile in roi_tiles(self.options.roi, self.tiles())}
-        return [unit for unit in units if unit is WHOLE or chosen & set(markers(unit))]
+        """Return the units that ``--roi`` chooses: all of them without it, and all that are no tiles.
 
-    def pending(
-        self, units: Sequence[AnyUnit], *, by_tiles: bool = True, resumes: bool = False
-    ) -> list[AnyUnit]:
-        """Return the chosen units that are not done; with ``--force`` all, unless the stage ``resumes``.
-
-        Units that are no tiles (``by_tiles=False``) are always chosen, and not forced by a choice of tiles.
+        Raises:
+            ConfigError: the sensor has no such region.
         """
-        done = self.store.records.done(self.stage, self.fingerprint)
-        chosen = self.selected(units) if by_tiles else list(units)
-        if self.options.force and not resumes and (by_tiles or self.options.roi is None):
+        if self.command.roi is None or (units and all(isinstance(unit, Named) for unit in units)):
+            return list(units)
+        chosen = {tile.key for tile in roi_tiles(self.command.roi, self.tiles())}
+        return [unit for unit in units if isinstance(unit, Named) or chosen & set(markers(unit))]
+
+    def pending(self, units: Sequence[AnyUnit], *, resumes: bool = False) -> list[AnyUnit]:
+        """Return the chosen units that are not done; with ``--force`` all, unless the stage ``resumes``."""
+        done, chosen = self.store.records.done(self.stage, self.fingerprint), self.selected(units)
+        if self.command.force and not resumes:
             return chosen
         return [unit for unit in chosen if not set(markers(unit)) <= done]
 
     def run_units(
         self,
         units: Sequence[AnyUnit],
-        task: Task[AnyUnit],
+        task: Task[AnyUnit] | None = None,
         *,
         unit_name: str = "tile",
         needs: str | None = None,
-        by_tiles: bool = True,
         total: int | None = None,
         unit_bytes: int = 0,
     ) -> dict[str, dict[str, Any]]:
-        """Run ``task`` on every unit that is chosen and not done yet, and mark each.
+        """Run ``task`` on every unit that is chosen and not done yet, and mark each; None: only mark them.
 
         Units that raise are kept in :attr:`failed` and stop nothing, except errors that would hit
         every unit (a full disk, vanished camera files). With ``needs``, an upstream stage of the same
-        tiles, units that it has not finished are failures too. ``by_tiles=False`` is for units that
-        ``--roi`` does not choose, such as blocks of frames. A stage that learns only on its way
+        tiles, units that it has not finished are failures too. A stage that learns only on its way
         what its units are calls this several times and says in ``total`` how many markers that makes so far;
         it resumes also under ``--force``, which has made it start anew. ``unit_bytes`` is the memory that a
         worker takes for a unit: fewer work at once where ``compute.max_memory`` says so. Returns the
@@ -357,12 +367,12 @@ class StageContext:
         """
         self.begin()
         self._know_total(sum(len(markers(unit)) for unit in units) if total is None else total)
-        todo = self._ready(self.pending(units, by_tiles=by_tiles, resumes=total is not None), needs)
+        todo = self._ready(self.pending(units, resumes=total is not None), needs)
         self.store.records.unmark(
             self.stage, self.fingerprint, (key for unit in todo for key in markers(unit))
         )
         fatal: list[BaseException] = []
-        shown = len(self.selected(units) if by_tiles else units)
+        shown = len(self.selected(units))
         undivided = list(units) == [WHOLE]
         # what is not divided is done here, and tells its own steps
         executor = SerialExecutor() if undivided else self.executor
@@ -386,9 +396,8 @@ class StageContext:
                     raise Stop
 
             self.stop.check()
-            here = executor.shares_memory
-            heard = tell if here else None
-            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard, not here)
+            heard = tell if executor.shares_memory else None
+            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard)
             try:
                 with self.stop.at_once() if undivided else contextlib.nullcontext():
                     executor.map(marked, todo, on_result)

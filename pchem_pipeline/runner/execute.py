@@ -32,7 +32,7 @@ def execute(name: str, context: StageContext) -> StageState:
     clock = time.perf_counter(), cpu_seconds()
     stage = STAGES[name]
     before = status(stage, context)
-    if before.state == "complete" and not context.options.force:
+    if before.state == "complete" and not context.command.force:
         context.selected(())  # refuses regions that the sensor does not have
         context.reporter.info(f"{name}: up to date")
         return before
@@ -63,7 +63,7 @@ def _perform(
 
     The clock (wall, CPU) started before the state was looked at: hashing the input is part of the work.
     """
-    records, restart = context.store.records, context.options.roi is None
+    records, restart = context.store.records, context.command.roi is None
     content = fingerprint_content(stage, context)
     old = records.known(stage.name)
     # a stage that was stopped before its first unit may lack arrays
@@ -72,7 +72,7 @@ def _perform(
         # chosen tiles mend chunks, and keep the rest
         same = fingerprint_of(content) == old.fingerprint
         resumes = same and not changed_file(old, context.store).endswith(DESCRIPTION)
-    if resumes and context.options.force and restart:
+    if resumes and context.command.force and restart:
         resumes = False
     context.stage, context.failed, context.notes, context.n_keys = stage.name, {}, [], 0
     context.fingerprint = old.fingerprint if resumes and old is not None else fingerprint_of(content)

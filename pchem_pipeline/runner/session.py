@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputError, StoreError
 from pchem_pipeline.compute.executor import make_executor
@@ -16,9 +15,9 @@ from pchem_pipeline.config.load import dump_config, effects_file, found_model
 from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.model_versions import keep_in_force, model_in_force
-from pchem_pipeline.run.progress import ProgressFile, ProgressMode, Reporter
+from pchem_pipeline.run.progress import ProgressFile, Reporter
 from pchem_pipeline.run.signals import stop_on_signals
-from pchem_pipeline.run.stage import Options, StageContext
+from pchem_pipeline.run.stage import Command, StageContext
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.samples import SAMPLES_UNTIL, check_samples, sample_targets
@@ -26,33 +25,6 @@ from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.files import write_record
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
-
-
-@dataclass(frozen=True)
-class Command:
-    """What the command line asked for, beside the configuration.
-
-    Attributes:
-        options: force, dry run, region.
-        workers: overrides ``compute.workers``.
-        backend: overrides ``compute.backend``.
-        progress: auto | on | off.
-        quiet: say warnings only.
-        log_json: file for JSON lines.
-        max_memory: overrides ``compute.max_memory``, MiB.
-    """
-
-    options: Options = field(default_factory=Options)
-    workers: int | None = None
-    backend: str | None = None
-    progress: ProgressMode = "auto"
-    quiet: bool = False
-    log_json: Path | None = None
-    max_memory: int | None = None
-
-    def choosing(self, **options: Any) -> Command:
-        """Return the command with other options of the stages."""
-        return replace(self, options=replace(self.options, **options))
 
 
 def with_overrides(target: Target, command: Command) -> Target:
@@ -64,10 +36,10 @@ def with_overrides(target: Target, command: Command) -> Target:
 
 def cropped(target: Target, command: Command) -> tuple[Target, Command]:
     """Turn the region of the command line into a crop of the input, where there is one."""
-    roi = command.options.roi
+    roi = command.roi
     if roi is None:
         return target, command
-    return target.changed("input", roi=roi), command.choosing(roi=None)
+    return target.changed("input", roi=roi), replace(command, roi=None)
 
 
 def up_to(last: str, stages: Sequence[str]) -> Sequence[str]:
@@ -91,7 +63,7 @@ def run_stages(target: Target, stages: Sequence[str], command: Command) -> list[
         PchEmError: a stage cannot be done; the message says why.
     """
     _bring_samples(target, stages, command)
-    if command.options.dry_run:
+    if command.dry_run:
         return _dry_run(target, stages, command)
     with working_run(target, command) as context:
         states = [_execute(name, context, stages) for name in stages]
@@ -132,12 +104,12 @@ def _bring_samples(target: Target, stages: Sequence[str], command: Command) -> N
     """
     if not target.config.input.samples or not any(STAGES[name].reads_input for name in stages):
         return
-    own = command.choosing(force=False, roi=None)
+    own = replace(command, force=False, roi=None)
     reporter = Reporter("off", quiet=command.quiet)
     for sample in sample_targets(target.config, target.base_dir):
         reporter.info(f"sample {sample.store.name}")
         run_stages(sample, up_to(SAMPLES_UNTIL, pipeline_of(sample.config)), own)
-    if not command.options.dry_run:
+    if not command.dry_run:
         check_samples(target.config, target.base_dir)
 
 
@@ -149,6 +121,29 @@ def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageSt
         for single_pass in filter(None, passes if of_files else ()):
             imported(single_pass)(context)
         return execute(name, context)
+
+
+@contextlib.contextmanager
+def at_work(target: Target, store: RunStore, reporter: Reporter, command: Command) -> Iterator[StageContext]:
+    """Lock a store, and yield what those need who work on it; signals are requests to stop meanwhile.
+
+    Raises:
+        LockedError: another process works on it.
+        PchEmError: the workers cannot be had.
+    """
+    with store.locked(), stop_on_signals() as stop:
+        executor = make_executor(target.config.compute, reporter.warning, stop.check)
+        with contextlib.closing(executor):
+            yield StageContext(
+                target.config,
+                target.base_dir,
+                store,
+                executor,
+                reporter,
+                stop,
+                command,
+                config_path=target.config_path,
+            )
 
 
 @contextlib.contextmanager
@@ -169,45 +164,33 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
             command.progress, quiet=command.quiet, log=command.log_json, progress_file=progress_file
         )
         stack.callback(reporter.close)
-        stack.enter_context(store.locked())
+        context = stack.enter_context(at_work(target, store, reporter, command))
         if (path := target.config_path) is not None:
             found = found_model(path)
             if found is not None and found.model == target.config.model:
                 file = effects_file(path).name
                 reporter.info(f"the model is that of {file}, instead of the one in {path.name}")
         progress_file.show({"stage": ""})
-        stop = stack.enter_context(stop_on_signals())
         store.write_config(dump_config(own))  # what a single command was given is no setting of the run
         keep_in_force(store, model_in_force(store, target.config.model))
         yaml = {} if target.config_path is None else {"config": str(target.config_path)}
         location = {"base_dir": str(target.base_dir), **yaml}  # to which its paths refer
         write_record(store.path / ".pchem" / "location.json", location)
-        executor = make_executor(target.config.compute, reporter.warning, stop.check)
-        stack.callback(executor.close)
-        yield StageContext(
-            target.config,
-            target.base_dir,
-            store,
-            executor,
-            reporter,
-            stop,
-            options=command.options,
-            config_path=target.config_path,
-        )
+        yield context
 
 
-def run_status(target: Target, options: Options | None = None) -> list[StageState]:
+def run_status(target: Target, command: Command | None = None) -> list[StageState]:
     """Return the state of every stage, of those on demand where they were run, without changing anything.
 
     Args:
         target: the run.
-        options: of a command that is about to work on it; None: nothing is asked for.
+        command: that is about to work on it; None: nothing is asked for.
     """
     stages = pipeline_of(target.config)
     if not any((target.store / each).exists() for each in ("zarr.json", ".pchem/stages")):
         return [StageState(name, "missing") for name in stages]
     store = RunStore.open(target.store)
-    context = StageContext(target.config, target.base_dir, store, options=options or Options())
+    context = StageContext(target.config, target.base_dir, store, command=command or Command())
     done = (target.store / ".pchem" / "stages" / f"{name}.json" for name in STAGES if STAGES[name].on_demand)
     stages += tuple(place.stem for place in done if place.exists())
     states: list[StageState] = []
@@ -226,11 +209,11 @@ def run_status(target: Target, options: Options | None = None) -> list[StageStat
 
 def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[StageState]:
     """Say what would be done and, as far as stages can tell, what it takes, without writing anything."""
-    chosen = Options(settings=command.options.settings)
+    chosen = Command(settings=command.settings)
     known = {state.stage: state for state in run_status(target, chosen)}
     states = [known.get(name, StageState(name, "missing")) for name in stages]
     reporter = Reporter("off", quiet=command.quiet)
-    todo = [state.stage for state in states if state.state != "complete" or command.options.force]
+    todo = [state.stage for state in states if state.state != "complete" or command.force]
     for state in states:
         words = "would run" if state.stage in todo else "nothing to do"
         reporter.info(f"{state.stage}: {state.words()} -> {words}")
@@ -243,7 +226,7 @@ def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[St
 
 def _check_failed_pixels(context: StageContext, name: str) -> None:
     """Raise an error if more pixels have no value than allowed, unless only some tiles were chosen."""
-    if context.options.roi is not None:
+    if context.command.roi is not None:
         return
     from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 

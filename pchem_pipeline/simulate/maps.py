@@ -1,7 +1,7 @@
 """Draw the parameter maps of a sensor: distributions, correlations, patterns and defects.
 
 A pixel's values depend on the seed and on its own position only, so a larger sensor with the same seed
-contains the smaller one (but for gradients, which are stretched), and any band of rows can be drawn alone.
+contains the smaller one (but for gradients, which are stretched).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import special
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.simulate.distributions import (
     ColumnPattern,
@@ -37,21 +37,19 @@ if TYPE_CHECKING:
     from pchem_pipeline.simulate.settings import SimulateSettings
 
 
-def draw_truth(settings: SimulateSettings, rows: tuple[int, int] | None = None) -> TruthMaps:
-    """Draw the true parameter maps (y, x) of the sensor, or of a band of its rows.
+def draw_truth(settings: SimulateSettings) -> TruthMaps:
+    """Draw the true parameter maps (y, x) of the sensor.
 
     Args:
         settings: the section ``simulate``.
-        rows: first row and the row after the last; ``None`` for all.
 
     Raises:
         ConfigError: if a value is impossible (H < 0, g <= 0, read noise < 0).
     """
-    ys = np.arange(*(rows or (0, settings.shape[0])))
     given = settings.parameters.given()
     maps = {
-        name: _with_patterns(truncated_quantile(distribution, u), name, distribution, settings, ys)
-        for (name, distribution), u in zip(given.items(), _copula(settings, ys), strict=True)
+        name: _with_patterns(truncated_quantile(distribution, u), name, distribution, settings)
+        for (name, distribution), u in zip(given.items(), _copula(settings), strict=True)
     }
     for name, values in maps.items():
         _refuse_impossible(name, values)
@@ -66,23 +64,23 @@ def draw_truth(settings: SimulateSettings, rows: tuple[int, int] | None = None) 
         analog_read_noise_e=maps["analog_read_noise_e"],
         defect=np.zeros(maps["bias"].shape, np.uint8),
     )
-    return _with_defects(truth, settings, ys)
+    return _with_defects(truth, settings)
 
 
-def _streams(settings: SimulateSettings, purpose: str, ys: IntArray) -> KeyedStreams:
+def _streams(settings: SimulateSettings, purpose: str) -> KeyedStreams:
     return KeyedStreams(
         settings.seed if settings.sensor_seed is None else settings.sensor_seed,
         f"map/{purpose}",
         np.zeros(1, np.int64),
-        ys,
+        np.arange(settings.shape[0]),
         np.arange(settings.shape[1]),
     )
 
 
-def _copula(settings: SimulateSettings, ys: IntArray) -> FloatArray:
+def _copula(settings: SimulateSettings) -> FloatArray:
     """Return uniforms (parameter, y, x) with the rank correlations asked for."""
     factor = np.linalg.cholesky(np.array(settings.parameters.copula()))
-    normals = [_streams(settings, f"parameter {i}", ys).normal(("y", "x"))[0] for i in range(len(factor))]
+    normals = [_streams(settings, f"parameter {i}").normal(("y", "x"))[0] for i in range(len(factor))]
     uniforms: FloatArray = special.ndtr(np.tensordot(factor, np.stack(normals), axes=1))
     return uniforms
 
@@ -92,10 +90,9 @@ def _with_patterns(
     name: str,
     distribution: Distribution,
     settings: SimulateSettings,
-    ys: IntArray,
 ) -> FloatArray:
     for i, pattern in enumerate(distribution.patterns):
-        streams = _streams(settings, f"{name} pattern {i}", ys)
+        streams = _streams(settings, f"{name} pattern {i}")
         shift = _pattern(pattern, streams, settings.shape)
         values = values * (1.0 + shift) if pattern.relative else values + shift
     if distribution.minimum is None and distribution.maximum is None:
@@ -104,7 +101,7 @@ def _with_patterns(
 
 
 def _pattern(pattern: Pattern, streams: KeyedStreams, shape: tuple[int, int]) -> FloatArray:
-    """Return a pattern on the band, broadcastable to (y, x)."""
+    """Return a pattern, broadcastable to (y, x)."""
     # position from -1/2 to 1/2 across the sensor; a single row or column is in the middle
     y = (streams.rows[:, None] - (shape[0] - 1) / 2) / max(shape[0] - 1, 1)
     x = (streams.columns[None, :] - (shape[1] - 1) / 2) / max(shape[1] - 1, 1)
@@ -136,10 +133,10 @@ def _refuse_impossible(name: str, values: FloatArray) -> None:
         )
 
 
-def _with_defects(truth: TruthMaps, settings: SimulateSettings, ys: IntArray) -> TruthMaps:
+def _with_defects(truth: TruthMaps, settings: SimulateSettings) -> TruthMaps:
     """Return the maps with hot, dead and stuck pixels; a pixel has one defect at most."""
     parameters = settings.parameters
-    streams = _streams(settings, "defect", ys)
+    streams = _streams(settings, "defect")
     lot = streams.uniform(("y", "x"), draw=0)[0]
     ends = np.cumsum([parameters.dead_fraction, parameters.stuck_fraction, parameters.hot_pixels.fraction])
     dead = lot < ends[0]

@@ -109,16 +109,13 @@ def cut_rows(ny: int, step: int, workers: int) -> list[tuple[int, int]]:
     return equal_rows(ny, step * max(1, -(-ny // step) // (4 * workers)))
 
 
-def tile_bands(
-    context: StageContext, needs: str, most_rows: int, rows_per_read: int = 1
-) -> list[Band | Tile]:
-    """Return the units of a stage that reads frames again by bands.
+def tile_bands(context: StageContext, most_rows: int, rows_per_read: int = 1) -> list[Band | Tile]:
+    """Return the units of a stage that reads the frames of fitted pixels again by bands.
 
-    A tile that is done, or that is not to be done, is in no band and stays a unit of its own.
+    A tile that is done, or that is not fitted, is in no band and stays a unit of its own.
 
     Args:
         context: of the stage.
-        needs: the stage whose tiles must be there; others are left as single tiles, which then fail.
         most_rows: rows that a worker can hold; one row of tiles is the least.
         rows_per_read: rows that come at no more cost than one.
 
@@ -126,7 +123,7 @@ def tile_bands(
         Bands of the tiles to be done, and all the other tiles.
     """
     tiles = context.tiles()
-    ready = context.tiles_done(needs)
+    ready = context.tiles_done("fit")
     todo = {tile.key for tile in context.pending(tiles)} & ready
     step = tiles[0].y1
     ny, workers = tiles[-1].y1, context.executor.workers

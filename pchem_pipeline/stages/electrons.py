@@ -66,7 +66,7 @@ def run(context: StageContext) -> None:
     )
     depth = context.store.array("electrons/electron_number").chunks[0]
     rows = BAND_BYTES // (depth * nx * 2)
-    bands = tile_bands(context, "fit", rows, source.rows_per_read)
+    bands = tile_bands(context, rows, source.rows_per_read)
     task = functools.partial(_do_band, source=source, depth=depth)
     context.run_units(bands, task, unit_name="band", needs="fit")
 

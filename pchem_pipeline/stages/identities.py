@@ -113,8 +113,8 @@ def _chosen(context: StageContext) -> dict[str, Any]:
     The result of a command with ``--pixels`` is thereby up to date until another one is asked for, whatever
     the YAML says.
     """
-    if context.options.settings is not None:
-        chosen: dict[str, Any] = to_jsonable_python(dict(context.options.settings))
+    if context.command.settings is not None:
+        chosen: dict[str, Any] = to_jsonable_python(dict(context.command.settings))
         return chosen
     record = context.store.records.known("methods")
     kept = {} if record is None else record.content.get("input") or {}
@@ -148,5 +148,5 @@ def search_start(context: StageContext) -> dict[str, Any]:
     before = with_digest(model_versions(context.store), kept.get("model"))
     own = model.source == "verdict" and before is not None and before.number == model.parent
     start = before if own and before is not None else model
-    roi = context.options.roi or (() if context.options.force else kept.get("roi", ()))
+    roi = context.command.roi or (() if context.command.force else kept.get("roi", ()))
     return {"model": start.digest, "roi": list(roi)}

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histo
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.input import keep_ingested, listed_identity
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.stage import WHOLE, StageContext, Task, nothing_left
+from pchem_pipeline.run.stage import WHOLE, Named, StageContext, Task
 from pchem_pipeline.stages.samples import check_samples, sample_sensor
 
 if TYPE_CHECKING:
@@ -35,19 +34,8 @@ _MANY_FILES = 1500
 _UNIT_BYTES = 128 << 20
 
 
-@dataclass(frozen=True)
-class CopyUnit:
-    """Frames t0..t1 and rows y0..y1: whole chunks of ``frames/dn``."""
-
-    t0: int
-    t1: int
-    y0: int
-    y1: int
-
-    @property
-    def key(self) -> str:
-        """What messages call it, and its marker."""
-        return f"frames-{self.t0}-{self.t1 - 1}-rows-{self.y0}-{self.y1 - 1}"
+#: Frames and rows, first and end each: whole chunks of ``frames/dn``.
+_Copied = tuple[int, int, int, int]
 
 
 def run(context: StageContext) -> None:
@@ -78,8 +66,7 @@ def run(context: StageContext) -> None:
         context.note(message)
     sensor_of(reader, context, listed_identity(context)).write(context.store)
     if reader.excluded is not None:
-        context.create("frames/excluded", lengths=dict(zip(("y", "x"), reader.shape[1:], strict=True)))
-        context.store.write("frames/excluded", (slice(None),) * 2, reader.excluded.astype(np.uint8))
+        context.store.write_array("frames/excluded", reader.excluded)
         number = np.count_nonzero(reader.excluded)
         context.note(f"{number} of {reader.excluded.size} pixels excluded by the mask or the marker 2^32-1")
     keep_ingested(context)
@@ -88,13 +75,13 @@ def run(context: StageContext) -> None:
         return
     chunk = chunk_shape(reader.shape, reader.dtype.itemsize)
     units = list(copy_units(reader.shape, reader.dtype.itemsize, chunk))
-    task: Task[CopyUnit] = nothing_left
+    task: Task[Named[_Copied]] | None = None
     if done is None:
         create_frames(context, reader)
         task = functools.partial(_copy, reader=reader)
     # the frames of a row of chunks, those that the reader holds, and the compressed ones
     held = 0 if done else 3 * chunk[0] * chunk[1] * reader.shape[2] * reader.dtype.itemsize
-    context.run_units(units, task, unit_name="block", by_tiles=False, unit_bytes=held)
+    context.run_units(units, task, unit_name="block", unit_bytes=held)
 
 
 def sensor_of(reader: FrameSequence, context: StageContext, identity: dict[str, Any]) -> SensorInfo:
@@ -147,23 +134,25 @@ def shard_shape(shape: tuple[int, int, int], chunk: tuple[int, int, int]) -> tup
     return None if wide == columns else (frames, rows, wide)
 
 
-def copy_units(shape: tuple[int, int, int], itemsize: int, chunk: tuple[int, int, int]) -> Iterator[CopyUnit]:
+def copy_units(
+    shape: tuple[int, int, int], itemsize: int, chunk: tuple[int, int, int]
+) -> Iterator[Named[_Copied]]:
     """Yield units of whole chunks over the full width, in the order of time."""
     n_frames, ny, nx = shape
     band = chunk[0] * chunk[1] * nx * itemsize
     rows = chunk[1] * max(1, _UNIT_BYTES // band)
     for t0 in range(0, n_frames, chunk[0]):
         for y0 in range(0, ny, rows):
-            yield CopyUnit(t0, min(t0 + chunk[0], n_frames), y0, min(y0 + rows, ny))
+            t1, y1 = min(t0 + chunk[0], n_frames), min(y0 + rows, ny)
+            yield Named(f"frames-{t0}-{t1 - 1}-rows-{y0}-{y1 - 1}", (t0, t1, y0, y1))
 
 
-def _copy(unit: CopyUnit, store: RunStore, *, reader: FrameReader) -> None:
+def _copy(unit: Named[_Copied], store: RunStore, *, reader: FrameReader) -> None:
     """Read the frames of a unit and write them into the store, a row of chunks at a time."""
-    rows = store.array("frames/dn").chunks[1]
-    for y in range(unit.y0, unit.y1, rows):
-        end = min(y + rows, unit.y1)
-        region = (slice(unit.t0, unit.t1), slice(y, end), slice(None))
-        store.write("frames/dn", region, reader.read(unit.t0, unit.t1, y, end))
+    rows, (t0, t1, y0, y1) = store.array("frames/dn").chunks[1], unit.content
+    for y in range(y0, y1, rows):
+        end = min(y + rows, y1)
+        store.write("frames/dn", (slice(t0, t1), slice(y, end), slice(None)), reader.read(t0, t1, y, end))
 
 
 def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:
@@ -178,7 +167,7 @@ def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:
 
 def _run_whole(context: StageContext) -> None:
     """Finish the stage where nothing is copied."""
-    context.run_units([WHOLE], nothing_left, unit_name="input", by_tiles=False)
+    context.run_units([WHOLE], unit_name="input")
 
 
 # -- ready-made histograms ----------------------------------------------------------------------

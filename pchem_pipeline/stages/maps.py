@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import Arrays
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, poorest
@@ -47,7 +48,7 @@ def _tell_time(context: StageContext) -> None:
 
 
 def maps_tile(
-    fit: Mapping[str, NDArray[Any]],
+    fit: Arrays,
     integration_time: float | None,
     rate: str = "charge_rate",
     n_frames: int | None = None,
@@ -66,13 +67,13 @@ def maps_tile(
     """
     parameters = {name: fit[name] for name in PARAMETERS}
     maps: dict[str, NDArray[Any]] = dict(parameters)
-    stderr = np.stack([fit[f"{name}_stderr"] for name in PARAMETERS], axis=-1)
+    stderr, status = np.stack([fit[f"{name}_stderr"] for name in PARAMETERS], axis=-1), fit["fit_status"]
     if n_frames is not None:
-        m, p = electron_shifts(fit["quanta_exposure"].ravel(), fit["likelihood_gap"].ravel(), n_frames)
-        off = np.sqrt(p @ m**2).reshape(fit["bias"].shape)
-        off[(fit["fit_status"] & _CUT) == _CUT] = np.nan
+        m, p = electron_shifts(maps["quanta_exposure"].ravel(), fit["likelihood_gap"].ravel(), n_frames)
+        off = np.sqrt(p @ m**2).reshape(status.shape)
+        off[(status & _CUT) == _CUT] = np.nan
         stderr[..., 0] = np.hypot(stderr[..., 0], off)
-        stderr[..., 2] = np.hypot(stderr[..., 2], off / fit["conversion_gain"])
+        stderr[..., 2] = np.hypot(stderr[..., 2], off / maps["conversion_gain"])
     maps |= {f"{name}_stderr": stderr[..., i] for i, name in enumerate(PARAMETERS)}
     maps |= derived_maps(parameters, covariance_from(stderr, fit["correlation"]), integration_time, rate)
     for name in (path for each in INTERVALS for path in interval_names(each)):
@@ -81,7 +82,7 @@ def maps_tile(
     if integration_time is not None and "quanta_exposure_low" in fit:
         ends = zip(interval_names(rate), interval_names("quanta_exposure"), strict=True)
         maps |= {name: fit[source] / integration_time for name, source in ends}
-    maps["quality"] = quality_map(fit["fit_status"], fit["conversion_gain"])
+    maps["quality"] = quality_map(status, maps["conversion_gain"])
     return maps
 
 
@@ -91,29 +92,24 @@ def run(context: StageContext) -> None:
     Raises:
         StoreError: the fit is missing, or the store refuses.
     """
-    time, line = context.sensor.integration_time, _line(context)
-    of_time = (context.charge_rate,) if time is not None and line is None else ()
-    names = [*PARAMETERS, "read_noise_e", "analog_read_noise_e", *(of_time if line is None else line.names)]
-    context.create(*(f"maps/{name}" for each in names for name in (each, f"{each}_stderr")))
-    ends = [path for each in (*INTERVALS, *of_time) for path in interval_names(each)]
-    if context.store.has(f"fit/{ends[0]}"):
-        context.create(*(f"maps/{name}" for name in ends))
-    context.create("maps/quality", "maps/goodness_q")
-    if line is not None:
-        residuals = ("residual", "residual_stderr", "chi2", "p")
-        context.create(*(f"samples/linearity_{name}" for name in residuals), lengths={"sample": len(line.x)})
-    elif not context.sensor.samples:
-        _tell_time(context)
-    task = functools.partial(
-        _do_tile,
-        integration_time=time,
+    line, sensor = _line(context), context.sensor
+    arrays = functools.partial(
+        _arrays,
+        integration_time=sensor.integration_time if line is None else None,
         rate=context.charge_rate,
         line=line,
-        n_frames=None if context.sensor.samples else context.sensor.n_frames,
+        n_frames=None if sensor.samples else sensor.n_frames,
     )
+    of_none = arrays(context.store, (slice(0), slice(0)))  # of no pixel, with all names
+    context.create_like(of_none)
+    context.create("maps/goodness_q")
+    if not sensor.samples:
+        _tell_time(context)
     held = context.tile_pixels * 80 * 8  # arrays that are read and made
+    task = functools.partial(_do_tile, arrays=arrays)
     context.run_units(context.tiles(), task, needs="fit", unit_bytes=held)
-    _summarise(context, names)
+    with_error = [path.removesuffix("_stderr") for path in of_none if path.endswith("_stderr")]
+    _summarise(context, [path.removeprefix("maps/") for path in with_error if path.startswith("maps/")])
 
 
 @dataclass(frozen=True)
@@ -132,30 +128,27 @@ def _line(context: StageContext) -> Line | None:
     )
 
 
-def _do_tile(
-    tile: Tile,
+def _arrays(
     store: RunStore,
+    region: tuple[slice, slice],
     *,
     integration_time: float | None,
     rate: str,
     line: Line | None,
     n_frames: int | None,
-) -> None:
-    needed = [*PARAMETERS, *(f"{name}_stderr" for name in PARAMETERS)]
-    needed += ["correlation", "fit_status", "likelihood_gap"]
-    needed += [path for name in INTERVALS for path in interval_names(name) if store.has(f"fit/{path}")]
-    fit = store.read_arrays("fit", needed, tile.region)
-    store.write_arrays("maps", maps_tile(fit, integration_time, rate, n_frames), tile.region)
-    if line is not None:
-        samples = store.read_arrays("samples", ("quanta_exposure", "covariance"), tile.region)
-        for group, arrays in zip(("maps", "samples"), line_tile(samples, line), strict=True):
-            store.write_arrays(group, arrays, tile.region)
+) -> dict[str, NDArray[Any]]:
+    """Return all that the stage makes of the fit of some pixels, by path."""
+    maps = maps_tile(store.at(region, "fit"), integration_time, rate, n_frames)
+    found = {f"maps/{name}": values for name, values in maps.items()}
+    return found if line is None else found | line_tile(store.at(region, "samples"), line)
 
 
-def line_tile(
-    samples: Mapping[str, NDArray[Any]], line: Line
-) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
-    """Return what a line through the exposures of each pixel tells, of the groups ``maps`` and ``samples``.
+def _do_tile(tile: Tile, store: RunStore, *, arrays: Callable[..., dict[str, NDArray[Any]]]) -> None:
+    store.at(tile.region).update(arrays(store, tile.region))
+
+
+def line_tile(samples: Arrays, line: Line) -> dict[str, NDArray[Any]]:
+    """Return what a line through the exposures of each pixel tells, by path.
 
     Args:
         samples: ``quanta_exposure`` (sample, y, x) and ``covariance`` (y, x, parameter, parameter) of a tile.
@@ -166,13 +159,11 @@ def line_tile(
     maps, left = line_maps(
         exposure.reshape(n, -1).T, covariance.reshape(-1, *covariance.shape[2:]), np.array(line.x), line.names
     )
-    return (
-        {name: values.reshape(shape) for name, values in maps.items()},
-        {
-            name: np.ascontiguousarray(values.T).reshape(*values.shape[1:], *shape)
-            for name, values in left.items()
-        },
-    )
+    return {
+        f"{group}/{name}": np.ascontiguousarray(values.T).reshape(*values.shape[1:], *shape)
+        for group, found in (("maps", maps), ("samples", left))
+        for name, values in found.items()
+    }
 
 
 def _summarise(context: StageContext, names: list[str]) -> None:
@@ -203,7 +194,7 @@ def _misfits(context: StageContext) -> dict[str, Any]:
     for values in (chi2, dof, p):
         values[failed] = np.nan
     q = false_discovery(p)
-    store.write("maps/goodness_q", (slice(None), slice(None)), q)
+    store.write("maps/goodness_q", None, q)
     worst = [
         {
             "y": y,

@@ -131,11 +131,6 @@ def run(context: StageContext) -> None:
         )
     settings = methods_settings(context)
     others = open_other_runs(context.store, context.base_dir, settings.with_runs)
-    n_pixels = min(settings.pixels, context.sensor.ny * context.sensor.nx)
-    names = list(methods())
-    lengths = {"method": len(names), "pixel": n_pixels}
-    context.create("methods/pixel_y", "methods/pixel_x", lengths=lengths)
-    context.create(*(f"methods/{name}" for name in PARAMETERS), lengths=lengths, methods=names)
     units = [_Unit("run", None), *_study_units(context, settings)]
     task = functools.partial(
         _do,
@@ -143,7 +138,7 @@ def run(context: StageContext) -> None:
         settings=settings,
         adc_limits=context.sensor.adc_limits,
     )
-    found = context.run_units(units, task, unit_name="part", by_tiles=False)
+    found = context.run_units(units, task, unit_name="part")
     if not {unit.key for unit in units} <= found.keys():
         return
     result = {
@@ -204,12 +199,12 @@ def _do(
     skipped = ("pchem_em",) if source == "fit" else ()
     results = compare(PixelSamples(samples, adc_limits), reference, settings, skip_errors=skipped)
     y, x = np.divmod(place, shape[1])
-    store.write("methods/pixel_y", (slice(None),), y.astype(np.int32))
-    store.write("methods/pixel_x", (slice(None),), x.astype(np.int32))
+    store.write_array("methods/pixel_y", y)
+    store.write_array("methods/pixel_x", x)
     blank = np.full((place.size, 4), np.nan)
     estimates = np.stack([blank if r.estimates is None else r.estimates for r in results])
     for column, name in enumerate(PARAMETERS):
-        store.write(f"methods/{name}", (slice(None), slice(None)), estimates[:, :, column])
+        store.write_array(f"methods/{name}", estimates[:, :, column], {"methods": list(methods())})
     words = _sample_words([path.name for path in stores], samples, reference)
     return {
         "pixels": int(place.size),

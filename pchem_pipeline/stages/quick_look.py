@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import Arrays, FloatArray, IntArray
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
 from pchem_pipeline.discrepancy.quick.codes import CodeSample
@@ -57,7 +56,7 @@ def run_quick_look(run: StoredRun, sums: StackSums | None) -> QuickLook | None:
     return quick_look(sums, maps, codes, run.model.effects, missing, "pchem discrepancy")
 
 
-def _maps(fit: Mapping[str, NDArray[Any]], maps: Mapping[str, FloatArray]) -> PixelMaps | None:
+def _maps(fit: Arrays, maps: Mapping[str, FloatArray]) -> PixelMaps | None:
     status = fit.get("fit_status")
     if status is None or not all(name in maps for name in PARAMETERS):
         return None

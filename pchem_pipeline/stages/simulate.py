@@ -11,11 +11,11 @@ import io
 import math
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -25,7 +25,7 @@ from pchem_pipeline.frames.formats.map_files import read_image
 from pchem_pipeline.frames.identity import content_identity
 from pchem_pipeline.frames.writing import WRITERS, write_frames
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
-from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.run.stage import Named, StageContext
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.scene import with_scene
@@ -46,26 +46,9 @@ _CHUNK = 16 << 20
 _MOST_UNITS = 256
 
 
-@dataclass(frozen=True)
-class SimulateUnit:
-    """Frames ``start .. stop - 1``, to be written to files, or whose electrons go into the store.
-
-    Attributes:
-        kind: what becomes of them.
-        start: first frame.
-        stop: frame after the last.
-        files: name, first frame and frame after the last of each file.
-    """
-
-    kind: Literal["frames", "electrons"]
-    start: int
-    stop: int
-    files: tuple[tuple[str, int, int], ...] = ()
-
-    @property
-    def key(self) -> str:
-        """What messages call it."""
-        return f"{self.kind}-{self.start}-{self.stop}"
+#: Frames, first and end, of the file of this name; None: whose electrons go into the store.
+_Frames = tuple[str | None, int, int]
+_Unit = Named[Sequence[_Frames]]
 
 
 def run(context: StageContext) -> None:
@@ -90,11 +73,11 @@ def run(context: StageContext) -> None:
     _write_truth(folder / TRUTH_FILE, truth, settings, [name for name, _, _ in files])
     electron_units = _electron_units(settings)
     if electron_units:
-        step, (rows, columns) = electron_units[0].stop, settings.shape
+        step, (rows, columns) = electron_units[0].content[-1][2], settings.shape
         band = min(rows, ROW_GROUP)
         context.create(
             "truth/electron_number",
-            lengths={"frame": electron_units[-1].stop, "y": rows, "x": columns},
+            lengths={"frame": electron_units[-1].content[-1][2], "y": rows, "x": columns},
             # the ensemble reads them by bands
             chunks={"frame": step, "y": band},
             shards=(step, band * math.ceil(rows / band), columns),
@@ -108,7 +91,7 @@ def run(context: StageContext) -> None:
         alone=len(_frame_units(files)) == 1,
     )
     # frames are made whole: tiles and regions mean the sensor that is read
-    context.run_units(units, task, unit_name="part", by_tiles=False)
+    context.run_units(units, task, unit_name="part")
 
 
 def frames_tile(truth: TruthMaps, settings: SimulateSettings, frames: tuple[int, int]) -> NDArray[Any]:
@@ -117,22 +100,21 @@ def frames_tile(truth: TruthMaps, settings: SimulateSettings, frames: tuple[int,
 
 
 def _do(
-    unit: SimulateUnit,
+    unit: _Unit,
     store: RunStore,
     *,
     settings: SimulateSettings,
     folder: Path,
     workers: int,
     alone: bool,
-) -> dict[str, Any]:
+) -> None:
     truth, settings = _sensor(settings.model_dump_json())
-    if unit.kind == "electrons":
-        _, electrons = simulate_block(truth, settings, (unit.start, unit.stop))
-        region = (slice(unit.start, unit.stop), slice(None), slice(None))
-        store.write("truth/electron_number", region, electrons)
-        return {}
     step = frames_per_block(settings, settings.shape[0], _BUDGET // workers)
-    for name, start, stop in unit.files:
+    for name, start, stop in unit.content:
+        if name is None:
+            _, electrons = simulate_block(truth, settings, (start, stop))
+            store.write("truth/electron_number", (slice(start, stop), slice(None), slice(None)), electrons)
+            continue
         blocks = [(first, min(first + step, stop)) for first in range(start, stop, step)]
         write_frames(
             settings.format,
@@ -144,7 +126,6 @@ def _do(
             integration_time=settings.integration_time,
             bit_depth=settings.bit_depth,
         )
-    return {"files": len(unit.files)}
 
 
 def scene_identity(context: StageContext) -> dict[str, Any] | None:
@@ -232,17 +213,18 @@ def _files(settings: SimulateSettings) -> list[tuple[str, int, int]]:
     ]
 
 
-def _frame_units(files: list[tuple[str, int, int]]) -> list[SimulateUnit]:
+def _frame_units(files: list[tuple[str, int, int]]) -> list[_Unit]:
     """Share the files out: some hundred units at most, so that markers cost nothing."""
     step = math.ceil(len(files) / _MOST_UNITS)
-    groups = [tuple(files[i : i + step]) for i in range(0, len(files), step)]
-    return [SimulateUnit("frames", group[0][1], group[-1][2], group) for group in groups]
+    groups = [files[i : i + step] for i in range(0, len(files), step)]
+    return [Named(f"frames-{group[0][1]}-{group[-1][2]}", group) for group in groups]
 
 
-def _electron_units(settings: SimulateSettings) -> list[SimulateUnit]:
+def _electron_units(settings: SimulateSettings) -> list[_Unit]:
     n = min(settings.truth_frames, settings.n_frames)
     step = max(1, min(n, _CHUNK // (4 * math.prod(settings.shape))))
-    return [SimulateUnit("electrons", start, min(start + step, n)) for start in range(0, n, step)]
+    parts = [(None, start, min(start + step, n)) for start in range(0, n, step)]
+    return [Named(f"electrons-{start}-{end}", [(None, start, end)]) for _, start, end in parts]
 
 
 def _prepare(folder: Path, settings: SimulateSettings) -> None:

@@ -133,7 +133,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=13,
+        version=14,
         upstream=("ingest",),
         settings=("discrepancy",),
         writes=("discrepancy",),

@@ -22,7 +22,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import PchEmError, StoreError, quoted
-from pchem_pipeline.base.variables import variable_at
+from pchem_pipeline.base.variables import VARIABLES, variable_at
 from pchem_pipeline.store import disk
 from pchem_pipeline.store.files import (
     DESCRIPTION,
@@ -199,7 +199,7 @@ class RunStore:
         """Make a small array and write it whole, in one chunk."""
         dtype = data.dtype if variable_at(name).dtype == "*" else None
         self.create_array(name, data.shape, chunks=data.shape, dtype=dtype, attributes=attributes)
-        self.write(name, (slice(None),) * data.ndim, data)
+        self.write(name, None, data)
 
     @functools.cached_property
     def _writer(self) -> zarr.Group:
@@ -247,37 +247,9 @@ class RunStore:
         with self._translated(name, region):
             return np.asarray(array[region if region is not None else ...])
 
-    def read_arrays(
-        self, group: str, names: Iterable[str], region: tuple[slice, slice] | None = None
-    ) -> dict[str, NDArray[Any]]:
-        """Return arrays of a group, by name.
-
-        Args:
-            group: of the store.
-            names: of the arrays in it.
-            region: of the sensor, (y, x); None: all of it.
-
-        Raises:
-            StoreError: one is missing or a chunk is corrupt.
-        """
-        paths = {name: f"{group}/{name}" for name in names}
-        return {
-            name: self.read(path, None if region is None else variable_at(path).index(region))
-            for name, path in paths.items()
-        }
-
-    def write_arrays(
-        self, group: str, arrays: Mapping[str, NDArray[Any]], region: tuple[slice, slice]
-    ) -> None:
-        """Write arrays of a region (y, x) of the sensor, whole chunks, into the arrays of a group.
-
-        Raises:
-            LockedError: the work of this thread was overtaken by a later command.
-            StoreError: the file system refused.
-        """
-        for name, values in arrays.items():
-            path = f"{group}/{name}"
-            self.write(path, variable_at(path).index(region), values)
+    def at(self, region: tuple[slice, slice] | None = None, group: str = "") -> Part:
+        """Return the arrays of a region (y, x), or whole, by their paths or by their names in a group."""
+        return Part(self, region, f"{group}/" if group else "")
 
     def file_shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of the parts of an array that are a file each, and that one task writes whole."""
@@ -307,8 +279,8 @@ class RunStore:
                 found[here] = _pixels_of(array, y[here], x[here])
         return found
 
-    def write(self, name: str, region: _Region, data: NDArray[Any]) -> None:
-        """Write ``data`` into a region made of whole chunks.
+    def write(self, name: str, region: _Region | None, data: NDArray[Any]) -> None:
+        """Write ``data`` into a region made of whole chunks; None: into the whole array.
 
         Raises:
             LockedError: the work of this thread was overtaken by a later command.
@@ -316,7 +288,7 @@ class RunStore:
         """
         check_work(self.path)
         with self._translated(name, region):
-            self.array(name, to_write=True)[region] = data
+            self.array(name, to_write=True)[... if region is None else region] = data
 
     def fill(self, name: str) -> None:
         """Write the fill value wherever nothing was written: a chunk that is missing is damage.
@@ -428,6 +400,39 @@ def stored_config(path: Path) -> str | None:
 
 def _digest_line(text: bytes) -> bytes:
     return f"{_DIGEST_LINE}{hashlib.sha256(text).hexdigest()}\n".encode()
+
+
+class Part(MutableMapping[str, NDArray[Any]]):
+    """Arrays of a region of the sensor: each is read when it is asked for, and what is set is written.
+
+    For the names see :meth:`RunStore.at`, for the errors :meth:`RunStore.read` and :meth:`RunStore.write`; an
+    array that is missing is a StoreError, also for ``get``.
+    """
+
+    def __init__(self, store: RunStore, region: tuple[slice, slice] | None, prefix: str) -> None:
+        self._store, self._region, self._prefix = store, region, prefix
+
+    def _index(self, path: str) -> _Region | None:
+        return None if self._region is None else variable_at(path).index(self._region)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self._store.read(self._prefix + name, self._index(self._prefix + name))
+
+    def __setitem__(self, name: str, values: NDArray[Any]) -> None:
+        self._store.write(self._prefix + name, self._index(self._prefix + name), values)
+
+    def __delitem__(self, name: str) -> None:
+        self._store.delete(self._prefix + name)
+
+    def __contains__(self, name: object) -> bool:
+        return self._store.has(f"{self._prefix}{name}")
+
+    def __iter__(self) -> Iterator[str]:
+        paths = (path for path in VARIABLES if path.startswith(self._prefix) and self._store.has(path))
+        return (path.removeprefix(self._prefix) for path in paths)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
 
 
 @functools.lru_cache(maxsize=64)  # once in a process: it takes 20 ms in the largest stores

@@ -248,17 +248,6 @@ def _gaps(pairs: Sequence[tuple[Record, Answer]]) -> None:
             closed = sorted(v["gap"]["closed_fraction"] for v in named)
             print(f"    closed fraction where named: median {median(closed):.3f}, lowest {closed[0]:.3f}")
     strong = [(r["verdict"]["steps"][0], a) for r, a in pairs if a.level == 4.0 and a.alone]
-    with_placebo = [(s, a) for s, a in strong if s.get("placebo") and s["gap_before"] > 0]
-    apart = [s for s, a in with_placebo if s["placebo"]["effect"] not in twins_of(next(iter(a.hidden)))]
-    _share(
-        "4 s95: a placebo closes a quarter at most", apart, lambda s: _closed(s, "placebo") <= 0.25, least=0.9
-    )
-    if apart:
-        shares = sorted(_closed(s, "placebo") for s in apart)
-        print(f"    closed by the placebo: median {median(shares):.3f}, largest {shares[-1]:.3f}")
-        worst = Counter(s["placebo"]["effect"] for s in apart if _closed(s, "placebo") > 0.25)
-        if worst:
-            print("    placebos that close more: " + ", ".join(f"{t} x{n}" for t, n in worst.most_common()))
     rivals = [s for s, _ in strong if s.get("rivals") and s["gap_before"] > 0]
     _share("4 s95: the right name closes more than the runner-up", rivals, _better_than_runner_up, least=1.0)
 
@@ -266,10 +255,6 @@ def _gaps(pairs: Sequence[tuple[Record, Answer]]) -> None:
 def at_floor(verdict: dict[str, Any]) -> bool:
     """Tell whether the gap that a verdict leaves is at its floor."""
     return bool(verdict["gap"]["after"] <= verdict["gap"]["floor"])
-
-
-def _closed(step: dict[str, Any], who: str) -> float:
-    return float(1 - max(step[who]["gap_after"], 0.0) / step["gap_before"])
 
 
 def _better_than_runner_up(step: dict[str, Any]) -> bool:

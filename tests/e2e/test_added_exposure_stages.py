@@ -5,8 +5,9 @@ import numpy as np
 from pchem_pipeline.commands.model import adopt_verdict, use_model
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.runner.session import run_stages, run_status
 from pchem_pipeline.store.run_store import RunStore
 
 QUIET = Command(quiet=True)

@@ -13,8 +13,9 @@ from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.fit.status import flags_of
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.runner.session import run_stages, run_status
 from pchem_pipeline.store.run_store import RunStore
 
 EFFECTS: list[dict[str, Any]] = [

@@ -17,7 +17,7 @@ from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import display_edges
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.style.wording import measured, short, symbol
-from pchem_pipeline.stages.report.inspector import StoredMaps, packed_map
+from pchem_pipeline.stages.report.inspector import packed_map
 
 NY, NX = 70, 90
 PANEL = ("quanta_exposure", "charge_rate", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
@@ -108,7 +108,7 @@ def shown_value(store, name, i):
 
 def as_shown(store, path):
     """The map as the page has it where it has no exact values."""
-    return unpack_map(packed_map(StoredMaps(store), path), (NY, NX))
+    return unpack_map(packed_map(store.at(), path), (NY, NX))
 
 
 def selected(tab):
@@ -247,7 +247,7 @@ def test_typed_ends_select_the_right_pixels(tab, store):
     assert selected(tab) == inside.sum()
     tab.show("maps/bias")
     bias = as_shown(store, "maps/bias")
-    step = packed_map(StoredMaps(store), "maps/bias").scale.step
+    step = packed_map(store.at(), "maps/bias").scale.step
     found = re.search(r"Median bias ([\d.]+) DN, of all ([\d.]+)", tab.text("#inspector-selection"))
     for text, values in ((found[1], bias[inside]), (found[2], bias[np.isfinite(bias)])):
         assert float(text) == pytest.approx(np.median(values), abs=step + 0.5)

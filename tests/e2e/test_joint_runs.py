@@ -15,14 +15,14 @@ from pchem_pipeline.commands.new_run import find_joint
 from pchem_pipeline.commands.notebook import open_run
 from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.discrepancy.verdict import read_verdict
-from pchem_pipeline.run.stage import Options
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages, run_status, up_to
+from pchem_pipeline.runner.session import run_stages, run_status, up_to
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.stages.table import pipeline, pipeline_of
 from pchem_pipeline.store.run_store import RunStore
 
-QUIET = Command(Options(), quiet=True, progress="off")
+QUIET = Command(quiet=True, progress="off")
 PIPELINE = pipeline()[1:]
 
 CAMERA = """
@@ -176,7 +176,7 @@ def test_histograms_made_again_make_the_fit_stale(joint):
 
 def test_light_levels_and_no_line(joint):
     samples = ["dark_1s.zarr, light_level: 10", "dark_2s.zarr, light_level: 20"]
-    store = fit(write(joint, "light", samples, against="light_level"))
+    store = fit(write(joint, "light", samples, against="light_level", integration_time=2.0))
     assert 0.03 < np.nanmedian(store.read("maps/charge_per_level")) < 0.07
     store = fit(write(joint, "plain", samples, against="none"))
     assert not store.has("maps/dark_current")

@@ -9,9 +9,9 @@ from pchem_pipeline.base.errors import ConfigError, PchEmError, StoreError
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.open import open_frames
-from pchem_pipeline.run.stage import Options
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages
+from pchem_pipeline.runner.session import run_stages
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.stages import simulate as stage
@@ -41,7 +41,7 @@ def prepare(folder, *, backend="serial", **changes):
 
 
 def simulated(target, **options):
-    command = Command(options=Options(**options), quiet=True)
+    command = Command(**options, quiet=True)
     return run_stages(target, ["simulate"], command)[0].state
 
 

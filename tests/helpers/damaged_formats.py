@@ -25,8 +25,9 @@ from pchem_pipeline.config.load import make_config
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
-from pchem_pipeline.runner.session import Command, run_stages
+from pchem_pipeline.runner.session import run_stages
 
 #: what a case may take: seconds, and bytes above what the undamaged files take
 SECONDS, MEMORY = 10.0, 1 << 30

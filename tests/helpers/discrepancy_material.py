@@ -181,7 +181,6 @@ def step(effect: str | None, verdict: str, before: float, after: float) -> dict[
             },
             {"effect": "interpixel_capacitance", "gap_after": 300 * micro, "behind": -262.0, "why": ""},
         ],
-        "placebo": {"effect": "flicker_noise", "gap_after": before * 0.97 * micro},
         "moved": {
             "quanta_exposure": {"median": 0.0004, "in_stderr": 0.02, "unit": "e-"},
             "conversion_gain": {"median": -2.1e-5, "in_stderr": -0.08, "unit": "e-/DN"},

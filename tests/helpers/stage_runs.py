@@ -4,12 +4,12 @@ from pchem_pipeline.compute.executor import SerialExecutor
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.signals import StopRequest
-from pchem_pipeline.run.stage import Options, StageContext
+from pchem_pipeline.run.stage import Command, StageContext
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.store.run_store import RunStore
 
 
-def stage_context(folder, executor=None, options=None, stop=None, **sections):
+def stage_context(folder, executor=None, command=None, stop=None, **sections):
     """Return the context of a run in a folder; its store is made where there is none."""
     config = RunConfig.model_validate(sections)
     return StageContext(
@@ -19,7 +19,7 @@ def stage_context(folder, executor=None, options=None, stop=None, **sections):
         executor or SerialExecutor(),
         Reporter("off", quiet=True),
         stop or StopRequest(),
-        options=options or Options(),
+        command=command or Command(),
     )
 
 

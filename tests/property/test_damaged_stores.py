@@ -12,9 +12,9 @@ import yaml
 from pchem_pipeline import open_run
 from pchem_pipeline.base.errors import PchEmError, StoreError
 from pchem_pipeline.model.maps.maps import NO_VALUE
-from pchem_pipeline.run.stage import Options, open_store
+from pchem_pipeline.run.stage import Command, open_store
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.runner.session import run_stages, run_status
 from pchem_pipeline.stages import maps
 from pchem_pipeline.stages.table import pipeline_of
 
@@ -41,7 +41,7 @@ def finished(tmp_path_factory):
 def run(path, stages=None, *, force=False):
     open_store.cache_clear()
     target = find_run(path)
-    command = Command(Options(force=force), quiet=True, progress="off")
+    command = Command(force=force, quiet=True, progress="off")
     run_stages(target, stages or pipeline_of(target.config), command)
 
 

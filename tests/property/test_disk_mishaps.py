@@ -18,7 +18,7 @@ from pchem_pipeline.run.declaration import Stage
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import StopRequest
-from pchem_pipeline.run.stage import WHOLE, Options, StageContext, open_store
+from pchem_pipeline.run.stage import WHOLE, Command, StageContext, open_store
 from pchem_pipeline.runner import execute as runner
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.store import disk
@@ -107,7 +107,7 @@ def _run(store, threshold, forced):
     reporter = Reporter("off", quiet=True)
     context = StageContext(config, path.parent, store, SerialExecutor(), reporter, StopRequest())
     for name in STAGES:
-        context.options = Options(force=name == forced)
+        context.command = Command(force=name == forced)
         state = execute(name, context)
         if state.state == "failed":
             raise StoreError(f"{name}: {state.why}; cure")

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,13 +23,7 @@ from pchem_pipeline.commands.apply.characterisation import (
 )
 from pchem_pipeline.commands.apply.finish import finish_maps, write_files
 from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
-from pchem_pipeline.commands.apply.source import (
-    check_camera,
-    check_level,
-    limits_of,
-    open_like_run,
-    some_of,
-)
+from pchem_pipeline.commands.apply.source import check_camera, check_level, limits_of, open_like_run, some_of
 from pchem_pipeline.commands.apply.tasks import (
     N_SUMS,
     convert_piece,
@@ -37,15 +31,13 @@ from pchem_pipeline.commands.apply.tasks import (
     moments_piece,
     offsets_piece,
 )
-from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.signals import stop_on_signals
-from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.runner.session import Command, with_overrides
+from pchem_pipeline.run.stage import Command, StageContext, Task
+from pchem_pipeline.runner.session import at_work, with_overrides
 from pchem_pipeline.store.files import fingerprint_of
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import local_path, place_of
@@ -56,7 +48,6 @@ from pchem_pipeline.use.common_modes import CommonModes, scene_of
 from pchem_pipeline.use.electrons import read_stderr
 
 if TYPE_CHECKING:
-    from pchem_pipeline.frames.sequence import FrameSequence
     from pchem_pipeline.run.target import Target
 
 #: Name of the work in the records of the output.
@@ -82,7 +73,7 @@ def apply_to_frames(
         files: camera files, globs, folders or URLs.
         output: a zarr store, or a folder of TIFF or FITS files.
         wanted: what to write.
-        command: of the command line; ``options.force`` replaces an output that is there.
+        command: of the command line; ``force`` replaces an output that is there.
 
     Returns:
         What was written.
@@ -99,53 +90,31 @@ def apply_to_frames(
     with contextlib.ExitStack() as stack:
         stack.callback(reporter.close)
         stack.enter_context(reporter.compilation(STAGE, target.config.compute.max_memory))
-        made = _make_job(run, target, files, wanted)
+        job, calibration, content, remarks = _make_job(run, target, files, wanted)
         output = place_of(output) if wanted.format == "zarr" else local_path(output)
         place = output if wanted.format == "zarr" else output.with_name(f".{output.name}.unfinished.zarr")
-        if wanted.format != "zarr" and _is_done(output, made.content, command):
+        if wanted.format != "zarr" and _is_done(output, content, command):
             reporter.info(f"apply: {output} is up to date")
             return sorted(output.iterdir())
-        store, fresh = _output_store(place, made.content, force=command.options.force)
-        stack.enter_context(store.locked())
-        stop = stack.enter_context(stop_on_signals())
-        executor = make_executor(target.config.compute, reporter.warning, stop.check)
-        stack.callback(executor.close)
-        context = StageContext(
-            target.config, target.base_dir, store, executor, reporter, stop, stage=STAGE, fresh=fresh
-        )
-        context.fingerprint = fingerprint_of(made.content)
-        for remark in made.remarks:
+        store, fresh = _output_store(place, content, force=command.force)
+        context = stack.enter_context(at_work(target, store, reporter, command))
+        context.stage, context.fresh, context.fingerprint = STAGE, fresh, fingerprint_of(content)
+        for remark in remarks:
             reporter.warning(remark)
-        _do(context, made)
+        _do(context, job, calibration)
         if wanted.format == "zarr":
             how = f'xarray.open_zarr("{output}", group="applied", consolidated=False)'
             reporter.info(f"apply: open it with {how}")
             return [output]
-        written = write_files(store, output, wanted.format, made.content)
+        written = write_files(store, output, wanted.format, content)
     shutil.rmtree(place, ignore_errors=True)
     return written
 
 
-@dataclass(frozen=True)
-class _Made:
-    """All that is known before anything is written.
-
-    Attributes:
-        job: of the workers.
-        content: what decides the result, as JSON data.
-        remarks: for the user.
-        calibration: of all pixels.
-        frames: to be calibrated.
-    """
-
-    job: Job
-    content: dict[str, Any]
-    remarks: list[str]
-    calibration: Calibration
-    frames: FrameSequence
-
-
-def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted: ApplySettings) -> _Made:
+def _make_job(
+    run: RunStore, target: Target, files: Sequence[str | Path], wanted: ApplySettings
+) -> tuple[Job, Calibration, dict[str, Any], list[str]]:
+    """Return the job of the workers, the calibration, what decides the result, as JSON data, and remarks."""
     digest = check_run(run)
     sensor = SensorInfo.read(run)
     frames = open_like_run(target, sensor, files, wanted.dataset)
@@ -202,7 +171,7 @@ def _make_job(run: RunStore, target: Target, files: Sequence[str | Path], wanted
         "frames": frames.quick_identity()["files"],
         "settings": {**settings, "kinds": list(wanted.kinds)},
     }
-    return _Made(job, content, remarks, calibration, frames)
+    return job, calibration, content, remarks
 
 
 # -- the output ------------------------------------------------------------------------------------
@@ -221,9 +190,9 @@ def _is_done(output: Path, content: dict[str, Any], command: Command) -> bool:
     if output.is_dir() and not any(output.iterdir()):
         return False
     there = read_json(output / "provenance.json") if output.is_dir() else None
-    if there == content and not command.options.force:
+    if there == content and not command.force:
         return True
-    if not command.options.force or (there or {}).get("product") != _PRODUCT:
+    if not command.force or (there or {}).get("product") != _PRODUCT:
         raise _exists(output, ours=(there or {}).get("product") == _PRODUCT)
     return False
 
@@ -297,7 +266,7 @@ def _create_converted(context: StageContext, job: Job, n_segments: int) -> None:
 # -- the work --------------------------------------------------------------------------------------
 
 
-def _do(context: StageContext, made: _Made) -> None:
+def _do(context: StageContext, job: Job, calibration: Calibration) -> None:
     """Bring the output up to date.
 
     Raises:
@@ -308,23 +277,35 @@ def _do(context: StageContext, made: _Made) -> None:
         context.store.delete("applied_parts")  # what a failure after the last step may have left
         context.reporter.info(f"apply: {context.store.path} is up to date")
         return
-    job, made = _with_moments(context, made.job, made)
-    if job.removed and not context.failed:
-        job = _with_offsets(context, job, made)
-    if job.counts and not context.failed:
-        job = _counted(context, job, made)
-    if job.converts and not context.failed:
+    job, calibration = _with_moments(context, job, calibration)
+    if job.removed:
+        job = _with_offsets(context, job, calibration)
+    if job.counts:
+        job = _counted(context, job, calibration)
+    if job.converts:
         _converted(context, job)
+    finish_maps(context.store, job, calibration, context.reporter)
+    if record is not None:
+        context.store.records.write(replace(record, finished=True, keys=context.n_keys))
+    context.store.delete("applied_parts")
+
+
+def _do_pieces(
+    context: StageContext, pieces: Sequence[Piece], task: Task[Piece], **how: Any
+) -> dict[str, dict[str, Any]]:
+    """Do the pieces as `StageContext.run_units` does.
+
+    Raises:
+        IncompleteRunError: some failed; the others are kept.
+    """
+    done = context.run_units(pieces, task, **how)
     if context.failed:
         key, reason = next(iter(context.failed.items()))
         raise IncompleteRunError(
             f"{len(context.failed)} pieces failed, first {key}: {reason}; finished pieces are kept, run "
             "again to retry"
         )
-    finish_maps(context.store, job, made.calibration, context.reporter)
-    if record is not None:
-        context.store.records.write(replace(record, finished=True, keys=context.n_keys))
-    context.store.delete("applied_parts")
+    return done
 
 
 def _rows_of_band(context: StageContext, job: Job, bytes_of_pixel: int) -> int:
@@ -336,32 +317,28 @@ def _rows_of_band(context: StageContext, job: Job, bytes_of_pixel: int) -> int:
     return rows * min(fitting, shared)
 
 
-def _with_moments(context: StageContext, job: Job, made: _Made) -> tuple[Job, _Made]:
+def _with_moments(context: StageContext, job: Job, calibration: Calibration) -> tuple[Job, Calibration]:
     """Find the errors of the calibration where the curvature of its likelihood does not tell them."""
     run = RunStore.open(job.run)
-    if not doubtful_pixels(run, made.calibration).any():
-        return job, made
+    if not doubtful_pixels(run, calibration).any():
+        return job, calibration
     _, ny, _ = job.source.shape
     rows = _chunks(job.source.shape)[1]
     lengths = {"row": 3, "column": 3, "side": 2, "quantity": 4}
     _create(context, job, "applied_parts/covariance", "applied_parts/rivals", lengths=lengths)
     task = functools.partial(moments_piece, job=job, settings=context.config.fit)
     pieces = [Piece("errors", *band, 0, 1) for band in equal_rows(ny, rows)]
-    context.run_units(pieces, task, unit_name="band", by_tiles=False)
-    if context.failed:
-        return job, made
-    return replace(job, moments=True), replace(
-        made, calibration=with_moments(made.calibration, context.store)
-    )
+    _do_pieces(context, pieces, task, unit_name="band")
+    return replace(job, moments=True), with_moments(calibration, context.store)
 
 
-def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
+def _with_offsets(context: StageContext, job: Job, calibration: Calibration) -> Job:
     """Find the offsets of frames, rows and columns; return the job that takes them away."""
     n, ny, nx = job.source.shape
     # some frames tell the scene
     chosen = np.unique(np.linspace(0, n - 1, 256).astype(int)).tolist()
-    mean = sum(made.frames.read(t, t + 1)[0].astype(np.float64) for t in chosen) / len(chosen)
-    job = replace(job, scene=scene_of(np.asarray(mean), made.calibration))
+    mean = sum(job.source.read(t, t + 1)[0].astype(np.float64) for t in chosen) / len(chosen)
+    job = replace(job, scene=scene_of(np.asarray(mean), calibration))
     parts = job.modes.parts
     waves = job.modes.waves
     lengths, whole = {"part": len(parts), "wave": len(waves), "coefficient": 2}, {"y": ny}
@@ -380,9 +357,7 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
     context.store.write_array("applied/offset_part", parts)
     length = job.depth * max(1, -(-_SEGMENT_SAMPLES // (8 * ny * nx * job.depth)))
     pieces = [Piece("offsets", 0, ny, t0, min(t0 + length, n)) for t0 in range(0, n, length)]
-    done = context.run_units(
-        pieces, functools.partial(offsets_piece, job=job), unit_name="piece", by_tiles=False
-    )
+    done = _do_pieces(context, pieces, functools.partial(offsets_piece, job=job), unit_name="piece")
     found = [summary for key, summary in done.items() if key.startswith("offsets-")]
     left = sum((np.array(each["left"]) for each in found), start=np.zeros(len(parts))) / n
     lift = int(np.ceil(max(float(each["largest"]) for each in found))) + 1 if found else 0
@@ -392,7 +367,7 @@ def _with_offsets(context: StageContext, job: Job, made: _Made) -> Job:
     return replace(job, parts=4, lift=lift, offset_variance=variance, reached=reached)
 
 
-def _counted(context: StageContext, job: Job, made: _Made) -> Job:
+def _counted(context: StageContext, job: Job, calibration: Calibration) -> Job:
     """Count the frames; return the job with the type of the electron numbers."""
     from pchem_pipeline.model.electrons.electrons import number_type  # loads compiled loops
     from pchem_pipeline.stages.histogram.histogram import bins_of
@@ -406,27 +381,27 @@ def _counted(context: StageContext, job: Job, made: _Made) -> Job:
     names = [f"applied/exposure{end}" for end in ends] if "exposure" in job.kinds else []
     names += ["applied_parts/prior"] if job.learns_prior else []
     _create(context, job, "applied_parts/range", *names, lengths={"end": 2})
-    bytes_of_pixel = 10 * job.bins + 2 * job.window * made.frames.dtype.itemsize + 200
+    bytes_of_pixel = 10 * job.bins + 2 * job.window * job.source.dtype.itemsize + 200
     step = _rows_of_band(context, job, bytes_of_pixel)
-    context.run_units(
+    _do_pieces(
+        context,
         [Piece("count", *band, 0, n) for band in equal_rows(ny, step)],
         functools.partial(count_piece, job=job),
         unit_name="band",
-        by_tiles=False,
         unit_bytes=bytes_of_pixel * step * job.source.shape[2],
     )
-    if context.failed or "numbers" not in job.kinds:
+    if "numbers" not in job.kinds:
         return job
     if job.learns_prior:
         from pchem_pipeline.use.exposure import ExposurePool  # loads compiled loops
 
-        noise = read_stderr(made.calibration) ** 2
+        noise = read_stderr(calibration) ** 2
         job = replace(job, pool=ExposurePool.of(context.store.read("applied_parts/prior"), noise, n))
     top = context.store.read("applied_parts/range", (slice(1, 2), slice(None), slice(None)))[0]
-    known = made.calibration.usable
+    known = calibration.usable
     dn = top[known] / job.parts - job.lift
-    reach = (dn - made.calibration.bias[known]) * made.calibration.conversion_gain[known]
-    reach += 9.0 * (made.calibration.read_noise_dn * made.calibration.conversion_gain)[known]
+    reach = (dn - calibration.bias[known]) * calibration.conversion_gain[known]
+    reach += 9.0 * (calibration.read_noise_dn * calibration.conversion_gain)[known]
     return replace(job, number_type=number_type(float(reach.max(initial=0.0))))
 
 
@@ -449,10 +424,5 @@ def _converted(context: StageContext, job: Job) -> None:
         for number, t0 in enumerate(starts)
         for band in equal_rows(ny, step)
     ]
-    context.run_units(
-        pieces,
-        functools.partial(convert_piece, job=job),
-        unit_name="piece",
-        by_tiles=False,
-        unit_bytes=bytes_of_pixel * step * nx,
-    )
+    task = functools.partial(convert_piece, job=job)
+    _do_pieces(context, pieces, task, unit_name="piece", unit_bytes=bytes_of_pixel * step * nx)

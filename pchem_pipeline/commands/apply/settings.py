@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.use.common_modes import CommonModes
 
 if TYPE_CHECKING:
+    from pchem_pipeline.frames.sequence import FrameSequence
     from pchem_pipeline.use.exposure import ExposurePool  # loads compiled loops
 
 #: What can be asked for.
@@ -102,7 +102,7 @@ class Job:
     """
 
     run: Path
-    source: FrameSource
+    source: FrameSequence
     kinds: tuple[str, ...]
     prior: str = "frames"
     pool: ExposurePool | None = None

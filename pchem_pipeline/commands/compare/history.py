@@ -119,7 +119,7 @@ class PixelStates:
         """Read those of a run; ``sigmas`` is its ``maps.outlier_sigmas``."""
         status = store.read("fit/fit_status")
         names = ("quanta_exposure", "quanta_exposure_stderr", "quality")
-        exposure, stderr, quality = store.read_arrays("maps", names).values()
+        exposure, stderr, quality = map(store.at(group="maps").__getitem__, names)
         hot = hot_pixels(exposure, stderr, (status & int(flags_of("quanta_exposure"))) != 0, sigmas)
         return cls(hot, exposure, stderr, status, quality)
 

@@ -122,8 +122,6 @@ class AddedSets:
         member = after.members[-1]
         compared = [(member, 0.0, 0.0), *named.rivals]
         weights = special.softmax([min(score, 0.0) for _, score, _ in compared])
-        rivals = self._rivals(named, before)
-        kin = {member.tag, *type(member.effect).separate}
         return Addition(
             effect=member.effect,
             alone=not named.equals,
@@ -137,8 +135,7 @@ class AddedSets:
             strength_stderr=float(np.hypot(after.stderr(member), named.apart)),
             before=gaps[0],
             after=gaps[1],
-            rivals=rivals[:MOST_RIVALS],
-            placebo=next((r for r in rivals[1:] if r.effect not in kin), None),
+            rivals=self._rivals(named, before)[:MOST_RIVALS],
             pulls=(),
             moved={
                 name: change_of(change, error, unit)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,7 +27,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, lesser
-from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, Contender, unrelated
+from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, Contender
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import NullModel, misfits
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -34,12 +35,13 @@ from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.verdict import Candidate, Rival, sigma_text
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, POSSIBLE
 
 _CLEAR_MARGIN = 50.0  # nats
 _OF_SIGNATURE = 0.1  # of what an effect does to all statistics, in a family where its signature stands
 _NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
-_AS_GOOD = 0.5  # of what an effect closes, from which on an unrelated one does about as well
+_AS_GOOD = 0.5  # of what an effect closes, from which on another one does about as well
 
 
 @dataclass(frozen=True)
@@ -185,9 +187,6 @@ class Extension:
             (added.effect if r.hypothesis.tag == added.tag else r.hypothesis.effect, r)
             for r in (rivals if named else kept)
         ]
-        others = self._others(member)
-        ranked = others[:MOST_RIVALS]
-        placebo = next((o for o in others[1:] if o.closes and unrelated(o.effect, added.effect)), None)
         return Addition(
             effect=added.effect if named else compared[0][0],
             alone=len(kept) == 1,
@@ -197,8 +196,7 @@ class Extension:
             strength_stderr=_stderr(added, float(self.stderr[member])),
             before=gaps[0],
             after=gaps[1],
-            rivals=tuple(self._rival(one, later) for one in ranked),
-            placebo=None if placebo is None else self._rival(placebo, later),
+            rivals=tuple(self._rival(one, later) for one in self._others(member)[:MOST_RIVALS]),
             pulls=largest_pulls(
                 self.first.names,
                 added.fingerprint / self.first.std,
@@ -288,17 +286,20 @@ class _Other:
 
 
 def without_better_reason(addition: Addition) -> Addition:
-    """Take the name from the only effect found if an unrelated one closes as much, or not much less.
+    """Take the name from the only effect found if an unrelated rival closes as much, or not much less.
 
     Asked where the data disagree with the model all the same: both merely mimic what it is.
     """
-    closed, placebo = addition.before.value - addition.after.value, addition.placebo
-    if addition.described or not addition.fits or placebo is None or closed <= 0.0:
+    closed, effect, classes = addition.before.value - addition.after.value, addition.effect, effect_classes()
+    unrelated = [
+        rival
+        for rival in addition.rivals
+        if rival.effect not in effect.separate and effect.tag not in classes[rival.effect].separate
+    ]
+    left = min((max(rival.gap_after, 0.0) for rival in unrelated), default=math.inf)
+    if addition.described or not addition.fits or addition.before.value - left <= _AS_GOOD * max(closed, 0.0):
         return addition
-    share = (addition.before.value - max(placebo.gap_after, 0.0)) / closed
-    if share <= _AS_GOOD:
-        return addition
-    return replace(addition, against="an unrelated control explains nearly as much")
+    return replace(addition, against="an unrelated effect explains nearly as much")
 
 
 def without_company(additions: Sequence[Addition]) -> list[Addition]:

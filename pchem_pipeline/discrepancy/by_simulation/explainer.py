@@ -216,7 +216,7 @@ class FrameExplainer(Explainer[Screened]):
         told = disagrees(null, self.prepared.z, settings.significance)
         doubtful: tuple[Comparison, Refitted] | None = None
         for _ in range(_MOST_JUDGED):
-            found = chosen(sets, explanation.hypotheses)
+            found = chosen(sets)
             if sets.limit is not None and not sets.complete:
                 tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
                 tried = self.work.effort.tried

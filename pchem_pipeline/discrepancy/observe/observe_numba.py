@@ -85,7 +85,7 @@ def fill_laws(
     for p in range(law.shape[0]):
         exposure, step, bias, width = parameters[p]
         full = np.empty((codes[p, 1] - codes[p, 0] + 1, law.shape[2]))
-        fill_law(exposure, step, bias - codes[p, 0], width, electrons[p, 0], electrons[p, 1], False, full)
+        fill_law(exposure, step, bias - codes[p, 0], width, electrons[p, 0], electrons[p, 1], full)
         for which in range(2):
             low, high, below, above = _support(full, samples[p], allowed[which])
             ends[p, 2 * which], ends[p, 2 * which + 1] = codes[p, 0] + low, codes[p, 0] + high

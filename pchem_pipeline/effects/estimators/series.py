@@ -36,6 +36,7 @@ SETTLING = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
 # nodes of a path that is fitted, each twice as fine as the one before, and values that come on each at least
 _NODES, _PER_NODE = (3, 5, 9, 17, 33), 3
 _STIFF = 1e-3  # relative: nodes without values follow their neighbours
+_MOST_CUTS = 100
 _FAR_BELOW = 25.0  # of the criterion, below the best: not to be considered
 
 
@@ -211,7 +212,7 @@ def likeliest_parts(
     return layout, steps
 
 
-def find_steps(series: FloatArray, gaps: FloatArray | None = None, *, largest: int = 100) -> list[Steps]:
+def find_steps(series: FloatArray, gaps: FloatArray | None = None) -> list[Steps]:
     """Return the levels of each series and where they begin.
 
     A cut must lower the sum of squares by ``4 log(n m) + 6`` times the variance of the noise (twice what the
@@ -221,7 +222,6 @@ def find_steps(series: FloatArray, gaps: FloatArray | None = None, *, largest: i
         series: shape (n, m), m of 2 or more.
         gaps: time between each value and the one before, in units of the shortest, shape (n,): a change
             during a long gap is so much likelier than one between two neighbours. All alike if None.
-        largest: most cuts.
     """
     n, m = series.shape
     variance = _own_variance(series)
@@ -231,7 +231,7 @@ def find_steps(series: FloatArray, gaps: FloatArray | None = None, *, largest: i
     bonus = 2.0 * np.log(np.ones(n) if gaps is None else np.maximum(gaps, 1.0))
     least = 4.0 * np.log(n * m) + 6.0
     cuts = [0, n]
-    while len(cuts) < largest + 2:
+    while len(cuts) < _MOST_CUTS + 2:
         gain, cut = max(_best_cut(contrast, first, last, bonus) for first, last in pairwise(cuts))
         if gain <= least:
             break

@@ -346,6 +346,16 @@ class Effect(Section):
         """
         return ()
 
+    def with_satellites(self, amplitude_e: FloatArray, weight: FloatArray, share: float) -> Self:
+        """Return it with the numbers that free satellites of single pixels tell; by default as it is.
+
+        Args:
+            amplitude_e: of the levels of pixels that have some, e-, shape (n,).
+            weight: of these levels, shape (n,).
+            share: of the pixels that have some.
+        """
+        return self
+
     def scaled(self, factor: float) -> Self:
         """Return a copy of ``factor`` times the strength, kept within the limits of its field.
 

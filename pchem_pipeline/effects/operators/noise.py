@@ -340,6 +340,8 @@ _LOGNORMAL = 0.4
 _FARTHEST = 4.0
 # amplitudes tried in every pixel, in units of that of the effect
 _EQUAL, _EXPONENTIAL = (0.5, 0.63, 0.8, 1.0, 1.25, 1.6, 2.0), (0.35, 0.5, 0.7, 1.0, 1.35, 1.8, 2.5, 3.4)
+#: Largest scatter of the logarithms of steps that are distributed so.
+_SPREADS = {"equal": 0.2, "lognormal": 0.6}
 _ALARM = 0.1  # pixels wrongly given levels, of those that have some
 
 
@@ -378,11 +380,10 @@ class RtsNoise(Effect, tag="rts_noise"):
         "overdispersed_counts": "frames without exposure: RTS noise remains",
         "flicker_noise": "longer runs: slow RTS noise has two levels, in the same few pixels",
     }
-    #: double sampling at two steps, multiple sampling, slow traps that are alike, and real ones
+    #: double and multiple sampling, slow traps that are alike, and real ones
     typical_values = (
         {"fraction": 0.014, "amplitude_e": 1.0},
-        {"fraction": 0.014, "amplitude_e": 2.5, "probability": 0.1},
-        {"fraction": 0.014, "amplitude_e": 1.0, "spread": "exponential"},
+        {"fraction": 0.014, "amplitude_e": 1.2, "samples": 2},
         {"fraction": 0.014, "amplitude_e": 1.5, "samples": 4},
         {"fraction": 0.014, "amplitude_e": 0.5, "probability": 0.5, "sampling": "single"},
         {"fraction": 0.014, "amplitude_e": 0.5, "probability": 0.5, "sampling": "single",
@@ -483,6 +484,14 @@ class RtsNoise(Effect, tag="rts_noise"):
             *(one for one in super().estimate(evidence) if one.sampling == "correlated"),
             *(one for one in slow if one.sampling == "single"),
         ]
+
+    def with_satellites(self, amplitude_e: FloatArray, weight: FloatArray, share: float) -> Self:
+        """Return it with the steps of these traps, as often full, in such a share of the pixels."""
+        scatter = float(np.std(np.log(amplitude_e)))
+        spread = next((name for name, most in _SPREADS.items() if scatter < most), "exponential")
+        middle = float(np.mean(amplitude_e) if spread == "exponential" else np.median(amplitude_e))
+        found = {"fraction": share, "amplitude_e": middle, "spread": spread, "probability": np.median(weight)}
+        return self.model_validate(self.model_dump() | found)
 
     def details(self) -> tuple[str, ...]:
         """Return the step, how often it comes, and how long a slow trap takes."""

@@ -155,13 +155,24 @@ def write_tiff_cube(path: Path, cube: Cube) -> None:
         "provenance": dict(cube.facts),
     }
     images = (image for block in cube.blocks for image in np.ascontiguousarray(block, cube.dtype))
-    options: dict[str, Any] = {"shape": cube.shape, "dtype": cube.dtype, "photometric": "minisblack"}
+    n, rows, columns = cube.shape
     with whole_file(path) as part:
         if size + (1 << 25) < _LARGEST_TIFF and cube.dtype.str[1:] in ("u1", "u2", "f4"):
-            frames = {"axes": "TYX", "Info": json.dumps(about), "unit": "pixel"}
+            frames = {"axes": "TZCYXS", "Info": json.dumps(about), "unit": "pixel"}
+            shape = (
+                n,
+                1,
+                1,
+                rows,
+                columns,
+                1,
+            )  # all axes: a last one of one column would be taken for samples
+            options = {"shape": shape, "dtype": cube.dtype, "photometric": "minisblack"}
             tifffile.imwrite(part, images, imagej=True, metadata=frames, **options)
         else:
-            tifffile.imwrite(part, images, bigtiff=True, metadata=about, **options)
+            with tifffile.TiffWriter(part, bigtiff=True) as file:
+                for image in images:
+                    file.write(image, photometric="minisblack", contiguous=True, metadata=about)
 
 
 def write_fits_cube(path: Path, cube: Cube) -> None:

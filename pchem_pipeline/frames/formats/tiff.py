@@ -254,13 +254,8 @@ def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) 
     shape, dtype, *_ = stack
     import tifffile
 
-    with whole_file(path) as part:
-        tifffile.imwrite(
-            part,
-            (frame for block in blocks for frame in np.ascontiguousarray(block, dtype)),
-            shape=shape,
-            dtype=dtype,
-            bigtiff=int(np.prod(shape)) * dtype.itemsize > 1 << 31,
-            photometric="minisblack",
-            metadata=stack.stated,
-        )
+    large = int(np.prod(shape)) * dtype.itemsize > 1 << 31
+    # frame by frame: the last axis of a stack whose frames have one column is taken for samples of a pixel
+    with whole_file(path) as part, tifffile.TiffWriter(part, bigtiff=large) as file:
+        for frame in (frame for block in blocks for frame in np.ascontiguousarray(block, dtype)):
+            file.write(frame, photometric="minisblack", contiguous=True, metadata=stack.stated)

@@ -91,15 +91,11 @@ def normalised_residuals(data: FloatArray, model: FloatArray, variance: FloatArr
 
 
 def chi_square(
-    data: FloatArray,
-    model: FloatArray,
-    variance: FloatArray,
-    counts: NDArray[np.integer[Any]],
-    least: int = 10,
+    data: FloatArray, model: FloatArray, variance: FloatArray, counts: NDArray[np.integer[Any]]
 ) -> ChiSquare:
     """Pearson's chi-square of an ensemble histogram with the binomial variance of its pixels.
 
-    Bins are taken where there are enough samples. The bins of one pixel are slightly
+    Bins are taken where there are at least 10 samples. The bins of one pixel are slightly
     anticorrelated, so the sum is not exactly chi-square; with many bins the difference is small.
 
     Args:
@@ -107,11 +103,10 @@ def chi_square(
         model: predicted density, shape (n,).
         variance: variance of the data's density, shape (n,).
         counts: samples in each bin, shape (n,).
-        least: samples below which a bin is left out.
 
     Returns:
         Chi-square, the number of bins and the p-value.
     """
-    use = (counts >= least) & (variance > 0)
+    use = (counts >= 10) & (variance > 0)
     value, dof = float(np.sum((data[use] - model[use]) ** 2 / variance[use])), int(use.sum())
     return ChiSquare(value, dof, float(chdtrc(dof, value)) if dof else math.nan)

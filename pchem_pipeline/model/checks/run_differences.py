@@ -90,8 +90,6 @@ class MapDifference:
     Attributes:
         difference: other minus one, in the unit of the map, shape (ny, nx); NaN where either has no value.
         z: the same in standard errors.
-        n_both: pixels with a value in both.
-        n_only_one, n_only_other: pixels with a value in one of them alone.
         median: median of the difference.
         median_stderr: its standard error.
         median_z: median of ``z`` over the pixels that count.
@@ -106,9 +104,6 @@ class MapDifference:
 
     difference: FloatArray
     z: FloatArray
-    n_both: int
-    n_only_one: int
-    n_only_other: int
     median: float
     median_stderr: float
     median_z: float
@@ -222,15 +217,11 @@ def _difference(
     with np.errstate(invalid="ignore", divide="ignore"):
         unit = np.sqrt((one[1] ** 2 + other[1] ** 2) / (2.0 if same_data else 1.0))
         z = np.where(unit > 0, difference / unit, np.nan)
-    known_one, known_other = np.isfinite(one[0]), np.isfinite(other[0])
     counted = z[good & np.isfinite(z)]
     whole, core = summarise(difference), summarise(counted)
     return MapDifference(
         difference=difference,
         z=z,
-        n_both=int((known_one & known_other).sum()),
-        n_only_one=int((known_one & ~known_other).sum()),
-        n_only_other=int((known_other & ~known_one).sum()),
         median=whole.median,
         median_stderr=whole.median_stderr,
         median_z=core.median,

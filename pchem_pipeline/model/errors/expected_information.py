@@ -1,12 +1,12 @@
 """Expected Fisher information of one or several samples: what frames can tell, before they are taken.
 
 In electrons the PCD depends on H and on the read noise ``s_e = g sigma`` alone, and so does the information
-of one frame in the coordinates ``(H, ln g, g mu, ln sigma)`` (:data:`COORDINATES`). It is the mean of the
-outer product of the score, and by Fisher's identity the score of a mixture is the posterior mean of the score
-of the complete data (Louis 1982), which for electron number k and deviation ``e = x - mu - k/g`` has the
-elements ``k/H - 1``, ``-k e g / s_e^2``, ``e g / s_e^2`` and ``(e g / s_e)^2 - 1``. Where a DN is not small
-against the read noise, a sample is the cell of width 1 around a whole DN, of the probability
-``sum_k P(k; H) (Phi(u_+) - Phi(u_-))`` with the analog read noise, and so is its score.
+of one frame in the coordinates ``(H, ln g, g mu, ln sigma)``. It is the mean of the outer product of the
+score, and by Fisher's identity the score of a mixture is the posterior mean of the score of the complete data
+(Louis 1982), which for electron number k and deviation ``e = x - mu - k/g`` has the elements ``k/H - 1``,
+``-k e g / s_e^2``, ``e g / s_e^2`` and ``(e g / s_e)^2 - 1``. Where a DN is not small against the read noise,
+a sample is the cell of width 1 around a whole DN, of the probability ``sum_k P(k; H) (Phi(u_+) - Phi(u_-))``
+with the analog read noise, and so is its score.
 
 Samples of one pixel that differ in exposure share g, mu and sigma; each has an H of its own that must be
 estimated too (Hendrickson et al. 2024, arXiv 2403.04498). What a sample tells about the shared ones is the
@@ -24,9 +24,6 @@ from pchem_pipeline.model.law.mass import sample_slopes
 from pchem_pipeline.model.law.pcd import pcd_posterior
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-#: The coordinates in which the information depends on H and the read noise in electrons only.
-COORDINATES = ("quanta_exposure", "log_gain", "bias_e", "log_read_noise_dn")
-
 _NODES_PER_SIGMA = 3.0  # halving the step changes no digit that matters; see the tests
 _REACH = 10.0  # read noises beyond which nothing is left
 _COARSE = 1.5  # DN: cells and density differ by exp(-2 pi^2 sigma^2)
@@ -36,7 +33,7 @@ _LEAST_EXPOSURE = 1e-12  # below it a sample holds no electrons
 def expected_information(
     quanta_exposure: float, read_noise_e: float, conversion_gain: float = 0.0
 ) -> FloatArray:
-    """Return the expected Fisher information of one frame in :data:`COORDINATES`.
+    """Return the expected Fisher information of one frame in ``(H, ln g, g mu, ln sigma)``.
 
     Args:
         quanta_exposure: H > 0, e-.
@@ -103,7 +100,7 @@ def _of_cells(quanta_exposure: float, read_noise_e: float, gain: float) -> Float
 def shared_information(
     quanta_exposure: float, read_noise_e: float, conversion_gain: float = 0.0
 ) -> FloatArray:
-    """Return what one frame of a sample, its exposure unknown, tells of the other :data:`COORDINATES`.
+    """Return what one frame of a sample, its exposure unknown, tells of the other coordinates.
 
     A sample without electrons (H = 0, bias frames) is one Gaussian: it tells bias and read noise, not the
     gain.

@@ -148,14 +148,13 @@ def _runs(frames: IntArray) -> list[str]:
     return [f"{run[0]} to {run[-1]}" if run.size > 1 else f"{run[0]}" for run in runs]
 
 
-def odd_words(odd: dict[str, IntArray], mean: FloatArray, variance: FloatArray, most: int = 4) -> str:
+def odd_words(odd: dict[str, IntArray], mean: FloatArray, variance: FloatArray) -> str:
     """Return which frames are odd and why.
 
     Args:
         odd: frames by kind.
         mean: of all frames over their pixels, DN, (n,).
         variance: likewise, DN^2, (n,).
-        most: runs of frames that are listed.
     """
     away, excess = levels_apart(mean), levels_apart(variance)
     added, nothing = np.sqrt(np.abs(excess)), np.zeros(0, np.int64)
@@ -177,8 +176,8 @@ def odd_words(odd: dict[str, IntArray], mean: FloatArray, variance: FloatArray, 
         if frames.size:
             size = "" if values is None else f"{_two_digits(np.median(np.abs(values[frames])))} "
             runs = _runs(frames)
-            listed = f": {', '.join(runs[:most])}, ..." if len(runs) > most else ""
-            words.append(f"{frame_words(frames, most)} {verbs[frames.size > 1]} {size}{says}{listed}")
+            listed = f": {', '.join(runs[:4])}, ..." if len(runs) > 4 else ""
+            words.append(f"{frame_words(frames)} {verbs[frames.size > 1]} {size}{says}{listed}")
     return "; ".join(words)
 
 

@@ -23,7 +23,6 @@ N_NUISANCE = 5
 N_COLUMNS = len(COLUMNS)
 #: Standard deviations of the read noise that a peak reaches
 REACH = 7.5
-_FAR_REACH = 37.0  # a density of 1e-298 there is the smallest that keeps its digits
 _SHORTEST_REACH = 2.0
 # DN per read noise: cells narrower than this are integrated by a series, to 1e-4 at five deviations
 _NARROW = 0.7
@@ -54,14 +53,13 @@ def _add_peak(
     mean: float,
     width: float,
     reach: float,
-    far: bool,
     law: FloatArray,
 ) -> None:
     """Add the peak of one electron number: ``weight`` and its products with the Charlier polynomials."""
     start = max(0, math.ceil(mean - reach * width))
     stop = min(law.shape[0] - 1, math.floor(mean + reach * width))
     cell = 1.0 / width
-    narrow = cell <= _NARROW and not far
+    narrow = cell <= _NARROW
     c2, c4, c6 = cell**2 / 24.0, cell**4 / 1920.0, cell**6 / 322560.0
     z = (start - 0.5 - mean) * cell
     # the density at edges and middles of the cells, by the ratio of successive values, itself geometric
@@ -112,7 +110,6 @@ def fill_law(
     width: float,
     first: int,
     last: int,
-    far: bool,
     law: FloatArray,
 ) -> None:
     """Fill ``law`` (code, column) of one pixel.
@@ -124,7 +121,6 @@ def fill_law(
         width: analog read noise, DN.
         first: smallest electron number.
         last: largest electron number.
-        far: down to the far ends of the tails; else up to `REACH` from the peaks, which is faster.
         law: to fill; its first dimension is the number of codes.
     """
     for i in range(law.shape[0]):  # a slice takes numba ten times as long to compile
@@ -138,8 +134,7 @@ def fill_law(
         weight = math.exp(log_weight)
         d = k - exposure
         # beyond, the density is below that of a likely peak at the same distance
-        reach = _FAR_REACH if far else REACH
-        reach = math.sqrt(max(reach * reach + 2.0 * log_weight, _SHORTEST_REACH**2))
+        reach = math.sqrt(max(REACH * REACH + 2.0 * log_weight, _SHORTEST_REACH**2))
         _add_peak(
             weight,
             weight * d / root,
@@ -148,6 +143,5 @@ def fill_law(
             offset + k * step,
             width,
             reach,
-            far,
             law,
         )

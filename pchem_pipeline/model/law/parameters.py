@@ -72,10 +72,14 @@ Parameters = PixelParameters | Sequence[ArrayLike]
 
 
 def columns_of(parameters: Parameters) -> FloatArray:
-    """Return (H, g, mu, sigma) as an array of shape (n, 4)."""
+    """Return (H, g, mu, sigma) as an array of shape (n, 4).
+
+    Raises:
+        ValueError: there are not four parameters.
+    """
     each = parameters.maps if isinstance(parameters, PixelParameters) else parameters
-    columns = [np.asarray(values, np.float64).ravel() for values in each]
-    return np.stack(np.broadcast_arrays(*columns), axis=1)
+    exposure, gain, bias, noise = (np.asarray(values, np.float64).ravel() for values in each)
+    return np.stack(np.broadcast_arrays(exposure, gain, bias, noise), axis=1)
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,8 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "shown",
         "The gap against its floor",
         "Gap before and after with 95 % intervals, the floor (gray: sampling noise), and the remaining gap "
-        "with the next best effect and with an unrelated control instead, fitted in the same way. Open "
-        "triangles at the edge are gaps below the axis. By family of statistics: before and after.",
+        "with the next best effect instead, fitted in the same way. Open triangles at the edge are gaps "
+        "below the axis. By family of statistics: before and after.",
         f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
         tables,
         _gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
@@ -169,12 +169,9 @@ def gap_bars(found: Verdict) -> list[GapBar]:
         lead = "" if words.startswith("nearest") else "with " if i == 0 else "… and "
         bars.append(_bar(f"{lead}{words}", after, interval, "after"))
     for step, _ in extended[-1:]:
-        for rival, role, words in (
-            (step.runner_up, "runner-up", "next best"),
-            (step.placebo, "placebo", "control"),
-        ):
-            if rival is not None:
-                bars.append(_bar(f"{words}: {rival.effect}", rival.gap_after, (math.nan, math.nan), role))
+        if (other := step.runner_up) is not None:
+            interval = (math.nan, math.nan)
+            bars.append(_bar(f"next best: {other.effect}", other.gap_after, interval, "runner-up"))
     return [bar for bar in bars if math.isfinite(bar.gap)]
 
 
@@ -200,7 +197,6 @@ _ROLES: dict[str, tuple[str, Shape]] = {
     "before": ("vermilion", "o"),
     "after": ("blue", "D"),
     "runner-up": ("orange", "s"),
-    "placebo": ("purple", "^"),
 }
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.discrepancy.where import PAIRS, map_of
 from pchem_pipeline.effects.framework.evidence import SCORES
@@ -132,11 +132,11 @@ def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
     )
 
 
-def _lines(arrays: Mapping[str, NDArray[Any]]) -> list[str]:
+def _lines(arrays: Arrays) -> list[str]:
     return [line for line in LINE_WORDS if arrays.get(f"{line}_rms", np.empty(0)).size]
 
 
-def _line_tables(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int]) -> tuple[DataTable, ...]:
+def _line_tables(arrays: Arrays, origin: tuple[int, int]) -> tuple[DataTable, ...]:
     """Return the scatter of each row and column, and their means in the first frames."""
     tables = []
     for line in _lines(arrays):
@@ -190,15 +190,12 @@ def regions_of(data: DiscrepancyData) -> dict[str, Region]:
     return found
 
 
-def largest_maps(
-    arrays: Mapping[str, NDArray[Any]], regions: Mapping[str, Region] | None = None, most: int = 3
-) -> list[PixelMap]:
-    """Return the maps with a deviating region, then goodness of fit, then the most deviating ones.
+def largest_maps(arrays: Arrays, regions: Mapping[str, Region] | None = None) -> list[PixelMap]:
+    """Return three maps: those with a deviating region, then goodness of fit, then the most deviating ones.
 
     Args:
         arrays: group ``discrepancy`` of the store.
         regions: deviating part of the sensor by map.
-        most: largest number of maps.
     """
     regions = regions or {}
     named = _named_maps(arrays)
@@ -207,10 +204,10 @@ def largest_maps(
     first = [maps.pop("goodness")] if "goodness" in maps else []
     # of neighbours only maps with a region: uniform correlations show better in rows and columns
     others = [each for name, each in maps.items() if np.isfinite(each.far) and name not in PAIRS]
-    return (placed + first + sorted(others, key=lambda each: -each.far))[:most]
+    return (placed + first + sorted(others, key=lambda each: -each.far))[:3]
 
 
-def _named_maps(arrays: Mapping[str, NDArray[Any]]) -> dict[str, tuple[str, NDArray[Any]]]:
+def _named_maps(arrays: Arrays) -> dict[str, tuple[str, NDArray[Any]]]:
     """Return title and values of all maps, by the names in :mod:`pchem_pipeline.discrepancy.where`."""
     found: dict[str, tuple[str, NDArray[Any]]] = {}
     if "goodness" in arrays:
@@ -314,7 +311,7 @@ def _outline(inside: BoolArray, origin: tuple[int, int]) -> Line:
     return Line(xs, ys, colour="ink", width=1.1)
 
 
-def _lines_chart(arrays: Mapping[str, NDArray[Any]], origin: tuple[int, int] = (0, 0)) -> Chart:
+def _lines_chart(arrays: Arrays, origin: tuple[int, int] = (0, 0)) -> Chart:
     """Return the means of rows and columns: the first frames as a picture, and the scatter of each line."""
     stacks = []
     for line in _lines(arrays):
@@ -444,7 +441,7 @@ def _has(data: DiscrepancyData, *names: str) -> bool:
     return all(name in data.arrays and data.arrays[name].size for name in names)
 
 
-def code_table(arrays: Mapping[str, NDArray[Any]]) -> DataTable:
+def code_table(arrays: Arrays) -> DataTable:
     """Return the counts of the codes and their residuals, (observed - expected) / sqrt(expected).
 
     They are made of ``code_dn``, ``code_observed``, ``code_expected``, and ``code_extended`` where effects
@@ -466,7 +463,7 @@ def code_table(arrays: Mapping[str, NDArray[Any]]) -> DataTable:
 _NAMED = "expected with added effects"
 
 
-def _frame_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, DataTable]:
+def _frame_tables(arrays: Arrays) -> tuple[DataTable, DataTable]:
     """Return means of the frames in both channels and their noise, and means over stretches of the run."""
     number = np.asarray(arrays["frame_number"], dtype=np.float64)
     columns, means = {"frame": number}, dict[str, FloatArray]()

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import Arrays, FloatArray
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
     Axis,
@@ -148,7 +148,7 @@ def case_name(constant: Sequence[str]) -> str:
     return ", ".join(_SYMBOLS.get(symbol, symbol) for symbol in constant) or "none"
 
 
-def ensemble_tables(arrays: Mapping[str, NDArray[Any]]) -> tuple[DataTable, ...]:
+def ensemble_tables(arrays: Arrays) -> tuple[DataTable, ...]:
     """Return data and predictions of the group ``ensemble``, raw and after correction; either may lack."""
     tables = []
     for part, axis, data, model, unit, *_ in HALVES:

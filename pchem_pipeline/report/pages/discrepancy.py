@@ -9,7 +9,6 @@ from dataclasses import replace
 
 from pchem_pipeline.base.units import typeset
 from pchem_pipeline.discrepancy.verdict import (
-    CONVINCING_PLACEBO,
     RARE,
     GapChange,
     Place,
@@ -202,25 +201,23 @@ def _gaps(found: Verdict) -> Table:
         low, high = step.gap_interval_after
         interval = f" ({micronats(low)} to {micronats(high)})" if math.isfinite(low) else ""
         none = "none reduces it" if step.effect else "not fitted"
-        runner_up, placebo = (
-            f"{micronats(rival.gap_after)} ({rival.effect})" if rival is not None else none
-            for rival in (step.runner_up, step.placebo)
-        )
+        other = step.runner_up
         rows.append(
             {
                 "step": f"{i + 1}: {found.added(step) or step.verdict}",
                 "before": micronats(step.gap_before),
                 "after": f"{micronats(step.gap_after)}{interval}",
                 "floor": micronats(step.gap_floor),
-                "next best effect instead": runner_up,
-                "unrelated control instead": placebo,
+                "next best effect instead": (
+                    none if other is None else f"{micronats(other.gap_after)} ({other.effect})"
+                ),
             }
         )
     return Table(
         "discrepancy-gap",
         "Gap by step",
-        "Gap on held-out frames, micronats per sample, with 95 % interval. The next best effect and the "
-        "unrelated control were fitted instead of the named effect.",
+        "Gap on held-out frames, micronats per sample, with 95 % interval. The next best effect "
+        "was fitted instead of the named effect.",
         rows,
     )
 
@@ -245,13 +242,13 @@ def _parameters(data: DiscrepancyData) -> Table:
             {
                 "parameter": f"{tag}: {name}",
                 "value": value,
-                "effect": f"{data.title(tag)}{place}{_how(step, data.found)}",
-                "source": effects[tag].source if tag in effects else "",
+                "effect": f"{data.title(tag)}{place}{_how(step, data.found)}" if i == 0 else "",
+                "source": effects[tag].source if i == 0 and tag in effects else "",
             }
             for step in data.found.steps
             for tag, place in [(step.likeliest, f", in {step.place}" if step.place else "")]
             if tag and (step.effect or step.verdict == "described" or data.found.verdict == "ambiguous")
-            for name, value in _values(step).items()
+            for i, (name, value) in enumerate(_values(step).items())
         ],
     )
 
@@ -633,13 +630,13 @@ def _closing(found: Verdict) -> Iterator[Flag]:
 
 
 def _compared(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
-    """State the share of the gap that the next best effect and an unrelated control close instead."""
+    """State the share of the gap that the next best effect closes instead."""
 
     def short_title(tag: str) -> str:
         return re.sub(r" \(.*?\)", "", data.title(tag))  # without synonyms
 
     own, name = step.closed, short_title(step.effect or "")
-    runner_up, placebo = step.runner_up, step.placebo
+    runner_up = step.runner_up
     if runner_up is not None and (step.within_chance or own > 0.0):
         rival, why = short_title(runner_up.effect), f"is rejected, since {runner_up.why}"
         # reductions of sampling noise mean nothing
@@ -649,13 +646,3 @@ def _compared(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
             yield Flag("note", f"{words}{f' and {why}' if runner_up.why else ''}.")
         elif runner_up.why:
             yield Flag("note", f"The next best effect, {rival}, {why}.")
-    if step.within_chance or not own > 0.0:
-        return
-    if placebo is None:
-        yield Flag("good", f"No unrelated control instead of {name} closes any of the gap.")
-        return
-    of_that = min(step.closed_by(placebo) / own, 1.0)
-    doubtful = of_that > CONVINCING_PLACEBO
-    text = f"An unrelated control ({short_title(placebo.effect)}) reduces the gap"
-    words = f"{text} {percent(of_that, 1.0)} as much as {name}{f': {name} is doubtful' if doubtful else ''}."
-    yield Flag("caution" if doubtful else "good", words)

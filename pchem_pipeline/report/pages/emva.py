@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import Arrays, FloatArray
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
 from pchem_pipeline.model.maps.maps import hot_pixels
 from pchem_pipeline.report.data import ReportData
@@ -20,8 +20,6 @@ COLUMNS = ("quantity", "symbol", "value", "standard_error", "unit", "definition_
 
 
 _NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
-#: Maps that the rows are made of; the last is there in the dark only.
-MAPS = (*_NAMES, *(f"{name}_stderr" for name in _NAMES), "dark_current")
 
 
 @dataclass(frozen=True)
@@ -79,13 +77,11 @@ def emva_tables(data: ReportData) -> list[Table]:
     ]
 
 
-def emva_rows(
-    stored: Mapping[str, NDArray[Any]], status: NDArray[Any], kind: str, outlier_sigmas: float = 6.0
-) -> list[EmvaRow]:
+def emva_rows(stored: Arrays, status: NDArray[Any], kind: str, outlier_sigmas: float = 6.0) -> list[EmvaRow]:
     """Return the table of a run; pixels without a value and flagged ones are left out.
 
     Args:
-        stored: the maps of :data:`MAPS`, (y, x).
+        stored: the maps with their standard errors by name, (y, x).
         status: status words of the fit, (y, x).
         kind: what made the charge: dark, light or unknown.
         outlier_sigmas: robust standard deviations above the median H from which a pixel is hot.

@@ -32,7 +32,7 @@ from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.model.histogram.odd_frames import frame_words
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
-from pchem_pipeline.run.stage import WHOLE, Named, StageContext, nothing_left
+from pchem_pipeline.run.stage import WHOLE, Named, StageContext
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
 from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import (
@@ -212,7 +212,7 @@ def _surveyed(
             )
             settings, seen = few, _survey(context, source, few)
         known = {"window": _taken_of(settings), "whole": _taken_of(most), **seen.numbers()}
-        context.run_units([WHOLE], lambda *_: known, by_tiles=False, total=1)
+        context.run_units([WHOLE], lambda *_: known, total=1)
     whole = known.get("whole", known["window"])
     few, most = (settings.model_copy(update=each) for each in (known["window"], whole))
     return few, Survey.of_numbers(known), most
@@ -257,7 +257,7 @@ def _run_histograms(context: StageContext, before: Sequence[Effect], tell: Calla
         samples, context.config.discrepancy, width=context.sensor.nx, model=model, tell=tell
     )
     _write(context, found, before)
-    context.run_units([WHOLE], nothing_left, by_tiles=False)
+    context.run_units([WHOLE])
 
 
 def _samples(context: StageContext) -> list[SampleHistograms]:
@@ -313,7 +313,6 @@ class _Mapper:
                 list(units.values()),
                 _simulate,
                 unit_name="stack",
-                by_tiles=False,
                 total=self.total,
                 unit_bytes=max((r.memory for r in replicates), default=0),
             )

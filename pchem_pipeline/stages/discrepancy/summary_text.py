@@ -156,8 +156,6 @@ def _gap(found: Verdict) -> list[str]:
     for step in found.steps:
         if step.within_chance or not step.effect:
             continue  # reductions of sampling noise mean nothing
-        rivals = (step.runner_up, "next best effect"), (step.placebo, "unrelated control")
-        left = [f"{micronats(r.gap_after)} with {r.effect} ({role})" for r, role in rivals if r is not None]
-        left += ["no unrelated control reduces it"] if step.placebo is None else []
-        words += f"; instead of {step.effect}: {', '.join(left)}"
+        if (other := step.runner_up) is not None:
+            words += f"; instead of {step.effect}: {micronats(other.gap_after)} with {other.effect}"
     return _wrapped(words)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import PARAMETERS
@@ -34,7 +34,7 @@ from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.progress import parts_told
-from pchem_pipeline.run.stage import StageContext, markers, nothing_left
+from pchem_pipeline.run.stage import StageContext, markers
 from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
 from pchem_pipeline.stages.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
@@ -95,7 +95,7 @@ class _Fitted:
 
     Attributes:
         pixels: their parameters.
-        mask: which pixels of the tiles have a value.
+        place: which pixels of the sensor they are, (y, x).
         origin: DN of bin 0.
         low: smallest DN.
         high: largest DN.
@@ -103,7 +103,7 @@ class _Fitted:
     """
 
     pixels: UsablePixels
-    mask: BoolArray
+    place: BoolArray
     origin: NDArray[np.int32]
     low: NDArray[np.int32]
     high: NDArray[np.int32]
@@ -112,11 +112,14 @@ class _Fitted:
     @classmethod
     def read(cls, store: RunStore, tiles: list[Tile]) -> _Fitted:
         """Read them from the run."""
-        bins = store.array("histogram/counts").shape[2]
-        paths = [*(f"fit/{n}" for n in PARAMETERS), *(f"histogram/{n}" for n in _HISTOGRAM)]
-        *maps, origin, low, high = (_pixels_of(store, path, tiles) for path in paths)
-        pixels, mask = UsablePixels.from_maps(maps)
-        return cls(pixels, mask, origin[mask], low[mask], high[mask], bins)
+        fit, histogram = store.at(group="fit"), store.at(group="histogram")
+        maps, place = [fit[name] for name in PARAMETERS], np.zeros(store.array("fit/bias").shape, np.bool_)
+        for tile in tiles:
+            place[tile.region] = True
+        pixels, known = UsablePixels.from_maps([values[place] for values in maps])
+        place[place] = known
+        origin, low, high = (histogram[name][place] for name in _HISTOGRAM)
+        return cls(pixels, place, origin, low, high, store.array("histogram/counts").shape[2])
 
     def limits(self, known: tuple[int, int] | None) -> tuple[int, int] | None:
         """Return the known limits of the codes where samples lie at one of them; else None."""
@@ -136,27 +139,6 @@ class _Fitted:
         mass = electron_pmf(self.pixels.quanta_exposure, int(largest + 12 * math.sqrt(largest) + 40))
         n_k = int(np.searchsorted(np.cumsum(mass), 1.0 - 1e-7)) + 2
         return EnsembleAxes(dn, nuced, n_k)
-
-
-def _pixels_of(
-    store: RunStore, name: str, tiles: list[Tile], region: tuple[slice, slice] | None = None
-) -> NDArray[Any]:
-    """Return the pixels of a map that lie in some tiles, in the order of the map.
-
-    Args:
-        store: the run.
-        name: an array whose first dimensions are (y, x).
-        tiles: the tiles.
-        region: part of the array that is the sensor; None: all of it.
-
-    Returns:
-        The values, pixels along the first axis.
-    """
-    whole = store.read(name, region)
-    inside = np.zeros(whole.shape[:2], dtype=bool)
-    for tile in tiles:
-        inside[tile.region] = True
-    return np.asarray(whole[inside])
 
 
 def run(context: StageContext) -> None:
@@ -182,14 +164,14 @@ def run(context: StageContext) -> None:
     if axes is None:
         if ready:
             context.note("no pixel has a value, so there is no ensemble; for the reasons see fit_status")
-        context.run_units(tiles, nothing_left, needs="fit")
+        context.run_units(tiles, needs="fit")
         return
     _create(context, axes, len(tiles))
     numbered = {tile.key: (number, tile) for number, tile in enumerate(tiles)}
     codes = {} if frames is None or everything else _codes(context)
     job = _Job(context.config, sensor, axes, numbered, frames, codes, source, truth, effects, limits)
     rows = max(1, BAND_BYTES // (sensor.nx * fitted.bins * 4))
-    bands = tiles if source is None else tile_bands(context, "fit", rows, source.rows_per_read)
+    bands = tiles if source is None else tile_bands(context, rows, source.rows_per_read)
     task = functools.partial(_do_band, job=job)
     counted = fitted.bins * store.array("histogram/counts").dtype.itemsize
     held = context.tile_pixels * (2 * counted + 40 * 8)  # with the maps of a tile
@@ -204,7 +186,7 @@ def run(context: StageContext) -> None:
             fitted = _Fitted.read(store, finished)
         made = {"tiles": len(finished), "tiles_missing": context.n_keys - len(finished)}
         totals = _totals(store, job, [numbered[tile.key][0] for tile in finished])
-        _write_result(store, totals, finished, fitted, job, made)
+        _write_result(store, totals, fitted, job, made)
 
 
 def _codes(context: StageContext) -> dict[str, dict[str, Any]]:
@@ -286,16 +268,16 @@ def _sum_tile(
         job: what is summed.
         chosen: histograms of the chosen frames; None: all frames.
     """
-    maps = [store.read(f"fit/{name}", tile.region) for name in PARAMETERS]
-    origin, low, high = _ranges(store, tile.region)
+    fit, histogram = (store.at(tile.region, group) for group in ("fit", "histogram"))
+    maps = [fit[name] for name in PARAMETERS]
+    origin, low, high = (histogram[name].astype(np.int64) for name in _HISTOGRAM)
     codes = None if chosen is None else job.codes.get(tile.key)
     if codes is None:
-        read = store.read_arrays("histogram", ("counts", "under", "over"), tile.region)
-        counted = PixelHistograms(read["counts"], origin, read["under"] + read["over"])
+        counted = PixelHistograms(histogram["counts"], origin, histogram["under"] + histogram["over"])
     else:  # only the number of the samples matters
         outside = np.full(origin.shape, job.sensor.n_frames, np.uint32)
         counted = PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
-    errors = _errors(store, tile)
+    errors = _errors(fit, tile, job.sensor.shape)
     rows = []
     for part in parts_told(tile.parts(store.array("histogram/counts").shape[2])):
         everything = counted.of(part).cut(low[part], high[part])
@@ -330,19 +312,13 @@ def on_axis(content: dict[str, Any], axis: DnAxis) -> tuple[IntArray, int]:
     return found, int(samples[~inside].sum()) + int(content["outside"])
 
 
-def _ranges(store: RunStore, region: tuple[slice, slice]) -> list[IntArray]:
-    """Return DN of bin 0, smallest and largest DN of the pixels of a region, (y, x)."""
-    found = store.read_arrays("histogram", _HISTOGRAM, region)
-    return [values.astype(np.int64) for values in found.values()]
-
-
-def _errors(store: RunStore, tile: Tile) -> PixelErrors | None:
+def _errors(fit: Arrays, tile: Tile, shape: tuple[int, int]) -> PixelErrors | None:
     """Return the errors of the pixels of a tile in C order; None where they are not known."""
-    if not store.has("fit/correlation"):
+    if "correlation" not in fit:
         return None
-    ny, nx = store.array("fit/correlation").shape[:2]
-    stderr = [store.read(f"fit/{name}_stderr", tile.region).ravel() for name in PARAMETERS]
-    correlation = store.read("fit/correlation", tile.region)
+    ny, nx = shape
+    stderr = [fit[f"{name}_stderr"].ravel() for name in PARAMETERS]
+    correlation = fit["correlation"]
     place = np.arange(tile.y0, tile.y1)[:, None] * nx + np.arange(tile.x0, tile.x1)
     share = min(1.0, WANTED / (ny * nx))
     flat = correlation.reshape(-1, correlation.shape[2])
@@ -366,7 +342,8 @@ def _count(store: RunStore, job: _Job, band: Band | Tile) -> PixelHistograms:
     """Histogram the chosen frames of a band; the same samples lie outside as in the stored histograms."""
     assert job.frames is not None
     like = store.array("histogram/counts")
-    origin, low, high = _ranges(store, (slice(band.y0, band.y1), slice(None)))
+    histogram = store.at((slice(band.y0, band.y1), slice(None)), "histogram")
+    origin, low, high = (histogram[name].astype(np.int64) for name in _HISTOGRAM)
     first, size = occupied(origin, low, high, like.shape[2])
     origin += first
     counts = np.zeros((*origin.shape, size), like.dtype)
@@ -427,7 +404,6 @@ def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
 def _write_result(
     store: RunStore,
     totals: EnsembleTotals,
-    tiles: list[Tile],
     fitted: _Fitted,
     job: _Job,
     facts: dict[str, Any],
@@ -441,8 +417,7 @@ def _write_result(
     Args:
         store: the run.
         totals: sums over the tiles.
-        tiles: the finished tiles.
-        fitted: their pixels.
+        fitted: pixels of the finished tiles.
         job: what the ensemble is of.
         facts: further attributes.
     """
@@ -450,17 +425,14 @@ def _write_result(
     pixels = fitted.pixels
     per_pixel: int | NDArray[Any] = totals.samples[0]
     if frames is None:
-        counts = _pixels_of(store, "histogram/counts", tiles)
-        per_pixel = counts.sum(axis=1, dtype=np.int64)[fitted.mask]
+        per_pixel = store.read("histogram/counts")[fitted.place].sum(axis=1, dtype=np.int64)
     weight = np.ones(len(pixels))
     if store.has("fit/likelihood_gap"):
-        gap, words = (
-            _pixels_of(store, f"fit/{name}", tiles)[fitted.mask] for name in ("likelihood_gap", "fit_status")
-        )
+        gap, words = (store.read(f"fit/{name}")[fitted.place] for name in ("likelihood_gap", "fit_status"))
         with np.errstate(divide="ignore"):  # one whose H, or gain, is more open may be off by any number
             wide = np.minimum(2.0 * pixels.maps[0] ** 2 / per_pixel, 0.5 / gap) > 0.25
         weight = bias_weight(np.where(wide | (words & int(flags_of("conversion_gain")) != 0), 0.0, gap))
-    true = _true_pixels(store, job, tiles, fitted.mask)
+    true = _true_pixels(store, job, fitted.place)
     arrays, found = curves(totals, pixels, settings, job.limits)
     numbers, electron_facts = electron_numbers_of(totals, pixels, settings)
     arrays |= numbers | components(pixels, numbers["electron_pmf"], weight)
@@ -486,7 +458,7 @@ def _write_result(
     store.set_attributes("ensemble", plain(found | facts))
 
 
-def _true_pixels(store: RunStore, job: _Job, tiles: list[Tile], mask: BoolArray) -> UsablePixels | None:
+def _true_pixels(store: RunStore, job: _Job, place: BoolArray) -> UsablePixels | None:
     """Return the true parameters of the pixels with a value, if they are all that made the frames."""
     simulated = job.config.simulate
     if job.truth is None or simulated is None or simulated.effects:
@@ -494,7 +466,7 @@ def _true_pixels(store: RunStore, job: _Job, tiles: list[Tile], mask: BoolArray)
     y0, x0, _ = job.truth
     ny, nx = job.sensor.shape
     region = (slice(y0, y0 + ny), slice(x0, x0 + nx))
-    maps = [_pixels_of(store, f"truth/{name}", tiles, region)[mask] for name in PARAMETERS]
+    maps = [store.read(f"truth/{name}", region)[place] for name in PARAMETERS]
     true, known = UsablePixels.from_maps(maps)
     return true if known.all() else None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,15 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
-from pchem_pipeline.base.variables import (
-    FREE_SATELLITES,
-    INTERVALS,
-    PARAMETERS,
-    VARIABLES,
-    interval_names,
-    variables_of,
-)
+from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray
+from pchem_pipeline.base.variables import PARAMETERS, VARIABLES
 from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.model.law.parameters import usable_pixels
@@ -50,7 +43,6 @@ def run(context: StageContext) -> None:
         StoreError: the histograms are missing, or the store refuses.
     """
     samples, store, model = context.sensor.samples, context.store, context.model
-    _create(context)
     how = TileFit(
         context.config.fit,
         context.sensor.adc_limits,
@@ -61,8 +53,7 @@ def run(context: StageContext) -> None:
     )
     runs = tuple(target.store for target in sample_targets(context.config, context.base_dir))
     counts = [each.array("histogram/counts") for each in ([RunStore.open(run) for run in runs] or [store])]
-    if not context.executor.shares_memory:
-        _compile(how, counts[0].dtype)
+    _create(context, how, counts[0].dtype)
     # of a pixel the histograms, and all that is kept of it until it is written, twice
     pixel_bytes = 2 * (sum(each.shape[2] * each.dtype.itemsize for each in counts) + 40 * 8)
     done = context.run_units(
@@ -90,30 +81,23 @@ def run(context: StageContext) -> None:
         )
 
 
-def _compile(how: TileFit, dtype: np.dtype[Any]) -> None:
-    """Compile the kernels once, into the cache, before other processes do it all at the same time."""
+def _create(context: StageContext, how: TileFit, dtype: np.dtype[Any]) -> None:
+    """Make the arrays that a fit gives; the words of its status are explained with them.
+
+    One is made for that, which compiles the kernels before other processes do it all at the same time.
+    """
     histogram: dict[str, NDArray[Any]] = {name: np.zeros((1, 1), np.int32) for name in _HISTOGRAM[1:]}
     histogram["counts"] = np.ones((1, 1, 8), dtype)
     everywhere = [effect.at_place(None) for effect in how.effects]
-    fit_tile([histogram] * max(1, len(how.bias)), replace(how, effects=everywhere, adc_limits=None))
-
-
-def _create(context: StageContext) -> None:
-    """Make the arrays that the fit will have; the words of its status are explained with them."""
-    left_out = {"fit_status", *(() if context.model.effects else FREE_SATELLITES)}
-    if context.config.fit.intervals == "normal":
-        left_out |= {path for name in INTERVALS for path in interval_names(name)}
-    context.create(*(v.path for v in variables_of("fit") if v.name not in left_out))
+    found = fit_tile([histogram] * max(1, len(how.bias)), replace(how, effects=everywhere, adc_limits=None))
+    for group, arrays in found.items():
+        context.create_like({f"{group}/{name}": values for name, values in arrays.items()})
     context.create(
         "fit/fit_status",
         flag_masks=[int(bit) for bit in MEANINGS],
         flag_meanings=" ".join(str(bit.name).lower() for bit in MEANINGS),
         flag_sentences={str(bit.name).lower(): sentence for bit, sentence in MEANINGS.items()},
     )
-    if n := len(context.sensor.samples):
-        names = ("quanta_exposure", "quanta_exposure_stderr", "mean", "variance", "covariance")
-        lengths = {"sample": n, "sample_parameter": n + 3, "sample_parameter_2": n + 3}
-        context.create(*(f"samples/{name}" for name in names), lengths=lengths)
 
 
 def _do_tile(
@@ -129,7 +113,8 @@ def _do_tile(
         model: of the run.
     """
     runs = [RunStore.open(path) for path in samples] or [store]
-    histograms = [each.read_arrays("histogram", _HISTOGRAM, tile.region) for each in runs]
+    read = [each.at(tile.region, "histogram") for each in runs]
+    histograms = [{name: each[name] for name in _HISTOGRAM} for each in read]
     start = added = None
     bins = sum(each["counts"].shape[2] for each in histograms)
     if not samples:
@@ -154,8 +139,7 @@ def _do_tile(
     for each in runs:
         if each.has("frames/excluded"):
             _leave_out(arrays, each.read("frames/excluded", tile.region) != 0)
-    for path, values in arrays.items():
-        store.write(path, VARIABLES[path].index(tile.region), values)
+    store.at(tile.region).update(arrays)
     words = arrays["fit/fit_status"]
     summary: dict[str, Any] = {
         "pixels": int(words.size),
@@ -172,7 +156,7 @@ def _do_tile(
     return summary
 
 
-def _leave_out(arrays: Mapping[str, NDArray[Any]], excluded: BoolArray) -> None:
+def _leave_out(arrays: Arrays, excluded: BoolArray) -> None:
     """Take the values of excluded pixels (y, x) out of the arrays of a tile, and give them their word."""
     for path, values in arrays.items():
         if values.dtype.kind == "f":
@@ -181,7 +165,7 @@ def _leave_out(arrays: Mapping[str, NDArray[Any]], excluded: BoolArray) -> None:
     arrays["fit/fit_status"][excluded] = int(FitStatus.EXCLUDED)
 
 
-def code_sums(histogram: Mapping[str, NDArray[Any]], maps: Sequence[NDArray[Any]]) -> dict[str, Any]:
+def code_sums(histogram: Arrays, maps: Sequence[NDArray[Any]]) -> dict[str, Any]:
     """Return the samples of each code over the pixels that have a value, as JSON data for their marker.
 
     The ensemble compares all frames with the model, and would decode every histogram again for it.

@@ -8,14 +8,14 @@ exposure has of its own.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import Arrays, FloatArray
 from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
 from pchem_pipeline.effects.framework.compose import AddedExposure, PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
@@ -50,7 +50,7 @@ class TileFit:
 
 
 def fit_tile(
-    histograms: Sequence[Mapping[str, NDArray[Any]]],
+    histograms: Sequence[Arrays],
     how: TileFit,
     start: FloatArray | None = None,
     added: AddedExposure | None = None,

@@ -60,9 +60,9 @@ def judge_sensor(context: StageContext) -> int:
 def _judged(store: RunStore, band: tuple[slice, slice]) -> Judged:
     """Return the pixels of a band, in order; NaN where they are not fitted."""
     names = ("conversion_gain", "read_noise_dn")
-    read = (*names, *(f"{name}_stderr" for name in names), "likelihood_gap")
-    fit = store.read_arrays("fit", read, band)
+    fit = store.at(band, "fit")
     pair = CORRELATION_PAIRS.index(tuple(map(PARAMETERS.index, names)))
-    gain, sigma, of_gain, of_sigma, gap = (values.ravel() for values in fit.values())
+    gain, sigma = (fit[name].ravel() for name in names)
+    of_gain, of_sigma = (fit[f"{name}_stderr"].ravel() for name in names)
     together = store.read("fit/correlation", (*band, slice(pair, pair + 1))).ravel()
-    return Judged(*noise_of(gain, sigma, of_gain, of_sigma, together), gap)
+    return Judged(*noise_of(gain, sigma, of_gain, of_sigma, together), fit["likelihood_gap"].ravel())

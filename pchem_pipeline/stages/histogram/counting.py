@@ -27,7 +27,7 @@ from pchem_pipeline.model.histogram.summaries import (
     line_sums,
 )
 from pchem_pipeline.run.stage import open_store
-from pchem_pipeline.stages.histogram.arrays import MAPS, with_block_length
+from pchem_pipeline.stages.histogram.arrays import with_block_length
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.stream import Block, Rows
@@ -181,11 +181,11 @@ class _BandCounter:
         """Go on behind the frames that the run has counted, see `StackCounter.resume`."""
         opened, self._spectrum = open_store(self._store), None  # that of the first frames is there
         region = self._rows, slice(None)
-        held = RowHistograms(**opened.read_arrays("histogram", ("counts", *MAPS), region))
+        held = RowHistograms(**opened.at(region, "histogram"))
         self._histograms = HistogramAccumulator.resumed(held, self._shape[0])
         if self._summaries is None:
             return
-        state = OpenSums(*opened.read_arrays("summary", _OPEN, region).values())
+        state = OpenSums(*map(opened.at(region, "summary").__getitem__, _OPEN))
         length = self._settings.block_length(n_frames)
         self._summaries = SummaryAccumulator.resumed(state, n_frames, length)
         blocks = n_frames // length
@@ -229,8 +229,9 @@ class _BandCounter:
                 self._add_sums(sums)
             for each in self._series.values():
                 each.flush()
-            opened.write_arrays("summary", vars(covariances), region)
-            opened.write_arrays("summary", dict(zip(_OPEN, vars(state).values(), strict=True)), region)
+            summary = opened.at(region, "summary")
+            summary.update(vars(covariances))
+            summary.update(zip(_OPEN, vars(state).values(), strict=True))
         for name, values in vars(histograms.finish()).items():
             # file by file: of each that is written there are copies in memory
             step = opened.file_shape(f"histogram/{name}")[1]

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
-from pchem_pipeline.model.histogram.count import RowHistograms, choose_bins, most_bins, pixels_by_range
+from pchem_pipeline.model.histogram.count import choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_scores, odd_frames
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, frame_statistics
 from pchem_pipeline.run.input import open_source
-from pchem_pipeline.run.stage import StageContext, Task, nothing_left
+from pchem_pipeline.run.stage import StageContext, Task
 from pchem_pipeline.stages.bands import Band, plan_bands
-from pchem_pipeline.stages.histogram.arrays import MAPS, create_arrays, create_counts, row_frames
+from pchem_pipeline.stages.histogram.arrays import create_arrays, create_counts, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
@@ -71,7 +71,7 @@ def run(context: StageContext) -> None:
         _copy_histograms(context)
         return
     if context.is_prepared:
-        context.run_units(context.tiles(), nothing_left)
+        context.run_units(context.tiles())
         _end(context, context.tiles())
         return
     source = open_source(context)
@@ -208,15 +208,14 @@ def _copied(context: StageContext, counts: Any, missing: str, task: Task[Tile]) 
 
 
 def _copy_sample_tile(tile: Tile, store: RunStore, *, sample: Path) -> None:
-    arrays = RunStore.open(sample).read_arrays("histogram", ("counts", *MAPS), tile.region)
-    store.write_arrays("histogram", arrays, tile.region)
+    store.at(tile.region, "histogram").update(RunStore.open(sample).at(tile.region, "histogram"))
 
 
 def _copy_tile(tile: Tile, store: RunStore, *, given: HistogramInput) -> None:
     counts, origin = given.counts[tile.region], given.origin[tile.region]
     occupied = counts > 0
     last = counts.shape[2] - 1
-    values = RowHistograms(
+    store.at(tile.region, "histogram").update(
         counts=counts,
         origin=origin,
         under=np.zeros(origin.shape, np.uint32),
@@ -224,4 +223,3 @@ def _copy_tile(tile: Tile, store: RunStore, *, given: HistogramInput) -> None:
         minimum=(origin + occupied.argmax(axis=2)).astype(np.int32),
         maximum=(origin + last - occupied[:, :, ::-1].argmax(axis=2)).astype(np.int32),
     )
-    store.write_arrays("histogram", vars(values), tile.region)

@@ -72,11 +72,11 @@ def leave_out_odd_frames(
 def _leave_out_of_histograms(context: StageContext, frames: IntArray) -> None:
     """Take samples of frames out of all histograms, those that are there still: the newest."""
     store, source = context.store, open_source(context)
-    names = [f"histogram/{name}" for name in ("counts", *MAPS)]
     newer = dict(zip(frames.tolist(), range(frames.size)[::-1], strict=True))
     for tile in context.tiles():
-        held = [store.read(name, tile.region) for name in names]
-        counts, origin, under, over, low, high = (values.astype(np.int64) for values in held)
+        held = store.at(tile.region, "histogram")
+        before = {name: held[name] for name in ("counts", *MAPS)}
+        counts, origin, under, over, low, high = (values.astype(np.int64) for values in before.values())
         last = origin + counts.shape[2] - 1
         there = counts.sum(axis=2) + under + over - (context.sensor.n_frames - frames.size)
         for t, dn in _samples(source, tile, newer):
@@ -88,8 +88,8 @@ def _leave_out_of_histograms(context: StageContext, frames: IntArray) -> None:
         filled = counts > 0
         low = np.where(under == 0, origin + filled.argmax(axis=2), low)
         high = np.where(over == 0, last - filled[:, :, ::-1].argmax(axis=2), high)
-        for name, old, new in zip(names, held, (counts, origin, under, over, low, high), strict=True):
-            store.write(name, tile.region, new.astype(old.dtype))
+        for (name, old), new in zip(before.items(), (counts, origin, under, over, low, high), strict=True):
+            held[name] = new.astype(old.dtype)
 
 
 def _samples(source: FrameSource, tile: Tile, frames: Iterable[int]) -> Iterator[tuple[int, IntArray]]:

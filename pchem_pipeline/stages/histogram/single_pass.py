@@ -114,10 +114,9 @@ def hashed_frames(
 
 def _is_wanted(context: StageContext) -> bool:
     """Tell whether both stages are to be done from the start."""
-    options, config = context.options, context.config
-    records = context.store.records
+    config, records = context.config, context.store.records
     return (
-        options.roi is None
+        context.command.roi is None
         and all(records.read(name) is None for name in PREPARED)
         and not is_histogram_input(config.input, context.base_dir)
         and identity_is_new(context)

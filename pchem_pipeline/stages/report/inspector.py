@@ -9,7 +9,8 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections import ChainMap
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import Arrays, FloatArray, IntArray
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, VARIABLES, Variable
 from pchem_pipeline.compute.executor import call_all
@@ -121,26 +122,6 @@ def _entry(variable: Variable) -> MapEntry:
     return MapEntry(variable.path, label, variable.unit, variable.long_name, kind, words)
 
 
-class StoredMaps:
-    """Maps of a run by their path: those ``loaded`` already, others from its store; the last two are kept."""
-
-    def __init__(self, store: RunStore, loaded: Mapping[str, NDArray[Any]] | None = None) -> None:
-        self.store, self.loaded = store, loaded or {}
-        self._read = functools.lru_cache(maxsize=2)(store.read)
-
-    def has(self, path: str) -> bool:
-        """Tell whether there is such a map."""
-        return path in self.loaded or self.store.has(path)
-
-    def read(self, path: str) -> NDArray[Any]:
-        """Return a map.
-
-        Raises:
-            StoreError: it is missing or corrupt.
-        """
-        return self.loaded[path] if path in self.loaded else self._read(path)
-
-
 def inspector_data(
     name: str, shape: tuple[int, int], maps: Sequence[MapEntry], sample: PixelSample
 ) -> InspectorData:
@@ -154,7 +135,7 @@ def read_maps(
     store: RunStore,
     shape: tuple[int, int],
     index: IntArray,
-    loaded: Mapping[str, NDArray[Any]] | None = None,
+    loaded: Arrays | None = None,
     threads: int = 1,
 ) -> tuple[list[MapEntry], dict[str, FloatArray]]:
     """Read every stored map: packed, the important ones first, until the page is full; exact for some pixels.
@@ -172,7 +153,8 @@ def read_maps(
     Raises:
         StoreError: an array is missing or corrupt.
     """
-    maps, listed, n = StoredMaps(store, loaded), listed_maps(store, shape), shape[0] * shape[1]
+    maps = ChainMap(dict(loaded or {}), store.at())
+    listed, n = listed_maps(store, shape), shape[0] * shape[1]
     budget = min(_MAPS_BUDGET * max(1.0, n / 512**2) ** _MAPS_POWER, _MOST_BYTES)
     order = sorted(listed, key=lambda entry: _importance(entry.path))
     found: dict[str, MapEntry] = {}
@@ -202,7 +184,7 @@ def _is_packed(entry: MapEntry | None) -> bool:
     return entry is not None and entry.packed is not None
 
 
-def _coded(maps: StoredMaps, entry: MapEntry, index: IntArray, pack: bool) -> tuple[MapEntry, FloatArray]:
+def _coded(maps: Arrays, entry: MapEntry, index: IntArray, pack: bool) -> tuple[MapEntry, FloatArray]:
     """Return a map in few bytes, or as a multiple of another, and its values at some pixels, shape (n,).
 
     It is packed only where asked for, and no multiple.
@@ -211,7 +193,7 @@ def _coded(maps: StoredMaps, entry: MapEntry, index: IntArray, pack: bool) -> tu
     if alike is None and not pack:
         return entry, np.empty(0)
     packed = packed_map(maps, entry.path) if alike is None else None
-    values = maps.read(entry.path).reshape(-1)[index].astype(np.float64)
+    values = maps[entry.path].reshape(-1)[index].astype(np.float64)
     return replace(entry, packed=packed, same_as=alike), values
 
 
@@ -222,19 +204,19 @@ def _importance(path: str) -> tuple[int, int]:
     return 1 + (_GROUPS.index(group) if group in _GROUPS else 1), 0
 
 
-def packed_map(maps: StoredMaps, path: str) -> PackedMap:
+def packed_map(maps: Arrays, path: str) -> PackedMap:
     """Return a stored map, quantised well below its standard error.
 
     Raises:
         StoreError: it is missing or corrupt.
     """
-    values = maps.read(path)
+    values = maps[path]
     coarse, _ = _coarse(values.size)
     step = 0.0
     if path.endswith("_stderr"):
         step = 0.04 * _median(values)
-    elif maps.has(f"{path}_stderr"):
-        step = _median(maps.read(f"{path}_stderr")) / 8.0
+    elif f"{path}_stderr" in maps:
+        step = _median(maps[f"{path}_stderr"]) / 8.0
     return pack_map(values, choose_scale(values, step=step, coarse=coarse))
 
 
@@ -248,15 +230,15 @@ def _median(values: NDArray[Any]) -> float:
     return known.median if known.size else 0.0
 
 
-def _multiple_of_exposure(maps: StoredMaps, path: str) -> tuple[str, float] | None:
+def _multiple_of_exposure(maps: Arrays, path: str) -> tuple[str, float] | None:
     """Return the map of H, or of its error, with the factor that makes it this one; None for other maps."""
     rate = next((name for name in CHARGE_RATES if path.startswith(f"maps/{name}")), None)
     if rate is None:
         return None
     other = path.replace(rate, "quanta_exposure")
-    if not maps.has(other):
+    if other not in maps:
         return None
-    current, exposure = maps.read(path), maps.read(other)
+    current, exposure = maps[path], maps[other]
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = _median(some_of(current.ravel()) / some_of(exposure.ravel()))
     same = factor != 0 and np.allclose(current, factor * exposure, rtol=1e-9, atol=0.0, equal_nan=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.model.fit.status import MEANINGS, describe
 from pchem_pipeline.model.law.mass import sample_mass
@@ -106,8 +106,8 @@ def pixel_index(chosen: Sequence[Chosen], shape: tuple[int, int]) -> IntArray:
 
 def pixel_fits(
     chosen: Sequence[Chosen],
-    maps: Mapping[str, Any],
-    fit: Mapping[str, Any],
+    maps: Mapping[Any, Any],
+    fit: Mapping[Any, Any],
     histograms: PixelHistograms,
     masses: Sequence[FloatArray],
     *,
@@ -172,8 +172,8 @@ def bin_masses(
 
 
 def choose_inspected(
-    maps: Mapping[str, NDArray[Any]],
-    fit: Mapping[str, NDArray[Any]],
+    maps: Arrays,
+    fit: Arrays,
     shown: Sequence[tuple[int, int]],
     suspects: Sequence[tuple[int, int]] = (),
     *,
@@ -250,7 +250,7 @@ def _flagged(status: NDArray[Any], rng: np.random.Generator) -> list[tuple[str, 
     return found
 
 
-def _extreme(maps: Mapping[str, NDArray[Any]]) -> list[tuple[str, str, IntArray]]:
+def _extreme(maps: Arrays) -> list[tuple[str, str, IntArray]]:
     found = []
     for name in MAP_NAMES:
         words = symbol(name)[1]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import Arrays, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, quoted
 from pchem_pipeline.base.variables import (
     CHARGE_RATES,
@@ -45,8 +45,6 @@ from pchem_pipeline.store.run_store import stored_config
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.store.run_store import RunStore
-
-Arrays = Mapping[str, NDArray[Any]]
 
 #: Group to the names of the arrays that the report is made from.
 _ARRAYS: dict[str, tuple[str, ...]] = {

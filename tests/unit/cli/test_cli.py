@@ -19,10 +19,9 @@ from pchem_pipeline.commands.new_run import find_or_start
 from pchem_pipeline.config.load import load_config, parse_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run import target as run_target
-from pchem_pipeline.run.stage import Options
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner import session
-from pchem_pipeline.runner.session import Command
 
 CONFIG = "input: {files: [a.tif]}\n"
 
@@ -46,15 +45,15 @@ def test_a_stage_command_runs_its_stage(calls, name):
     [(target, stages, command)] = calls
     assert stages == [name]
     assert target.config == parse_config(CONFIG)
-    expected = Options(force=True, dry_run=False, roi=(0, 8, 8, 16))
-    assert command == Command(expected, 3, "serial", "off", True, Path("l.json"), 900)
+    common = Command(True, False, (0, 8, 8, 16), None, 3, "serial", "off", True, Path("l.json"), 900)
+    assert command == common
 
 
 def test_ingest_crops_the_input_to_the_region(calls):
     invoke("ingest", "c.yaml", "--roi", "0:8,8:16")
     [(target, _, command)] = calls
     assert target.config.input.roi == (0, 8, 8, 16)
-    assert command.options.roi is None
+    assert command.roi is None
 
 
 def test_run_does_every_stage(calls):

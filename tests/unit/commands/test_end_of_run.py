@@ -8,9 +8,8 @@ import pytest
 from pchem_pipeline.base.errors import ExitCode, IncompleteRunError, NotBelievedError
 from pchem_pipeline.commands import first_screen
 from pchem_pipeline.config.load import parse_config
-from pchem_pipeline.run.stage import Options
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
-from pchem_pipeline.runner.session import Command
 
 STAGES = ("maps", "report")
 
@@ -93,7 +92,7 @@ def test_without_a_report_the_store_is_told(target, capsys):
     first_screen.run_to_first_screen(target, ("maps",), Command(), said.append, strict=True)
     assert said == [str(target.store)]
     dry: list[str] = []
-    first_screen.run_to_first_screen(target, STAGES, Command(Options(dry_run=True)), dry.append)
+    first_screen.run_to_first_screen(target, STAGES, Command(dry_run=True), dry.append)
     assert dry == []
     assert capsys.readouterr().err == ""
 

@@ -23,7 +23,6 @@ def record(hidden, verdict, *steps, kind="single", level=4.0, **more):
         {
             "effect": step if isinstance(step, str) else None,
             "candidates": [{"effect": tag} for tag in ([step, "other"] if isinstance(step, str) else step)],
-            "placebo": {"effect": "frame_noise", "gap_after": 9e-5},
             "rivals": [],
             "gap_before": 1e-4,
             "gap_after": 1e-7,

@@ -21,7 +21,6 @@ from pchem_pipeline.frames.inspect import _gaps
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import natural_key, resolve_files
 from pchem_pipeline.frames.settings import InputSettings
-from pchem_pipeline.frames.writing import write_frames
 
 STACK = np.random.default_rng(15).integers(0, 4096, (12, 17, 19)).astype(np.uint16)
 
@@ -271,7 +270,9 @@ def test_read_into_checks_its_arguments(tmp_path):
 def test_identity(tmp_path):
     first, second = tmp_path / "one", tmp_path / "two"
     for folder in (first, second):
-        write_frames("npy", folder / "a.npy", iter([STACK]), STACK.shape, "uint16", frames_per_file=4)
+        folder.mkdir()
+        for i in range(3):
+            np.save(folder / f"a_{i + 1:05d}.npy", STACK[4 * i : 4 * i + 4])
     settings = InputSettings(files=("*.npy",))
     here, there = open_frames(settings, first), open_frames(settings, second)
     identity = here.identity()

@@ -129,7 +129,7 @@ def test_plug_in_that_is_no_reader(monkeypatch, name, cls):
 @pytest.mark.parametrize(("format", "library"), [("fits", "astropy"), ("hdf5", "h5py")])
 def test_missing_library_is_named_with_what_installs_it(tmp_path, monkeypatch, format, library):
     stack = np.zeros((2, 3, 4), np.uint16)
-    [path] = write_frames(format, tmp_path / "a", iter([stack]), stack.shape, "uint16")
+    path = write_frames(format, tmp_path / "a", iter([stack]), stack.shape, "uint16")
     for name in list(sys.modules):
         if name == library or name.startswith(f"{library}."):
             monkeypatch.delitem(sys.modules, name)

@@ -25,8 +25,9 @@ from pchem_pipeline.run.model_versions import (
     version_with,
     write_added_exposure,
 )
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.runner.session import run_stages, run_status
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import fingerprint_of, read_record, write_record
 from pchem_pipeline.store.records import StageRecord

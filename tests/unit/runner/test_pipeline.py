@@ -19,7 +19,7 @@ from pchem_pipeline.run.fingerprint import differences, status
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest, stop_on_signals
-from pchem_pipeline.run.stage import WHOLE, Options, StageContext, open_store
+from pchem_pipeline.run.stage import WHOLE, Command, StageContext, open_store
 from pchem_pipeline.runner import execute as runner
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.store.run_store import RunStore
@@ -80,7 +80,7 @@ def make(tmp_path, monkeypatch):
     def context(config="", **options):
         text = f"input: {{files: [a]}}\nrun: {{tile: 8}}\n{config}"
         return StageContext(
-            parse_config(text), tmp_path, store, SerialExecutor(), reporter, StopRequest(), Options(**options)
+            parse_config(text), tmp_path, store, SerialExecutor(), reporter, StopRequest(), Command(**options)
         )
 
     yield context

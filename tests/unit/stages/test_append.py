@@ -10,9 +10,9 @@ from pchem_pipeline.commands.append import append_frames
 from pchem_pipeline.compute import memory
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.run.stage import Options
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.runner.session import run_stages, run_status
 from pchem_pipeline.stages.fit.fit import kept_fit
 from pchem_pipeline.store.run_store import RunStore
 
@@ -98,7 +98,7 @@ def test_old_frames_are_not_read(tmp_path, frames, monkeypatch):
 
     run = begun(tmp_path, frames, 600)
     assert [state.state for state in run_status(run)][:2] == ["stale", "stale"]  # a look changes nothing
-    append_frames(run, Command(Options(dry_run=True), quiet=True))
+    append_frames(run, Command(dry_run=True, quiet=True))
     seen = []
     real = sequence.FrameSequence.pieces
     monkeypatch.setattr(

@@ -18,7 +18,7 @@ from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
-from pchem_pipeline.run.stage import Options, open_store
+from pchem_pipeline.run.stage import Command, open_store
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.table import STAGES
@@ -41,8 +41,8 @@ def write_stack(folder, parts=4):
         tifffile.imwrite(folder / f"f{i + 8}.tif", part, photometric="minisblack")
 
 
-def make_context(folder, *, executor=None, options=None, stop=None, **settings):
-    return stage_context(folder, executor, options, stop, input={"files": ["cam"], **settings})
+def make_context(folder, *, executor=None, command=None, stop=None, **settings):
+    return stage_context(folder, executor, command, stop, input={"files": ["cam"], **settings})
 
 
 def run(context):
@@ -89,7 +89,7 @@ def test_reference_copies_nothing(tmp_path):
 
 def test_tiles_of_the_command_line_do_not_cut_the_input(tmp_path):
     write_stack(tmp_path / "cam")
-    context = make_context(tmp_path, options=Options(roi=(0, 1, 0, 1)))
+    context = make_context(tmp_path, command=Command(roi=(0, 1, 0, 1)))
     assert run(context).state == "complete"
     np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
 
@@ -233,12 +233,13 @@ def test_units_are_whole_chunks_within_memory(n, ny, nx, itemsize):
     units = ingest.copy_units(shape, itemsize, chunk)
     t = y = 0
     for number, unit in enumerate(units):
-        assert (unit.t0, unit.y0) == (t, y)
-        assert unit.t0 % chunk[0] == unit.y0 % chunk[1] == 0
-        assert unit.t1 == n or unit.t1 % chunk[0] == 0
-        assert unit.y1 == ny or unit.y1 % chunk[1] == 0
-        assert (unit.t1 - unit.t0) * (unit.y1 - unit.y0) * nx * itemsize <= 128 << 20
-        t, y = (unit.t0, unit.y1) if unit.y1 < ny else (unit.t1, 0)
+        t0, t1, y0, y1 = unit.content
+        assert (t0, y0) == (t, y)
+        assert t0 % chunk[0] == y0 % chunk[1] == 0
+        assert t1 == n or t1 % chunk[0] == 0
+        assert y1 == ny or y1 % chunk[1] == 0
+        assert (t1 - t0) * (y1 - y0) * nx * itemsize <= 128 << 20
+        t, y = (t0, y1) if y1 < ny else (t1, 0)
         if number > 200:
             return
     assert (t, y) == (n, 0)

@@ -47,6 +47,27 @@ def test_pixels_are_read_in_any_order_and_number(store, shards):
     np.testing.assert_array_equal(store.read_pixels("fit/bias", y, x), [1330.0, 69.0])
 
 
+def test_a_region_of_the_arrays_is_a_mapping(store):
+    store.create_array("fit/bias", (8, 12), chunks=(4, 6))
+    store.create_array("samples/mean", (3, 8, 12), chunks=(3, 4, 6))
+    region = slice(4, 8), slice(6, 12)
+    part = store.at(region)
+    part.update({"fit/bias": np.full((4, 6), 2.0), "samples/mean": np.ones((3, 4, 6))})
+    assert list(part) == ["fit/bias", "samples/mean"]
+    assert "fit/correlation" not in part
+    assert store.at(region, "samples")["mean"].shape == (3, 4, 6)
+    for name in ("fit/bias", "samples/mean"):
+        store.fill(name)
+    assert store.at(group="fit")["bias"].shape == (8, 12)
+    assert np.nansum(store.read("fit/bias")) == 48.0
+    assert np.nansum(store.read("samples/mean")) == 72.0
+    assert {name: values.size for name, values in store.at((slice(0), slice(0)), "fit").items()} == {
+        "bias": 0
+    }
+    with pytest.raises(StoreError, match="has no fit/correlation"):
+        store.at(group="fit").get("correlation")
+
+
 def test_only_registered_arrays_are_stored(store):
     with pytest.raises(KeyError):
         store.create_array("fit/offset", (4, 4), chunks=(4, 4))

@@ -80,6 +80,7 @@ def test_pixels_without_a_fit_stay_at_their_level(camera, exposure):
     usable[4, 7] = False
     twin = twin_of(camera, np.where(usable, exposure, np.nan), usable)
     assert twin.truth.defect[4, 7] == Defect.STUCK
+    assert twin.truth.conversion_gain[4, 7] == np.median(twin.truth.conversion_gain[usable])
     for scene in (None, 9.0, np.full((2, *SHAPE), 9.0)):
         assert (twin.frames(scene, 20)[:, 4, 7] == 77).all()
 

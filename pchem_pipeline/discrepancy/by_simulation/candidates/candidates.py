@@ -85,35 +85,6 @@ def candidate_classes(settings: DiscrepancySettings) -> dict[str, type[Effect]]:
     }
 
 
-def placebo_for(
-    guesses: Sequence[Effect], classes: Mapping[str, type[Effect]], defects: dict[str, str]
-) -> list[Effect]:
-    """Return an effect for which nothing speaks and that is no relative of those for which something does.
-
-    It is fitted like the others: a gap that it closes as well proves nothing.
-
-    Args:
-        guesses: effects for which something speaks.
-        classes: of the candidates, by tag.
-        defects: candidates that failed, and why; more come to them.
-    """
-    guessed = {effect.tag: type(effect) for effect in guesses}
-    related = {tag for effect in guessed.values() for tag in effect.separate}
-    for tag in sorted(classes):
-        effect = classes[tag]
-        if tag in defects or tag in guessed or tag in related or guessed.keys() & effect.separate.keys():
-            continue
-        try:
-            typical = effect.typical() if effect.strength else ()
-        # an effect of a plug-in may raise anything: the others are compared all the same
-        except Exception as error:
-            note_defect(defects, tag, error)
-            continue
-        if typical:
-            return [typical[0]]
-    return []
-
-
 @dataclass
 class ReplicateSimulator:
     """Simulates what candidates would do on top of the present model.

@@ -9,7 +9,6 @@ from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import (
     MOST_HYPOTHESES,
     ReplicateSimulator,
-    placebo_for,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
@@ -98,7 +97,7 @@ class Screening:
         parts = self.observed.frames.parts
         suggested = self._apart(model, histograms.suggested(self.classes, parts, guesses))
         guesses += suggested
-        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses)])
+        hypotheses = simulator.fingerprints(guesses)
         shift = self.z.both - null.mean
         noise = noise_of_splits(null, 2, self.model_error)
         hypotheses = simulator.refined(hypotheses, shift, noise, histograms.told)
@@ -121,16 +120,10 @@ class Screening:
         """
         simulator = self._simulator(model, null, "/".join(["0", *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
-        hypotheses = simulator.fingerprints([*guesses, *self._placebo(model, guesses)])
+        hypotheses = simulator.fingerprints(guesses)
         noise = noise_of_splits(null, 2, self.model_error)
         doubtful = replace(noise, covariance=noise.covariance.with_modes(_DOUBT * slopes))
         return likeliest_sets(hypotheses, self.z.both - null.mean, doubtful)
-
-    def _placebo(self, model: tuple[Effect, ...], guesses: Sequence[Effect]) -> list[Effect]:
-        """Return an effect that the model does not have and for which nothing speaks."""
-        have = {effect.tag for effect in model}
-        others = {tag: kind for tag, kind in self.classes.items() if tag not in have}
-        return placebo_for(guesses, others, self.defects)
 
     def _simulator(self, model: tuple[Effect, ...], null: NullModel, purpose: str) -> ReplicateSimulator:
         return ReplicateSimulator(

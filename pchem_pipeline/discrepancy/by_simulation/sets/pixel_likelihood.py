@@ -20,6 +20,7 @@ from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import LARGEST_FACTOR, Hypothesis
+from pchem_pipeline.discrepancy.by_simulation.candidates.satellites import with_satellites
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, multistart, shift_bias_by_electrons
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.places import Part
@@ -256,8 +257,9 @@ class Histograms:
         """Return guesses with the numbers that histograms tell, the likeliest of an effect in a place first.
 
         Those of effects with a law, by the samples on which they act: a strong effect has moved the pixels
-        from which its estimator takes a strength. Others, and those that no pixel can be fitted with, stay as
-        they are. Guesses that come to the same are one.
+        from which its estimator takes a strength. Those that give single pixels levels of their own, by these
+        levels. Others, and those that no pixel can be fitted with, stay as they are. Guesses that come to the
+        same are one.
         """
         by_place: dict[Part, dict[str, list[Effect]]] = {}
         for g in guesses:
@@ -270,14 +272,16 @@ class Histograms:
                 for tag, there in anywhere.items()
                 if any(identifiable_from_histograms(g) for g in there)
             }
-            by = self._of(place) if told else None
-            for tag, effects in {} if by is None else _likeliest(by, told).items():
+            by, samples = self._of(place) if told else None, self._samples(place)
+            numbers = {} if by is None else _likeliest(by, told)
+            levels = {} if samples is None else with_satellites(*samples, self.present, anywhere, self.effort)
+            for tag, effects in (numbers | levels).items():
                 likely[tag, place] = [e.at_place(place.region, place.when) for e in effects]
+                self.told += likely[tag, place] if tag in numbers else []
         found: list[Effect] = []
         for tag in dict.fromkeys(g.tag for g in guesses):
             for place, own in by_place.items():
                 found += likely.get((tag, place)) or own.get(tag, [])
-        self.told += [effect for effects in likely.values() for effect in effects]
         return found
 
     def suggested(
@@ -297,15 +301,20 @@ class Histograms:
     def _of(self, part: Part) -> PixelLikelihood | None:
         """Return the likelihood of the samples of a part; None: they are too few, or have no one law."""
         if part not in self._known:
-            some, inside = self.samples_of(part)
-            usable = self.maps.usable & inside
-            enough = usable.sum() >= _FEWEST_PIXELS and some.sum() >= _FEWEST_FRAMES
-            told = enough and all(each.everywhere for each in self.present)
-            own = self.frames if some.all() else self.frames[some]
-            maps = replace(self.maps, usable=usable)
-            of = own, maps, self.present, self.effort, FEW_PIXELS
-            self._known[part] = PixelLikelihood(*of, self.defects) if told else None
+            known = None
+            if (own := self._samples(part)) is not None:
+                known = PixelLikelihood(*own, self.present, self.effort, FEW_PIXELS, self.defects)
+            self._known[part] = known
         return self._known[part]
+
+    def _samples(self, part: Part) -> tuple[NDArray[np.unsignedinteger], PixelMaps] | None:
+        """Return the frames of a part, and the maps of its pixels; None as above."""
+        some, inside = self.samples_of(part)
+        usable = self.maps.usable & inside
+        enough = usable.sum() >= _FEWEST_PIXELS and some.sum() >= _FEWEST_FRAMES
+        if not enough or not all(each.everywhere for each in self.present):
+            return None
+        return self.frames if some.all() else self.frames[some], replace(self.maps, usable=usable)
 
 
 def _likeliest(by: PixelLikelihood, guesses: Mapping[str, Sequence[Effect]]) -> dict[str, list[Effect]]:

@@ -1,7 +1,7 @@
 """Which of the sets that were tried is in the data, and what could stand in the place of each effect.
 
 One effect that leaves nothing beyond chance after its best fit is all there is; of a set of several, each
-must be seen: by a statistic that the others at their best fit leave, and that it explains.
+must be needed: without it the others at their best fit leave a statistic that it explains, or are far behind.
 """
 
 from __future__ import annotations
@@ -16,15 +16,11 @@ from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR,
     Hypothesis,
-    fit_set,
-    seen_among,
-    share_place,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter, is_expensive
-from pchem_pipeline.discrepancy.by_simulation.sets.search import LOOSE, Search, Trial
-from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
+from pchem_pipeline.discrepancy.by_simulation.sets.search import Search
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR, DECISIVE
 
 _UNTOUCHED = 0.5  # of what an effect does to a statistic, the most by which others may move one of its own
 
@@ -90,8 +86,8 @@ class Comparison:
         return tuple(sorted(shared, key=lambda c: (-c.probability, -c.score)))
 
 
-def chosen(search: Search, hypotheses: Sequence[Hypothesis]) -> Comparison | None:
-    """Choose among the sets that were tried, and fit placebos in the place of its effects; None: none holds.
+def chosen(search: Search) -> Comparison | None:
+    """Choose among the sets that were tried; None: none holds.
 
     The best of which each effect is seen, or where the statistics tell two sets badly apart the one by which
     the histograms of the pixels are likelier.
@@ -103,9 +99,6 @@ def chosen(search: Search, hypotheses: Sequence[Hypothesis]) -> Comparison | Non
     other = max(search.ranked, key=lambda one: by_histograms.get(one.tags, (0.0, 0.0))[0])
     if by_histograms.get(other.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(search, other):
         best, by_histograms = other, _by_histograms(other, search.ranked, search.likelihood)
-    for member in best.hypotheses:
-        if not type(member.effect).empirical:
-            _try_placebo(search, hypotheses, best, member)
     return Comparison(best, tuple(search.ranked), by_histograms)
 
 
@@ -138,45 +131,6 @@ def _by_histograms(
     return found
 
 
-def unrelated(one: Effect, other: Effect) -> bool:
-    """Tell whether neither of two effects is known to be confused with the other."""
-    known = other.tag in type(one).separate or one.tag in type(other).separate
-    return not known and one.tag != other.tag
-
-
-def _try_placebo(
-    search: Search, hypotheses: Sequence[Hypothesis], chosen: Refitted, member: Hypothesis
-) -> None:
-    """Try the best unrelated effect in the place of a member, unless there is one.
-
-    Of all that have nothing to do with it, the one whose fingerprint would explain most: one that cannot
-    close anything, whatever its strength, proves nothing about the name. At that strength: it is not to win.
-    """
-    refitter, others = search.refitter, [h for h in chosen.hypotheses if h.tag != member.tag]
-    kept = {h.tag for h in others}
-    pool = [
-        h
-        for h in hypotheses
-        if h.tag not in chosen.tags
-        and unrelated(h.effect, member.effect)
-        and not is_expensive([h.effect])
-        and not share_place(other.effect for other in (*others, h))
-    ]
-    if any(one.tags == kept | {h.tag} for one in search.tried for h in pool):
-        return
-    noise = refitter.noise(refitter.null.covariance, refitter.null.n_replicates)
-    shift = refitter.target - refitter.null.mean
-    fits = [fit_set([*others, h], shift, noise) for h in pool]
-    closing = [(fit.log_score(shift, noise), i) for i, fit in enumerate(fits) if fit.factors[-1] > 0.0]
-    if closing:
-        score, index = max(closing)
-        best = pool[index].times(float(fits[index].factors[-1]))
-        trial = Trial((*others, best), score)
-        search.advance(trial)
-        trial.ended = True
-        search.trials.append(trial)
-
-
 def own_statistics(own: FloatArray, others: FloatArray, noise: FloatArray) -> BoolArray:
     """Return which statistics an effect moves, and others leave alone, (m,).
 
@@ -190,9 +144,10 @@ def own_statistics(own: FloatArray, others: FloatArray, noise: FloatArray) -> Bo
 
 
 def _all_seen(search: Search, one: Refitted) -> bool:
-    """Test whether each effect of a set has a signature of its own beside the best fit of the others.
+    """Test whether each effect of a set is needed beside the best fit of the others.
 
-    Or, of a set that leaves nothing, whether it is seen beside them.
+    Of a set that leaves something each must have a statistic of its own, which stands out without it. Of one
+    that leaves nothing it suffices that without it the set is far behind.
     """
     if len(one.tags) == 1:
         # the same effect in two places: without it nothing is left to compare with
@@ -203,29 +158,20 @@ def _all_seen(search: Search, one: Refitted) -> bool:
     apart = (own_statistics(part, np.delete(one.parts, i, axis=0), noise) for i, part in enumerate(one.parts))
     if not complete and not all(own.any() for own in apart):
         return False
+    least = one.penalised_log_likelihood - DECISIVE
     for hypothesis in one.hypotheses:
         rest = [h for h in one.hypotheses if h is not hypothesis]
-        others = search.at_best_fit(rest, one.penalised_log_likelihood)
+        others = search.at_best_fit(rest, least)
         if others is None:
             return False
+        if complete and others.penalised_log_likelihood < least:
+            continue
         part = hypothesis.fingerprint
         noise = refitter.scatter(others.covariance, len(others.vectors))
         left = (np.abs(others.rest) > CERTAIN) & (others.rest * part > 0.0)
-        seen = bool((own_statistics(part, others.parts, noise) & left).any())
-        if not seen and not (complete and _seen_beside(refitter, part, others)):
+        if not (own_statistics(part, others.parts, noise) & left).any():
             return False
     return True
-
-
-def _seen_beside(refitter: Refitter, part: FloatArray, others: Refitted) -> bool:
-    """Tell whether others leave a statistic that an effect moves, by more than their details may be wrong.
-
-    Where a set leaves nothing at all, its effects may move the same statistics: those that merely mimic
-    something else mend each other, and do not do so everywhere.
-    """
-    noise = replace(refitter.noise(others.covariance, len(others.vectors)), model_error=LOOSE)
-    shift = refitter.target - others.mean + others.parts.sum(axis=0)
-    return seen_among(part, others.parts, shift, noise)
 
 
 def _apart(first: Refitted, second: Refitted) -> float:

@@ -27,7 +27,7 @@ H, STEP, BIAS, WIDTH = 1.7, 9.0, 40.3, 2.4
 def _law(width: float = WIDTH) -> np.ndarray:
     first, last = cell_scores_numba.electron_range(H, np.log(1e-12))
     law = np.empty((int(BIAS + last * STEP + 8 * width) + 1, cell_scores_numba.N_COLUMNS))
-    cell_scores_numba.fill_law(H, STEP, BIAS, width, first, last, False, law)
+    cell_scores_numba.fill_law(H, STEP, BIAS, width, first, last, law)
     return law
 
 
@@ -94,7 +94,7 @@ def test_a_parameter_without_a_trace_in_the_law_takes_nothing_from_the_scores() 
     # each electron number has the same two codes, half of its samples in each, whatever the read noise
     first, last = cell_scores_numba.electron_range(H, np.log(1e-12))
     law = np.zeros((160, cell_scores_numba.N_COLUMNS))
-    cell_scores_numba.fill_law(H, 4.0, 40.5, 0.1, first, last, False, law)
+    cell_scores_numba.fill_law(H, 4.0, 40.5, 0.1, first, last, law)
     inverse = np.divide(1.0, law[:, 0], out=np.zeros(160), where=law[:, 0] > 1e-14)
     raw = law.copy()
     _, scored = whitened(law, inverse)

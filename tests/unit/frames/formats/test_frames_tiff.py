@@ -11,6 +11,7 @@ from helpers.camera_files import opened, read, refused
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
+from pchem_pipeline.frames.formats.map_files import Cube, write_tiff_cube
 from pchem_pipeline.frames.formats.tiff import TiffReader
 from pchem_pipeline.frames.settings import InputSettings
 
@@ -41,6 +42,17 @@ def test_twelve_bits_packed(tmp_path):
     assert columns * 12 % 8 == 0
     np.testing.assert_array_equal(reader.read(), STACK[:1])
     np.testing.assert_array_equal(reader.read(0, 1, 5, 9), STACK[:1, 5:9])
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("shape", [(3, 5, 1), (3, 1, 5), (3, 4, 5)])
+def test_calibrated_frames_of_one_row_or_column_are_pages(tmp_path, shape, dtype):
+    stack = np.arange(np.prod(shape)).reshape(shape).astype(dtype)
+    write_tiff_cube(tmp_path / "a.tif", Cube("electrons", iter([stack]), shape, stack.dtype, "e-", "-", {}))
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        np.testing.assert_array_equal([page.asarray() for page in file.pages], stack)
+        assert file.is_imagej == (dtype == "float32")
+        assert file.series[0].shape == shape
 
 
 def test_imagej_stack_with_one_directory(tmp_path):

@@ -13,8 +13,9 @@ from pchem_pipeline.model.fit.api import fit_histograms, likelihood_moments
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import log_pcd
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
-from pchem_pipeline.runner.session import Command, run_stages, run_status
+from pchem_pipeline.runner.session import run_stages, run_status
 from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
 from pchem_pipeline.store.run_store import RunStore
 

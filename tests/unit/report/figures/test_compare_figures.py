@@ -39,7 +39,7 @@ def test_maps_of_differences_of_all_shapes(shape: tuple[int, int]) -> None:
         level = np.asarray(top.images[0].get_array(), dtype=float)
         np.testing.assert_allclose(level, found.z, rtol=1e-6)
         assert figure.axes[0].child_axes[0].get_yticklabels()[0].get_text() == "−4"
-    assert sum(bottom.patches[0].get_data().values) == found.n_both
+    assert sum(bottom.patches[0].get_data().values) == np.isfinite(found.z).sum()
     assert len(bottom.lines) == 1  # what chance gives
 
 

@@ -99,7 +99,6 @@ def test_a_named_effect_has_all_its_evidence(base: ReportData) -> None:
         "sampling noise: up to 0.66",
         "of the gap closed",
         "0.3512 ± 0.0041 DN",
-        "An unrelated control (flicker noise of the pixels) reduces the gap 3",
         " closes 75 % of the",
         "it leaves a misfit of 9.1 sigma: row means",
         "−16.8 ± 3.3",
@@ -380,7 +379,6 @@ def test_the_gap_has_a_line_for_every_model() -> None:
         ("with row_noise", "after", 31.0),
         ("… and bias_drift", "after", 0.4),
         ("next best: periodic_pickup", "runner-up", 120.0),
-        ("control: flicker_noise", "placebo", 116.4),
     ]
     doubt = [bar.label for bar in discrepancy_gap.gap_bars(verdict_of("ambiguous"))]
     assert doubt[1] == "with row_noise or periodic_pickup or interpixel_capacitance"
@@ -409,15 +407,8 @@ def test_pulls_come_from_the_steps_or_from_the_vectors() -> None:
     assert largest_pulls(discrepancy_data("named", steps=[placed]))[0].sentence == "in a part"
 
 
-def test_a_placebo_that_closes_the_gap_is_a_caution() -> None:
-    data = discrepancy_data("named")
-    steps, gap = result("named")["steps"], result("named")["gap"]
-    last = {**steps[-1], "placebo": {"effect": "flicker_noise", "gap_after": 30e-6}}
-    doubted = replace(data, found=verdict_of("named", steps=[steps[0], last]))
-    words = {flag.text: flag.level for flag in remarks(doubted)}
-    doubt = next(text for text in words if "control" in text and "drift" in text)
-    assert "reduces the gap 75 % as much as bias drift: bias drift is doubtful" in doubt
-    assert words[doubt] == "caution"
+def test_what_is_left_of_the_gap_is_a_caution() -> None:
+    data, gap = discrepancy_data("named"), result("named")["gap"]
     part = {flag.text: flag.level for flag in remarks(replace(data, found=verdict_of("named_in_part")))}
     assert [level for text, level in part.items() if "of the gap remains" in text] == ["caution"]
     closed = replace(data, found=verdict_of("named", gap={**gap, "after": 0.5e-6}))
@@ -430,7 +421,7 @@ def test_a_gap_that_chance_makes_is_not_said_to_be_closed() -> None:
     gap = {**result("named")["gap"], "before": 0.6e-6, "after": 0.0, "floor": 1e-6, "closed_fraction": 1.0}
     data = discrepancy_data("named", steps=[weak], gap=gap)
     told = [flag.text for flag in remarks(data)]
-    assert not any("closes" in text or "control" in text for text in told)
+    assert not any("closes" in text for text in told)
     assert any("periodic pickup, is rejected, since it leaves a misfit" in text for text in told)
     facts = {fact.label: fact for fact in key_facts(data)}
     assert "of the gap closed" not in facts

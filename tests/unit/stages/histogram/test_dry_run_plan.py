@@ -25,7 +25,8 @@ import json, sys
 from pchem_pipeline.compute.environment import peak_rss_bytes, prepare_environment
 prepare_environment()
 from pathlib import Path
-from pchem_pipeline.runner.session import Command, run_stages
+from pchem_pipeline.run.stage import Command
+from pchem_pipeline.runner.session import run_stages
 from pchem_pipeline.run.target import find_run
 target = find_run(Path(sys.argv[1]))
 states = run_stages(target, ["ingest", "histogram"], Command(quiet=True))

@@ -13,7 +13,7 @@ from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.histogram.summaries import SummaryAccumulator
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.stage import Options
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.bands import plan_bands
 from pchem_pipeline.stages.histogram import arrays, histogram
@@ -42,13 +42,13 @@ def ingest(store, info, frames):
     store.records.mark("ingest", "abc", "all", {})
 
 
-def make_context(folder, frames, *, mode="reference", executor=None, options=None, tile=64, **settings):
+def make_context(folder, frames, *, mode="reference", executor=None, command=None, tile=64, **settings):
     folder.mkdir(exist_ok=True)
     if not (folder / "frames.npy").exists():
         np.save(folder / "frames.npy", frames)
     sections = {"run": {"tile": tile}, "input": {"files": ["frames.npy"], "mode": mode}}
     sections["histogram"] = {"block_frames": 128, "window_frames": 64, **settings}
-    context = stage_context(folder, executor, options, **sections)
+    context = stage_context(folder, executor, command, **sections)
     if not context.store.records.read("ingest"):
         info = SensorInfo("frames", *frames.shape, str(frames.dtype), None, None, mode, {})
         ingest(context.store, info, frames if mode == "copy" else None)
@@ -118,7 +118,7 @@ def test_tasks_can_go_to_threads_and_other_processes(tmp_path, frames, expected,
 
 
 def test_tiles_then_the_rest(tmp_path, frames, expected):
-    part = make_context(tmp_path, frames, options=Options(roi=(64, 128, 0, 1)))
+    part = make_context(tmp_path, frames, command=Command(roi=(64, 128, 0, 1)))
     state = execute("histogram", part)
     assert (state.state, state.done, state.total) == ("partial", 1, 3)
     assert not part.store.has("summary/frame_mean")

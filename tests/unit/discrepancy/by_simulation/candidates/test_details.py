@@ -120,7 +120,7 @@ def test_an_effect_that_wrong_numbers_of_another_brought_in_is_not_kept(truth: D
     assert {h.tag for h in sets[0].hypotheses} == {"dark_current_rts", "row_noise"}
     search = Search(world.refitter(), HistogramLikelihood())
     compare(search, hypotheses, sets)
-    found = chosen(search, hypotheses)
+    found = chosen(search)
     assert found is not None
     assert found.chosen.tags == {"dark_current_rts"}
 

@@ -120,7 +120,7 @@ class World:
         search = Search(self.refitter(), likelihood or HistogramLikelihood())
         compare(search, hypotheses, sets, **how)
         search.refitter = replace(search.refitter, allow=lambda _: None)
-        return chosen(search, hypotheses)
+        return chosen(search)
 
     def chosen(self, *hypotheses: Hypothesis, **how: Any) -> frozenset[str] | None:
         """Return the tags of the chosen set; None where none holds."""
@@ -563,17 +563,18 @@ def test_a_simulated_stack_is_known_by_all_that_makes_it_under_a_name_that_a_fil
     assert not any("/" in key for key in keys)
 
 
-@pytest.mark.parametrize("rest", [0.0, 9.0])
+@pytest.mark.parametrize(("strong", "rest"), [(20.0, 0.0), (100.0, 0.0), (20.0, 9.0)])
 def test_effects_that_move_the_same_statistics_are_seen_where_they_leave_nothing(
-    monkeypatch: pytest.MonkeyPatch, rest: float
+    monkeypatch: pytest.MonkeyPatch, strong: float, rest: float
 ) -> None:
     # a clamp takes back what a common noise does to the means of frames: nothing of that is its own
-    monkeypatch.setitem(TRUTH, "row_noise", (np.eye(M)[0] * 40.0 + np.eye(M)[1] * 20.0, 1.0))
-    monkeypatch.setitem(TRUTH, "frame_noise", (-np.eye(M)[1] * 20.0, 1.0))
+    own, shared = np.eye(M)[0], np.eye(M)[1:5].sum(axis=0)
+    monkeypatch.setitem(TRUTH, "row_noise", (strong * (2.0 * own + shared), 1.0))
+    monkeypatch.setitem(TRUTH, "frame_noise", (-20.0 * shared, 1.0))
     world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
     left = rest * np.eye(M)[5]
     world.z = Measured(world.z.train + left, world.z.test + left, world.z.final + left)
-    found = world.compare(hypothesis("row_noise"), hypothesis("frame_noise"))
+    found = world.compare(hypothesis("row_noise"), beside=[hypothesis("frame_noise")])
     assert found.chosen.tags == ({"row_noise"} if rest else {"row_noise", "frame_noise"})
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
-from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import placebo_for
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     HistogramLikelihood,
@@ -273,14 +272,3 @@ def test_what_a_fit_raises_is_noted_unless_its_numbers_are_no_law(
     monkeypatch.setattr(SetComparison, "fit", broken)
     assert likelihood.fitted([SKEW(share=0.3)]) == []
     assert (str(raised) in defects.get("noise_skew", "")) is noted
-
-
-def test_an_effect_that_fails_as_placebo_is_noted() -> None:
-    class Broken(SKEW):
-        @classmethod
-        def typical(cls) -> Sequence[Effect]:
-            raise RuntimeError("no such thing")
-
-    defects: dict[str, str] = {}
-    assert placebo_for([], {"noise_skew": Broken}, defects) == []
-    assert "no such thing" in defects["noise_skew"]

@@ -1,0 +1,59 @@
+"""Levels that single pixels show tell the kind of their traps, step, probability and share."""
+
+import numpy as np
+import pytest
+
+from pchem_pipeline.discrepancy.by_simulation.candidates.satellites import with_satellites
+from pchem_pipeline.discrepancy.effort import Effort
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.framework.registry import effect_class
+
+SHAPE, FRAMES, STEP, NOISE, EXPOSURE = (24, 24), 2000, 8.0, 0.27, 1.2  # pixels, frames, DN per e-, e-, e-
+WITH_TRAP = np.arange(576).reshape(SHAPE) % 12 == 0
+TRAPS = effect_class("rts_noise")
+GUESSES: dict[str, list[Effect]] = {
+    "rts_noise": list(TRAPS.typical()),
+    "row_noise": list(effect_class("row_noise").typical()),
+}
+
+
+def frames_of(jumps: np.ndarray, seed: int) -> np.ndarray:
+    """Return frames of which some pixels have jumps, e-: an own simulator, independent of the product's."""
+    rng = np.random.default_rng(seed)
+    signal = rng.poisson(EXPOSURE, (FRAMES, *SHAPE)) + rng.normal(0.0, NOISE, (FRAMES, *SHAPE))
+    signal[:, WITH_TRAP] += jumps
+    return np.rint(100.0 + STEP * signal).astype(np.uint16)
+
+
+def maps() -> PixelMaps:
+    values = (EXPOSURE, 1.0 / STEP, 100.0, STEP * NOISE)
+    return PixelMaps.known([np.full(SHAPE, v) for v in values], np.ones(SHAPE, np.bool_))
+
+
+@pytest.mark.parametrize(("reads", "step", "scatter"), [(1, 1.3, 0.3), (1, 1.6, 0.05), (4, 1.6, 0.05)])
+def test_steps_and_weights_of_traps_are_those_of_the_pixels_that_have_one(
+    reads: int, step: float, scatter: float
+) -> None:
+    rng, weight, n = np.random.default_rng(3), 0.4, int(WITH_TRAP.sum())
+    steps = step * np.exp(scatter * rng.standard_normal(n))
+    # a jump falls between two successive samples of the 2 N, or after them
+    heights = np.concatenate([np.arange(1, reads + 1), np.arange(reads - 1, 0, -1)]) / reads
+    jumps = rng.choice(heights, (FRAMES, n)) * rng.choice([-1.0, 1.0], (FRAMES, n))
+    frames = frames_of(steps * np.where(rng.random((FRAMES, n)) < weight, jumps, 0.0), 5)
+    found = with_satellites(frames, maps(), (), GUESSES, Effort(None))
+    assert list(found) == ["rts_noise"]
+    best = found["rts_noise"][0]
+    assert (best.sampling, best.samples) == ("correlated", reads)  # type: ignore[attr-defined]
+    # the median of n steps, and of n weights of so many samples each
+    error = step * max(scatter, 0.03) * np.sqrt(np.pi / 2.0 / n)
+    assert abs(best.amplitude_e - np.median(steps)) < 4.0 * error + 0.02 * step  # type: ignore[attr-defined]
+    assert abs(best.probability - weight) < 0.05  # type: ignore[attr-defined]
+    assert best.spread == ("lognormal" if scatter > 0.2 else "equal")  # type: ignore[attr-defined]
+    # a step that blurs the peaks passes for read noise
+    assert 0.7 * WITH_TRAP.mean() < best.fraction <= 1.05 * WITH_TRAP.mean()  # type: ignore[attr-defined]
+
+
+def test_pixels_without_levels_tell_nothing() -> None:
+    frames = frames_of(np.zeros((FRAMES, int(WITH_TRAP.sum()))), 6)
+    assert with_satellites(frames, maps(), (), GUESSES, Effort(None)) == {}
