@@ -286,17 +286,16 @@ class _Other:
 
 
 def without_better_reason(addition: Addition) -> Addition:
-    """Take the name from the only effect found if an unrelated rival closes as much, or not much less.
+    """Take the name from the only effect found if an unrelated one with a name closes as much, or nearly.
 
     Asked where the data disagree with the model all the same: both merely mimic what it is.
     """
     closed, effect, classes = addition.before.value - addition.after.value, addition.effect, effect_classes()
-    unrelated = [
-        rival
-        for rival in addition.rivals
-        if rival.effect not in effect.separate and effect.tag not in classes[rival.effect].separate
-    ]
-    left = min((max(rival.gap_after, 0.0) for rival in unrelated), default=math.inf)
+    left = math.inf
+    for rival in addition.rivals:
+        other = classes[rival.effect]
+        if not (other.empirical or rival.effect in effect.separate or effect.tag in other.separate):
+            left = min(left, max(rival.gap_after, 0.0))
     if addition.described or not addition.fits or addition.before.value - left <= _AS_GOOD * max(closed, 0.0):
         return addition
     return replace(addition, against="an unrelated effect explains nearly as much")

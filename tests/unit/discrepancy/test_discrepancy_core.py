@@ -69,7 +69,8 @@ def test_what_something_unrelated_closes_nearly_as_well_gets_no_name(left: float
     related, rival = (Rival(effect=tag, gap_after=left) for tag in ("periodic_pickup", "adc_dnl"))
     one = Addition(effect, True, "", (), 0.01, before, after, (related, rival), ())
     assert without_better_reason(one).fits is fits
-    for other in (replace(one, rivals=(related,)), replace(one, described=True)):
+    measured = Rival(effect="empirical_noise", gap_after=left)
+    for other in (replace(one, rivals=(related, measured)), replace(one, described=True)):
         assert without_better_reason(other) == other
 
 

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
@@ -26,7 +27,8 @@ from pchem_pipeline.model.histogram.count import histogram_frames
 #: Amplitudes that are tried, 0.35 to 5 e-: a fit refines the best one.
 _AMPLITUDES = tuple(0.35 * 1.35**i for i in range(10))
 _MOST_PIXELS = 256
-_FAR_SHARE = 0.1  # of what the likeliest pattern explains, by which another one is left out
+#: Share of what the best one explains, by which another one is far behind it.
+FAR_SHARE = 0.1
 
 
 def with_satellites(
@@ -35,6 +37,7 @@ def with_satellites(
     present: Sequence[Effect],
     guesses: Mapping[str, Sequence[Effect]],
     effort: Effort,
+    defects: dict[str, str],
 ) -> dict[str, list[Effect]]:
     """Return effects with the numbers that free satellites of the pixels tell, by tag, the likeliest first.
 
@@ -46,6 +49,7 @@ def with_satellites(
         present: effects of the model, which act everywhere.
         guesses: effects by tag.
         effort: counts the work.
+        defects: effects that failed, and why; more come to them.
     """
     usable = np.flatnonzero(maps.usable.ravel())
     start = np.stack([values.ravel()[usable] for values in maps.maps], axis=1)
@@ -80,8 +84,13 @@ def with_satellites(
         if has.any():
             rise = float(np.nansum(fit.log_likelihood - plain.log_likelihood[some]))
             own = fit.satellite_amplitude_e[has], fit.satellite_weight[has]
-            found.append((rise, guess.with_satellites(*own, float(has.mean()) * poor.size / usable.size)))
-    least = (1.0 - _FAR_SHARE) * max((rise for rise, _ in found), default=0.0)
+            share = float(has.mean()) * poor.size / usable.size
+            # an effect of a plug-in may raise anything: the others are compared all the same
+            try:
+                found.append((rise, guess.with_satellites(*own, share)))
+            except Exception as error:
+                defects[guess.tag] = error_words(error)
+    least = (1.0 - FAR_SHARE) * max((rise for rise, _ in found), default=0.0)
     likely: dict[str, list[Effect]] = {}
     for rise, effect in sorted(found, key=lambda one: -one[0]):
         if rise >= least:

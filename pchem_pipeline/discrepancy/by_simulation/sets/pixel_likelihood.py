@@ -20,7 +20,7 @@ from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import LARGEST_FACTOR, Hypothesis
-from pchem_pipeline.discrepancy.by_simulation.candidates.satellites import with_satellites
+from pchem_pipeline.discrepancy.by_simulation.candidates.satellites import FAR_SHARE, with_satellites
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, multistart, shift_bias_by_electrons
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.places import Part
@@ -44,7 +44,6 @@ _PROBED = 64  # pixels
 _REMEMBERED = 12  # fits: each holds the masses of all codes
 _ASTRAY = 5.0  # nats of a pixel that an effect explains, from which on it may mistake the peak of no electron
 _FEWEST_PIXELS, _FEWEST_FRAMES = 16, 200  # of a place, whose histograms tell numbers
-_FAR_SHARE = 0.1  # of what the best effect explains, beside chance, by which one is far behind it
 
 
 class PixelLikelihood:
@@ -272,9 +271,11 @@ class Histograms:
                 for tag, there in anywhere.items()
                 if any(identifiable_from_histograms(g) for g in there)
             }
-            by, samples = self._of(place) if told else None, self._samples(place)
+            by = self._of(place) if told else None
             numbers = {} if by is None else _likeliest(by, told)
-            levels = {} if samples is None else with_satellites(*samples, self.present, anywhere, self.effort)
+            levels: dict[str, list[Effect]] = {}
+            if (samples := self._samples(place)) is not None:
+                levels = with_satellites(*samples, self.present, anywhere, self.effort, self.defects)
             for tag, effects in (numbers | levels).items():
                 likely[tag, place] = [e.at_place(place.region, place.when) for e in effects]
                 self.told += likely[tag, place] if tag in numbers else []
@@ -328,7 +329,7 @@ def _likeliest(by: PixelLikelihood, guesses: Mapping[str, Sequence[Effect]]) -> 
     best = max((fits[0][0] for fits in rough.values() if fits), default=0.0)
     found = {}
     for tag, fits in rough.items():
-        near = bool(fits) and fits[0][0] > (1.0 - _FAR_SHARE) * best - DECISIVE
+        near = bool(fits) and fits[0][0] > (1.0 - FAR_SHARE) * best - DECISIVE
         fits = by.fitted([effect for _, effect in fits]) if near and few is not by else fits
         found[tag] = [effect for _, effect in fits]
     return found

@@ -41,7 +41,7 @@ def test_steps_and_weights_of_traps_are_those_of_the_pixels_that_have_one(
     heights = np.concatenate([np.arange(1, reads + 1), np.arange(reads - 1, 0, -1)]) / reads
     jumps = rng.choice(heights, (FRAMES, n)) * rng.choice([-1.0, 1.0], (FRAMES, n))
     frames = frames_of(steps * np.where(rng.random((FRAMES, n)) < weight, jumps, 0.0), 5)
-    found = with_satellites(frames, maps(), (), GUESSES, Effort(None))
+    found = with_satellites(frames, maps(), (), GUESSES, Effort(None), {})
     assert list(found) == ["rts_noise"]
     best = found["rts_noise"][0]
     assert (best.sampling, best.samples) == ("correlated", reads)  # type: ignore[attr-defined]
@@ -56,4 +56,15 @@ def test_steps_and_weights_of_traps_are_those_of_the_pixels_that_have_one(
 
 def test_pixels_without_levels_tell_nothing() -> None:
     frames = frames_of(np.zeros((FRAMES, int(WITH_TRAP.sum()))), 6)
-    assert with_satellites(frames, maps(), (), GUESSES, Effort(None)) == {}
+    assert with_satellites(frames, maps(), (), GUESSES, Effort(None), {}) == {}
+
+
+def test_an_effect_that_cannot_take_its_numbers_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("no such thing")
+
+    jumps = np.random.default_rng(7).choice([-1.6, 0.0, 1.6], (FRAMES, int(WITH_TRAP.sum())))
+    monkeypatch.setattr(TRAPS, "with_satellites", broken)
+    defects: dict[str, str] = {}
+    assert with_satellites(frames_of(jumps, 5), maps(), (), GUESSES, Effort(None), defects) == {}
+    assert "no such thing" in defects["rts_noise"]
