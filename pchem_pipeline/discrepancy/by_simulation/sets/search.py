@@ -148,7 +148,7 @@ class Search:
         if share_place(h.effect for h in members) or meets_itself(members):
             return
         if not any(same_kinds(members, trial.members) for trial in self.trials):
-            self.trials.append(Trial(tuple(members), self._foreseen(members)[1]))
+            self.trials.append(Trial(tuple(members), self._foreseen(members)))
 
     def compare(self, sets: Iterable[Sequence[Hypothesis]]) -> None:
         """Simulate sets, the most promising one a step further each time, until none is open.
@@ -287,30 +287,28 @@ class Search:
         if named and price(trial.effects) > best.price:
             return False
         if trial.way is None:
-            if named and self._is_blind(trial.members):
+            if named and self._is_blind(trial.members, best):
                 return False
             share = _FAR_SHARE if named and len(trial.members) >= len(best.hypotheses) else FAR_SHARE_OF_PART
             return trial.promise + FAR + share * explained >= best.penalised_log_likelihood
         return _may_reach(trial, best.penalised_log_likelihood)
 
-    def _foreseen(self, members: Sequence[Hypothesis]) -> tuple[np.ndarray, float]:
-        """Return what fingerprints at their best strengths leave where they move nothing, and the log score.
+    def _foreseen(self, members: Sequence[Hypothesis]) -> float:
+        """Return the log score of fingerprints at their best strengths."""
+        null, shift = self.refitter.null, self.refitter.target - self.refitter.null.mean
+        noise = replace(self.refitter.noise(null.covariance, null.n_replicates), model_error=LOOSE)
+        return fit_set(members, shift, noise).log_score(shift, noise)
 
-        In errors, of statistics of which they move less than a share.
+    def _is_blind(self, members: Sequence[Hypothesis], best: Refitted) -> bool:
+        """Test whether a statistic stands out that a set hardly moves: a refit does not change that.
+
+        By the errors under the best set: an effect may scatter what it does not shift.
         """
-        refitter = self.refitter
-        shift = refitter.target - refitter.null.mean
-        noise = replace(
-            refitter.noise(refitter.null.covariance, refitter.null.n_replicates), model_error=LOOSE
-        )
-        fit = fit_set(members, shift, noise)
-        left = np.abs(shift - fit.parts.sum(axis=0)) / np.sqrt(noise.of(fit.parts).variances)
-        moved = np.abs(fit.parts).max(axis=0)
-        return np.where(moved < _HARDLY * np.abs(shift), left, 0.0), fit.log_score(shift, noise)
-
-    def _is_blind(self, members: Sequence[Hypothesis]) -> bool:
-        """Test whether a statistic stands out that a set hardly moves: a refit does not change that."""
-        return bool((self._foreseen(members)[0] > CERTAIN).any())
+        shift = self.refitter.target - self.refitter.null.mean
+        noise = replace(self.refitter.noise(best.covariance, len(best.vectors)), model_error=LOOSE)
+        parts = fit_set(members, shift, noise).parts
+        left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(noise.of(parts).variances)
+        return bool((left[np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift)] > CERTAIN).any())
 
     def _started(self, members: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Return effects as the best trials have them that are a part of the set, or differ in one effect.
