@@ -26,7 +26,7 @@ from pchem_pipeline.model.histogram.count import histogram_frames
 
 #: Amplitudes that are tried, 0.35 to 5 e-: a fit refines the best one.
 _AMPLITUDES = tuple(0.35 * 1.35**i for i in range(10))
-_MOST_PIXELS = 256
+_MOST_PIXELS = 64
 #: Share of what the best one explains, by which another one is far behind it.
 FAR_SHARE = 0.1
 
