@@ -98,7 +98,7 @@ def _words(version: ModelVersion) -> str:
 def _effect_words(effect: Effect) -> str:
     if not effect.strength:
         return effect_words(effect)
-    strength = parameters_of(effect, math.nan)[effect.strength]
+    strength = parameters_of(effect, {})[effect.strength]
     tag, *place = effect_words(effect).partition(" in ")
     return f"{tag} {strength.value:.4g} {strength.unit}".rstrip() + "".join(place)
 

@@ -47,7 +47,7 @@ class Addition:
         effect: with its fitted parameters.
         alone: whether all others are excluded.
         against: reason of its rejection, starting with "it"; empty if it is accepted.
-        strength_stderr: standard error of its strength.
+        stderr: standard errors of its parameters, of those that have one.
         before, after: gap on the final samples without and with it.
         described: whether it is an empirical description without a cause.
         certain: whether its strength is significant.
@@ -58,7 +58,7 @@ class Addition:
     alone: bool
     against: str
     candidates: tuple[schema.Candidate, ...]
-    strength_stderr: float
+    stderr: Mapping[str, float]
     before: Gap
     after: Gap
     rivals: tuple[schema.Rival, ...]
@@ -98,7 +98,7 @@ class Addition:
             verdict=self.verdict,
             # an unconfirmed effect without a competitor is listed alone
             candidates=self.candidates[:1] if self.alone and not self.confirmed else self.candidates,
-            parameters=schema.parameters_of(self.effect, self.strength_stderr),
+            parameters=schema.parameters_of(self.effect, self.stderr),
             form=schema.form_of(self.effect),
             place=place_words(self.effect),
             gap_before=self.before.value,

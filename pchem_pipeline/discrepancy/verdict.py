@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -620,14 +620,13 @@ def read_verdict(folder: Path) -> Verdict | None:
     return Verdict.from_json(text, str(path))
 
 
-def parameters_of(effect: Effect, stderr: float) -> dict[str, Measured]:
-    """Return the parameters of an effect; only the strength has a standard error.
+def parameters_of(effect: Effect, errors: Mapping[str, float]) -> dict[str, Measured]:
+    """Return the parameters of an effect, with the standard errors of those that have one.
 
     Args:
         effect: with its fitted parameters.
-        stderr: standard error of the strength; NaN if it has none.
+        errors: standard errors by parameter.
     """
-    errors = {effect.strength: stderr}
     return {
         name: Measured(
             value=value, stderr=errors.get(name, _NAN), unit=effect.unit(name).removeprefix("none")

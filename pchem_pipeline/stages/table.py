@@ -133,7 +133,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=14,
+        version=15,
         upstream=("ingest",),
         settings=("discrepancy",),
         writes=("discrepancy",),

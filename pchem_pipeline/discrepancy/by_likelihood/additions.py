@@ -131,8 +131,11 @@ class AddedSets:
                 for (each, score, error), weight in zip(compared, weights, strict=True)
                 if not named.equals or each.tag in (member.tag, *named.equals)
             ),
-            # of the fit, and what the choice of the codes makes of it
-            strength_stderr=float(np.hypot(after.stderr(member), named.apart)),
+            # of the fit; that of the strength with what the choice of the codes makes of it
+            stderr={
+                name: float(np.hypot(error, named.apart if name == member.effect.strength else 0.0))
+                for name, error in after.stderr(member).items()
+            },
             before=gaps[0],
             after=gaps[1],
             rivals=self._rivals(named, before)[:MOST_RIVALS],

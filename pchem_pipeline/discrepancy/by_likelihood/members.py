@@ -50,6 +50,11 @@ class Coordinate:
         """Return the coordinate of a field."""
         return float(np.sign(value) * abs(value) ** self.power)
 
+    def stderr(self, coordinate: float, stderr: float) -> float:
+        """Return the standard error of the field, given its coordinate and that of it."""
+        at = abs(coordinate)
+        return float(stderr * at ** (1.0 / self.power - 1.0) / self.power) if at else stderr
+
 
 @dataclass(frozen=True)
 class Member:
@@ -143,11 +148,6 @@ class Member:
             return self.moved(start)
         except ValueError:
             return self
-
-    def strength_error(self, stderr: float) -> float:
-        """Return the standard error of the strength, given that of its coordinate."""
-        power, at = self.coordinates[0].power, abs(float(self.start[0]))
-        return float(stderr * at ** (1.0 / power - 1.0) / power) if at else stderr
 
     def excludes(self, other: Member) -> bool:
         """Tell whether both cannot be in one model: one effect, or two laws of the electron number."""

@@ -62,11 +62,11 @@ class FittedSet:
         """Return a member; None: it has none of that tag."""
         return next((m for m in self.members if m.tag == tag), None)
 
-    def stderr(self, member: Member) -> float:
-        """Return the standard error of the strength of one of the members; NaN: it has none."""
-        parts = split_coordinates(self.members, np.diag(self.fit.covariance))
-        variance = parts[self.members.index(member)]
-        return member.strength_error(float(np.sqrt(variance[0]))) if variance.size else float("nan")
+    def stderr(self, member: Member) -> dict[str, float]:
+        """Return the standard errors of the fitted fields of one of the members."""
+        parts = split_coordinates(self.members, np.sqrt(np.diag(self.fit.covariance)))
+        errors = zip(member.coordinates, member.start, parts[self.members.index(member)], strict=True)
+        return {c.name: c.stderr(float(at), float(error)) for c, at, error in errors}
 
 
 @dataclass

@@ -51,7 +51,7 @@ class Extension:
     Attributes:
         compared: the sets at their best fit.
         added: the effects of the chosen one, with what each has moved of the statistics.
-        stderr: relative standard errors of their factors, shape (e,).
+        stderr: standard errors of their parameters, of those that have one.
         hypotheses: all candidates.
         first: null of the model before.
         last: of the model with them.
@@ -63,7 +63,7 @@ class Extension:
 
     compared: Comparison
     added: tuple[Hypothesis, ...]
-    stderr: FloatArray
+    stderr: tuple[Mapping[str, float], ...]
     hypotheses: tuple[Hypothesis, ...]
     first: NullModel
     last: NullModel
@@ -80,6 +80,7 @@ class Extension:
         accept: Acceptance,
         compared: Comparison,
         added: Refitted,
+        stderr: Sequence[Mapping[str, float]],
         hypotheses: tuple[Hypothesis, ...],
         certain: bool,
     ) -> Extension:
@@ -91,6 +92,7 @@ class Extension:
             accept: see the attributes, as `compared`, `hypotheses` and `certain`.
             compared: how it was chosen.
             added: the set with many replicates.
+            stderr: standard errors of the parameters of its effects.
             hypotheses: all candidates.
             certain: whether its effects are beyond doubt.
         """
@@ -110,7 +112,7 @@ class Extension:
         last = last.shifted(np.sum(slopes * change[:, None], axis=0))
         fitted = np.array([bool(h.effect.strength) for h in added.hypotheses])
         last = replace(last, strengths=slopes * (added.stderr * fitted)[:, None])
-        own = taken, added.stderr, hypotheses, accept.first, last, moved, certain, accept, model
+        own = taken, tuple(stderr), hypotheses, accept.first, last, moved, certain, accept, model
         return cls(compared, *own)
 
     @property
@@ -193,7 +195,7 @@ class Extension:
             against=against,
             described=described,
             candidates=tuple(Candidate.of(e, r.score, r.stderr, r.probability) for e, r in compared),
-            strength_stderr=_stderr(added, float(self.stderr[member])),
+            stderr=self.stderr[member],
             before=gaps[0],
             after=gaps[1],
             rivals=tuple(self._rival(one, later) for one in self._others(member)[:MOST_RIVALS]),
@@ -343,13 +345,6 @@ def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, 
 
 def _weight(part: FloatArray, null: NullModel) -> float:
     return float(np.sum((part / null.std) ** 2))
-
-
-def _stderr(added: Hypothesis, factor_error: float) -> float:
-    """Return the standard error of the strength, given that of the factor of the fingerprint."""
-    strength = added.effect.strength
-    value = float(getattr(added.effect, strength, float("nan"))) if strength else float("nan")
-    return abs(value) * factor_error / added.effect.power
 
 
 def _ambiguous_set(rivals: Sequence[Contender], certainty: float) -> list[Contender]:

@@ -19,6 +19,7 @@ from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
 from pchem_pipeline.discrepancy.by_simulation.additions import Extension
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper, candidate_classes, serial
+from pchem_pipeline.discrepancy.by_simulation.candidates.details import standard_errors
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, SetFit
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened, Screening, noise_of_splits
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
@@ -242,7 +243,11 @@ class FrameExplainer(Explainer[Screened]):
         return not self.accept.widens(added)
 
     def _put(self, found: Comparison, added: Refitted, explanation: Screened, *, certain: bool) -> NullModel:
-        own = self.accept, found, added, explanation.hypotheses, certain
+        by_law = HistogramLikelihood(self._likelihood).standard_errors(found.chosen.hypotheses)
+        refitter = replace(self._refitter(), allow=lambda _: None)
+        measured = standard_errors(refitter, found.chosen, added.stderr)
+        stderr = [by_law.get(h.tag, {}) | own for h, own in zip(added.hypotheses, measured, strict=True)]
+        own = self.accept, found, added, stderr, explanation.hypotheses, certain
         self.extension = Extension.of(self.work, self.given, *own)
         return self.extension.last
 

@@ -53,7 +53,7 @@ def _hypothesis(tag: str, fingerprint: np.ndarray) -> Hypothesis:
 def test_beside_an_effect_that_moves_more_and_does_not_fit_there_is_no_name() -> None:
     def one(tag: str, against: str) -> Addition:
         effect, gap = _hypothesis(tag, np.zeros(1)).effect, Gap(1.0, 0.1, (1.0, 1.0), {})
-        return Addition(effect, True, against, (), 0.01, gap, gap, (), ())
+        return Addition(effect, True, against, (), {}, gap, gap, (), ())
 
     mimic, good = one("frame_noise", "it leaves too much of the discrepancy"), one("row_noise", "")
     assert [each.fits for each in without_company([mimic, good])] == [False, False]
@@ -67,7 +67,7 @@ def test_beside_an_effect_that_moves_more_and_does_not_fit_there_is_no_name() ->
 def test_what_something_unrelated_closes_nearly_as_well_gets_no_name(left: float, fits: bool) -> None:
     effect, before, after = _hypothesis("row_noise", np.zeros(1)).effect, _gap_of(1.0), _gap_of(0.0)
     related, rival = (Rival(effect=tag, gap_after=left) for tag in ("periodic_pickup", "adc_dnl"))
-    one = Addition(effect, True, "", (), 0.01, before, after, (related, rival), ())
+    one = Addition(effect, True, "", (), {}, before, after, (related, rival), ())
     assert without_better_reason(one).fits is fits
     measured = Rival(effect="empirical_noise", gap_after=left)
     for other in (replace(one, rivals=(related, measured)), replace(one, described=True)):
@@ -399,7 +399,7 @@ def test_rivals_that_frames_cannot_tell_apart_come_with_the_measurement_that_can
     first, other = (effect_class(tag).typical()[0] for tag in (effect, rival))
     candidates = (Candidate.of(first, 0.0, 0.0, 0.6), Candidate.of(other, score, 4.0, 0.4))
     gap = Gap(9e-5, 3e-5, (0.0, 0.0), {})
-    addition = Addition(first, False, "", candidates, 1e-4, gap, gap, (), ())
+    addition = Addition(first, False, "", candidates, {}, gap, gap, (), ())
     assert list(addition.step(None).separate) == [rival]
     assert says in addition.step(None).separate[rival]
 
@@ -421,7 +421,7 @@ def test_what_the_final_frames_do_not_confirm_has_no_name(before: float, after: 
     rival = [
         Candidate.of(one, 0.0, 0.0, 0.5) for one in (effect, effect_class("row_noise")(row_noise_dn=1.0))
     ]
-    addition = Addition(effect, True, "", tuple(rival), 1e-4, first, last, (), ())
+    addition = Addition(effect, True, "", tuple(rival), {}, first, last, (), ())
     found = Findings("frames", None, None, None, first, [], False, Added((addition,), last))  # type: ignore[arg-type]
     assert found.state == addition.verdict == state
     assert bool(found.named) == bool(found.model((), (effect,))) == (state == "named")
@@ -442,7 +442,7 @@ def test_what_one_statistic_shows_still_is_a_part_that_has_no_name() -> None:
     z[7] += 7.5 * null.std[7]
     effect = effect_class("row_noise")(row_noise_dn=1.0)
     first, last = (Gap(value, 3e-5, (0.0, 0.0), {}) for value in (9e-5, 1e-5))
-    addition = Addition(effect, True, "", (), 0.1, first, last, (), ())
+    addition = Addition(effect, True, "", (), {}, first, last, (), ())
     found = Findings("frames", Measured(z, z, z), null, null, first, [], True, Added((addition,), last))
     assert (found.state, found.named) == ("named_in_part", (effect,))
     assert STATISTICS[NAMES[7]].sentence in _sentence(found, {})

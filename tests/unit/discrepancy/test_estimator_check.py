@@ -101,7 +101,7 @@ def state_of(before: float, after: float, pull: float, monkeypatch: pytest.Monke
     z = NULL.mean + pull * NULL.std * np.eye(40)[0]
     gaps = [Gap(value, 3e-5, (0.0, 0.0), {}) for value in (before, after)]
     effect = effect_class("noise_skew")(share=0.1)
-    addition = Addition(effect, True, "", (), 0.01, gaps[0], gaps[1], (), ())
+    addition = Addition(effect, True, "", (), {}, gaps[0], gaps[1], (), ())
     monkeypatch.setattr(skeleton, "locate", lambda *_: [])
     monkeypatch.setattr(skeleton, "build_verdict", lambda found, *_, **__: found)
     unused: Any = None

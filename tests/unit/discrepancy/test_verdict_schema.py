@@ -115,14 +115,14 @@ def test_a_place_takes_its_words_from_the_catalogue() -> None:
 def test_the_unit_of_a_parameter_is_that_of_its_type(tag: str, name: str, unit: str) -> None:
     kind = effect_class(tag)
     effect = kind.model_construct(**{name: 1})
-    assert parameters_of(effect, 0.1)[name].unit == unit
+    assert parameters_of(effect, {})[name].unit == unit
 
 
 @pytest.mark.parametrize("tag", effect_classes())
 def test_every_number_of_an_effect_is_declared_with_its_unit(tag: str) -> None:
     kind = effect_class(tag)
     for typical in kind.typical():
-        for name in parameters_of(typical, 0.1):
+        for name in parameters_of(typical, {}):
             assert kind.unit(name), name
     # also where it is null by default, and never another unit than the description has
     for name, field in kind.model_fields.items():
@@ -142,9 +142,9 @@ def test_the_form_of_an_effect_is_told_where_it_is_not_the_usual_one() -> None:
     assert form_of(effect_class("row_noise").model_validate({"row_noise_dn": 1.0, **here})) == {}
 
 
-def test_only_the_strength_has_a_standard_error() -> None:
+def test_a_parameter_has_the_standard_error_that_is_known() -> None:
     effect = effect_class("row_noise").model_validate({"row_noise_dn": 0.35})
-    found = parameters_of(effect, 0.004)
+    found = parameters_of(effect, {"row_noise_dn": 0.004})
     assert found["row_noise_dn"].model_dump() == {"value": 0.35, "stderr": 0.004, "unit": "DN"}
     others = [measured for name, measured in found.items() if name != "row_noise_dn"]
     assert all(math.isnan(measured.stderr) for measured in others)

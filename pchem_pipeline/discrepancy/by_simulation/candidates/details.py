@@ -40,6 +40,7 @@ _STEPS = 4
 _USUAL_ERROR = 0.5  # of the logarithm of a number as it is guessed
 _LARGEST_STEP = LARGEST_STEP / 2.0  # of a number: it bends what an effect does, and a strength scales it
 _FARTHEST = LARGEST_STEP  # from the guess: beyond, it is another hypothesis
+_LEARNT = 0.8  # of that error, what may be left of it where the data tell the number
 _WORTHWHILE = 5.0  # nats that a step must promise
 _MOVED = 1.0  # by which an effect must move it for its numbers to matter there
 _ELSEWHERE = 0.5  # of the squares of what is left, the most where its effects move nothing
@@ -77,8 +78,7 @@ def tuned(refitter: Refitter, one: Refitted) -> Refitted:
     Raises:
         EffortSpentError: the work is at its limit, and nothing was tuned.
     """
-    measured = [_measured(refitter, one, place, name) for place, name in _numbers(refitter, one.hypotheses)]
-    details = [detail for detail in measured if detail is not None]
+    details = _details(refitter, one)
     if not details:
         return one
     way = DampedSteps(one, one.score)
@@ -100,6 +100,37 @@ def tuned(refitter: Refitter, one: Refitted) -> Refitted:
         details = _secant(best, now, details, taken)
         way.judge(replace(now, tuned=True), now.score)
     return way.best
+
+
+def standard_errors(refitter: Refitter, one: Refitted, least: FloatArray) -> list[dict[str, float]]:
+    """Return the standard errors of the strength and of the numbers of each effect of a set.
+
+    All are taken to be uncertain together (the inverse of the information). A number of which the data tell
+    hardly more than the guess has none.
+
+    Args:
+        refitter: simulates the set.
+        one: the set.
+        least: relative errors of the factors where the numbers are known, shape (e,).
+    """
+    details = _details(refitter, one)
+    information, _ = _normal_equations(refitter, one, details)
+    relative = np.sqrt(np.diag(np.linalg.inv(information)))
+    found: list[dict[str, float]] = []
+    for h, error in zip(one.hypotheses, np.maximum(relative[: len(least)], least), strict=True):
+        strength = abs(float(getattr(h.effect, h.effect.strength))) if h.effect.strength else np.nan
+        found.append({h.effect.strength: strength * float(error) / h.effect.power})
+    for detail, error in zip(details, relative[len(least) :], strict=True):
+        if error < _LEARNT * _USUAL_ERROR:
+            value = getattr(one.effects[detail.place], detail.name)
+            found[detail.place][detail.name] = float(value * error)
+    return found
+
+
+def _details(refitter: Refitter, one: Refitted) -> list[_Detail]:
+    """Return the numbers that may be tuned, with their slopes."""
+    measured = [_measured(refitter, one, place, name) for place, name in _numbers(refitter, one.hypotheses)]
+    return [detail for detail in measured if detail is not None]
 
 
 def _numbers(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> list[tuple[int, str]]:
@@ -138,18 +169,31 @@ def _measured(refitter: Refitter, one: Refitted, place: int, name: str) -> _Deta
 
 def _correction(refitter: Refitter, one: Refitted, details: Sequence[_Detail]) -> tuple[FloatArray, float]:
     """Return changes of the logarithms of factors and numbers, (e + d,), and the score that they promise."""
-    noise, kept = refitter.noise(one.covariance, len(one.vectors)), refitter.kept(one.hypotheses)
-    slopes = np.concatenate([one.slopes, [detail.slope for detail in details]])
-    residual = refitter.target - one.mean
-    covariance = noise.among(kept).of(one.parts[:, kept])
-    design, left = covariance.white(slopes[:, kept]).T, covariance.white(residual[kept])
     n = len(one.hypotheses)
+    step = np.asarray(np.linalg.solve(*_normal_equations(refitter, one, details)), np.float64)
     scaling = [bool(h.effect.strength) for h in one.hypotheses]
-    damping = np.where(np.arange(len(slopes)) < n, 1e-6, _USUAL_ERROR**-2.0)
-    step = np.linalg.solve(design.T @ design + np.diag(damping), design.T @ left)
     step[:n] = np.where(scaling, np.clip(step[:n], -LARGEST_STEP, LARGEST_STEP), 0.0)
     step[n:] = np.clip(step[n:], -_LARGEST_STEP, _LARGEST_STEP)
-    return step, log_density(residual - step @ slopes, noise.of(one.parts))
+    noise = refitter.noise(one.covariance, len(one.vectors))
+    left = refitter.target - one.mean - step @ _slopes(one, details)
+    return step, log_density(left, noise.of(one.parts))
+
+
+def _normal_equations(
+    refitter: Refitter, one: Refitted, details: Sequence[_Detail]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the information of the logarithms of factors and numbers, (e + d, e + d), and the score."""
+    noise, kept = refitter.noise(one.covariance, len(one.vectors)), refitter.kept(one.hypotheses)
+    covariance = noise.among(kept).of(one.parts[:, kept])
+    design = covariance.white(_slopes(one, details)[:, kept]).T
+    left = covariance.white((refitter.target - one.mean)[kept])
+    damping = np.where(np.arange(design.shape[1]) < len(one.hypotheses), 1e-6, _USUAL_ERROR**-2.0)
+    return design.T @ design + np.diag(damping), design.T @ left
+
+
+def _slopes(one: Refitted, details: Sequence[_Detail]) -> FloatArray:
+    """Return how the statistics go with the logarithms of factors and numbers, shape (e + d, m)."""
+    return np.concatenate([one.slopes, *(detail.slope[None] for detail in details)])
 
 
 def _moved(
@@ -173,7 +217,7 @@ def _moved(
 
 def _secant(before: Refitted, after: Refitted, details: Sequence[_Detail], step: FloatArray) -> list[_Detail]:
     """Return the numbers with the slopes that account for what a step has done, too."""
-    slopes = np.concatenate([before.slopes, [detail.slope for detail in details]])
+    slopes = _slopes(before, details)
     difference = after.vectors - before.vectors
     error = difference.std(axis=0, ddof=1) / np.sqrt(len(difference))
     unforeseen = beyond_chance(difference.mean(axis=0) - step @ slopes, error)

@@ -134,14 +134,22 @@ class PixelLikelihood:
 
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
         """Return the effects of a set at the numbers that are likeliest together, where a law tells them."""
-        told = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
-        fit = self._fit_once(
-            told, [h.effect for h in hypotheses if not identifiable_from_histograms(h.effect)]
-        )
+        fit = self._fit_set(hypotheses)
         if fit is None or any(member.at_limit for member in fit.members):
             return tuple(hypotheses)
         likely = {member.tag: member.effect for member in fit.members}
         return tuple(_at(h, likely[h.tag]) if h.tag in likely else h for h in hypotheses)
+
+    def standard_errors(self, hypotheses: Sequence[Hypothesis]) -> dict[str, dict[str, float]]:
+        """Return the standard errors of the fields of a set that a law tells, by tag."""
+        fit = self._fit_set(hypotheses)
+        return {} if fit is None else {member.tag: fit.stderr(member) for member in fit.members}
+
+    def _fit_set(self, hypotheses: Sequence[Hypothesis]) -> FittedSet | None:
+        told = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
+        return self._fit_once(
+            told, [h.effect for h in hypotheses if not identifiable_from_histograms(h.effect)]
+        )
 
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
         """Return how far a set is behind another in likelihood, nats, and the standard error (Vuong 1989).
@@ -210,12 +218,19 @@ class HistogramLikelihood:
 
         A number beside the strength stays as it is told here; a few pixels tell it badly.
         """
-        told = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
-        if not told:
-            return tuple(hypotheses)
-        number = MANY_PIXELS if any(len(Member.of(e).coordinates) > 1 for e in told) else FEW_PIXELS
-        pixels = self.of([h.effect for h in hypotheses], number)
+        pixels = self._pixels(hypotheses)
         return tuple(hypotheses) if pixels is None else pixels.begun(hypotheses)
+
+    def standard_errors(self, hypotheses: Sequence[Hypothesis]) -> dict[str, dict[str, float]]:
+        """Return standard errors by tag and field; see `PixelLikelihood.standard_errors`."""
+        pixels = self._pixels(hypotheses)
+        return {} if pixels is None else pixels.standard_errors(hypotheses)
+
+    def _pixels(self, hypotheses: Sequence[Hypothesis]) -> PixelLikelihood | None:
+        """Return the likelihood for a set; None where no law tells anything of it."""
+        told = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
+        number = MANY_PIXELS if any(len(Member.of(e).coordinates) > 1 for e in told) else FEW_PIXELS
+        return self.of([h.effect for h in hypotheses], number) if told else None
 
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
         """Return how far a set is behind another by many pixels; see `PixelLikelihood.behind`.

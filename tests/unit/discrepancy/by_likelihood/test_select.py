@@ -41,7 +41,7 @@ def test_what_is_in_the_data_is_selected(sets):
     assert tags(found) == {"branching_counts", "signal_dependent_noise"}
     for member, true in zip(sorted(found.members, key=lambda m: m.tag), (0.08, 0.12), strict=True):
         value = getattr(member.effect, member.effect.strength)
-        assert abs(value - true) < 4 * found.stderr(member)
+        assert abs(value - true) < 4 * found.stderr(member)[member.effect.strength]
     assert sets.distance(found).gap.at_floor
 
 

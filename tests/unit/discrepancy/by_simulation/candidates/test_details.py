@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.by_simulation.candidates.details import may_be_tuned, tuned
+from pchem_pipeline.discrepancy.by_simulation.candidates.details import may_be_tuned, standard_errors, tuned
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     SetFit,
@@ -88,6 +88,27 @@ def test_numbers_are_brought_to_what_the_data_ask_for() -> None:
     assert effect.fraction == pytest.approx(TRUE.fraction, rel=0.15)
     assert effect.step_e == pytest.approx(TRUE.step_e, rel=0.15)
     assert effect.dwell_low_frames == pytest.approx(TRUE.dwell_low_frames, rel=0.3)
+
+
+def test_standard_errors_are_those_of_a_fit_of_all_numbers_together() -> None:
+    """The scatter of least squares with other derivatives; a number that nothing tells has none."""
+    world = World([TRUE])
+    one = world.refined(TRUE)
+    [found] = standard_errors(world.refitter(), one, np.zeros(1))
+    [taken] = one.effects
+    names = ["fraction", "step_e", "dwell_low_frames", "dwell_high_frames"]
+    ahead, back = ([taken.times(n, factor) for n in names] for factor in (1.01, 0.99))
+    slopes = np.stack([statistics([a]) - statistics([b]) for a, b in zip(ahead, back, strict=True)]) / 0.02
+    # by chance, in data and replicates, and where the model is wrong by 3 %
+    noise = np.sqrt(1 / 2 + 1 / len(one.vectors) + (0.03 * statistics([taken])) ** 2)
+    draws = noise[:, None] * np.random.default_rng(3).standard_normal((M, 4000))
+    scatter = np.linalg.lstsq(slopes.T / noise[:, None], draws / noise[:, None], rcond=None)[0].std(axis=1)
+    for name, relative in zip(names, scatter, strict=True):
+        assert found[name] == pytest.approx(relative * getattr(taken, name), rel=0.25)
+    alone = taken.fraction / np.linalg.norm(slopes[0] / noise)
+    assert found["fraction"] > 1.5 * alone
+    [blind] = standard_errors(replace(world.refitter(), draw=lambda *_: (None, one.vectors)), one, np.ones(1))
+    assert blind == {"fraction": pytest.approx(taken.fraction)}
 
 
 def test_what_is_left_where_the_effect_moves_nothing_is_no_reason_to_tune() -> None:

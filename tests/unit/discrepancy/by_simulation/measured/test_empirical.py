@@ -232,7 +232,7 @@ def test_half_a_table_is_refused() -> None:
 def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() -> None:
     effect = Empirical(share=0.004, moves=(MixtureShift(shift_dn=-8),))
     before, after = Gap(2e-3, 5e-5, (0.0, 0.0), {}), Gap(3e-5, 5e-5, (0.0, 0.0), {})
-    addition = Addition(effect, True, "", (), 1e-4, before, after, (), (), described=True)
+    addition = Addition(effect, True, "", (), {}, before, after, (), (), described=True)
     found = Findings(
         "frames",
         None,
@@ -256,8 +256,8 @@ def test_a_description_that_leaves_a_part_of_the_gap_is_proposed_and_not_in_the_
     effect, named = Empirical(share=0.004, moves=(MixtureShift(shift_dn=-8),)), RowNoise(row_noise_dn=0.3)
     first, second, third = (Gap(value, 5e-5, (0.0, 0.0), {}) for value in (4e-3, 2e-3, 4e-4))
     steps = (
-        Addition(named, True, "", (), 1e-4, first, second, (), ()),
-        Addition(effect, True, "", (), 1e-4, second, third, (), (), described=True),
+        Addition(named, True, "", (), {}, first, second, (), ()),
+        Addition(effect, True, "", (), {}, second, third, (), (), described=True),
     )
     empty: Any = None
     found = Findings("frames", empty, empty, empty, first, [], False, Added(steps, third))

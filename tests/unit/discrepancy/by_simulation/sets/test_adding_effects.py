@@ -612,7 +612,7 @@ def test_slopes_beyond_all_that_an_effect_does_do_not_lift_the_floor() -> None:
     def floor(slopes: np.ndarray) -> float:
         steep = replace(one, slopes=slopes)
         accept = Acceptance(world.null, world.z, gaps, DiscrepancySettings())
-        null = Extension.of(work, (), accept, Comparison(steep, (steep,)), steep, (), certain=True).last
+        null = Extension.of(work, (), accept, Comparison(steep, (steep,)), steep, [{}], (), certain=True).last
         return gaps.gap(world.z.final, null.mean, null.replicates, null.strengths).floor
 
     assert floor(1e5 * one.slopes) == pytest.approx(floor(one.slopes), rel=0.5)
