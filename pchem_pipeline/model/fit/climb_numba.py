@@ -27,6 +27,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     FIXED,
     HELD,
     INFORMATION,
+    KNOWN,
     LOG_VARIANCE,
     N_BLOCK,
     N_FRAMES,
@@ -164,12 +165,12 @@ def brightest(theta: FloatArray) -> float:
 
 @kernel(borrows=True)
 def sensible(theta: FloatArray, longest_step: float, cells: bool) -> bool:
-    """Tell whether the parameters are in the range in which they can be told from those of Gaussians."""
+    """Tell whether parameters that are sought are where they can be told from those of Gaussians."""
     n = theta.size - N_BLOCK + 1
     a = theta[n + STEP]
     noise = math.exp(0.5 * theta[n + LOG_VARIANCE]) / a
     least = LEAST_STEP if cells else MIN_STEP
-    inside = noise < MAX_ELECTRON_NOISE and least < a < longest_step
+    inside = longest_step == KNOWN or (noise < MAX_ELECTRON_NOISE and least < a < longest_step)
     return bool(inside and brightest(theta) < MAX_LOG_EXPOSURE)
 
 

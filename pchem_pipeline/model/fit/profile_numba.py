@@ -20,6 +20,8 @@ from pchem_pipeline.model.law.pixel_numba import (
     HELD,
     HERE,
     INFORMATION,
+    KNOWN,
+    LOG_VARIANCE,
     N_BLOCK,
     N_SHARED,
     OTHER,
@@ -73,8 +75,8 @@ def climb_tile(
     here, start = scratch.small[HERE], scratch.small[OTHER]
     for row in range(chosen.size):
         pixel = load_pixel(given, chosen[row], room)
-        if fixed[row, n + STEP]:
-            pixel = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, pixel.centre, math.inf)
+        if fixed[row, n + STEP] and fixed[row, n + LOG_VARIANCE]:
+            pixel = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, pixel.centre, KNOWN)
         if limits.cells:
             resolve(law, chosen[row], amplitudes[row], pixel)
         copy(theta[row], here)
