@@ -350,7 +350,7 @@ def _damping_after(risen: float, expected: float, rise: float, share: float) -> 
 
 
 @kernel(borrows=True)
-def _ascend(
+def ascend(
     pixel: Pixel,
     evaluate: Any,
     limits: Limits,
@@ -445,7 +445,7 @@ def climb(
         Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once
         that is trusted), number of evaluations.
     """
-    outcome, loglik, used, place = _ascend(pixel, evaluate, limits, goal, known, theta, scratch)
+    outcome, loglik, used, place = ascend(pixel, evaluate, limits, goal, known, theta, scratch)
     if place != AT:
         copy_evaluation(scratch.evaluations[place], scratch.evaluations[AT])
     return outcome, loglik, used
