@@ -9,11 +9,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.fit import engine, profile_numba
+from pchem_pipeline.model.fit.climb_numba import LEAST_NOISE_DN, LEAST_NOISE_E, Limits
+from pchem_pipeline.model.fit.tile_numba import Histograms
+from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.inputs import kernel_counts, pack
-from pchem_pipeline.use import exposure_numba
 from pchem_pipeline.use.calibration import Calibration
-from pchem_pipeline.use.exposure_numba import LEAST_EXPOSURE
+
+LEAST_EXPOSURE = 1e-6  # e-; less is none
+_LEAST_START = 1e-3  # e-
+_LEAST_WEIGHT = 1e-6  # of a rival: less moves no standard error
+_DEPTH, _FARTHEST = 12.0, 1e4  # nats down to which a likelihood is summed, and e- up to which
+_NODES = 16  # of that sum: a likelihood is an exponential times a smooth function
+_LIMITS = Limits(
+    *(float(np.log(LEAST_EXPOSURE)), 1e-14, 200, 0, False, True, 0.0, 0.0, 0.0, 0.0, 0.0),
+    *(False, False, False, False, False),
+)
 
 
 @dataclass(frozen=True)
@@ -106,6 +119,103 @@ def mean_signal(
     return np.where(calibration.usable, found / (law.exposure_factors @ law.exposure_weights), np.nan)
 
 
+@dataclass(frozen=True)
+class _Known:
+    """Histograms of pixels of which g, mu and sigma are known, and the climb to their exposures.
+
+    Attributes:
+        given: a sample for each part of a DN in which codes lie: all have one exposure.
+        law: of the samples.
+        satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
+    """
+
+    given: Histograms
+    law: Law
+    satellites: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        counts: NDArray[np.unsignedinteger[Any]],
+        origin: NDArray[np.integer[Any]],
+        calibration: Calibration,
+        parts: int,
+    ) -> _Known:
+        """Return codes sorted by how far they lie above a whole DN, as if mu were lower by that in each."""
+        n, width = counts.shape
+        whole, aside = np.divmod(origin.astype(np.int64) + parts // 2, parts)
+        found = np.zeros((n, (-(-width // parts) + 1) * parts), counts.dtype)
+        for i in range(parts):
+            found[aside == i, i : i + width] = counts[aside == i]
+        by_part = found.reshape(n, -1, parts).transpose(0, 2, 1).reshape(n, -1)
+        given = Histograms(
+            kernel_counts(by_part),
+            np.arange(parts + 1) * (by_part.shape[1] // parts),
+            np.repeat(whole[:, None], parts, axis=1),
+            np.zeros(parts, np.bool_),
+            np.zeros(by_part.shape, np.uint8),
+        )
+        laws = [calibration.law.with_noise([1.0], shift_dn=(parts // 2 - i) / parts) for i in range(parts)]
+        return cls(given, pack(laws, n), calibration.own_satellites)
+
+    def climb(
+        self, pixels: IntArray, exposure: FloatArray, own: FloatArray, *, stay: bool = False
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Climb to the exposure of largest likelihood, or evaluate where it is to ``stay``.
+
+        Args:
+            pixels: which, shape (m,).
+            exposure: starts, e-, shape (m,).
+            own: (g, mu, sigma), shape (m, 3).
+            stay: the exposure is the one given.
+
+        Returns:
+            Exposure, e-, 0 where no electron is likelier than any; log-likelihood, nats; minus the second
+            derivatives of that in H and in (H, g, mu, sigma), shape (m, 4).
+        """
+        gain, bias, sigma = own.T
+        least = np.maximum(LEAST_NOISE_DN, LEAST_NOISE_E / gain)
+        variance = np.maximum(sigma**2 - QUANTISATION_VARIANCE, least**2 * (1.0 + 1e-12))
+        amplitude, weight = self.satellites[pixels].T
+        log_exposure = np.log(np.maximum(exposure, LEAST_EXPOSURE))
+        theta = np.column_stack([log_exposure, 1.0 / gain, bias, np.log(variance), weight])
+        fixed = np.ones(theta.shape, np.bool_)
+        fixed[:, 0] = stay
+        loglik, curvature = np.empty(pixels.size), np.full(theta.shape, np.nan)
+        profile_numba.climb_tile(
+            *(self.given, pixels, self.law, _LIMITS, engine.likelihood(cells=True), engine.climb()),
+            *(np.ascontiguousarray(amplitude), fixed, np.zeros(pixels.size, np.bool_), theta, loglik),
+            *(np.empty((*theta.shape, theta.shape[1])), curvature),
+        )
+        found = np.where(theta[:, 0] > _LIMITS.bound + 1e-9, np.exp(theta[:, 0]), 0.0)
+        found[loglik == -np.inf] = np.nan
+        slopes = np.stack([np.ones_like(gain), -(gain**-2), np.ones_like(gain), 2.0 * sigma / variance])
+        return found, loglik, curvature[:, :4] * slopes.T
+
+    def at_border(self, pixels: IntArray, height: FloatArray, own: FloatArray) -> FloatArray:
+        """Return one over the mean square of H over the likelihoods of which the maximum is at 0.
+
+        The curvature there says nothing: they fall as an exponential does, or as half a normal law.
+
+        Args:
+            pixels: which, shape (m,).
+            height: log-likelihood at 0, shape (m,).
+            own: (g, mu, sigma), shape (m, 3).
+        """
+        reach = _DEPTH / self.given.counts[pixels].sum(axis=1)  # by one a sample and electron at most
+        near = np.arange(pixels.size)
+        while near.size:
+            fallen = height[near] - self.climb(pixels[near], reach[near], own[near], stay=True)[1]
+            near = near[(fallen < _DEPTH) & (reach[near] < _FARTHEST)]
+            reach[near] *= 2.0
+        mass = square = np.zeros(pixels.size)
+        for place, weight in zip(*np.polynomial.legendre.leggauss(_NODES), strict=True):
+            exposure = 0.5 * (1.0 + place) * reach
+            part = weight * np.exp(np.minimum(self.climb(pixels, exposure, own, stay=True)[1] - height, 0.0))
+            mass, square = mass + part, square + part * exposure**2
+        return mass / square
+
+
 def estimate_exposure(
     counts: NDArray[np.unsignedinteger[Any]],
     origin: NDArray[np.integer[Any]],
@@ -124,20 +234,26 @@ def estimate_exposure(
         calibration: of these pixels.
         parts: codes in a DN.
     """
-    n = origin.size
-    out = np.full((n, 3), np.nan)
-    given = np.zeros((n, 2, 4)) if calibration.rivals is None else calibration.rivals
-    rivals = np.ascontiguousarray(given.reshape(n, 2, 4))
-    columns = calibration.columns
-    exposure_numba.estimate_exposures(
-        kernel_counts(counts.reshape(n, -1)),
-        np.ascontiguousarray(origin.ravel(), np.int64),
-        parts,
-        columns,
-        np.ascontiguousarray(calibration.covariance.reshape(n, 3, 3)),
-        rivals,
-        calibration.own_satellites,
-        pack([calibration.law], n),
-        out,
-    )
-    return ExposureMaps(*(out[:, i].reshape(origin.shape) for i in range(3)))
+    n, seen = origin.size, counts.sum(axis=-1) > 0
+    known = _Known.of(counts.reshape(n, -1), origin.ravel(), calibration, parts)
+    pixels = np.flatnonzero(seen.ravel() & np.isfinite(calibration.columns).all(axis=1))
+    own = calibration.columns[pixels, 1:]
+    start = np.maximum(mean_signal(counts, origin, calibration, parts).ravel()[pixels], _LEAST_START)
+    exposure, height, bend = known.climb(pixels, start, own)
+    curvature, border = bend[:, 0], np.flatnonzero(exposure == 0.0)
+    curvature[border] = known.at_border(pixels[border], height[border], own[border])
+    with np.errstate(invalid="ignore"):
+        counting = curvature**-0.5
+    # errors of g, mu and sigma, by the implicit function theorem
+    slopes = bend[:, 1:] / curvature[:, None]
+    covariance = calibration.covariance.reshape(n, 3, 3)[pixels]
+    variance = np.einsum("ni,nij,nj->n", slopes, covariance, slopes)
+    variance = np.where(np.isnan(variance), variance, np.maximum(variance, 0.0))
+    rivals = np.zeros((n, 2, 4)) if calibration.rivals is None else calibration.rivals.reshape(n, 2, 4)
+    for rival in rivals[pixels].swapaxes(0, 1):
+        some = np.flatnonzero(rival[:, 0] > _LEAST_WEIGHT)
+        there = known.climb(pixels[some], exposure[some], rival[some, 1:])[0]
+        variance[some] += rival[some, 0] * (there - exposure[some]) ** 2
+    out = np.full((3, n), np.nan)
+    out[:, pixels] = exposure, counting, np.sqrt(variance)
+    return ExposureMaps(*out.reshape(3, *origin.shape))

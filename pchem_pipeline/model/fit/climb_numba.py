@@ -27,6 +27,7 @@ from pchem_pipeline.model.law.pixel_numba import (
     FIXED,
     HELD,
     INFORMATION,
+    KNOWN,
     LOG_VARIANCE,
     N_BLOCK,
     N_FRAMES,
@@ -164,12 +165,12 @@ def brightest(theta: FloatArray) -> float:
 
 @kernel(borrows=True)
 def sensible(theta: FloatArray, longest_step: float, cells: bool) -> bool:
-    """Tell whether the parameters are in the range in which they can be told from those of Gaussians."""
+    """Tell whether parameters that are sought are where they can be told from those of Gaussians."""
     n = theta.size - N_BLOCK + 1
     a = theta[n + STEP]
     noise = math.exp(0.5 * theta[n + LOG_VARIANCE]) / a
     least = LEAST_STEP if cells else MIN_STEP
-    inside = noise < MAX_ELECTRON_NOISE and least < a < longest_step
+    inside = longest_step == KNOWN or (noise < MAX_ELECTRON_NOISE and least < a < longest_step)
     return bool(inside and brightest(theta) < MAX_LOG_EXPOSURE)
 
 
@@ -349,7 +350,7 @@ def _damping_after(risen: float, expected: float, rise: float, share: float) -> 
 
 
 @kernel(borrows=True)
-def _ascend(
+def ascend(
     pixel: Pixel,
     evaluate: Any,
     limits: Limits,
@@ -444,7 +445,7 @@ def climb(
         Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once
         that is trusted), number of evaluations.
     """
-    outcome, loglik, used, place = _ascend(pixel, evaluate, limits, goal, known, theta, scratch)
+    outcome, loglik, used, place = ascend(pixel, evaluate, limits, goal, known, theta, scratch)
     if place != AT:
         copy_evaluation(scratch.evaluations[place], scratch.evaluations[AT])
     return outcome, loglik, used

@@ -14,7 +14,7 @@ from pchem_pipeline.model.fit import engine, profile_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.tile_numba import Histograms
 from pchem_pipeline.model.law.cells_numba import Law
-from pchem_pipeline.model.law.pixel_numba import BIAS, LOG_VARIANCE, SATELLITE, STEP
+from pchem_pipeline.model.law.pixel_numba import BIAS, LOG_VARIANCE, N_BLOCK, SATELLITE, STEP
 
 #: Standard errors between the biases that are looked at, and how many there are at most on either side; a
 #: normal law summed in steps of 1.25 has a variance right to 1e-4.
@@ -105,7 +105,7 @@ class Profile:
         profile_numba.climb_tile(
             *(self._given, pixels, self._law, self._limits, engine.likelihood(self._limits.cells)),
             *(engine.climb(), self._amplitudes[pixels], fixed, np.broadcast_to(tied, m).copy()),
-            *(found, loglik, covariance),
+            *(found, loglik, covariance, np.empty((m, N_BLOCK))),
         )
         return found, loglik, covariance
 

@@ -1,4 +1,4 @@
-"""The loop of :mod:`pchem_pipeline.model.fit.profile`: climbs with some parameters fixed."""
+"""The loop over climbs with some parameters fixed: of profiles, and of the exposures of known pixels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,24 @@ from pchem_pipeline.model.errors.algebra_numba import invert_arrow
 from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, Limits, keep_inside
 from pchem_pipeline.model.fit.tile_numba import Histograms, load_pixel, make_room
 from pchem_pipeline.model.law.cells_numba import Law, resolve
-from pchem_pipeline.model.law.pixel_numba import AT, BIAS, FIXED, HELD, HERE, OTHER, STEP, copy, make_scratch
+from pchem_pipeline.model.law.pixel_numba import (
+    AT,
+    BIAS,
+    FIXED,
+    HELD,
+    HERE,
+    INFORMATION,
+    KNOWN,
+    LOG_VARIANCE,
+    N_BLOCK,
+    N_SHARED,
+    OTHER,
+    SCORE,
+    STEP,
+    Pixel,
+    copy,
+    make_scratch,
+)
 
 
 @kernel
@@ -30,11 +47,13 @@ def climb_tile(
     theta: FloatArray,
     loglik: FloatArray,
     covariance: FloatArray,
+    curvature: FloatArray,
 ) -> None:
     """Climb to the maximum near each of m starts, with some parameters fixed.
 
     Args:
-        given: histograms; codes left out by the tail guard do not count.
+        given: histograms; codes left out by the tail guard do not count. Samples beyond the exposures of
+            theta have the last of these.
         chosen: pixel of each start, shape (m,).
         law: of the samples.
         limits: bounds and limits.
@@ -47,13 +66,17 @@ def climb_tile(
         loglik: out, shape (m,); -inf where there is no maximum, or where what is fixed is not allowed.
         covariance: out, of (H_1 ... H_J, 1/g, mu, v, q), 0 for what stays and NaN where the maximum is not
             regular, shape (m, J + N_SHARED, J + N_SHARED).
+        curvature: out, minus the second derivatives of the log-likelihood in H_1 and in (H_1, 1/g, mu, v, q),
+            shape (m, N_BLOCK).
     """
-    n, size = given.dark.size, theta.shape[1]
-    room = make_room(given, law)
+    size = theta.shape[1]
+    n, room = size - N_SHARED, make_room(given, law)
     scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)
     here, start = scratch.small[HERE], scratch.small[OTHER]
     for row in range(chosen.size):
         pixel = load_pixel(given, chosen[row], room)
+        if fixed[row, n + STEP] and fixed[row, n + LOG_VARIANCE]:
+            pixel = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, pixel.centre, KNOWN)
         if limits.cells:
             resolve(law, chosen[row], amplitudes[row], pixel)
         copy(theta[row], here)
@@ -75,6 +98,10 @@ def climb_tile(
                 loglik[row] = height
                 at, held = scratch.evaluations[AT], scratch.flags[HELD]
                 regular = invert_arrow(at, here, held, covariance[row])
+                for i in range(N_BLOCK):
+                    curvature[row, i] = at[0, INFORMATION + i, 0] * math.exp(-here[0])
+                curvature[row, 0] += at[0, SCORE, 0] * math.exp(-here[0])
+                curvature[row, 0] *= math.exp(-here[0])
         copy(here, theta[row])
         theta[row, n + BIAS] += pixel.centre
         if not regular:

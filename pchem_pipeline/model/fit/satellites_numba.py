@@ -15,23 +15,33 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
-from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, find_held, newton_step, sensible
-from pchem_pipeline.model.fit.search_numba import CLEAR_GAP, Tools, climb_neighbours, climb_on, next_start
+from pchem_pipeline.model.fit.climb_numba import CONVERGED, Goal, ascend, find_held, newton_step, sensible
+from pchem_pipeline.model.fit.search_numba import (
+    CLEAR_GAP,
+    Tools,
+    climb_neighbours,
+    climb_on,
+    from_start,
+    next_start,
+)
 from pchem_pipeline.model.fit.starts_numba import keep_start, no_starts
 from pchem_pipeline.model.law.cells_numba import Law, set_peaks
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     BIAS,
+    DAMPING,
     DARK,
     DERIVATIVES,
     FIXED,
     HEIGHTS,
     HELD,
     HERE,
+    INFORMATION,
     LOG_VARIANCE,
     MASS,
     N_BINS,
     SATELLITE,
+    SCORE,
     SLOPES,
     STEP,
     STEPS,
@@ -53,7 +63,6 @@ _SHORTFALL = 0.25  # of the electrons, by which their variance may exceed that o
 _N_ATTEMPTS = 4  # from the fit, one electron more and less, another comb
 _FINER, _N_REFINED = 0.12, 4  # first step of log amplitude, and steps at most
 _LEAST_START, _MOST_START = 0.005, 0.5  # weight of the satellites at a start
-_ROW = SLOPES + 1 + SATELLITE  # of the slopes in the weight
 
 
 @kernel(borrows=True)
@@ -65,64 +74,54 @@ def _climb(pixel: Pixel, tools: Tools, to_beat: float, theta: FloatArray) -> tup
 
 
 @kernel(borrows=True)
-def _weight(pixel: Pixel, scratch: Scratch) -> tuple[float, float]:
-    """Return the likeliest weight of the free satellites, and the rise of the log-likelihood.
+def _evaluate_weight(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch, out: FloatArray) -> float:
+    """Evaluate the rise of the log-likelihood with the weight of the free satellites, the rest held.
 
-    The masses are linear in the weight, so the log-likelihood is concave: Newton steps, halved inside 0..1.
+    The masses are linear in it; those without satellites, and their slopes, are in the scratch.
     """
-    weight, low, high = 0.02, 0.0, 1.0
-    for _ in range(30):
-        slope = bend = 0.0
-        for j in range(pixel.facts.shape[0]):
-            weights, room = pixel.bins[j, WEIGHT], scratch.cells[j]
-            for i in range(int(pixel.facts[j, N_BINS])):
-                if weights[i] > 0.0 and room[MASS, i] > 0.0:
-                    ratio = room[_ROW, i] / (room[MASS, i] + weight * room[_ROW, i])
-                    slope += weights[i] * ratio
-                    bend += weights[i] * ratio * ratio
-        if slope > 0.0:
-            low = weight
-        else:
-            high = weight
-        following = weight + slope / bend if bend > 0.0 else 0.5 * (low + high)
-        if not low < following < high:
-            following = 0.5 * (low + high)
-        if abs(following - weight) < 1e-4 * weight + 1e-7:
-            break
-        weight = following
-    rise = 0.0
+    rise, weight, place = 0.0, theta[theta.size - 1], 1 + SATELLITE
     for j in range(pixel.facts.shape[0]):
-        weights, room = pixel.bins[j, WEIGHT], scratch.cells[j]
+        weights, room, slope, bend = pixel.bins[j, WEIGHT], scratch.cells[j], 0.0, 0.0
         for i in range(int(pixel.facts[j, N_BINS])):
             if weights[i] > 0.0 and room[MASS, i] > 0.0:
-                rise += weights[i] * math.log1p(weight * room[_ROW, i] / room[MASS, i])
-    return weight, rise
+                ratio = room[SLOPES + place, i] / room[MASS, i]
+                factor = 1.0 + weight * ratio
+                rise += weights[i] * math.log(factor)
+                ratio /= factor
+                slope += weights[i] * ratio
+                bend += weights[i] * ratio * ratio
+        out[j, SCORE, place] = slope
+        out[j, INFORMATION + place, place] = out[j, DAMPING + place, place] = bend
+    return rise
 
 
 @kernel(borrows=True)
-def _with_weight(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, float]:
-    """Set the likeliest weight of the free satellites; return the log-likelihood without, and the rise.
+def _with_weight(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, float, float]:
+    """Set the likeliest weight of the free satellites.
 
-    The evaluation without them stays in the scratch.
+    Returns:
+        The log-likelihood without them, its rise by the weight, and that expected of all parameters.
     """
-    scratch = tools.scratch
-    theta[-1] = 0.0
-    without: float = tools.evaluate(pixel, theta, DERIVATIVES, scratch, scratch.evaluations[AT])
-    weight, rise = _weight(pixel, scratch)
-    theta[-1] = min(max(weight, _LEAST_START), _MOST_START)
-    return without, rise
+    scratch, limits, last = tools.scratch, tools.limits, theta.size - 1
+    at, fixed = scratch.evaluations[AT], scratch.flags[FIXED]
+    theta[last] = 0.0
+    without: float = tools.evaluate(pixel, theta, DERIVATIVES, scratch, at)
+    find_held(theta, at, fixed, limits, scratch.flags[HELD])
+    expected, _ = newton_step(at, 0.0, 1.0, scratch, scratch.small[STEPS])
+    theta[last] = _LEAST_WEIGHT
+    for i in range(last):
+        fixed[i] = True
+    _, rise, _, _ = ascend(pixel, _evaluate_weight, limits, from_start(), theta, theta, scratch)
+    for i in range(last):
+        fixed[i] = i < pixel.facts.shape[0] and pixel.facts[i, DARK] > 0.0
+    theta[last] = min(max(theta[last], _LEAST_START), _MOST_START)
+    return without, rise, expected
 
 
 @kernel(borrows=True)
 def _from_fit(pixel: Pixel, tools: Tools, theta: FloatArray) -> bool:
     """Add the weight of free satellites to the fit without; False where nothing speaks for them."""
-    scratch = tools.scratch
-    at, held = scratch.evaluations[AT], scratch.flags[HELD]
-    _, rise = _with_weight(pixel, tools, theta)
-    weight, theta[-1] = theta[-1], 0.0
-    find_held(theta, at, scratch.flags[FIXED], tools.limits, held)
-    expected, _ = newton_step(at, 0.0, 1.0, scratch, scratch.small[STEPS])
-    theta[-1] = weight
+    _, rise, expected = _with_weight(pixel, tools, theta)
     least = _SCREEN * tools.limits.satellite_rise
     return bool(rise > least or expected > least)
 
@@ -142,7 +141,7 @@ def _beside(direction: float, pixel: Pixel, tools: Tools, theta: FloatArray) -> 
                 return -math.inf
             theta[j] = math.log(exposure)
     theta[n + BIAS] -= direction * theta[n + STEP]
-    without, rise = _with_weight(pixel, tools, theta)
+    without, rise, _ = _with_weight(pixel, tools, theta)
     return float(without + rise)
 
 

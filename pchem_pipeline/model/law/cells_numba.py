@@ -540,7 +540,7 @@ def _log_mass(cells: Cells, room: FloatArray) -> float:
 
 @kernel(inline=True, borrows=True)
 def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
-    """Return the log-likelihood of the masses in the room; fill score, squared scores and ratios.
+    """Return the log-likelihood of the masses in the room; add score and squared scores, fill ratios.
 
     Given that a sample is in a code that is not set aside, its score is less by that of their whole mass.
     """
@@ -554,29 +554,25 @@ def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray)
         simd_store(room, RATIO, i, weight * per_mass)
     simd_store(room, RATIO, cells.n_bins, 0.0)
     loglik = float(simd_sum(total))
-    for row in range(DAMPING + N_BLOCK):
-        for column in range(N_BLOCK):
-            out[row, column] = 0.0
     for row in range(N_BLOCK):
         score = counting() * 0.0
         for i in range(0, cells.n_bins, SIMD_WIDTH):
             score = fused(simd_load(room, RATIO, i), simd_load(room, SLOPES + row, i), score)
-        out[SCORE, row] = simd_sum(score)
+        out[SCORE, row] += simd_sum(score)
         for column in range(row + 1):
             square = counting() * 0.0
             for i in range(0, cells.n_bins, SIMD_WIDTH):
                 here = simd_load(room, RATIO, i) * simd_load(room, SLOPES + row, i)
                 other = simd_load(room, PER_MASS, i) * simd_load(room, SLOPES + column, i)
                 square = fused(here, other, square)
-            out[DAMPING + row, column] = simd_sum(square)
+            both = simd_sum(square)
+            out[DAMPING + row, column] += both
+            out[INFORMATION + row, column] += both
     if cells.outlier_share > 0.0:
         for i in range(cells.n_bins):
             room[RATIO, i] *= 1.0 - cells.outlier_share
     if cells.conditional:
         loglik += _condition(cells, room, change, out)
-    for i in range(N_BLOCK):
-        for j in range(i + 1):
-            out[INFORMATION + i, j] += out[DAMPING + i, j]
     return loglik
 
 
@@ -606,7 +602,6 @@ def _condition(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArr
             out[INFORMATION + i, j] -= n * change[i] * change[j]
             shared = n * change[i] * change[j] - out[SCORE, i] * change[j] - change[i] * out[SCORE, j]
             out[DAMPING + i, j] += shared
-            out[INFORMATION + i, j] -= shared
     for i in range(N_BLOCK):
         out[SCORE, i] -= n * change[i]
     for cell in range(cells.n_bins):
@@ -707,7 +702,7 @@ def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch,
 
     Args:
         pixel: histograms and law.
-        theta: parameters, shape (J + N_SHARED,).
+        theta: parameters, shape (J + N_SHARED,); with fewer exposures, the last is that of the other samples.
         what: `LOGLIK_ALONE`, `DERIVATIVES`, or `EXPECTATIONS`, left of each DN in the pixel's ``bins``.
         scratch: room to work in; its ``cells`` keep the masses and their slopes.
         out: out, the evaluation; lower triangles of the matrices.
@@ -715,23 +710,28 @@ def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch,
     Returns:
         The log-likelihood, nats.
     """
-    own, n, loglik = scratch.small[OWN], pixel.facts.shape[0], 0.0
+    own, n, loglik = scratch.small[OWN], theta.size - N_BLOCK + 1, 0.0
     own[_STEP], own[_VARIANCE] = theta[n + STEP], theta[n + LOG_VARIANCE]
     own[_SATELLITE] = theta[n + SATELLITE]
-    for j in range(n):
-        own[_EXPOSURE] = theta[j] if pixel.facts[j, DARK] == 0.0 else _NO_ELECTRONS
+    for place in range(n if what != LOGLIK_ALONE else 0):
+        for row in range(DAMPING + N_BLOCK):
+            for column in range(N_BLOCK):
+                out[place, row, column] = 0.0
+    for j in range(pixel.facts.shape[0]):
+        place = min(j, n - 1)
+        own[_EXPOSURE] = theta[place] if pixel.facts[j, DARK] == 0.0 else _NO_ELECTRONS
         own[_BIAS] = theta[n + BIAS] - pixel.facts[j, CENTRE]
-        cells, room = cells_of(pixel, j), scratch.cells[j]
+        cells, room = cells_of(pixel, j), scratch.cells[place]
         count, reach = fill_far_enough(own, cells, what, scratch.numbers, scratch.edges, room)
         if what == LOGLIK_ALONE:
             loglik += _log_mass(cells, room)
             continue
-        loglik += _sum_up(cells, room, scratch.small[RIGHT], out[j])
-        _subtract_curvature(own, cells, reach, scratch.numbers[:count], scratch.edges, room, out[j])
+        loglik += _sum_up(cells, room, scratch.small[RIGHT], out[place])
+        _subtract_curvature(own, cells, reach, scratch.numbers[:count], scratch.edges, room, out[place])
         if what == EXPECTATIONS:
             _expect(pixel, j, cells, room)
         if pixel.facts[j, DARK] > 0.0:
-            out[j, SCORE, 0] = 0.0
+            out[place, SCORE, 0] = 0.0
             for i in range(N_BLOCK):
-                out[j, INFORMATION + i, 0] = out[j, DAMPING + i, 0] = 0.0
+                out[place, INFORMATION + i, 0] = out[place, DAMPING + i, 0] = 0.0
     return loglik

@@ -1,9 +1,9 @@
 """What each electron number of a known pixel gives to its codes.
 
 With g, mu and sigma held, ``P(x) = sum_k P(k; H) W_k(x)`` under any law of the samples
-(:mod:`pchem_pipeline.model.law.sample_law`), and only P(k; H) depends on the exposure. W is made once for a
-pixel. A code may be a whole DN or a fraction of one (``1 / parts``) where an offset was taken from the
-samples: the cell of a sample is still 1 DN wide.
+(:mod:`pchem_pipeline.model.law.sample_law`), and only P(k; H) depends on the exposure. A code may be a whole
+DN or a fraction of one (``1 / parts``) where an offset was taken from the samples: the cell of a sample is
+still 1 DN wide.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
 from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST, REACH, normal_mass, reach_of
@@ -45,23 +45,6 @@ class Codes(NamedTuple):
     first: float
     parts: int
     n: int
-
-
-class Levels(NamedTuple):
-    """What electron numbers give to codes.
-
-    Attributes:
-        number: electron numbers that reach the codes, increasing, shape (m,).
-        low, high: first code of each, and the one after its last.
-        start: place of its first code in ``share``.
-        share: P(code | electron number), one number after the other.
-    """
-
-    number: IntArray
-    low: IntArray
-    high: IntArray
-    start: IntArray
-    share: FloatArray
 
 
 @kernel
@@ -222,21 +205,3 @@ def fill_level(
             inside = normal_mass((lower - part.mean) / part.sd, (upper - part.mean) / part.sd)
             share[0, i - low] += weight * inside
     return low, max(low, high)
-
-
-@kernel
-def list_levels(theta: FloatArray, cells: Cells, codes: Codes) -> Levels:
-    """Return what each electron number gives to the codes of a pixel."""
-    first, end = number_range(theta, cells, codes)
-    n, total = max(end - first, 0), 0
-    for k in range(first, end):
-        low, high, _ = _span(k, theta, cells, codes, REACH)
-        total += max(high - low, 0)
-    number, share = np.empty(n, np.int64), share_scratch(total)
-    lows, highs, start = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    place = 0
-    for row in range(n):
-        low, high = fill_level(first + row, 1.0, theta, cells, codes, share[:, place:])
-        number[row], lows[row], highs[row], start[row] = first + row, low, high, place
-        place += high - low
-    return Levels(number, lows, highs, start, share[0])

@@ -84,6 +84,7 @@ HEIGHTS = KEPT_STARTS + N_KEPT
 N_SMALL = HEIGHTS + 2  # of a single sample, the heights are more than a row
 # rows of `Scratch.flags`: parameters that stay in a step, and all the time
 HELD, FIXED = range(2)
+KNOWN = 0.0  # in place of the longest step
 # places in `Scratch.evaluations`: of the last climb, of its trials, at the best maximum
 AT, AHEAD, AT_BEST = range(3)
 N_DENSITY_ROWS = 10
@@ -132,7 +133,7 @@ class Pixel(NamedTuple):
         peaks: satellite peaks of each sample, shape (J, N_PEAK_ROWS, enough); weight 0 where there are fewer.
         mixtures: of exposures, shape (J, N_MIXTURE_ROWS, enough); weight 0 where there are fewer.
         centre: DN that all is counted from.
-        longest_step: 1/g beyond which there is one Gaussian, DN.
+        longest_step: 1/g beyond which there is one Gaussian, DN; `KNOWN`: 1/g and sigma are not sought.
     """
 
     bins: FloatArray

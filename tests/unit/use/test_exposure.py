@@ -136,3 +136,46 @@ def test_the_error_of_no_exposure_is_that_of_its_likelihood(n_frames):
         expected = np.sqrt((weight * h**2).sum() / weight.sum())
         assert exact.counting[y, x] == pytest.approx(expected, rel=0.03)
     assert np.nanmax(found.stderr) < 4.0 / np.sqrt(n_frames) + 0.2
+
+
+def test_codes_in_parts_of_a_dn_tell_what_whole_ones_do():
+    """Samples moved by offsets that are known in quarters of a DN: the same exposures and errors."""
+    rng, camera, _, frames = KnownCamera.taken(27, (6, 8), 2.0, 200)
+    calibration = camera.calibration(rng, (1e-4, 0.1, 0.02))
+    whole, histograms = estimated(frames, calibration), histogram_frames(4 * frames)
+    parts = estimate_exposure(histograms.counts, histograms.origin, calibration, 4)
+    for name in ("exposure", "counting", "calibration"):
+        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-9)
+    shift = rng.integers(-6, 7, (200, 1, 1))
+    electrons = rng.poisson(2.0, frames.shape) + camera.read_noise_e * rng.standard_normal(frames.shape)
+    codes = 4 * np.rint(camera.bias + electrons / camera.gain + shift / 4) - shift
+    histograms = histogram_frames(codes.astype(np.uint16))
+    moved = estimate_exposure(histograms.counts, histograms.origin, camera.calibration(), 4)
+    z = pulls(moved, 2.0, moved.stderr)
+    assert abs(z.mean()) < 5 / np.sqrt(z.size)
+    assert abs(z.std() - 1) < 5 / np.sqrt(2 * z.size)
+
+
+def test_the_calibration_error_is_the_slope_of_the_exposure(night):
+    camera, _, _, histograms, _ = night
+    for index, name in enumerate(("conversion_gain", "bias", "read_noise_dn")):
+        own = camera.calibration(errors=np.eye(3)[index])
+        step = 1e-4 * getattr(own, name).mean() / 10
+        ends = [
+            estimate_exposure(
+                histograms.counts, histograms.origin, replace(own, **{name: getattr(own, name) + side * step})
+            ).exposure
+            for side in (1, -1)
+        ]
+        found = estimate_exposure(histograms.counts, histograms.origin, own).calibration
+        np.testing.assert_allclose(found, abs(ends[0] - ends[1]) / (2 * step), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(("noise", "gain"), [(4.0, 0.1), (0.3, 2.5)])
+def test_known_pixels_may_be_beyond_what_a_fit_can_tell(noise, gain):
+    rng = np.random.default_rng(28)
+    camera = KnownCamera(np.full(SHAPE, gain), np.full(SHAPE, 200.0), np.full(SHAPE, noise))
+    found = estimated(camera.frames(rng, 5.0, N_FRAMES)[1], camera.calibration())
+    z = pulls(found, 5.0, found.stderr)
+    assert abs(z.mean()) < 5 / np.sqrt(N) + 0.05
+    assert abs(z.std() - 1) < 5 / np.sqrt(2 * N)
