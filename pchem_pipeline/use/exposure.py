@@ -11,6 +11,7 @@ from scipy.special import gammaincinv
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.arithmetic.normal_numba import REACH
 from pchem_pipeline.model.fit import engine, profile_numba
 from pchem_pipeline.model.fit.climb_numba import LEAST_NOISE_DN, LEAST_NOISE_E, Limits
 from pchem_pipeline.model.fit.tile_numba import Histograms
@@ -227,6 +228,7 @@ def estimate_exposure(
     ``sum_i c_i log sum_k P(k; H) P(x_i | k)``, the cells of the codes integrated exactly; effects of the
     model are in the law. It uses what a sample says of its electron number, where the mean of rounded or of
     corrected frames adds the read noise to that of the numbers.
+    NaN where all samples lie below those of no electron.
 
     Args:
         counts: histograms, shape (y, x, code).
@@ -234,9 +236,13 @@ def estimate_exposure(
         calibration: of these pixels.
         parts: codes in a DN.
     """
-    n, seen = origin.size, counts.sum(axis=-1) > 0
+    n, occupied = origin.size, counts.reshape(origin.size, -1) > 0
+    # far below the level of no electron are codes that no exposure explains
+    highest = (origin.ravel() + occupied.shape[1] - 1 - occupied[:, ::-1].argmax(axis=1)) / parts
+    _, _, bias, sigma = calibration.columns.T
+    seen = occupied.any(axis=1) & (highest > bias - REACH * sigma)
     known = _Known.of(counts.reshape(n, -1), origin.ravel(), calibration, parts)
-    pixels = np.flatnonzero(seen.ravel() & np.isfinite(calibration.columns).all(axis=1))
+    pixels = np.flatnonzero(seen & np.isfinite(calibration.columns).all(axis=1))
     own = calibration.columns[pixels, 1:]
     start = np.maximum(mean_signal(counts, origin, calibration, parts).ravel()[pixels], _LEAST_START)
     exposure, height, bend = known.climb(pixels, start, own)
