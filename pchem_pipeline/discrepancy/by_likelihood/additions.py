@@ -54,7 +54,7 @@ class AddedSets:
         count as closed.
         """
         masses = on_all_codes(fitted.log_masses, self.found.kept, self.whole.plain.log_masses)
-        return self.whole.distance(replace(fitted, log_masses=masses)).gap
+        return self.whole.gap(replace(fitted, log_masses=masses))
 
     def close(
         self, before: Gap, nulls: tuple[NullModel, NullModel], z: Measured, still: bool

@@ -165,7 +165,7 @@ class HistogramExplainer(Explainer[Explanation]):
 
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap of the likelihood on the final part."""
-        return self.whole.distance(self.whole.plain).gap
+        return self.whole.gap(self.whole.plain)
 
     def suspects(self, null: NullModel) -> bool:
         """Tell whether several samples fit badly together although no statistic of one deviates."""

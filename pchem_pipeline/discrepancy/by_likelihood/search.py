@@ -78,7 +78,7 @@ def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
     nearest = tuple(one.members[0].tag for one in sets.extended(sets.plain, candidates))
     best = select(sets, candidates)
     rest, rise = _rest(sets, best), sets.difference(best, sets.plain)
-    if best.members and (rest <= LARGEST_REST or sets.distance(best).gap.at_floor):
+    if best.members and (rest <= LARGEST_REST or sets.gap(best).at_floor):
         named = tuple(_named(sets, best, candidates))
         return Explanation(sets.kept, (), best, named, (), nearest, rest, rise)
     fixed_in_dn = combs_coincide(sets.plain.fit.parameters)
@@ -88,7 +88,7 @@ def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
 
 def _rest(sets: SetComparison, best: FittedSet) -> float:
     """Return the share of the gap of the plain law that a set leaves."""
-    return sets.distance(best).excess / max(sets.distance(sets.plain).excess, 1e-12)
+    return sets.gap(best).value / max(sets.gap(sets.plain).value, 1e-12)
 
 
 def combs_coincide(parameters: FloatArray) -> bool:
@@ -109,7 +109,7 @@ def _narrowed(sets: SetComparison, candidates: Sequence[Member], nearest: tuple[
     def excluding(*intervals: Interval) -> SetComparison:
         return replace(sets, kept=~inside(intervals, electrons), start=parameters)
 
-    excess = sets.distance(select(sets, candidates)).excess
+    excess = _excess(sets, select(sets, candidates))
     peak = _cut_peak({p: excluding(p) for p in doubtful_peaks(sets.train, electrons)}, candidates, excess)
     between = valleys(sets.train, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
     wide, view = excluding(*peak), excluding(*peak, *between)
@@ -139,10 +139,15 @@ def _cut_peak(
         candidates: effects at their starts.
         excess: gap that is left with all peaks, nats.
     """
-    likely = sorted(views, key=lambda peak: views[peak].distance(views[peak].plain).excess)[:_PEAKS_TRIED]
-    left = {p: views[p].distance(select(views[p], candidates, largest=1)).excess for p in likely}
+    likely = sorted(views, key=lambda peak: _excess(views[peak], views[peak].plain))[:_PEAKS_TRIED]
+    left = {p: _excess(views[p], select(views[p], candidates, largest=1)) for p in likely}
     best = min(left, key=lambda peak: left[peak], default=None)
     return () if best is None or left[best] >= _PAYS * excess else (best,)
+
+
+def _excess(sets: SetComparison, found: FittedSet) -> float:
+    """Return the gap that a set leaves, nats of all samples together."""
+    return sets.gap(found).value * float(np.where(sets.kept, sets.test, 0).sum())
 
 
 def _apart(member: Member, there: Member) -> float:
