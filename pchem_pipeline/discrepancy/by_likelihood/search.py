@@ -26,14 +26,12 @@ class Named:
 
     Attributes:
         member: as fitted.
-        weight: what it adds to the score, nats.
         rivals: effects that could stand in its place, the best first, with how far the set with each is
             behind the judged one, nats, and the standard error.
         apart: by how much its strength differs when fewer codes are compared.
     """
 
     member: Member
-    weight: float
     rivals: tuple[tuple[Member, float, float], ...]
     apart: float = 0.0
 
@@ -115,7 +113,7 @@ def _narrowed(sets: SetComparison, candidates: Sequence[Member], nearest: tuple[
     wide, view = excluding(*peak), excluding(*peak, *between)
     judged = select(view, candidates)
     there = wide.attempt(judged.members, judged.fit.parameters)
-    there = select(wide, candidates, there, largest=len(judged.members), least=0.0)
+    there = select(wide, candidates, there, len(judged.members))
     steady = [other for m in judged.members if (other := there.member(m.tag)) and _alike(m, other)]
     best = wide.attempt(steady, judged.fit.parameters) or wide.plain
     again = view.attempt(best.members, judged.fit.parameters) or judged
@@ -173,7 +171,6 @@ def _named(sets: SetComparison, best: FittedSet, candidates: Sequence[Member]) -
         others = [c for c in candidates if c.tag != member.tag]
         without = sets.without(best, member.tag)
         instead = [] if without is None else sets.extended(without, others)
-        weight = 0.0 if without is None else best.score - without.score
         rivals = tuple((one.members[-1], *sets.difference(one, best)) for one in instead)
-        found.append(Named(member, weight, rivals))
-    return sorted(found, key=lambda n: -n.weight)
+        found.append((best.score if without is None else without.score, Named(member, rivals)))
+    return [named for _, named in sorted(found, key=lambda pair: pair[0])]

@@ -245,9 +245,7 @@ def select(
     sets: SetComparison,
     candidates: Sequence[Member],
     start: FittedSet | None = None,
-    *,
     largest: int = _LARGEST_SET,
-    least: float = _LEAST_SHARE,
 ) -> FittedSet:
     """Select effects stepwise (Efroymson 1960): one is added, else exchanged, else left out, while that pays.
 
@@ -256,7 +254,6 @@ def select(
         candidates: starts; several may be of one effect.
         start: a set to begin with; None: no effect.
         largest: number of effects.
-        least: of what a set that misfits explains, share that each of its effects must.
     """
     best, passed = start or sets.plain, set[frozenset[str]]()
     while best.kinds not in passed:
@@ -268,7 +265,7 @@ def select(
             smaller = [one for m in best.members if (one := sets.without(best, m.tag)) is not None]
             exchanged = [one for base in smaller for one in sets.extended(base, others, 1)]
             steps = [one for one in exchanged if one.score > best.score] or [
-                one for one in smaller if not sets.beats(best, one, least)
+                one for one in smaller if not sets.beats(best, one, _LEAST_SHARE)
             ]
         best = max(steps, key=lambda one: one.score, default=best)
     return best
