@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -32,7 +31,7 @@ from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import NullModel, misfits
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part
-from pchem_pipeline.discrepancy.verdict import Candidate, Rival, sigma_text
+from pchem_pipeline.discrepancy.verdict import Candidate, Moved, Rival, sigma_text
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
@@ -67,7 +66,7 @@ class Extension:
     hypotheses: tuple[Hypothesis, ...]
     first: NullModel
     last: NullModel
-    moved: Mapping[str, Mapping[str, Any]]
+    moved: Mapping[str, Moved]
     certain: bool
     accept: Acceptance
     model: tuple[Effect, ...]
