@@ -21,7 +21,7 @@ from pchem_pipeline.discrepancy.by_likelihood.observed import ObservedHistograms
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
-from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
+from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import CONVINCING, Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -177,13 +177,8 @@ class HistogramExplainer(Explainer[Explanation]):
         Raises:
             EffortSpentError: the work is at its limit; nothing was found.
         """
-        tried = self.prepared.effort.tried
-        tried.clear()
-        try:
-            found = explain(self.sets, self.members)
-        except EffortSpentError as spent:
-            tags = dict.fromkeys(m.tag for m in self.members)
-            raise EffortSpentError(spent.doing, (t for t in tags if t not in tried)) from spent
+        self.candidates = [m.tag for m in self.members]
+        found = explain(self.sets, self.members)
         rise, error = found.rise
         if not disagreed and (not found.named or rise < max(CONVINCING, CLEAR * error)):
             return None
