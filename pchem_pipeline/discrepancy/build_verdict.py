@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -63,7 +63,7 @@ class Addition:
     after: Gap
     rivals: tuple[schema.Rival, ...]
     pulls: tuple[schema.Pull, ...]
-    moved: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    moved: Mapping[str, schema.Moved] = field(default_factory=dict)
     described: bool = False
     certain: bool = True
 
@@ -108,7 +108,7 @@ class Addition:
             families=schema.Families(before=dict(self.before.families), after=dict(self.after.families)),
             size=size,
             rivals=self.rivals,
-            moved={name: schema.Moved(**change) for name, change in self.moved.items()},
+            moved=dict(self.moved),
             separate=self._separate(),
             pulls=self.pulls,
         )

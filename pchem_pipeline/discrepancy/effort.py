@@ -31,22 +31,7 @@ _FOR_FITS = 0.4
 
 
 class EffortSpentError(Exception):
-    """The search has used its budget.
-
-    Attributes:
-        doing: the next step.
-        untried: effects that were not fitted.
-    """
-
-    def __init__(self, doing: str, untried: Iterable[str] = ()) -> None:
-        """Keep what was not done."""
-        super().__init__(doing)
-        self.doing, self.untried = doing, tuple(untried)
-
-    def words(self) -> str:
-        """State where the search ended, what was not tried, and how to continue."""
-        rest = f"; not tried: {', '.join(self.untried)}" if self.untried else ""
-        return f"the search used its budget before {self.doing}{rest}; go on with a larger --effort"
+    """The search has used its budget; the message is the next step."""
 
 
 @dataclass
@@ -76,7 +61,8 @@ class Effort:
     replicates: int = 0
 
     def begin(self) -> None:
-        """Set the limit, now that the null distribution has been paid."""
+        """Set the limit, now that the null distribution has been paid; no candidate was fitted for that."""
+        self.tried.clear()
         limit = math.inf if self.share is None else self.share * max(_LEAST, _OF_NULL * self.spent)
         self.kept, self.for_choice = _KEPT * limit, _FOR_CHOICE * limit
         self.most = self.spent + (1.0 - _KEPT) * limit
@@ -129,6 +115,12 @@ class Effort:
         """Raise an error if there is nothing left for what comes next."""
         if self.spent >= self.most:
             raise EffortSpentError(doing)
+
+    def limit_words(self, spent: EffortSpentError, candidates: Iterable[str]) -> str:
+        """State where the search ended, which candidates (tags) were not tried, and how to continue."""
+        untried = ", ".join(tag for tag in dict.fromkeys(candidates) if tag not in self.tried)
+        rest = f"; not tried: {untried}" if untried else ""
+        return f"the search used its budget before {spent}{rest}; go on with a larger --effort"
 
     @property
     def _hard(self) -> float:

@@ -11,7 +11,7 @@ histograms they are parameters of the exact likelihood (:mod:`.by_likelihood`). 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -63,10 +63,12 @@ class Explainer(ABC, Generic[Explanation]):
 
     Attributes:
         prepared: the data and the model before the search.
+        candidates: tags of the effects that are compared, once they are.
         limit: what was not tried when the search had used its budget; empty if it finished.
     """
 
     prepared: Prepared
+    candidates: Sequence[str] = ()
     limit: str = ""
 
     @property
@@ -129,7 +131,7 @@ def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> 
                 tell("refitting the pixels with the likeliest effects")
                 null = by.add(explanation, null) or null
         except EffortSpentError as spent:
-            limit = spent.words()
+            limit = data.effort.limit_words(spent, by.candidates)
         still = disagrees(null, z, significance, by.tolerance())
     tell("measuring the remaining disagreement")
     added = by.close(before, null, still)

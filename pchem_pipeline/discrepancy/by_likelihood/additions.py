@@ -12,7 +12,6 @@ from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.build_verdict import (
     LARGEST_REST,
     LEAVES_TOO_MUCH,
-    MOST_RIVALS,
     Added,
     Addition,
     largest_pulls,
@@ -22,7 +21,7 @@ from pchem_pipeline.discrepancy.by_likelihood.gap import on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import UNITS, change_of
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import changes
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
@@ -54,7 +53,7 @@ class AddedSets:
         count as closed.
         """
         masses = on_all_codes(fitted.log_masses, self.found.kept, self.whole.plain.log_masses)
-        return self.whole.distance(replace(fitted, log_masses=masses)).gap
+        return self.whole.gap(replace(fitted, log_masses=masses))
 
     def close(
         self, before: Gap, nulls: tuple[NullModel, NullModel], z: Measured, still: bool
@@ -138,17 +137,9 @@ class AddedSets:
             },
             before=gaps[0],
             after=gaps[1],
-            rivals=self._rivals(named, before)[:MOST_RIVALS],
+            rivals=self._rivals(named, before),
             pulls=(),
-            moved={
-                name: change_of(change, error, unit)
-                for (name, unit), change, error in zip(
-                    UNITS.items(),
-                    (after.fit.parameters - before.fit.parameters).T,
-                    after.fit.stderr.T,
-                    strict=True,
-                )
-            },
+            moved=changes(before.fit.parameters, after.fit.parameters, after.fit.stderr),
         )
 
     def _rivals(self, named: Named, before: FittedSet) -> tuple[Rival, ...]:
@@ -165,4 +156,4 @@ class AddedSets:
             if other.tag in named.equals:
                 why = "it predicts unseen samples as well: these histograms do not decide"
             found.append(Rival(effect=other.tag, gap_after=gap.value, behind=behind, why=why))
-        return tuple(sorted(found, key=lambda rival: -rival.behind))
+        return tuple(found)

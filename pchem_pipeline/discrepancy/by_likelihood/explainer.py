@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
 from pchem_pipeline.discrepancy.by_likelihood.additions import AddedSets
 from pchem_pipeline.discrepancy.by_likelihood.gap import on_all_codes
@@ -21,7 +20,7 @@ from pchem_pipeline.discrepancy.by_likelihood.observed import ObservedHistograms
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
-from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
+from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import CONVINCING, Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -96,8 +95,7 @@ class HistogramExplainer(Explainer[Explanation]):
         members: the candidates.
         effects: of the model; those that were there before, and those added since.
         final: the fit of the final model to train and test part.
-        found: what the search came to; None: nothing.
-        code: samples that it expects at each code of the evidence; None: without effects.
+        found: what the search came to, for the final part; None: nothing.
     """
 
     prepared: Prepared
@@ -109,8 +107,7 @@ class HistogramExplainer(Explainer[Explanation]):
     members: Sequence[Member]
     effects: tuple[Effect, ...]
     final: FittedSet
-    found: Explanation | None = None
-    code: FloatArray | None = None
+    found: AddedSets | None = None
 
     @classmethod
     def begin(
@@ -165,7 +162,7 @@ class HistogramExplainer(Explainer[Explanation]):
 
     def gap(self, null: NullModel) -> Gap:
         """Measure the gap of the likelihood on the final part."""
-        return self.whole.distance(self.whole.plain).gap
+        return self.whole.gap(self.whole.plain)
 
     def suspects(self, null: NullModel) -> bool:
         """Tell whether several samples fit badly together although no statistic of one deviates."""
@@ -177,17 +174,12 @@ class HistogramExplainer(Explainer[Explanation]):
         Raises:
             EffortSpentError: the work is at its limit; nothing was found.
         """
-        tried = self.prepared.effort.tried
-        tried.clear()
-        try:
-            found = explain(self.sets, self.members)
-        except EffortSpentError as spent:
-            tags = dict.fromkeys(m.tag for m in self.members)
-            raise EffortSpentError(spent.doing, (t for t in tags if t not in tried)) from spent
+        self.candidates = [m.tag for m in self.members]
+        found = explain(self.sets, self.members)
         rise, error = found.rise
         if not disagreed and (not found.named or rise < max(CONVINCING, CLEAR * error)):
             return None
-        self.found = found
+        self.found = AddedSets(found, self.whole)
         return found if found.named else None
 
     def add(self, explanation: Explanation, null: NullModel) -> NullModel:
@@ -200,15 +192,15 @@ class HistogramExplainer(Explainer[Explanation]):
         """Fit train and test part together with each effect, and measure the gap on the final part."""
         if self.found is None:
             return Added((), before)
-        closing = AddedSets(self.found, self.whole)
-        added, self.final = closing.close(before, (self.prepared.first, null), self.prepared.z, disagreed)
-        self.code = closing.codes(self.final, self.observed.evidence)
+        nulls = self.prepared.first, null
+        added, self.final = self.found.close(before, nulls, self.prepared.z, disagreed)
         self.effects = along_chain(self.sets.present, [each.effect for each in added.additions])
         return added
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the parameters of the rows looked at, NaN elsewhere, shape (1, n) or (n, J)."""
-        return Fitted(self.observed.maps(self.final.fit.parameters), self.code)
+        code = None if self.found is None else self.found.codes(self.final, self.observed.evidence)
+        return Fitted(self.observed.maps(self.final.fit.parameters), code)
 
 
 def _on_a_line(

@@ -7,7 +7,6 @@ chance what Poisson counts have in each cell, and what the errors of the fitted 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,63 +18,33 @@ from pchem_pipeline.discrepancy.gap import Gap
 _QUANTILES = special.ndtri((np.arange(400) + 0.5) / 400)  # of a sum of many cells, standard deviations
 
 
-@dataclass(frozen=True)
-class Distance:
-    """The distance of histograms from a fit, nats.
+def gap_of(
+    counts: NDArray[np.integer],
+    log_masses: FloatArray,
+    n_parameters: int,
+    *,
+    share: float,
+    kept: BoolArray | bool = True,
+) -> Gap:
+    """Return the gap of histograms from a fit.
 
-    Attributes:
-        value: log-likelihood of their own frequencies above that of the fit.
-        expected: mean of that if the fit's law is right.
-        scatter: standard deviation of the same.
-        variance: of the value, by the samples.
-        n_samples: samples that are compared.
+    Args:
+        counts: histograms, shape (n, B).
+        log_masses: of the codes under the fit, given that they are kept, shape (n, B).
+        n_parameters: of the fit.
+        share: samples here for each sample that was fitted.
+        kept: codes that are compared, shape (n, B); True: all.
     """
-
-    value: float
-    expected: float
-    scatter: float
-    variance: float
-    n_samples: float
-
-    @classmethod
-    def of(
-        cls,
-        counts: NDArray[np.integer],
-        log_masses: FloatArray,
-        n_parameters: int,
-        *,
-        share: float,
-        kept: BoolArray | bool = True,
-    ) -> Distance:
-        """Compute it.
-
-        Args:
-            counts: histograms, shape (n, B).
-            log_masses: of the codes under the fit, given that they are kept, shape (n, B).
-            n_parameters: of the fit.
-            share: samples here for each sample that was fitted.
-            kept: codes that are compared, shape (n, B); True: all.
-        """
-        seen = np.where(kept, counts, 0).astype(np.float64)
-        total = np.maximum(seen.sum(axis=1, keepdims=True), 1.0)
-        ratio = np.where(seen > 0, np.log(np.maximum(seen, 1.0) / total) - log_masses, 0.0)
-        value, variance = sum_over_samples(seen, ratio)
-        mean, square = _of_cells(np.where(kept, np.exp(log_masses), 0.0) * total)
-        # the number of samples is fixed; fit and counts are both off by chance along each parameter
-        mean += 0.5 * (share * n_parameters - total.size)
-        square += share * (1.0 + 0.5 * share) * n_parameters - 0.5 * total.size
-        return cls(value, mean, float(np.sqrt(max(square, 0.0))), variance, float(total.sum()))
-
-    @property
-    def excess(self) -> float:
-        """What is beyond chance, nats."""
-        return self.value - self.expected
-
-    @property
-    def gap(self) -> Gap:
-        """What is beyond chance, per sample."""
-        chance = self.expected + self.scatter * _QUANTILES
-        return Gap.of(self.value, chance, self.n_samples, variance=self.variance)
+    seen = np.where(kept, counts, 0).astype(np.float64)
+    total = np.maximum(seen.sum(axis=1, keepdims=True), 1.0)
+    ratio = np.where(seen > 0, np.log(np.maximum(seen, 1.0) / total) - log_masses, 0.0)
+    value, variance = sum_over_samples(seen, ratio)
+    mean, square = _of_cells(np.where(kept, np.exp(log_masses), 0.0) * total)
+    # the number of samples is fixed; fit and counts are both off by chance along each parameter
+    mean += 0.5 * (share * n_parameters - total.size)
+    square += share * (1.0 + 0.5 * share) * n_parameters - 0.5 * total.size
+    chance = mean + np.sqrt(max(square, 0.0)) * _QUANTILES
+    return Gap.of(value, chance, float(total.sum()), variance=variance)
 
 
 def on_all_codes(log_masses: FloatArray, kept: BoolArray, plain: FloatArray) -> FloatArray:

@@ -26,14 +26,12 @@ class Named:
 
     Attributes:
         member: as fitted.
-        weight: what it adds to the score, nats.
         rivals: effects that could stand in its place, the best first, with how far the set with each is
             behind the judged one, nats, and the standard error.
         apart: by how much its strength differs when fewer codes are compared.
     """
 
     member: Member
-    weight: float
     rivals: tuple[tuple[Member, float, float], ...]
     apart: float = 0.0
 
@@ -78,7 +76,7 @@ def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
     nearest = tuple(one.members[0].tag for one in sets.extended(sets.plain, candidates))
     best = select(sets, candidates)
     rest, rise = _rest(sets, best), sets.difference(best, sets.plain)
-    if best.members and (rest <= LARGEST_REST or sets.distance(best).gap.at_floor):
+    if best.members and (rest <= LARGEST_REST or sets.gap(best).at_floor):
         named = tuple(_named(sets, best, candidates))
         return Explanation(sets.kept, (), best, named, (), nearest, rest, rise)
     fixed_in_dn = combs_coincide(sets.plain.fit.parameters)
@@ -88,7 +86,7 @@ def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
 
 def _rest(sets: SetComparison, best: FittedSet) -> float:
     """Return the share of the gap of the plain law that a set leaves."""
-    return sets.distance(best).excess / max(sets.distance(sets.plain).excess, 1e-12)
+    return sets.gap(best).value / max(sets.gap(sets.plain).value, 1e-12)
 
 
 def combs_coincide(parameters: FloatArray) -> bool:
@@ -109,13 +107,13 @@ def _narrowed(sets: SetComparison, candidates: Sequence[Member], nearest: tuple[
     def excluding(*intervals: Interval) -> SetComparison:
         return replace(sets, kept=~inside(intervals, electrons), start=parameters)
 
-    excess = sets.distance(select(sets, candidates)).excess
+    excess = _excess(sets, select(sets, candidates))
     peak = _cut_peak({p: excluding(p) for p in doubtful_peaks(sets.train, electrons)}, candidates, excess)
     between = valleys(sets.train, electrons, float(np.median(parameters[:, 1] * parameters[:, 3])))
     wide, view = excluding(*peak), excluding(*peak, *between)
     judged = select(view, candidates)
     there = wide.attempt(judged.members, judged.fit.parameters)
-    there = select(wide, candidates, there, largest=len(judged.members), least=0.0)
+    there = select(wide, candidates, there, len(judged.members))
     steady = [other for m in judged.members if (other := there.member(m.tag)) and _alike(m, other)]
     best = wide.attempt(steady, judged.fit.parameters) or wide.plain
     again = view.attempt(best.members, judged.fit.parameters) or judged
@@ -139,10 +137,15 @@ def _cut_peak(
         candidates: effects at their starts.
         excess: gap that is left with all peaks, nats.
     """
-    likely = sorted(views, key=lambda peak: views[peak].distance(views[peak].plain).excess)[:_PEAKS_TRIED]
-    left = {p: views[p].distance(select(views[p], candidates, largest=1)).excess for p in likely}
+    likely = sorted(views, key=lambda peak: _excess(views[peak], views[peak].plain))[:_PEAKS_TRIED]
+    left = {p: _excess(views[p], select(views[p], candidates, largest=1)) for p in likely}
     best = min(left, key=lambda peak: left[peak], default=None)
     return () if best is None or left[best] >= _PAYS * excess else (best,)
+
+
+def _excess(sets: SetComparison, found: FittedSet) -> float:
+    """Return the gap that a set leaves, nats of all samples together."""
+    return sets.gap(found).value * float(np.where(sets.kept, sets.test, 0).sum())
 
 
 def _apart(member: Member, there: Member) -> float:
@@ -168,7 +171,6 @@ def _named(sets: SetComparison, best: FittedSet, candidates: Sequence[Member]) -
         others = [c for c in candidates if c.tag != member.tag]
         without = sets.without(best, member.tag)
         instead = [] if without is None else sets.extended(without, others)
-        weight = 0.0 if without is None else best.score - without.score
         rivals = tuple((one.members[-1], *sets.difference(one, best)) for one in instead)
-        found.append(Named(member, weight, rivals))
-    return sorted(found, key=lambda n: -n.weight)
+        found.append((best.score if without is None else without.score, Named(member, rivals)))
+    return [named for _, named in sorted(found, key=lambda pair: pair[0])]

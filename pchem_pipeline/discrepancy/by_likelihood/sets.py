@@ -15,9 +15,10 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import error_words
-from pchem_pipeline.discrepancy.by_likelihood.gap import Distance, sum_over_samples
+from pchem_pipeline.discrepancy.by_likelihood.gap import gap_of, sum_over_samples
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, split_coordinates
 from pchem_pipeline.discrepancy.effort import Effort
+from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import CLEAR, PRICE
 from pchem_pipeline.model.fit.shared import Samples, SharedFit, SharedProblem, Tangent, fit_shared
@@ -184,7 +185,7 @@ class SetComparison:
         """
         rise, error = self.difference(one, part)
         price = PRICE
-        if least and not self.distance(one).gap.at_floor:
+        if least and not self.gap(one).at_floor:
             price = max(price, least * self.difference(one, self.plain)[0])
         return rise > max(CLEAR * error, price)
 
@@ -194,10 +195,10 @@ class SetComparison:
         rise, variance = sum_over_samples(seen, one.log_masses - other.log_masses)
         return rise, float(np.sqrt(variance))
 
-    def distance(self, found: FittedSet) -> Distance:
-        """Return the distance of the scored part from a set."""
+    def gap(self, found: FittedSet) -> Gap:
+        """Return the gap of the scored part from a set."""
         share = float(self.test.sum() / self.train.sum())
-        return Distance.of(self.test, found.log_masses, found.n_parameters, share=share, kept=self.kept)
+        return gap_of(self.test, found.log_masses, found.n_parameters, share=share, kept=self.kept)
 
     def promising(self, base: FittedSet, candidates: Sequence[Member]) -> list[Member]:
         """Return candidates, each moved by a first-order step, by the rise that this promises (Rao 1948)."""
@@ -244,9 +245,7 @@ def select(
     sets: SetComparison,
     candidates: Sequence[Member],
     start: FittedSet | None = None,
-    *,
     largest: int = _LARGEST_SET,
-    least: float = _LEAST_SHARE,
 ) -> FittedSet:
     """Select effects stepwise (Efroymson 1960): one is added, else exchanged, else left out, while that pays.
 
@@ -255,7 +254,6 @@ def select(
         candidates: starts; several may be of one effect.
         start: a set to begin with; None: no effect.
         largest: number of effects.
-        least: of what a set that misfits explains, share that each of its effects must.
     """
     best, passed = start or sets.plain, set[frozenset[str]]()
     while best.kinds not in passed:
@@ -267,7 +265,7 @@ def select(
             smaller = [one for m in best.members if (one := sets.without(best, m.tag)) is not None]
             exchanged = [one for base in smaller for one in sets.extended(base, others, 1)]
             steps = [one for one in exchanged if one.score > best.score] or [
-                one for one in smaller if not sets.beats(best, one, least)
+                one for one in smaller if not sets.beats(best, one, _LEAST_SHARE)
             ]
         best = max(steps, key=lambda one: one.score, default=best)
     return best

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -32,7 +31,7 @@ from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import NullModel, misfits
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part
-from pchem_pipeline.discrepancy.verdict import Candidate, Rival, sigma_text
+from pchem_pipeline.discrepancy.verdict import Candidate, Moved, Rival, sigma_text
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
@@ -67,7 +66,7 @@ class Extension:
     hypotheses: tuple[Hypothesis, ...]
     first: NullModel
     last: NullModel
-    moved: Mapping[str, Mapping[str, Any]]
+    moved: Mapping[str, Moved]
     certain: bool
     accept: Acceptance
     model: tuple[Effect, ...]
@@ -180,21 +179,19 @@ class Extension:
     def _addition(self, member: int, gaps: tuple[Gap, Gap], against: str, later: FloatArray) -> Addition:
         """Return an added effect; ``later`` is what those do that come after, shape (m,)."""
         added = self.added[member]
-        rivals = self.compared.rivals_of(added.tag)
+        rivals = self.compared.rivals_of(added)
         kept = _ambiguous_set(rivals, self.accept.settings.certainty)
         described = type(added.effect).empirical
         against = "" if described else against
         named = len(kept) == 1 and not against and not described
-        compared = [
-            (added.effect if r.hypothesis.tag == added.tag else r.hypothesis.effect, r)
-            for r in (rivals if named else kept)
-        ]
         return Addition(
-            effect=added.effect if named else compared[0][0],
+            effect=kept[0].effect,
             alone=len(kept) == 1,
             against=against,
             described=described,
-            candidates=tuple(Candidate.of(e, r.score, r.stderr, r.probability) for e, r in compared),
+            candidates=tuple(
+                Candidate.of(r.effect, r.score, r.stderr, r.probability) for r in (rivals if named else kept)
+            ),
             stderr=self.stderr[member],
             before=gaps[0],
             after=gaps[1],
@@ -358,5 +355,5 @@ def _ambiguous_set(rivals: Sequence[Contender], certainty: float) -> list[Conten
         if share >= certainty:
             break
     # what goes its own way in every simulation is not beaten by a few nats
-    erratic = [r for r in rivals if type(r.hypothesis.effect).random_realisation and r.score > -_CLEAR_MARGIN]
+    erratic = [r for r in rivals if type(r.effect).random_realisation and r.score > -_CLEAR_MARGIN]
     return kept + [r for r in erratic if r not in kept]

@@ -38,7 +38,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
 from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, chosen
 from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, compare
-from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
+from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import (
     CONVINCING,
@@ -207,6 +207,7 @@ class FrameExplainer(Explainer[Screened]):
         that leaves nothing though nothing of it is certain is told in the end.
         """
         self.work.forget(self.given)
+        self.candidates = [h.tag for h in explanation.hypotheses]
         refitter, settings = self._refitter(), self.prepared.settings
         sets = Search(refitter, HistogramLikelihood(self._likelihood))
         own, measured = (explanation.hypotheses, explanation.sets), self._measured(refitter)
@@ -219,9 +220,7 @@ class FrameExplainer(Explainer[Screened]):
         for _ in range(_MOST_JUDGED):
             found = chosen(sets)
             if sets.limit is not None and not sets.complete:
-                tags = dict.fromkeys(h.tag for h in explanation.hypotheses)
-                tried = self.work.effort.tried
-                self.limit = EffortSpentError(sets.limit.doing, (t for t in tags if t not in tried)).words()
+                self.limit = self.work.effort.limit_words(sets.limit, self.candidates)
             if found is None:
                 break
             added = refitter.sharpened(found.chosen, settings.extended_replicates)

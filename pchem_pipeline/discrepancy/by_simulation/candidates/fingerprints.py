@@ -11,6 +11,7 @@ worth a refit of the pixels.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -55,6 +56,11 @@ class Hypothesis:
     def tag(self) -> str:
         """Tag of the effect, with its number if there are others of it beside: what tells it from those."""
         return self.effect.tag if self.number == 1 else f"{self.effect.tag} {self.number}"
+
+    @functools.cached_property
+    def kind(self) -> str:
+        """The effect without its strength, and its number."""
+        return f"{self.effect.model_dump_json(exclude={self.effect.strength})} {self.number}"
 
     def rescaled(self, factor: float) -> Effect:
         """Return the effect with the strength at which its fingerprint is ``factor`` times as large."""

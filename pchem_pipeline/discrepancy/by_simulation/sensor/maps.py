@@ -20,6 +20,7 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.population import (
     shrinkage_bias,
 )
 from pchem_pipeline.discrepancy.observe.observe import MOST_OUTSIDE
+from pchem_pipeline.discrepancy.verdict import Moved
 from pchem_pipeline.effects.framework.compose import AddedExposure, PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -32,8 +33,8 @@ from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-#: Of the parameters of a pixel, in their order.
-UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
+# of the parameters of a pixel, in their order
+_UNITS = {"quanta_exposure": "e-", "conversion_gain": "e-/DN", "bias": "DN", "read_noise_dn": "DN"}
 
 _LEAST_LEFT = 0.2  # of the fitted exposure, or variance of the read noise, without what effects add to it
 _FEWEST_CODES = 3  # that a pixel must have shown
@@ -63,8 +64,7 @@ class Refit:
 
     Attributes:
         maps: H, g, mu, sigma of the pixels themselves.
-        moved: by parameter: median change against the maps before, of the pixels on which the effects act,
-            the same in standard errors of a pixel, and the unit.
+        moved: by parameter: change against the maps before, of the pixels on which the effects act.
         covariance: of (H, g, mu, sigma) of each pixel, shape (y, x, 4, 4).
         components: of the law of a sample, with all effects.
         evaluations: of the likelihood of a pixel, on average.
@@ -72,7 +72,7 @@ class Refit:
     """
 
     maps: PixelMaps
-    moved: Mapping[str, Mapping[str, Any]]
+    moved: Mapping[str, Moved]
     covariance: FloatArray
     components: int = 1
     evaluations: float = 0.0
@@ -144,12 +144,9 @@ def refit_maps(
         fit = fit.with_pixels(astray[inside], fitted(astray[inside], start))
     new = fit.maps
     good = maps.usable.ravel() & np.isfinite(fit.columns).all(axis=1)
-    stderr = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)).T
+    stderr = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2))
     inside = good & acted_on
-    moved = {
-        name: change_of(after[inside] - before[inside], error[inside], unit)
-        for (name, unit), before, after, error in zip(UNITS.items(), flat, new, stderr, strict=True)
-    }
+    moved = changes(np.stack(flat, axis=1)[inside], np.stack(new, axis=1)[inside], stderr[inside])
     new_maps = PixelMaps.known(new, good.reshape(shape))
     covariance = fit.covariance[:, :4, :4].reshape(*shape, 4, 4)
     return Refit(new_maps, moved, covariance, law.components, float(fit.n_iterations.mean()), added)
@@ -265,16 +262,19 @@ def _places(maps: PixelMaps, numbers: IntArray) -> PixelPlaces:
     return PixelPlaces.of_block(None, (ny, nx), numbers)
 
 
-def change_of(difference: FloatArray, stderr: FloatArray, unit: str) -> dict[str, Any]:
-    """Return the median of a change of a parameter over the pixels, and the same in standard errors."""
+def changes(before: FloatArray, after: FloatArray, stderr: FloatArray) -> dict[str, Moved]:
+    """Return the medians over the pixels of the changes of their parameters; all arguments (n, 4)."""
+    found = {}
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = difference / stderr
-    finite = ratio[np.isfinite(ratio)]
-    return {
-        "median": float(np.median(difference)) if difference.size else 0.0,
-        "in_stderr": float(np.median(finite)) if finite.size else 0.0,
-        "unit": unit,
-    }
+        ratios = (after - before) / stderr
+    for (name, unit), difference, ratio in zip(_UNITS.items(), (after - before).T, ratios.T, strict=True):
+        finite = ratio[np.isfinite(ratio)]
+        found[name] = Moved(
+            median=float(np.median(difference)) if difference.size else 0.0,
+            in_stderr=float(np.median(finite)) if finite.size else 0.0,
+            unit=unit,
+        )
+    return found
 
 
 @dataclass(frozen=True)

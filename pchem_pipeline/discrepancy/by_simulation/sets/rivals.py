@@ -20,6 +20,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 from pchem_pipeline.discrepancy.by_simulation.sets.search import Search
+from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR, DECISIVE
 
 _UNTOUCHED = 0.5  # of what an effect does to a statistic, the most by which others may move one of its own
@@ -30,13 +31,13 @@ class Contender:
     """An effect that could stand in the place of a chosen one.
 
     Attributes:
-        hypothesis: of the rival.
+        effect: itself.
         score: log score of the best set with it in that place, relative to the chosen set, nats.
         stderr: of that score: how far the two predictions lie apart, nats.
         probability: among all that could stand there.
     """
 
-    hypothesis: Hypothesis
+    effect: Effect
     score: float
     stderr: float
     probability: float
@@ -57,19 +58,19 @@ class Comparison:
     tried: tuple[Refitted, ...]
     by_histograms: Mapping[frozenset[str], tuple[float, float]] = field(default_factory=dict)
 
-    def rivals_of(self, tag: str) -> tuple[Contender, ...]:
-        """Return what could stand in the place of an effect of the chosen set, itself first."""
-        others = self.chosen.tags - {tag}
+    def rivals_of(self, added: Hypothesis) -> tuple[Contender, ...]:
+        """Return what could stand in the place of an effect of the chosen set, that one first."""
+        others = self.chosen.tags - {added.tag}
         found: dict[str, Contender] = {}
         for one in self.tried:
             new = one.tags - others
             if not others <= one.tags or len(new) != 1 or new & found.keys():
                 continue
             [name] = new
-            hypothesis = next(h for h in one.hypotheses if h.tag == name)
-            if name != tag and hypothesis.effect.tag == tag.partition(" ")[0]:
+            effect = next(h.effect for h in (added, *one.hypotheses) if h.tag == name)
+            if name != added.tag and effect.tag == added.effect.tag:
                 continue  # the same effect elsewhere
-            if name != tag and type(hypothesis.effect).empirical:
+            if name != added.tag and type(effect).empirical:
                 continue  # what has no name is no rival of a name
             if one.tags in self.by_histograms:
                 behind, error = self.by_histograms[one.tags]
@@ -80,7 +81,7 @@ class Comparison:
                 error = _apart(one, self.chosen)
                 # predictions d errors apart tell d^2 / 2 nats (Kullback and Leibler 1951); more is chance
                 probability = float(np.exp(min(max(behind, -0.5 * error**2), 0.0)))
-            found[name] = Contender(hypothesis, behind, error, probability)
+            found[name] = Contender(effect, behind, error, probability)
         total = sum(c.probability for c in found.values())
         shared = [replace(c, probability=c.probability / total) for c in found.values()]
         return tuple(sorted(shared, key=lambda c: (-c.probability, -c.score)))

@@ -147,8 +147,13 @@ class Search:
         """Propose a set, unless it is one that was proposed before, or its effects exclude each other."""
         if share_place(h.effect for h in members) or meets_itself(members):
             return
-        if not any(same_kinds(members, trial.members) for trial in self.trials):
+        if self._trial_of(members) is None:
             self.trials.append(Trial(tuple(members), self._foreseen(members)))
+
+    def _trial_of(self, members: Sequence[Hypothesis]) -> Trial | None:
+        """Return the trial of the same effects at whatever strengths; None: there is none."""
+        kinds = {h.kind for h in members}
+        return next((each for each in self.trials if {h.kind for h in each.members} == kinds), None)
 
     def compare(self, sets: Iterable[Sequence[Hypothesis]]) -> None:
         """Simulate sets, the most promising one a step further each time, until none is open.
@@ -210,7 +215,7 @@ class Search:
         if tuned is not None:
             return tuned
         self.add(members)
-        trial = next((each for each in self.trials if same_kinds(members, each.members)), None)
+        trial = self._trial_of(members)
         return None if trial is None else self.settle(trial, least)
 
     def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]]) -> None:
@@ -372,7 +377,7 @@ def _singles(hypotheses: Sequence[Hypothesis], best: Sequence[Hypothesis]) -> li
     for hypothesis in firsts(hypotheses):
         same = [h for h in chosen if h.tag == hypothesis.tag]
         most = 1 if type(hypothesis.effect).random_realisation else MOST_STARTS
-        if len(same) < most and len(chosen) < _MOST_SINGLES and not any(alike(hypothesis, h) for h in same):
+        if len(same) < most and len(chosen) < _MOST_SINGLES and hypothesis.kind not in [h.kind for h in same]:
             chosen.append(hypothesis)
     return chosen
 
@@ -409,15 +414,3 @@ def vanished(one: Refitted) -> set[str]:
     """Return the tags of the effects of a set of which its best fit leaves no more than their error."""
     gone = np.exp(one.change) < ESTABLISHED * one.stderr
     return {h.tag for h, is_gone in zip(one.hypotheses, gone, strict=True) if is_gone and h.effect.strength}
-
-
-def alike(one: Hypothesis, other: Hypothesis) -> bool:
-    """Test whether two hypotheses differ in nothing but the strength of their effect."""
-    without = {one.effect.strength}
-    return one.effect.model_dump(exclude=without) == other.effect.model_dump(exclude=without)
-
-
-def same_kinds(one: Sequence[Hypothesis], other: Sequence[Hypothesis]) -> bool:
-    """Test whether two sets differ in the strengths of their effects only."""
-    own = {h.tag: h for h in one}
-    return own.keys() == {h.tag for h in other} and all(alike(own[h.tag], h) for h in other)

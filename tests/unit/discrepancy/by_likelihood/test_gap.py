@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.discrepancy.by_likelihood.gap import Distance, on_all_codes
+from pchem_pipeline.discrepancy.by_likelihood.gap import gap_of, on_all_codes
 
 
 def masses(n_codes, spread):
@@ -13,15 +13,20 @@ def masses(n_codes, spread):
     return found / found.sum()
 
 
+def assert_by_chance(gaps):
+    """Gaps by chance scatter about 0, as much as their floor says."""
+    values = np.array([gap.value for gap in gaps])
+    assert abs(values.mean()) < 4 * values.std() / len(gaps) ** 0.5
+    assert 1.645 * values.std() == pytest.approx(gaps[0].floor, rel=0.15)
+
+
 @pytest.mark.parametrize("samples", [30, 3000])
-def test_distance_by_chance_is_that_of_simulated_histograms(samples):
+def test_gap_by_chance_is_that_of_simulated_histograms(samples):
     rng = np.random.default_rng(1)
     p = np.tile(masses(60, 6.0), (8, 1))
-    drawn = [Distance.of(rng.multinomial(samples, p), np.log(p), 0, share=1.0) for _ in range(400)]
-    values = np.array([each.value for each in drawn])
-    assert abs(values.mean() - drawn[0].expected) < 4 * values.std() / 20
-    assert values.std() == pytest.approx(drawn[0].scatter, rel=0.15)
-    assert np.mean([each.gap.at_floor for each in drawn]) == pytest.approx(0.95, abs=0.04)
+    drawn = [gap_of(rng.multinomial(samples, p), np.log(p), 0, share=1.0) for _ in range(400)]
+    assert_by_chance(drawn)
+    assert np.mean([gap.at_floor for gap in drawn]) == pytest.approx(0.95, abs=0.04)
 
 
 def test_fitted_parameters_add_what_their_errors_do():
@@ -31,10 +36,8 @@ def test_fitted_parameters_add_what_their_errors_do():
     found = []
     for _ in range(300):
         fitted = rng.multinomial(4000, p) / 4000
-        found.append(Distance.of(rng.multinomial(2000, p), np.log(fitted), 100, share=0.5))
-    values = np.array([each.value for each in found])
-    assert abs(values.mean() - found[0].expected) < 4 * values.std() / 300**0.5
-    assert values.std() == pytest.approx(found[0].scatter, rel=0.15)
+        found.append(gap_of(rng.multinomial(2000, p), np.log(fitted), 100, share=0.5))
+    assert_by_chance(found)
 
 
 def test_codes_that_are_set_aside_keep_what_they_have_without_effects():

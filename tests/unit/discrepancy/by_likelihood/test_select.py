@@ -42,7 +42,7 @@ def test_what_is_in_the_data_is_selected(sets):
     for member, true in zip(sorted(found.members, key=lambda m: m.tag), (0.08, 0.12), strict=True):
         value = getattr(member.effect, member.effect.strength)
         assert abs(value - true) < 4 * found.stderr(member)[member.effect.strength]
-    assert sets.distance(found).gap.at_floor
+    assert sets.gap(found).at_floor
 
 
 def test_a_needless_effect_is_left_out_and_a_wrong_one_exchanged(sets):

@@ -414,7 +414,7 @@ def test_parameters_move_by_the_pixels_that_an_effect_is_about():
     fit = refit_maps(frames, seen.maps, [noise], seen.covariance)
     # 12 x 0.3 = 3.6 DN of read noise, and 4.4 with 2.5 more
     error = 4.4 / np.sqrt(2 * 900 * 16)
-    moved = fit.moved["read_noise_dn"]["median"]
+    moved = fit.moved["read_noise_dn"].median
     assert moved < -0.5
     assert abs(moved + (np.hypot(3.6, 2.5) - 3.6)) < 10 * error
     beside = fit.maps.read_noise_dn[:, :6] - seen.maps.read_noise_dn[:, :6]

@@ -303,7 +303,7 @@ def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
     mimic = Hypothesis(effect("frame_noise", 0.1), 20.0 * (np.eye(M)[0] + np.eye(M)[1]))
     found = world.compare(hypothesis("row_noise"), mimic)
     assert found.chosen.tags == {"row_noise"}
-    assert found.rivals_of("row_noise")[0].hypothesis.tag == "row_noise"
+    assert found.rivals_of(found.chosen.hypotheses[0])[0].effect.tag == "row_noise"
 
 
 def likelihood_of(behind: Callable[[str, str], tuple[float, float] | None]) -> HistogramLikelihood:
@@ -336,11 +336,11 @@ def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
     assert plain.chosen.tags == open_.chosen.tags == {"row_noise"}
     assert found.chosen.tags == {"frame_noise"}
     assert asked == [("frame_noise", "row_noise"), ("row_noise", "frame_noise")]
-    first, second = found.rivals_of("frame_noise")
-    assert (first.hypothesis.tag, second.hypothesis.tag) == ("frame_noise", "row_noise")
+    first, second = found.rivals_of(found.chosen.hypotheses[0])
+    assert (first.effect.tag, second.effect.tag) == ("frame_noise", "row_noise")
     assert (second.score, second.stderr) == (-12.0, 4.0)
     assert second.probability == pytest.approx(stats.norm.cdf(-3.0), rel=0.01)
-    assert open_.rivals_of("row_noise")[1].probability > 0.1
+    assert open_.rivals_of(open_.chosen.hypotheses[0])[1].probability > 0.1
 
 
 def test_statistics_that_are_all_off_a_little_are_no_good_fit() -> None:
@@ -365,7 +365,7 @@ def test_predictions_that_lie_near_each_other_are_not_told_apart_by_chance(
     twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
     monkeypatch.setitem(TRUTH, "frame_noise", (row[0] + 0.35 * np.eye(M)[1], row[1]))
     found: Any = world.compare(hypothesis("row_noise", 0.5), twin)
-    _, second = found.rivals_of("row_noise")
+    _, second = found.rivals_of(found.chosen.hypotheses[0])
     assert second.score < -4.0
     assert second.stderr == pytest.approx(2.4, abs=0.1)
     assert second.probability == pytest.approx(1.0 / (1.0 + np.exp(second.stderr**2 / 2.0)))
