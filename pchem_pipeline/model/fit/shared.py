@@ -244,7 +244,7 @@ def fit_shared(
             from the first sample of a pixel.
         shared: start of the shared parameters, shape (d,).
         max_steps: scoring steps at most.
-        tolerance: converged where a step promises a smaller rise, nats.
+        tolerance: converged where a step promises a smaller rise of all pixels together, nats.
     """
     theta = problem.samples.theta(parameters)
     limits = _limits(theta, problem.samples.n_exposures)
@@ -256,9 +256,9 @@ def fit_shared(
     for _ in range(max_steps):
         slopes = slopes or Tangent.at(problem, theta, shared).slopes(problem.counts)
         step, shared_step, promised = slopes.step(damping)
-        active = promised >= tolerance
-        if together:
-            active[:] = promised.sum() >= tolerance
+        active = np.full(promised.size, promised.sum() >= tolerance)
+        if not together:
+            active &= promised >= tolerance / promised.size
         active &= damping < _LARGEST_DAMPING
         if not active.any():
             break
@@ -275,9 +275,9 @@ def fit_shared(
             shared = shared_trial if together else shared
             slopes = None
     slopes = slopes or Tangent.at(problem, theta, shared).slopes(problem.counts)
-    fine = bool(promised.sum() < tolerance) if together else bool((promised < tolerance).all())
     own, common = slopes.covariance()
-    return SharedFit(theta, shared, own, common, loglik, fine, problem.samples)
+    arrived = bool(promised.sum() < tolerance)
+    return SharedFit(theta, shared, own, common, loglik, arrived, problem.samples)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Parameters that all pixels share, with one or several samples of each: slopes, recovery, coverage."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,3 +92,20 @@ def test_pulls_of_own_and_shared_parameters_have_unit_spread(samples):
     shared_pulls = np.array(common)
     assert abs(shared_pulls.mean()) < 5 / np.sqrt(12)
     assert abs(shared_pulls.std() - 1) < 5 / np.sqrt(2 * 12)
+
+
+def test_the_tolerance_is_that_of_all_pixels_together_with_and_without_a_shared_parameter():
+    """Else a law with a shared parameter would gain a little in each pixel, whatever the parameter does."""
+    whole, theta, _ = problem(Samples(), 200, 2000, 3)
+    rows = Samples().rows(theta)
+    start = np.column_stack(
+        [1.3 * np.exp(rows[:, 0]), 0.97 * np.exp(-rows[:, 1]), rows[:, 2] - 1, np.exp(rows[:, 3] / 2)]
+    )
+    alone = replace(
+        whole, bounds=np.zeros((0, 2)), scale=np.zeros(0), law=lambda _, own: law([SHARED**2], own)
+    )
+    best = fit_shared(alone, start, np.zeros(0), tolerance=1e-9).log_likelihood.sum()
+    for each, shared in ((alone, np.zeros(0)), (whole, np.array([SHARED**2]))):
+        fit = fit_shared(each, start, shared, tolerance=0.4)
+        assert fit.converged
+        assert fit.log_likelihood.sum() > best - 0.8
