@@ -23,6 +23,7 @@ from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFra
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import Histograms
 from pchem_pipeline.discrepancy.null import Measured, NullModel
+from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence
 
@@ -145,8 +146,15 @@ class Screening:
         most: int,
     ) -> list[Effect]:
         """Return the guesses of all candidates that are not where a found effect of their kind is."""
-        apart = self.observed.frames.seen_apart(self.observed.plain)
-        beside = self._evidence_beside(model, null)
+        left = dict(zip(null.names, null.pulls(self.z.both, 2).tolist(), strict=True))
+
+        def beside_all(part: Part, own: Evidence) -> tuple[Part, Evidence]:
+            """Beside the model of all frames a part may show what fits of its few samples have taken up."""
+            z = {name: max(z, left.get(f"{name}@{part.text}", z), key=abs) for name, z in own.z.items()}
+            return part, replace(own, z=z)
+
+        apart = [beside_all(*each) for each in self.observed.frames.seen_apart(self.observed.plain)]
+        beside = self._evidence_beside(model, left)
         self.work.effort.ask(self.observed.samples)
         return self._apart(model, simulator.guesses(self.classes, evidence, apart, beside, most))
 
@@ -155,7 +163,7 @@ class Screening:
         found = [effect for effect in model if effect not in self.given]
         return [guess for guess in guesses if not share_place((*found, guess))]
 
-    def _evidence_beside(self, model: tuple[Effect, ...], null: NullModel) -> Evidence | None:
+    def _evidence_beside(self, model: tuple[Effect, ...], left: dict[str, float]) -> Evidence | None:
         """Return the evidence of the seen frames beside the effects of a model; None where it has none.
 
         Counts per code beside those that the model expects, and the vector as it deviates from the model's.
@@ -165,5 +173,4 @@ class Screening:
         plain = self.observed.plain
         expected = self.work.expected(model, plain, self.observed.frames.seen_numbers)
         code = plain.code if expected is None else replace(plain.code, expected=expected)
-        left = dict(zip(null.names, null.pulls(self.z.both, 2).tolist(), strict=True))
         return replace(plain, code=code, z=left)

@@ -1,0 +1,40 @@
+"""What candidates are asked for, everywhere and in parts."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.discrepancy_material import evidence
+
+from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screening
+from pchem_pipeline.discrepancy.null import Measured, NullModel
+from pchem_pipeline.discrepancy.observe.places import Part
+from pchem_pipeline.effects.framework.region import When
+
+PART = Part(None, When(range=((300, 420),)))
+NAMES = ("tail.low.count", f"tail.low.count@{PART.text}", "shape.He4.mean")
+
+
+@pytest.mark.parametrize(("of_all", "of_itself", "seen"), [(8.0, 1.5, 8.0), (0.5, -6.0, -6.0)])
+def test_a_part_shows_what_it_does_beside_the_model_of_all_frames_or_of_itself(
+    of_all: float, of_itself: float, seen: float
+) -> None:
+    """A few samples far below all others are lost in a fit of few frames, and stand out in one of all."""
+    null = NullModel.from_replicates(NAMES, np.random.default_rng(1).standard_normal((4000, 3)))
+    chance = np.sqrt(0.5)  # of the mean of two splits
+    z = Measured(*(np.array([0.0, of_all * chance, 9.0]) for _ in range(3)))
+    own = replace(evidence(), z={"tail.low.count": of_itself, "shape.He4.mean": 1.0})
+    observed: Any = SimpleNamespace(
+        plain=own, samples=1, frames=SimpleNamespace(seen_apart=lambda _: [(PART, own)])
+    )
+    work: Any = SimpleNamespace(effort=SimpleNamespace(ask=lambda _: None))
+    asked: list[Any] = []
+    simulator: Any = SimpleNamespace(guesses=lambda *given: asked.append(given[2]) or [])
+    Screening(observed, work, z, {}, (), 0.1)._guesses(simulator, (), null, (), 5)
+    [[(part, found)]] = asked
+    assert part == PART
+    assert found.z["tail.low.count"] == pytest.approx(seen, rel=0.05)
+    # what is known of all frames only says nothing about the part
+    assert found.z["shape.He4.mean"] == 1.0
