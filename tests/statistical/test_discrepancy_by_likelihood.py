@@ -59,6 +59,19 @@ def counted(x, **sample):
     return SampleHistograms(np.array(counts, np.uint32), origin, **sample)
 
 
+@pytest.mark.parametrize("seed", [101, 103])
+def test_a_peak_that_is_taken_for_that_of_no_electron_is_put_right_with_the_effect(seed):
+    """The plain fit of some bright pixels is an electron off; with the effect from there, too, it misfits."""
+    rng = np.random.default_rng(seed)
+    h, step, bias = (rng.uniform(*limits, PIXELS) for limits in ((0.6, 4.0), (13.0, 15.0), (80.0, 120.0)))
+    k = branching_numbers(rng, np.broadcast_to(h[:, None], (PIXELS, SAMPLES)), 0.1, (PIXELS, SAMPLES))
+    electrons = k + 0.2 * rng.normal(size=k.shape)
+    found = find_in_histograms([counted(bias[:, None] + step[:, None] * electrons)], SETTINGS)
+    assert found.verdict.verdict == "named"
+    assert found.verdict.effects == ("branching_counts",)
+    assert abs((found.maps.bias.ravel() - bias) / step).max() < 0.2
+
+
 def test_nothing_hidden_is_consistent():
     found = find_in_histograms([histograms(1)], SETTINGS).verdict
     assert found.verdict == "consistent"

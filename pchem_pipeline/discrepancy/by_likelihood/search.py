@@ -73,8 +73,17 @@ def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
         sets: with all codes.
         candidates: effects at their starts.
     """
-    nearest = tuple(one.members[0].tag for one in sets.extended(sets.plain, candidates))
     best = select(sets, candidates)
+    right = best
+    if sets.samples.n == 1 and best.members:  # bias frames leave no choice of the bias
+        right = sets.with_right_peaks(best)
+    if right is not best:
+        moved = replace(sets, start=right.fit.parameters)
+        again = select(moved, candidates)
+        # what misfits all the same may be anything, such as a peak of no electron that is cut
+        if moved.gap(again).at_floor:
+            sets, best = moved, again
+    nearest = tuple(one.members[0].tag for one in sets.extended(sets.plain, candidates))
     rest, rise = _rest(sets, best), sets.difference(best, sets.plain)
     if best.members and (rest <= LARGEST_REST or sets.gap(best).at_floor):
         named = tuple(_named(sets, best, candidates))

@@ -17,6 +17,7 @@ from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.discrepancy.by_likelihood.gap import gap_of, sum_over_samples
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, split_coordinates
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, shift_bias_by_electrons
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.effects.framework.effect import Effect
@@ -30,6 +31,7 @@ _FITTED = 3  # candidates fitted in full, of those that a first-order step promi
 _TOLERANCE = 0.02  # nats; of a misfit more, since it is known no better
 _TOLERANCE_PER_SAMPLE = 1e-6
 _MOST_STEPS = 20
+PROBED = 64  # pixels that tell first whether a long fit is worth it
 _SECANT = 0.1  # of the start: where the slope at no effect is taken
 
 
@@ -62,6 +64,10 @@ class FittedSet:
     def member(self, tag: str) -> Member | None:
         """Return a member; None: it has none of that tag."""
         return next((m for m in self.members if m.tag == tag), None)
+
+    def likelier_than(self, other: FittedSet) -> BoolArray:
+        """Tell which pixels it explains clearly better than another fit, (n,)."""
+        return np.asarray(self.fit.log_likelihood > other.fit.log_likelihood + CLEARLY)
 
     def stderr(self, member: Member) -> dict[str, float]:
         """Return the standard errors of the fitted fields of one of the members."""
@@ -160,6 +166,35 @@ class SetComparison:
         except Exception as error:
             self.failed[members[-1].tag] = error_words(error)
             return None
+
+    def with_right_peaks(self, fitted: FittedSet) -> FittedSet:
+        """Return a fit with pixels whose bias is an electron off where that is clearly likelier, or as it is.
+
+        Where effects explain much, the peak that was taken for that of no electron without them may be that
+        of one.
+        """
+        for electrons in (-1.0, 1.0):
+            fitted = self._electrons_off(fitted, electrons)
+        return fitted
+
+    def _electrons_off(self, fitted: FittedSet, electrons: float) -> FittedSet:
+        """Return the same with pixels whose bias is so many electrons lower.
+
+        Some pixels tell first whether it ever is: from there a fit takes many steps.
+        """
+        if len(self.train) > 2 * PROBED:
+            few = self.of(slice(None, None, len(self.train) // PROBED), fitted.fit.parameters)
+            probe = few.fit(fitted.members)
+            start = shift_bias_by_electrons(few.start, electrons)
+            if not few.fit(fitted.members, start).likelier_than(probe).any():
+                return fitted
+        other = self.fit(fitted.members, shift_bias_by_electrons(fitted.fit.parameters, electrons))
+        better = other.likelier_than(fitted)
+        if not better.any():
+            return fitted
+        start = np.where(better[:, None], other.fit.parameters, fitted.fit.parameters)
+        both = other if better.all() else self.fit(other.members, start)
+        return max(fitted, other, both, key=lambda one: float(one.fit.log_likelihood.sum()))
 
     def extended(self, base: FittedSet, candidates: Sequence[Member], most: int = _FITTED) -> list[FittedSet]:
         """Fit a set with each of the most promising candidates, the best start of each, the best first."""

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import BoolArray
 from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, law_of, leads_in_histograms
-from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
+from pchem_pipeline.discrepancy.by_likelihood.sets import PROBED, FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import LARGEST_FACTOR, Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.candidates.satellites import FAR_SHARE, with_satellites
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import CLEARLY, multistart, shift_bias_by_electrons
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import multistart
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.effect import Effect, tag_of
@@ -40,7 +40,6 @@ MOST_IN_A_PART = 2  # hypotheses of an effect, or effects for which no estimator
 # nats that an effect for which no estimator speaks must explain, and times as strong as is typical, where a
 # plain fit is led astray
 _SPEAKS, _STRONG = 15.0, 5.0
-_PROBED = 64  # pixels
 _REMEMBERED = 12  # fits: each holds the masses of all codes
 _ASTRAY = 5.0  # nats of a pixel that an effect explains, from which on it may mistake the peak of no electron
 _FEWEST_PIXELS, _FEWEST_FRAMES = 16, 200  # of a place, whose histograms tell numbers
@@ -89,11 +88,11 @@ class PixelLikelihood:
     def fewer(self) -> PixelLikelihood:
         """Return that of a part of these pixels, a first answer for a fraction of the work; itself if few."""
         n = len(self._sets.train)
-        if n <= 2 * _PROBED:
+        if n <= 2 * PROBED:
             return self
         if self._fewer is None:
             self._fewer = copy.copy(self)
-            self._fewer._sets = self._sets.of(slice(None, None, n // _PROBED), self._sets.start)
+            self._fewer._sets = self._sets.of(slice(None, None, n // PROBED), self._sets.start)
             self._fewer._asked, self._fewer._without = {}, {}
         return self._fewer
 
@@ -193,8 +192,7 @@ class PixelLikelihood:
                 self._without[sets.present] = without
             fitted = _multistart(sets, fitted)
             if fitted.fit.log_likelihood.sum() - without > _ASTRAY * len(fitted.fit.log_likelihood):
-                for electrons in (-1.0, 1.0):
-                    fitted = _electrons_off(sets, fitted, electrons)
+                fitted = sets.with_right_peaks(fitted)
         # an effect of a plug-in may raise anything: the others are compared all the same
         except Exception as error:
             if not _refuses(error):
@@ -363,30 +361,6 @@ def _starts(kind: type[Effect]) -> tuple[Effect, ...]:
     """Return what is typical of an effect and the same stronger; nothing where no law tells it."""
     typical = next((e for e in kind.typical() if e.strength and identifiable_from_histograms(e)), None)
     return () if typical is None else (typical, typical.scaled(_STRONG))
-
-
-def _electrons_off(sets: SetComparison, fitted: FittedSet, electrons: float) -> FittedSet:
-    """Return a fit with pixels whose bias is so many electrons lower where that is likelier, or as it is.
-
-    Some pixels tell first whether it ever is: from there a fit takes many steps.
-    """
-    if len(sets.train) > 2 * _PROBED:
-        few = sets.of(slice(None, None, len(sets.train) // _PROBED), fitted.fit.parameters)
-        probe = few.fit(fitted.members)
-        if not _likelier(few.fit(fitted.members, shift_bias_by_electrons(few.start, electrons)), probe).any():
-            return fitted
-    other = sets.fit(fitted.members, shift_bias_by_electrons(fitted.fit.parameters, electrons))
-    better = _likelier(other, fitted)
-    if not better.any():
-        return fitted
-    start = np.where(better[:, None], other.fit.parameters, fitted.fit.parameters)
-    both = other if better.all() else sets.fit(other.members, start)
-    return max(fitted, other, both, key=lambda one: float(one.fit.log_likelihood.sum()))
-
-
-def _likelier(one: FittedSet, other: FittedSet) -> BoolArray:
-    """Tell which pixels a fit explains clearly better than another one, (n,)."""
-    return np.asarray(one.fit.log_likelihood > other.fit.log_likelihood + CLEARLY)
 
 
 def _multistart(sets: SetComparison, fitted: FittedSet) -> FittedSet:
