@@ -222,7 +222,8 @@ class Findings:
     @property
     def proposed(self) -> tuple[Effect, ...]:
         """Incomplete descriptions: parameters fitted with them may be worse than without."""
-        return () if self.added.after.at_floor else self.described
+        complete = self.added.after.at_floor and all(each.fits for each in self.added.additions)
+        return () if complete else self.described
 
     def model(self, present: Sequence[Effect], extended: Sequence[Effect]) -> tuple[Effect, ...]:
         """Return the model with the named effects and complete descriptions.

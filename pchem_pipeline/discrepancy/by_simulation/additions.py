@@ -301,15 +301,17 @@ def without_better_reason(addition: Addition) -> Addition:
 
 
 def without_company(additions: Sequence[Addition]) -> list[Addition]:
-    """Take the names from effects that were fitted beside one which moves more and does not fit.
+    """Take the names from effects beside one which moves more and does not fit or has no name.
+
+    What a description leaves of something unknown is explained by whatever is like it.
 
     Args:
         additions: the weightiest first.
     """
-    mimics = [i for i, each in enumerate(additions) if each.against]
-    first = mimics[0] if mimics else len(additions)
+    nameless = [i for i, each in enumerate(additions) if each.against or each.described]
+    first = nameless[0] if nameless else len(additions)
     return [
-        replace(each, against="it was fitted together with a larger effect that is rejected")
+        replace(each, against="it was fitted together with a larger effect that is rejected or has no name")
         if i > first and each.fits and not each.described
         else each
         for i, each in enumerate(additions)

@@ -566,7 +566,7 @@ def _threshold(seen: PredictedSamples) -> tuple[int, float] | None:
     with np.errstate(divide="ignore", invalid="ignore"):
         fall = np.where(own > 0, own * np.log(own / one), 0.0) - (own - one)
         z = (one - own) / np.sqrt(own + one / 3.0)
-    fall = np.where((z > CLEAR) & (one >= _FEWEST), fall, 0.0)
+    fall = np.where((z > CLEAR) & (one >= _FEWEST) & (seen.thresholds > 0), fall, 0.0)
     place = int(fall.argmax())
     if fall[place] <= 0.0:
         return None

@@ -61,6 +61,8 @@ def test_beside_an_effect_that_moves_more_and_does_not_fit_there_is_no_name() ->
     assert without_company([good, good]) == [good, good]
     measured = replace(good, described=True)
     assert without_company([mimic, measured])[1].verdict == "described"
+    assert [each.verdict for each in without_company([measured, good])] == ["described", "unexplained"]
+    assert without_company([good, measured]) == [good, measured]
 
 
 @pytest.mark.parametrize(("left", "fits"), [(0.9, True), (0.6, True), (0.4, False), (-0.1, False)])

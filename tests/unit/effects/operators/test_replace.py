@@ -219,6 +219,15 @@ def test_threshold_and_share_are_found(effect, shape, n_frames, seed):
     assert evidence.z["space.predicted.equal"] > 20.0
 
 
+def test_a_rule_without_a_threshold_is_none_that_an_effect_can_have():
+    truth = drawn_truth((24, 24), seed=25)
+    frames = taken(truth, n_frames=1600, seed=5)
+    inner, prediction = frames[:, 1:-1, 1:-1], predicted(frames, "row")
+    some = np.random.default_rng(6).random(inner.shape) < 0.3
+    inner[some] = np.minimum(inner, prediction)[some]
+    assert all(found.threshold_dn > 0 for found in PixelCorrection.estimate(seen(frames)))
+
+
 def test_the_rule_says_what_comes_out_in_the_stead_of_a_sample():
     frames = np.random.default_rng(4).integers(90, 140, (5, 7, 6)).astype(np.uint16)
     effect = PixelCorrection(threshold_dn=12)
