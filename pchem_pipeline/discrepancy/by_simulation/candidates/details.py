@@ -129,8 +129,16 @@ def standard_errors(refitter: Refitter, one: Refitted, least: FloatArray) -> lis
 
 def _details(refitter: Refitter, one: Refitted) -> list[_Detail]:
     """Return the numbers that may be tuned, with their slopes."""
-    measured = [_measured(refitter, one, place, name) for place, name in _numbers(refitter, one.hypotheses)]
-    return [detail for detail in measured if detail is not None]
+    found = []
+    for place, name in _numbers(refitter, one.hypotheses):
+        # an effect of a plug-in may raise anything: what is known of the others counts all the same
+        try:
+            found.append(_measured(refitter, one, place, name))
+        except EffortSpentError:
+            raise
+        except Exception as error:
+            note_defect(refitter.defects, one.hypotheses[place].tag, error)
+    return [detail for detail in found if detail is not None]
 
 
 def _numbers(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> list[tuple[int, str]]:

@@ -188,5 +188,7 @@ def test_what_an_effect_of_another_package_raises_ends_no_search(strange: type[D
     search = Search(refitter, HistogramLikelihood())
     compare(search, hypotheses, sets)
     assert "dark_current_rts" in search.best.tags
+    own = world.refined(guessed)
+    assert standard_errors(refitter, own, own.stderr)[0].keys() == {"fraction"}
     assert refitter.defects
     assert all("dark_current_rts" in failed for failed in refitter.defects)
