@@ -133,7 +133,9 @@ def _places(part: Path, sharding: Any, chunks: int) -> Iterator[tuple[Path, int,
     """Yield where the chunks of a shard are: file, first byte and bytes, by the index of the shard."""
     whole, length = part.stat().st_size, 16 * chunks
     checksum = 4 * (len(sharding.index_codecs) - 1)
-    first = 0 if sharding.index_location.value == "start" else max(0, whole - length - checksum)
+    # as the file has it: the attribute is a text in some versions of zarr, a member of an Enum in others
+    at_start = sharding.to_dict()["configuration"]["index_location"] == "start"
+    first = 0 if at_start else max(0, whole - length - checksum)
     index = np.frombuffer(_read(part, first, length)[: length // 16 * 16], "<u8")
     for start, size in index[: len(index) // 2 * 2].reshape(-1, 2).tolist():
         if start + size <= whole:  # not those that were never written
