@@ -227,8 +227,8 @@ def estimate_exposure(
 
     ``sum_i c_i log sum_k P(k; H) P(x_i | k)``, the cells of the codes integrated exactly; effects of the
     model are in the law. It uses what a sample says of its electron number, where the mean of rounded or of
-    corrected frames adds the read noise to that of the numbers.
-    NaN where all samples lie below those of no electron.
+    corrected frames adds the read noise to that of the numbers. NaN where all samples lie below those of no
+    electron.
 
     Args:
         counts: histograms, shape (y, x, code).
@@ -237,15 +237,17 @@ def estimate_exposure(
         parts: codes in a DN.
     """
     n, occupied = origin.size, counts.reshape(origin.size, -1) > 0
-    # far below the level of no electron are codes that no exposure explains
     highest = (origin.ravel() + occupied.shape[1] - 1 - occupied[:, ::-1].argmax(axis=1)) / parts
     _, _, bias, sigma = calibration.columns.T
-    seen = occupied.any(axis=1) & (highest > bias - REACH * sigma)
     known = _Known.of(counts.reshape(n, -1), origin.ravel(), calibration, parts)
-    pixels = np.flatnonzero(seen & np.isfinite(calibration.columns).all(axis=1))
+    pixels = np.flatnonzero(occupied.any(axis=1) & np.isfinite(calibration.columns).all(axis=1))
     own = calibration.columns[pixels, 1:]
     start = np.maximum(mean_signal(counts, origin, calibration, parts).ravel()[pixels], _LEAST_START)
     exposure, height, bend = known.climb(pixels, start, own)
+    # codes so far below the level of no electron no exposure explains, unless the law has wider noise
+    least = -0.5 * REACH**2 * counts.reshape(n, -1)[pixels].sum(axis=1)
+    possible = (highest > bias - REACH * sigma)[pixels] | (height > least)
+    pixels, own, exposure, height, bend = (a[possible] for a in (pixels, own, exposure, height, bend))
     curvature, border = bend[:, 0], np.flatnonzero(exposure == 0.0)
     curvature[border] = known.at_border(pixels[border], height[border], own[border])
     with np.errstate(invalid="ignore"):

@@ -159,14 +159,8 @@ def write_tiff_cube(path: Path, cube: Cube) -> None:
     with whole_file(path) as part:
         if size + (1 << 25) < _LARGEST_TIFF and cube.dtype.str[1:] in ("u1", "u2", "f4"):
             frames = {"axes": "TZCYXS", "Info": json.dumps(about), "unit": "pixel"}
-            shape = (
-                n,
-                1,
-                1,
-                rows,
-                columns,
-                1,
-            )  # all axes: a last one of one column would be taken for samples
+            # all axes: a last one of one column would be taken for samples of a pixel
+            shape = (n, 1, 1, rows, columns, 1)
             options = {"shape": shape, "dtype": cube.dtype, "photometric": "minisblack"}
             tifffile.imwrite(part, images, imagej=True, metadata=frames, **options)
         else:

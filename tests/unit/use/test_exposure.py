@@ -87,6 +87,14 @@ def test_dark_and_unknown_pixels():
     assert (found.counting[known] > 0).all()
 
 
+def test_a_sample_far_below_is_one_without_electrons_where_the_law_has_wider_noise():
+    camera = KnownCamera(np.full((1, 1), 0.1), np.full((1, 1), 200.0), np.full((1, 1), 0.3))
+    frames = np.full((1, 1, 1), 170, np.uint16)  # 10 sigma below, and 2 of the wide noise
+    wide = replace(camera.calibration(), law=SampleLaw().with_noise([0.9, 0.1], width=[1.0, 5.0]))
+    assert estimated(frames, wide).exposure == 0.0
+    assert np.isnan(estimated(frames, camera.calibration()).exposure)
+
+
 def test_samples_at_the_top_of_the_adc_are_taken_as_a_limit():
     rng = np.random.default_rng(24)
     camera = KnownCamera(np.full(SHAPE, 0.1), np.full(SHAPE, 20.0), np.full(SHAPE, 0.25))

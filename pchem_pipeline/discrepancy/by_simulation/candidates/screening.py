@@ -148,12 +148,12 @@ class Screening:
         """Return the guesses of all candidates that are not where a found effect of their kind is."""
         left = dict(zip(null.names, null.pulls(self.z.both, 2).tolist(), strict=True))
 
-        def beside_all(part: Part, own: Evidence) -> tuple[Part, Evidence]:
+        def evidence_of(part: Part, own: Evidence) -> tuple[Part, Evidence]:
             """Beside the model of all frames a part may show what fits of its few samples have taken up."""
             z = {name: max(z, left.get(f"{name}@{part.text}", z), key=abs) for name, z in own.z.items()}
             return part, replace(own, z=z)
 
-        apart = [beside_all(*each) for each in self.observed.frames.seen_apart(self.observed.plain)]
+        apart = [evidence_of(*each) for each in self.observed.frames.seen_apart(self.observed.plain)]
         beside = self._evidence_beside(model, left)
         self.work.effort.ask(self.observed.samples)
         return self._apart(model, simulator.guesses(self.classes, evidence, apart, beside, most))
