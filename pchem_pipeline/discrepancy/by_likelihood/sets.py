@@ -22,7 +22,14 @@ from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import CLEAR, PRICE
-from pchem_pipeline.model.fit.shared import Samples, SharedFit, SharedProblem, Tangent, fit_shared
+from pchem_pipeline.model.fit.shared import (
+    Ascent,
+    Samples,
+    SharedFit,
+    SharedProblem,
+    Tangent,
+    fit_shared,
+)
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _LARGEST_SET = 4  # effects
@@ -264,13 +271,13 @@ class SetComparison:
         problem = self.problem((*base.members, member))
         moved = problem.log_masses(theta, np.concatenate([base.fit.shared, shared]))
         slope = (moved - tangent.log_masses) / shared[0]
-        alone = replace(problem, bounds=np.array([[-np.inf, np.inf]]))
         derivatives = np.concatenate([tangent.derivatives[:, :4], slope[:, None, :]], axis=1)
-        slopes = Tangent(alone, tangent.log_masses, derivatives, np.zeros(1)).slopes(self.train)
-        variance = float(slopes.covariance()[1][0, 0])
+        expansion = Tangent(problem, tangent.log_masses, derivatives).expansion(self.train)
+        ascent = Ascent(theta, np.zeros(1), expansion, np.array([[-np.inf, np.inf]]), np.ones(1))
+        variance = float(ascent.covariance()[1][0, 0])
         if not variance > 0.0:
             return 0.0, member
-        length = float(slopes.step(np.zeros(theta.shape[0]))[1][0])
+        length = float(ascent.step(np.zeros(theta.shape[0]))[1][0])
         if length * shared[0] <= 0 and member.coordinates[0].bounds[0] >= 0:
             return -1.0, member
         return 0.5 * length**2 / variance, member.placed(length)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,14 +162,13 @@ class SharedProblem:
         inside = np.maximum(mass.sum(axis=1, keepdims=True), LEAST_SEEN)
         return np.where(self.kept, np.log(np.maximum(mass, LEAST_SEEN) / inside), 0.0)
 
-    def log_likelihood(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
-        """Return the log-likelihood of each pixel, nats; -inf where the law refuses."""
-        try:
-            rows = (self.counts * self.log_masses(theta, shared)).sum(axis=1)
-        except ValueError:  # fields that do not go together
-            return np.full(theta.shape[0], -np.inf)
-        found = rows.reshape(-1, self.samples.n).sum(axis=1)
-        return np.where(np.isfinite(found), found, -np.inf)
+    def expansion(self, theta: FloatArray, shared: FloatArray) -> Expansion:
+        """Return the log-likelihood of each pixel to second order.
+
+        Raises:
+            ValueError: fields of the law do not go together.
+        """
+        return Tangent.at(self, theta, shared).expansion(self.counts)
 
 
 @dataclass(frozen=True)
@@ -236,8 +236,6 @@ def fit_shared(
 ) -> SharedFit:
     """Climb the likelihood from a start.
 
-    Without shared parameters the pixels are independent, and each has a damping of its own.
-
     Args:
         problem: histograms and law.
         parameters: start of (H, g, mu, sigma) of the rows, shape (n J, 4), finite; g, mu and sigma are taken
@@ -247,37 +245,165 @@ def fit_shared(
         tolerance: converged where a step promises a smaller rise of all pixels together, nats.
     """
     theta = problem.samples.theta(parameters)
-    limits = _limits(theta, problem.samples.n_exposures)
     shared = np.clip(np.asarray(shared, np.float64), problem.bounds[:, 0], problem.bounds[:, 1])
-    loglik = problem.log_likelihood(theta, shared)
-    together = problem.n_shared > 0
-    damping = np.full(theta.shape[0], _FIRST_DAMPING)
-    promised, slopes = np.full(theta.shape[0], np.inf), None
-    for _ in range(max_steps):
-        slopes = slopes or Tangent.at(problem, theta, shared).slopes(problem.counts)
-        step, shared_step, promised = slopes.step(damping)
-        active = np.full(promised.size, promised.sum() >= tolerance)
-        if not together:
-            active &= promised >= tolerance / promised.size
-        active &= damping < _LARGEST_DAMPING
-        if not active.any():
-            break
-        trial = np.where(active[:, None], np.clip(theta + step, *limits), theta)
-        reach = np.abs(shared) + problem.scale
-        shared_trial = shared + np.clip(shared_step, -reach, reach)
-        shared_trial = np.clip(shared_trial, problem.bounds[:, 0], problem.bounds[:, 1])
-        found = problem.log_likelihood(trial, shared_trial)
-        better = np.full(theta.shape[0], found.sum() > loglik.sum()) if together else found > loglik
-        better &= active
-        damping = np.where(better, damping / 10.0, np.where(active, damping * 6.0, damping))
-        if better.any():
-            theta, loglik = np.where(better[:, None], trial, theta), np.where(better, found, loglik)
-            shared = shared_trial if together else shared
-            slopes = None
-    slopes = slopes or Tangent.at(problem, theta, shared).slopes(problem.counts)
-    own, common = slopes.covariance()
-    arrived = bool(promised.sum() < tolerance)
-    return SharedFit(theta, shared, own, common, loglik, arrived, problem.samples)
+    limits = _limits(theta, problem.samples.n_exposures)
+    ascent = Ascent(theta, shared, problem.expansion(theta, shared), problem.bounds, problem.scale)
+    arrived = ascent.climb(
+        lambda theta, shared, rows: problem.expansion(theta, shared).of(rows),
+        limits,
+        limits[1] - limits[0],
+        max_steps,
+        tolerance,
+    )
+    own, common = ascent.covariance()
+    return SharedFit(
+        ascent.theta, ascent.shared, own, common, ascent.expansion.value, arrived, problem.samples
+    )
+
+
+@dataclass
+class Expansion:
+    """A function of own parameters (n, P) and shared ones (d,) about a point, to second order.
+
+    Attributes:
+        value: of each pixel, shape (n,).
+        score: its gradient, own parameters first, shape (n, P + d).
+        information: the curvature with the opposite sign, as expected, shape (n, P + d, P + d).
+    """
+
+    value: FloatArray
+    score: FloatArray
+    information: FloatArray
+
+    def of(self, pixels: Any) -> Expansion:
+        """Return that of some pixels, by any index."""
+        return Expansion(self.value[pixels], self.score[pixels], self.information[pixels])
+
+    def shaped(self, *shape: int) -> Expansion:
+        """Return it with the pixels in another order of axes, from shape (n, ...) or (j, n, ...)."""
+        p = self.score.shape[-1]
+        score, information = self.score.reshape(*shape, p), self.information.reshape(*shape, p, p)
+        return Expansion(self.value.reshape(shape), score, information)
+
+    def put(self, pixels: Any, other: Expansion) -> None:
+        """Replace that of some pixels, by any index."""
+        for old, new in zip(vars(self).values(), vars(other).values(), strict=True):
+            old[pixels] = new
+
+
+@dataclass
+class Ascent:
+    """Damped scoring steps (Fisher 1935; Levenberg 1944; Marquardt 1963) that never lead down.
+
+    Without shared parameters the pixels are independent, and each has a damping of its own.
+
+    Attributes:
+        theta: own parameters, shape (n, P).
+        shared: shared parameters, shape (d,).
+        expansion: of the function that is to be maximised, there.
+        bounds: lowest and highest value of each shared parameter, shape (d, 2).
+        scale: natural scale of each shared parameter, shape (d,).
+    """
+
+    theta: FloatArray
+    shared: FloatArray
+    expansion: Expansion
+    bounds: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    scale: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def climb(
+        self,
+        expand: Callable[[FloatArray, FloatArray, IntArray], Expansion],
+        limits: tuple[FloatArray, FloatArray],
+        longest: FloatArray,
+        max_steps: int,
+        tolerance: float,
+    ) -> bool:
+        """Go up, and return whether the rise that a further step promises is below the tolerance.
+
+        Args:
+            expand: the expansion of some pixels at a point (theta, shared); the point is refused where it
+                raises ValueError.
+            limits: lowest and highest own parameters, shapes (n, P).
+            longest: longest step of the own parameters, shape (n, P); a longer one is shortened as a whole.
+            max_steps: steps at most.
+            tolerance: of the sum over all pixels.
+        """
+        n, together = len(self.theta), self.shared.size > 0
+        damping, promised = np.full(n, _FIRST_DAMPING), np.full(n, np.inf)
+        for _ in range(max_steps):
+            step, shared_step, promised = self.step(damping)
+            active = (promised.sum() >= tolerance) & (damping < _LARGEST_DAMPING)
+            if not together:
+                active &= promised >= tolerance / n
+            rows = np.flatnonzero(active)
+            if rows.size == 0:
+                break
+            step /= np.maximum(1.0, (np.abs(step) / longest).max(axis=1, keepdims=True))
+            theta = np.where(active[:, None], np.clip(self.theta + step, *limits), self.theta)
+            reach = np.abs(self.shared) + self.scale
+            shared = np.clip(self.shared + np.clip(shared_step, -reach, reach), *self.bounds.T)
+            try:
+                new = expand(theta, shared, rows)
+            except ValueError:
+                better = np.zeros(rows.size, np.bool_)
+            else:
+                rise = new.value - self.expansion.value[rows]
+                better = np.full(rows.size, rise.sum() > 0.0) if together else rise > 0.0
+            damping[rows] = np.where(better, damping[rows] / 10.0, 10.0 * damping[rows] + 1.0)
+            if better.any():
+                took = rows[better]
+                self.theta[took], self.shared = theta[took], shared
+                self.expansion.put(took, new.of(better))
+        return bool(promised.sum() < tolerance)
+
+    def step(self, damping: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the steps of own and shared parameters, and the rise promised in each pixel."""
+        score, free = self.expansion.score[:, : self.theta.shape[1]], self._free
+        inverse, through, schur = self._reduced(damping)
+        own = np.einsum("nab,nb->na", inverse, score)
+        shared = np.zeros(self.shared.size)
+        if free.any():
+            right = self._shared_score[free] - np.einsum("nad,na->d", through, score)
+            shared[free] = np.linalg.lstsq(schur, right, rcond=1e-12)[0]
+            own -= np.einsum("nad,d->na", through, shared[free])
+        promised = 0.5 * (own * score).sum(axis=1)
+        return own, shared, promised + 0.5 * float(shared[free] @ self._shared_score[free]) / promised.size
+
+    def covariance(self) -> tuple[FloatArray, FloatArray]:
+        """Return covariances of own, (n, P, P), and of shared parameters, (d, d), NaN for those at bounds.
+
+        That of the own parameters takes the shared ones as known.
+        """
+        inverse, _, schur = self._reduced(np.zeros(len(self.theta)))
+        found = np.full((self.shared.size, self.shared.size), np.nan)
+        found[np.ix_(self._free, self._free)] = np.linalg.pinv(schur, rcond=1e-15)
+        return inverse, found
+
+    @property
+    def _shared_score(self) -> FloatArray:
+        return np.asarray(self.expansion.score[:, self.theta.shape[1] :].sum(axis=0))
+
+    @property
+    def _free(self) -> BoolArray:
+        """Which shared parameters may move: not those at a bound whose score leads outside, shape (d,)."""
+        low, high = (self.bounds >= self.shared[:, None])[:, 0], (self.bounds <= self.shared[:, None])[:, 1]
+        return ~((low & (self._shared_score < 0)) | (high & (self._shared_score > 0)))
+
+    def _reduced(self, damping: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Eliminate the own parameters from the information, which has the shape of an arrow.
+
+        Returns:
+            The inverse of the own block, what the own parameters answer to the free shared ones, and the
+            information that is left of these: shapes (n, P, P), (n, P, d') and (d', d').
+        """
+        p, information = self.theta.shape[1], self.expansion.information
+        inverse = np.asarray(np.linalg.inv(_damped(information[:, :p, :p], damping)), np.float64)
+        border = information[:, :p, p:][:, :, self._free]
+        through = np.einsum("nab,nbd->nad", inverse, border)
+        common = information[:, p:, p:].sum(axis=0)[np.ix_(self._free, self._free)]
+        common = common * (1.0 + damping.max(initial=0.0) * np.eye(len(common)))
+        return inverse, through, common - np.einsum("nad,nae->de", border, through)
 
 
 @dataclass(frozen=True)
@@ -288,95 +414,26 @@ class Tangent:
         problem: histograms and law.
         log_masses: given that the code is kept, shape (n, B); 0 where it is not.
         derivatives: of the log masses of the rows, their own four parameters first, shape (n, 4 + d, B).
-        shared: shared parameters, shape (d,).
     """
 
     problem: SharedProblem
     log_masses: FloatArray
     derivatives: FloatArray
-    shared: FloatArray
 
     @classmethod
     def at(cls, problem: SharedProblem, theta: FloatArray, shared: FloatArray) -> Tangent:
         """Evaluate at a point."""
         base = problem.log_masses(theta, shared)
-        return cls(problem, base, _differences(problem, theta, shared, base), shared)
+        return cls(problem, base, _differences(problem, theta, shared, base))
 
-    @property
-    def masses(self) -> FloatArray:
-        """Mass of each code given that it is kept, shape (n, B)."""
-        return np.where(self.problem.kept, np.exp(self.log_masses), 0.0)
-
-    def slopes(self, counts: NDArray[np.integer]) -> Slopes:
-        """Return score and information of histograms, shape (n, B)."""
-        seen = np.where(self.problem.kept, counts, 0)
-        score, information = score_and_information(self.derivatives, self.masses, seen)
-        information, score = self.problem.samples.by_pixel(information, score)
-        own = self.problem.samples.n_exposures + 3
-        shared_score = score[:, own:].sum(axis=0)
-        low, high = self.problem.bounds[:, 0] >= self.shared, self.problem.bounds[:, 1] <= self.shared
-        return Slopes(
-            information[:, :own, :own],
-            information[:, :own, own:],
-            information[:, own:, own:].sum(axis=0),
-            score[:, :own],
-            shared_score,
-            ~((low & (shared_score < 0)) | (high & (shared_score > 0))),
-        )
-
-
-@dataclass(frozen=True)
-class Slopes:
-    """Score and information at a point.
-
-    Attributes:
-        own, border, common: blocks of the information: (n, P, P), (n, P, d), (d, d).
-        score, shared_score: gradients, shapes (n, P) and (d,).
-        free: shared parameters that may move, shape (d,).
-    """
-
-    own: FloatArray
-    border: FloatArray
-    common: FloatArray
-    score: FloatArray
-    shared_score: FloatArray
-    free: BoolArray
-
-    def step(self, damping: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the steps of own and shared parameters, and the rise promised in each pixel, nats."""
-        inverse = np.asarray(np.linalg.inv(_damped(self.own, damping)), np.float64)
-        own = np.einsum("nab,nb->na", inverse, self.score)
-        shared = np.zeros(self.free.size)
-        if self.free.any():
-            through, schur = self._reduced(inverse, float(damping.max()))
-            right = self.shared_score[self.free] - np.einsum("nad,na->d", through, self.score)
-            shared[self.free] = np.linalg.lstsq(schur, right, rcond=1e-12)[0]
-            own -= np.einsum("nad,d->na", through, shared[self.free])
-        promised = 0.5 * (own * self.score).sum(axis=1)
-        promised += 0.5 * float(shared @ np.where(self.free, self.shared_score, 0.0)) / promised.size
-        return own, shared, promised
-
-    def covariance(self) -> tuple[FloatArray, FloatArray]:
-        """Return covariances of own, (n, P, P), and of shared parameters, (d, d), NaN for those at bounds.
-
-        That of the own parameters takes the shared ones as known.
-        """
-        still = np.zeros(self.own.shape[0])
-        inverse = np.asarray(np.linalg.inv(_damped(self.own, still)), np.float64)
-        found = np.full((self.free.size, self.free.size), np.nan)
-        if self.free.any():
-            found[np.ix_(self.free, self.free)] = np.linalg.pinv(
-                np.asarray(self._reduced(inverse, 0.0)[1]), rcond=1e-15
-            )
-        return inverse, found
-
-    def _reduced(self, inverse: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Eliminate the own parameters: return their answer to the shared ones, and the information left."""
-        border = self.border[:, :, self.free]
-        through = np.einsum("nab,nbd->nad", inverse, border)
-        common = self.common[np.ix_(self.free, self.free)]
-        schur = common * (1.0 + damping * np.eye(common.shape[0])) - np.einsum("nad,nae->de", border, through)
-        return through, schur
+    def expansion(self, counts: NDArray[np.integer]) -> Expansion:
+        """Return the log-likelihood of histograms, shape (n, B), to second order."""
+        kept, samples = self.problem.kept, self.problem.samples
+        seen, mass = np.where(kept, counts, 0), np.where(kept, np.exp(self.log_masses), 0.0)
+        score, information = score_and_information(self.derivatives, mass, seen)
+        information, score = samples.by_pixel(information, score)
+        value = (seen * self.log_masses).sum(axis=1).reshape(-1, samples.n).sum(axis=1)
+        return Expansion(value, score, information)
 
 
 def _damped(information: FloatArray, damping: FloatArray) -> FloatArray:

@@ -28,7 +28,13 @@ from pchem_pipeline.discrepancy.effort import MOST_LEARNT_FROM
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.arithmetic.significance import POSSIBLE
 from pchem_pipeline.model.fit.climb_numba import LEAST_STEP, MAX_LOG_EXPOSURE
-from pchem_pipeline.model.fit.shared import LOWEST_LOG_VARIANCE, to_parameters, to_theta
+from pchem_pipeline.model.fit.shared import (
+    LOWEST_LOG_VARIANCE,
+    Ascent,
+    Expansion,
+    to_parameters,
+    to_theta,
+)
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -41,6 +47,7 @@ _NEWTON_STEPS = 3  # of each pixel between two rounds of EM, and in the end
 _LAST_STEPS = 8
 _SETTLED = 0.02  # nats: a smaller rise of the marginal likelihood per pixel ends the rounds
 _LARGEST_STEP = np.array([0.7, 0.15, 0.5, 0.8])  # of theta at once; of mu in DN per electron
+_RISE = 1e-3  # nats per pixel: a smaller one ends the steps
 # scatters below which pixels are alike for all purposes: of log H, log 1/g, mu (DN), log sigma_R^2
 _LEAST_SCATTER = np.array([2e-3, 2e-4, 5e-3, 2e-3])
 _LOWEST_LOG_EXPOSURE = float(np.log(1e-5))
@@ -213,9 +220,8 @@ def posterior_of_estimates(parameters: FloatArray, covariance: FloatArray) -> Po
     information = np.zeros((1, *covariance.shape))
     information[0, known] = np.linalg.inv(error[known] + 1e-12 * np.eye(4))
     shape = (1, len(theta))
-    maxima = _Maxima(
-        theta[None], np.zeros(shape), np.zeros((*shape, 4)), information, np.ones(len(theta)), parabolic=True
-    )
+    parabolas = Expansion(np.zeros(shape), np.zeros((*shape, 4)), information)
+    maxima = _Maxima(theta[None], parabolas, np.ones(len(theta)), parabolic=True)
     return maxima.posterior(_expectation_maximisation(maxima, population))
 
 
@@ -233,8 +239,8 @@ class _Pixels:
         replaced = None if self.replaced is None else self.replaced.of(some)
         return _Pixels(self.counts[some], self.origin[some], self.law.of(some), replaced)
 
-    def parabolas(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return log-likelihood (n,), score (n, 4) and Fisher's information (n, 4, 4) at theta (n, 4)."""
+    def expansion(self, theta: FloatArray) -> Expansion:
+        """Return the log-likelihood about theta (n, 4), with Fisher's information."""
         own = to_parameters(theta)
         columns = [np.ascontiguousarray(column) for column in own.T]
         value, score, information = sample_parabolas(
@@ -244,31 +250,26 @@ class _Pixels:
         score[:, 1] /= own[:, 1]
         information[:, 1] /= own[:, 1, None]
         information[:, :, 1] /= own[:, 1, None]
-        return value, score, information
+        return Expansion(value, score, information)
 
     def about(self, theta: FloatArray) -> _Maxima:
         """Return the parabolas about theta (j, n, 4)."""
         j, n = theta.shape[:2]
         theta = _inside(theta)
-        flat = self.of(np.tile(np.arange(n), j))
-        value, score, information = flat.parabolas(theta.reshape(-1, 4))
-        return _Maxima(
-            theta, value.reshape(j, n), score.reshape(j, n, 4), information.reshape(j, n, 4, 4), np.ones(n)
-        )
+        found = self.of(np.tile(np.arange(n), j)).expansion(theta.reshape(-1, 4))
+        return _Maxima(theta, found.shaped(j, n), np.ones(n))
 
 
 @dataclass
 class _Maxima:
-    """Parabolas of the log-likelihood about theta, shapes (j, n, ...), and each pixel's widening of T.
+    """The log-likelihood about theta (j, n, 4), shapes (j, n, ...), and each pixel's widening of T.
 
     ``evidence`` is the logarithm of each pixel's marginal likelihood as of the last solution, shape (n,);
     ``parabolic`` likelihoods are parabolas everywhere, so that one step arrives.
     """
 
     theta: FloatArray
-    value: FloatArray
-    score: FloatArray
-    information: FloatArray
+    expansion: Expansion
     widening: FloatArray
     evidence: FloatArray = field(default_factory=lambda: np.zeros(0))
     parabolic: bool = False
@@ -277,14 +278,14 @@ class _Maxima:
         """Return posterior mean (j, n, 4), covariance (j, n, 4, 4) and weight (j, n) under a population."""
         prior = np.linalg.inv(population.scatter)
         pull, off = prior / self.widening[:, None, None], self.theta - population.centre
-        precision = self.information + pull
+        precision = self.expansion.information + pull
         covariance = np.asarray(np.linalg.inv(precision), np.float64)
-        slope = self.score - np.einsum("nab,jnb->jna", pull, off)
+        slope = self.expansion.score - np.einsum("nab,jnb->jna", pull, off)
         step = np.einsum("jnab,jnb->jna", covariance, slope)
         promised, far = (slope * step).sum(axis=2), np.einsum("jna,nab,jnb->jn", off, pull, off)
         arrived, ends = self.parabolic | (promised < _ARRIVED), self.theta + step
         mean = np.where(arrived[:, :, None], ends, self.theta)
-        evidence = self.value + 0.5 * (promised - far - np.linalg.slogdet(precision)[1])
+        evidence = self.expansion.value + 0.5 * (promised - far - np.linalg.slogdet(precision)[1])
         counts = arrived.copy()
         counts[0] = True
         for j in range(1, len(counts)):
@@ -300,13 +301,9 @@ class _Maxima:
         weight = np.exp(evidence - evidence.max(axis=0))
         return mean, covariance, weight / weight.sum(axis=0)
 
-    @property
-    def _parabolas(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        return self.theta, self.value, self.score, self.information
-
     def _among(self, kinds: BoolArray | slice, pixels: NDArray[np.intp] | slice) -> _Maxima:
-        theta, value, score, information = (each[kinds][:, pixels] for each in self._parabolas)
-        return _Maxima(theta, value, score, information, self.widening[pixels])
+        expansion = self.expansion.of(kinds).of((slice(None), pixels))
+        return _Maxima(self.theta[kinds][:, pixels], expansion, self.widening[pixels])
 
     def of(self, some: NDArray[np.intp]) -> _Maxima:
         """Return those of some pixels."""
@@ -314,10 +311,9 @@ class _Maxima:
 
     def with_those(self, found: _Maxima, some: NDArray[np.intp]) -> _Maxima:
         """Return it with what was found for some pixels, if that has all kinds of maxima; changes it."""
-        if found.value.shape[0] < self.value.shape[0]:
-            return self
-        for old, own in zip(self._parabolas, found._parabolas, strict=True):
-            old[:, some] = own
+        if len(found.theta) == len(self.theta):
+            self.theta[:, some] = found.theta
+            self.expansion.put((slice(None), some), found.expansion)
         return self
 
     def likely(self, population: Population) -> _Maxima:
@@ -332,50 +328,37 @@ class _Maxima:
 
 
 def _climb(pixels: _Pixels, start: _Maxima, population: Population, steps: int) -> _Maxima:
-    """Find the posterior maxima near others (j, n) by damped scoring steps, each pixel by itself."""
-    j, n = start.value.shape
-    flat = pixels.of(np.tile(np.arange(n), j))
-    x, value = start.theta.reshape(-1, 4).copy(), start.value.ravel().copy()
-    score, information = start.score.reshape(-1, 4).copy(), start.information.reshape(-1, 4, 4).copy()
+    """Find the posterior maxima near others (j, n), each pixel by itself."""
+    j, n = start.theta.shape[:2]
+    flat, theta = pixels.of(np.tile(np.arange(n), j)), start.theta.reshape(-1, 4).copy()
     prior = np.linalg.inv(population.scatter)
 
-    def height(at: FloatArray, value: FloatArray) -> FloatArray:
-        off = at - population.centre
-        far = np.einsum("na,ab,nb->n", off, prior, off)
-        return np.asarray(value - 0.5 * (_TAILS + 4.0) * np.log1p(far / _TAILS))
+    def widened(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        off = theta - population.centre
+        return off, (_TAILS + np.einsum("na,ab,nb->n", off, prior, off)) / (_TAILS + 4.0)
 
-    top, share = height(x, value), np.ones(len(x))
-    for _ in range(steps):
-        active = np.flatnonzero(share > 1e-3)
-        if active.size == 0:
-            break
-        off = x[active] - population.centre
-        far = np.einsum("na,ab,nb->n", off, prior, off)
-        pull = prior / ((_TAILS + far) / (_TAILS + 4.0))[:, None, None]
-        slope = score[active] - np.einsum("nab,nb->na", pull, off)
-        step = np.linalg.solve(information[active] + pull, slope[:, :, None])[:, :, 0]
-        promised = 0.5 * (step * slope).sum(axis=1)
-        limit = np.tile(_LARGEST_STEP, (active.size, 1))
-        limit[:, 2] *= np.exp(x[active, 1])
-        step *= np.minimum(1.0, (limit / np.maximum(np.abs(step), 1e-300)).min(axis=1))[:, None]
-        trial = _inside(x[active] + share[active, None] * step)
-        some = flat.of(active)
-        new = some.parabolas(trial)
-        better = height(trial, new[0]) > top[active]
-        took = active[better]
-        x[took], value[took], score[took], information[took] = (
-            trial[better], new[0][better], new[1][better], new[2][better],
-        )  # fmt: skip
-        top[took] = height(x[took], value[took])
-        share[took] = np.minimum(1.0, 2.0 * share[took])
-        share[active[~better]] *= 0.3
-        share[active[promised < 1e-3]] = 0.0
-    off = x - population.centre
-    far = np.einsum("na,ab,nb->n", off, prior, off)
-    wide = ((_TAILS + far) / (_TAILS + 4.0)).reshape(j, n).min(axis=0)
-    return _Maxima(
-        x.reshape(j, n, 4), value.reshape(j, n), score.reshape(j, n, 4), information.reshape(j, n, 4, 4), wide
+    def times_prior(likelihood: Expansion, theta: FloatArray, power: float = 1.0) -> Expansion:
+        """Multiply by Student's t; its information is that of the Gaussian of the same slope."""
+        off, wide = widened(theta)
+        pull = power * prior / wide[:, None, None]
+        return Expansion(
+            likelihood.value - power * 0.5 * (_TAILS + 4.0) * np.log(wide),
+            likelihood.score - np.einsum("nab,nb->na", pull, off),
+            likelihood.information + pull,
+        )
+
+    ascent = Ascent(theta, np.zeros(0), times_prior(start.expansion.shaped(j * n), theta))
+    longest = np.tile(_LARGEST_STEP, (j * n, 1))
+    longest[:, 2] *= np.exp(theta[:, 1])
+    ascent.climb(
+        lambda theta, _, rows: times_prior(flat.of(rows).expansion(theta[rows]), theta[rows]),
+        (_inside(np.full_like(theta, -np.inf)), _inside(np.full_like(theta, np.inf))),
+        longest,
+        steps,
+        _RISE * j * n,
     )
+    found, wide = times_prior(ascent.expansion, theta, -1.0).shaped(j, n), widened(theta)[1]
+    return _Maxima(theta.reshape(j, n, 4), found, wide.reshape(j, n).min(axis=0))
 
 
 def _learn(pixels: _Pixels, start: _Maxima, population: Population) -> tuple[_Maxima, Population, float]:

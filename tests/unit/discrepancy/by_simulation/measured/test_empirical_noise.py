@@ -207,7 +207,7 @@ def test_it_is_found_beside_a_named_effect_and_closes_the_gap():
         return of_next_rows(rng) + 0.7 * rng.standard_normal((FRAMES, ROWS, 1))
 
     settings = DiscrepancySettings(candidates=("row_noise",), replicates=24, extended_replicates=12)
-    found = find_discrepancies(stack(41, hidden), settings=settings)
+    found = find_discrepancies(stack(42, hidden), settings=settings)
     verdict = found.verdict
     assert (verdict.verdict, verdict.effects) == ("described", ("row_noise",))
     effects = {effect.tag: effect for effect in found.model}
