@@ -7,15 +7,22 @@ from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
+
 from pchem_pipeline import __version__
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.base.kernel_cache import cache_folder
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.inspect import survey
+from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.reader import FrameReader, described
 from pchem_pipeline.frames.registry import reader_class, reader_names
 from pchem_pipeline.frames.resolve import HISTOGRAM_SUFFIXES
+from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
+
+_MOST_CODES_OF = 4_000_000  # samples whose codes are counted
 
 
 def about_program() -> list[str]:
@@ -46,7 +53,25 @@ def about_files(places: Sequence[Path]) -> Iterator[str]:
     by_path = {reader.paths[0]: reader for reader in readers}
     for entry in report.files:
         yield f"{entry.path}: {entry.problem or _reader_words(by_path[entry.path])}"
-    yield from report.notes
+    if not report.good:
+        yield from report.notes
+        return
+    try:
+        with open_frames(settings.model_copy(update={"on_bad_file": "skip"}), here, least=1) as frames:
+            yield _stack_words(frames)
+            yield from dict.fromkeys((*frames.notes, *frames.report.notes))
+    except InputError as error:
+        yield f"together no stack: {error}"
+
+
+def _stack_words(frames: FrameSequence) -> str:
+    """Return what the frames of all files are together."""
+    n, rows, columns = frames.shape
+    some = np.concatenate([frames.read(t, t + 1) for t in sorted({0, n // 2, n - 1})])
+    codes = np.unique(some.ravel()[:: 1 + some.size // _MOST_CODES_OF]).size
+    parts = [f"together {n} frames of {rows} x {columns}", f"DN {some.min()} to {some.max()} ({codes} codes)"]
+    parts += [frames.camera.words()] if frames.camera.words() else []
+    return ", ".join(parts)
 
 
 def _reader_words(reader: FrameReader) -> str:
@@ -55,4 +80,8 @@ def _reader_words(reader: FrameReader) -> str:
     depth = "bit depth not stated" if reader.bit_depth is None else f"{reader.bit_depth} bits"
     seconds = reader.integration_time
     time = "no exposure time" if seconds is None else f"exposure {seconds:g} s ({reader.time_words})"
-    return f"{described(type(reader))}, {n} frames of {rows} x {columns}, {reader.dtype}, {depth}, {time}"
+    size = f"{n} frames of {rows} x {columns}"
+    if reader.active is not None:
+        y0, y1, x0, x1 = reader.active
+        size += f" (light-sensitive: rows {y0} to {y1 - 1}, columns {x0} to {x1 - 1})"
+    return f"{described(type(reader))}, {size}, {reader.dtype}, {depth}, {time}"

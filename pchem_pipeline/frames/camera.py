@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from numbers import Integral
 from typing import Any, NamedTuple
@@ -21,6 +21,7 @@ _TEMPERATURES = ("sensor_temperature", "detector_temperature", "temperature")
 _TIMES = ("start_time", "acquisition_date", "date")
 _DURATIONS = ("integration_time", "exposure_time", "count_time")
 _DEPTHS = ("bit_depth", "bit_depth_readout")
+_SETUP = ("gain", "gain_setting", "readout_mode", "binning", "image_type")
 _UNIT_SUFFIXES = ("_units", "_unit")
 #: names of the unit of whatever time there is
 TIME_UNIT = re.compile(r"(time|exp\w*?|integration(_?time)?|count_?time)_?units?", re.IGNORECASE)
@@ -28,9 +29,11 @@ TIME_UNIT = re.compile(r"(time|exp\w*?|integration(_?time)?|count_?time)_?units?
 _DURATIONS_IN = {
     f"{name}_{unit}": unit for name in ("exposure", *_DURATIONS) for unit in ("s", "ms", "us", "ns")
 }
+#: what differs between dark and illuminated frames of one setting, too
+IMAGE_TYPES = ("image_type", "IMAGETYP")
 #: All of them.
 FACT_NAMES = (
-    *(*_NAMES, *_SERIALS, *_TEMPERATURES, *_TIMES, *_DURATIONS, *_DEPTHS, *_DURATIONS_IN),
+    *(*_NAMES, *_SERIALS, *_TEMPERATURES, *_TIMES, *_DURATIONS, *_DEPTHS, *_DURATIONS_IN, *_SETUP),
     *(name + suffix for name in (*_DURATIONS, *_TEMPERATURES) for suffix in _UNIT_SUFFIXES),
 )
 #: share by which two statements of one time may differ, printed with few digits
@@ -75,17 +78,20 @@ class CameraFacts:
         serial: serial number.
         temperature: of the sensor, degrees Celsius.
         taken: when the first frame was taken, s since 1970-01-01 UTC (a time without a zone counts as UTC).
+        setup: how the camera was set, by the names that the file has for it (gain, readout mode, binning).
     """
 
     name: str | None = None
     serial: str | None = None
     temperature: float | None = None
     taken: float | None = None
+    setup: Mapping[str, str] = field(default_factory=dict)
 
     def words(self) -> str:
-        """Return name, serial number and temperature in one line; empty where nothing is known."""
+        """Return all but the time in one line; empty where nothing is known."""
         parts = [self.name, f"serial number {self.serial}" if self.serial else None]
         parts.append(None if self.temperature is None else f"sensor at {self.temperature:.4g} °C")
+        parts += [f"{name} {value}" for name, value in self.setup.items()]
         return ", ".join(part for part in parts if part)
 
 
@@ -124,6 +130,16 @@ def text_of(value: Any) -> str | None:
         return None
     text = "".join(each if each.isprintable() else " " for each in str(value).split("\0")[0])
     return " ".join(text.split())[:_LONGEST] or None
+
+
+def texts_of(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, str]:
+    """Return some of the values as short texts, numbers included, by name."""
+    texts = {
+        name: f"{value:g}" if isinstance(value, float) else text_of(value)
+        for name in names
+        if (value := values.get(name)) is not None
+    }
+    return {name: text for name, text in texts.items() if text}
 
 
 def celsius(value: Any, unit: Any = "C") -> float | None:
@@ -256,6 +272,7 @@ def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None 
         first_of(text_of(values.get(name)) for name in _SERIALS),
         first_of(temperatures),
         first_of(seconds_of(values.get(name)) for name in _TIMES),
+        texts_of(values, _SETUP),
     )
     return StatedFacts(
         camera, agreed_duration(durations), first_of(bits_of(values.get(name)) for name in _DEPTHS)
@@ -282,6 +299,7 @@ def shared_facts(each: Iterable[CameraFacts]) -> tuple[CameraFacts, str]:
         _alike(one.serial for one in facts),
         math.fsum(known) / len(known) if whole else None,
         min(times, default=None),
+        {name: value for one in facts for name, value in one.setup.items()},
     )
     if whole and max(known) - min(known) > 1.0:
         return shared, (

@@ -50,13 +50,19 @@ _MARKER = (1 << 32) - 1
 
 
 def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> BoolArray:
-    """Return the pixels (y, x) that ``input.mask`` excludes, or that hold the marker at both ends of the run.
+    """Return the pixels (y, x) that ``input.mask`` excludes, overscan, and those with the camera's marker.
+
+    The marker is there in the first and the last frame.
 
     Raises:
         InputError: the mask is no image of the shape of the frames.
     """
     n, rows, columns = frames.shape
     excluded = np.zeros((rows, columns), np.bool_)
+    if frames.active is not None:
+        y0, y1, x0, x1 = frames.active
+        excluded[:] = True
+        excluded[y0:y1, x0:x1] = False
     if frames.dtype.itemsize == 4:
         first, last = (frames.stored(t, t + 1, 0, rows)[0] for t in (0, n - 1))
         excluded |= (first == _MARKER) & (last == _MARKER)

@@ -43,6 +43,8 @@ class FrameReader(ABC):
         integration_time: s, where the file says so.
         time_words: what the file states of it, and in what unit.
         camera: its name, serial number, temperature and time, as far as the file says.
+        active: first row, end of the rows, first column and end of the columns of the light-sensitive area,
+            where the file says so; the pixels around it are overscan.
         timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
         notes: remarks for the user on what was left out or assumed.
         byte_order: of the bytes of a sample, little or big, where ``input.byte_order`` decides it.
@@ -65,6 +67,7 @@ class FrameReader(ABC):
     integration_time: float | None = None
     time_words: str = ""
     camera: CameraFacts = CameraFacts()
+    active: tuple[int, int, int, int] | None = None
     timestamps: FloatArray | None = None
     notes: tuple[str, ...] = ()
     byte_order: str | None = None

@@ -66,8 +66,26 @@ class FrameSequence(FrameReader):
         self.rows_per_read = max(reader.rows_per_read for reader in readers)
         self.byte_order = readers[0].byte_order
         self.seen_limits: tuple[int | None, int | None] = (None, None)
+        self.active = self._own_active(readers)
         self.unwritten = any(reader.unwritten for reader in readers)
         self._set_facts(readers, settings, end)
+
+    def _own_active(self, readers: Sequence[FrameReader]) -> tuple[int, int, int, int] | None:
+        """Return the light-sensitive part of the region of interest; None: all, or all of it is overscan."""
+        active = {reader.active for reader in readers}
+        if len(active) > 1:
+            raise InputError(
+                f"{_where(self.paths)}: the files have different light-sensitive areas (TRIMSEC or DATASEC: "
+                f"{len(active)} of them); make one run of each"
+            )
+        (area,) = active
+        if area is None:
+            return None
+        rows, columns = self.shape[1:]
+        y0, y1 = (min(max(y - self._y0, 0), rows) for y in area[:2])
+        x0, x1 = (min(max(x - self._x0, 0), columns) for x in area[2:])
+        whole = (y0, y1, x0, x1) == (0, rows, 0, columns)
+        return None if whole or y0 == y1 or x0 == x1 else (y0, y1, x0, x1)
 
     def _set_facts(self, readers: Sequence[FrameReader], settings: InputSettings, end: int) -> None:
         """Take bit shift, bit depth, integration time and times from the settings, else from the files."""
@@ -245,10 +263,17 @@ def _where(paths: Sequence[Path]) -> str:
 
 
 def _check_same_camera(readers: Sequence[FrameReader]) -> None:
-    """Refuse files of different cameras: pixel by pixel, their frames are no samples of one law.
+    """Refuse files of different cameras or settings: their frames are no samples of one distribution.
 
-    A number that differs in each of many files counts files, not cameras.
+    A serial number that differs in each of many files counts files, not cameras.
     """
+    for name in dict.fromkeys(name for reader in readers for name in reader.camera.setup):
+        values = {
+            each.paths[0].name: each.camera.setup[name] for each in readers if name in each.camera.setup
+        }
+        if len(set(values.values())) > 1:
+            shown = _first_of_each(values, f"{name} = ")
+            raise InputError(f"the files were taken with different settings: {shown}; make one run of each")
     serials = {reader.paths[0].name: reader.camera.serial for reader in readers if reader.camera.serial}
     distinct = set(serials.values())
     if len(distinct) > 1 and not 2 < len(readers) == len(distinct):

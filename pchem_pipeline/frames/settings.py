@@ -129,8 +129,8 @@ class InputSettings(Section):
     mask: Place | None = Field(
         default=None,
         description="image file (npy, TIFF, FITS) with the shape of the frames or of roi, relative to this "
-        "YAML file: pixels other than 0 are excluded; pixels that always have the marker 2^32-1 are "
-        "excluded, too",
+        "YAML file: pixels other than 0 are excluded; so are overscan (FITS: TRIMSEC, DATASEC) and pixels "
+        "that always have the marker 2^32-1",
     )
     roi: tuple[int, int, int, int] | None = Field(
         default=None, description="region of interest [y0, y1, x0, x1] in pixels, ends excluded; null: all"

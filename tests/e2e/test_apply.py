@@ -217,7 +217,22 @@ def test_frames_of_another_camera_or_temperature(lab, night):
     refused = lab("apply", "own.zarr", "other.tif", "--output", "out.zarr")
     assert (refused.code, refused.stderr.count("\n")) == (4, 1)
     assert "serial number 43, but the run has 42" in refused.stderr
-    night_file(lab, "warm.tif", camera="camera x", serial_number="42", sensor_temperature=-10)
+    replace(SensorInfo.read(store), camera=replace(camera, setup={"gain": "0", "image_type": "dark"})).write(
+        store
+    )
+    night_file(lab, "high.tif", gain=10)
+    refused = lab("apply", "own.zarr", "high.tif", "--output", "out.zarr")
+    assert (refused.code, refused.stderr.count("\n")) == (4, 1)
+    assert "taken with gain = 10, but the run with gain = 0; give a run of the same setting" in refused.stderr
+    night_file(
+        lab,
+        "warm.tif",
+        gain=0,
+        image_type="light",
+        camera="camera x",
+        serial_number="42",
+        sensor_temperature=-10,
+    )
     warm = lab.ok("apply", "own.zarr", "warm.tif", "--output", "out.zarr", "--what", "electrons")
     assert "-10 °C, but -20 °C in the characterisation" in warm.stderr
     assert "in the run" not in warm.stderr

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.frames.camera import IMAGE_TYPES
 from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.sensor import SensorInfo
@@ -109,12 +110,14 @@ def limits_of(frames: FrameSequence, sensor: SensorInfo) -> tuple[int, int] | No
 def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
     """Return remarks on frames of another camera or temperature, as far as the files say; none where alike.
 
+    Dark and illuminated frames are alike.
+
     Args:
         frames: to be calibrated.
         sensor: of the run.
 
     Raises:
-        InputError: both state a serial number, and these differ.
+        InputError: both state a serial number, gain, readout mode or binning, and these differ.
     """
     here, there = frames.camera, sensor.camera
     name = frames.paths[0]
@@ -123,6 +126,13 @@ def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
             f"{name}: camera with serial number {here.serial}, but the run has {there.serial}; give frames "
             "of the same camera, or a run of this camera"
         )
+    for setting, value in here.setup.items():
+        other = there.setup.get(setting, value)
+        if other != value and setting not in IMAGE_TYPES:
+            raise InputError(
+                f"{name}: taken with {setting} = {value}, but the run with {setting} = {other}; give a run "
+                "of the same setting"
+            )
     remarks = []
     if here.name and there.name and here.name.casefold() != there.name.casefold():
         remarks.append(f"camera {here.name}, but {there.name} in the run")

@@ -33,6 +33,7 @@ from pchem_pipeline.frames.camera import (
     first_of,
     seconds_of,
     text_of,
+    texts_of,
 )
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.kinds import check_coded, check_unpacked_size, chosen_pieces, full_window
@@ -48,6 +49,9 @@ _TOTAL_TIME_KEYWORDS = ("TELAPSE", "XPOSURE")
 _DEPTH_KEYWORDS = ("BITDEPTH", "ADCBITS")
 _CAMERA_KEYWORDS = ("CAMERA", "DETNAM", "DETECTOR", "INSTRUME")
 _SERIAL_KEYWORDS = ("SERIALNO", "SERNO", "SERIAL", "CAMSERNO", "DETSERNO")
+_SETUP_KEYWORDS = ("GAIN", "OFFSET", "READMODE", "READOUTM", "XBINNING", "YBINNING", "IMAGETYP")
+#: of these the first counts
+_SECTION_KEYWORDS = ("TRIMSEC", "DATASEC")
 _TEMPERATURE_KEYWORDS = ("CCD-TEMP", "DET-TEMP", "DETTEMP", "CCDTEMP", "SENSTEMP", "SET-TEMP")
 #: BITPIX -> BZERO of unsigned integers of that size
 _UNSIGNED_ZERO = {16: 1 << 15, 32: 1 << 31}
@@ -116,6 +120,8 @@ class FitsReader(ContiguousReader):
         duration = agreed_duration(map(time_of, _TIME_KEYWORDS)) or first_of(
             map(time_of, _TOTAL_TIME_KEYWORDS)
         )
+        sections = (header[name] for name in _SECTION_KEYWORDS for header in last if name in header)
+        self.active = first_of(_active(section, *self.shape[1:]) for section in sections)
         depths = (bits_of(header.get(name)) for header in last for name in _DEPTH_KEYWORDS)
         self.take_facts(StatedFacts(_camera(last), duration, first_of(depths)))
 
@@ -222,7 +228,17 @@ def _camera(headers: Sequence[Any]) -> CameraFacts:
         text_of(_keyword(headers, _SERIAL_KEYWORDS)[0]),
         celsius(hot, stated[0] if stated else "C"),
         seconds_of(taken),
+        texts_of({name: _keyword(headers, (name,))[0] for name in _SETUP_KEYWORDS}, _SETUP_KEYWORDS),
     )
+
+
+def _active(section: Any, rows: int, columns: int) -> tuple[int, int, int, int] | None:
+    """Return rows and columns of ``[x1:x2,y1:y2]``, counted from 1, both ends included; None if unusable."""
+    match = re.fullmatch(r"\s*\[(\d+):(\d+),(\d+):(\d+)\]\s*", str(section))
+    if match is None:
+        return None
+    x1, x2, y1, y2 = map(int, match.groups())
+    return (y1 - 1, y2, x1 - 1, x2) if 1 <= x1 <= x2 <= columns and 1 <= y1 <= y2 <= rows else None
 
 
 def _keyword(headers: Sequence[Any], names: Sequence[str]) -> tuple[Any, str]:

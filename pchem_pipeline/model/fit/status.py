@@ -121,7 +121,7 @@ MEANINGS: dict[FitStatus, str] = {
     FitStatus.BIAS_UNSURE: "bias not certain: in such pixels often off by one electron (1/g in DN)",
     FitStatus.WEAKLY_IDENTIFIED: "too few frames for this sensor's read noise: bias not certain, standard "
     "errors approximate",
-    FitStatus.EXCLUDED: "excluded by input.mask or the camera's marker",
+    FitStatus.EXCLUDED: "excluded by input.mask, as overscan, or by the camera's marker",
 }
 
 

@@ -24,8 +24,13 @@ def test_formats_effects_and_the_cache_are_listed(monkeypatch):
 def test_files_are_described_and_what_cannot_be_read_says_why(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack")
     (tmp_path / "b.tif").write_bytes(b"hello")
-    good, bad = info.about_files([tmp_path / "a.tif", tmp_path / "b.tif"])
+    good, bad, together = info.about_files([tmp_path / "a.tif", tmp_path / "b.tif"])
     assert "tiff (tifffile), 40 frames of 8 x 9, uint16, bit depth not stated, no exposure time" in good
     assert bad.startswith(f"{tmp_path / 'b.tif'}: ")
+    codes = np.unique(FRAMES[[0, 20, 39]])
+    assert together == f"together 40 frames of 8 x 9, DN {codes[0]} to {codes[-1]} ({codes.size} codes)"
     with pytest.raises(InputError, match="no such file"):
         list(info.about_files([tmp_path / "none.tif"]))
+    tifffile.imwrite(tmp_path / "c.tif", FRAMES[:, :, 1:], photometric="minisblack")
+    *_, together = info.about_files([tmp_path / "b.tif"])
+    assert together.startswith(f"{tmp_path / 'b.tif'}: ")

@@ -138,6 +138,25 @@ def test_files_of_two_cameras_are_no_stack(tmp_path):
         assert frames.camera.serial is None
 
 
+def test_files_of_two_settings_are_no_stack(tmp_path):
+    for i, gain in enumerate((0, 0, 10, 0)):
+        write_fits(
+            tmp_path / f"{i}.fits",
+            STACK[i],
+            GAIN=gain,
+            READMODE="fast",
+            IMAGETYP="DARK" if i < 3 else "LIGHT",
+        )
+    words = r"different settings: GAIN = 0 in 0\.fits, GAIN = 10 in 2\.fits; make one run of each"
+    with pytest.raises(InputError, match=words):
+        open_frames(InputSettings(files=("*.fits",)), tmp_path)
+    with pytest.raises(InputError, match=r"IMAGETYP = DARK in 0\.fits, IMAGETYP = LIGHT in 3\.fits"):
+        open_frames(InputSettings(files=("0.fits", "3.fits")), tmp_path)
+    with open_frames(InputSettings(files=("0.fits", "1.fits")), tmp_path) as frames:
+        assert frames.camera.setup == {"GAIN": "0", "READMODE": "fast", "IMAGETYP": "DARK"}
+        assert frames.camera.words() == "GAIN 0, READMODE fast, IMAGETYP DARK"
+
+
 @pytest.mark.parametrize(
     ("value", "unit", "found"),
     [

@@ -316,6 +316,39 @@ def test_unreadable_file(tmp_path, monkeypatch):
     not_opened(r"a\.npy: cannot be read \(Permission denied\)", tmp_path / "a.npy", format="npy")
 
 
+@pytest.mark.parametrize(
+    ("cards", "roi", "used"),
+    [
+        ({"DATASEC": "[3:8,1:5]"}, None, (0, 5, 2, 8)),
+        ({"DATASEC": "[1:8,1:6]", "TRIMSEC": "[3:8,2:6]"}, None, (1, 6, 2, 8)),
+        ({"DATASEC": "[3:8,1:5]"}, (1, 6, 1, 8), (0, 4, 1, 7)),
+        ({"DATASEC": "[1:8,1:6]"}, None, None),  # all
+        ({"DATASEC": "[3:8,1:6]"}, (0, 6, 0, 2), None),  # overscan alone is what is wanted
+        ({"DATASEC": "[3:9,1:6]"}, None, None),  # not of this image
+        ({"DATASEC": "whole"}, None, None),
+    ],
+)
+def test_overscan_is_excluded(tmp_path, cards, roi, used):
+    stack = np.arange(4 * 6 * 8, dtype=np.uint16).reshape(4, 6, 8)
+    write_fits(tmp_path / "a.fits", stack, **cards)
+    with opened(tmp_path / "a.fits", roi=roi) as frames:
+        assert frames.active == used
+        if used is None:
+            assert frames.excluded is None
+            return
+        y0, y1, x0, x1 = used
+        inside = np.zeros(frames.shape[1:], bool)
+        inside[y0:y1, x0:x1] = True
+        np.testing.assert_array_equal(frames.excluded, ~inside)
+
+
+def test_files_with_two_light_sensitive_areas_are_no_stack(tmp_path):
+    for i, columns in enumerate(("3:8", "1:8")):
+        write_fits(tmp_path / f"{i}.fits", np.full((4, 6, 8), i, np.uint16), DATASEC=f"[{columns},1:6]")
+    with pytest.raises(InputError, match="different light-sensitive areas"):
+        opened(tmp_path / "*.fits")
+
+
 def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path):
     stack = np.random.default_rng(4).integers(100, 4096, (9, 6, 8)).astype(np.uint32)
     stack[:, 2, 3] = stack[4, 5, 5] = 2**32 - 1
