@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
 from pchem_pipeline.frames.identity import content_identity, quick_identity
@@ -44,6 +44,7 @@ class FrameReader(ABC):
         time_words: what the file states of it, and in what unit.
         camera: its name, serial number, temperature and time, as far as the file says.
         timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
+        frame_stamps: number that the camera gave to each frame, (frames,), where the file says so.
         notes: remarks for the user on what was left out or assumed.
         byte_order: of the bytes of a sample, little or big, where ``input.byte_order`` decides it.
         unwritten: samples of the file were never written, and are read as a fill value.
@@ -66,6 +67,7 @@ class FrameReader(ABC):
     time_words: str = ""
     camera: CameraFacts = CameraFacts()
     timestamps: FloatArray | None = None
+    frame_stamps: IntArray | None = None
     notes: tuple[str, ...] = ()
     byte_order: str | None = None
     unwritten: bool = False
