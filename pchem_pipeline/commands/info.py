@@ -50,9 +50,11 @@ def about_files(places: Sequence[Path]) -> Iterator[str]:
 
 
 def _reader_words(reader: FrameReader) -> str:
-    """Return format, shape, type, bit depth and exposure time of a file, as far as it says."""
+    """Return format, shape, type, bit depth, exposure time and stamps of a file, as far as it says."""
     n, rows, columns = reader.shape
     depth = "bit depth not stated" if reader.bit_depth is None else f"{reader.bit_depth} bits"
     seconds = reader.integration_time
     time = "no exposure time" if seconds is None else f"exposure {seconds:g} s ({reader.time_words})"
-    return f"{described(type(reader))}, {n} frames of {rows} x {columns}, {reader.dtype}, {depth}, {time}"
+    stamped = {"frame stamps": reader.frame_stamps, "time stamps": reader.timestamps}
+    words = f"{described(type(reader))}, {n} frames of {rows} x {columns}, {reader.dtype}, {depth}, {time}"
+    return ", ".join([words, *(name for name, stamps in stamped.items() if stamps is not None)])
