@@ -14,6 +14,7 @@ from pchem_pipeline.frames.inspect import survey
 from pchem_pipeline.frames.resolve import mask_path
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.stamps import stamped_pixels
 
 
 def open_frames(
@@ -39,7 +40,15 @@ def open_frames(
     readers, report = survey(settings, base_dir, check_duplicates=check_duplicates)
     report.raise_if_refused(settings.on_bad_file)
     frames = FrameSequence(readers, settings, report, least)
-    frames.exclude(_excluded(frames, settings, base_dir))
+    excluded = _excluded(frames, settings, base_dir)
+    stamped = stamped_pixels(frames)
+    if stamped is not None and frames.within_region(stamped).any():
+        excluded |= frames.within_region(stamped)
+        report.notes.append(
+            f"{readers[0].paths[0].name}: {np.count_nonzero(stamped)} pixels from the first one on hold a "
+            "stamp that counts the frames, and no samples; excluded"
+        )
+    frames.exclude(excluded)
     if check_duplicates:
         report.notes += first_look(frames, settings)
     return frames
