@@ -117,12 +117,13 @@ class DcimgReader(ContiguousReader):
         frame_bytes = self._layout.frame_bytes
         starts = (self._layout.offsets + frame_bytes).tolist()
         self._check_end(starts[-1] + n_bytes)
+        numbers = np.empty((len(starts), 3), "<u4")
         with OpenedFile(self.paths[0], self._size) as file:
-            stamps = b"".join(file.read_bytes(start, _STAMP) for start in starts)
+            for line, start in zip(numbers, starts, strict=True):
+                file.read_into(line.data.cast("B"), start)
             apart = file.read_bytes(
                 starts[0] + _STAMP, len(_MARKER) if n_bytes == 32 or n_bytes >= 512 else 0
             )
-        numbers = np.frombuffer(stamps, "<u4").reshape(-1, 3)
         self._take_stamps(numbers[:, 0], numbers[:, 1:])
         row = self._marked_row() if apart else None
         if row is not None:
