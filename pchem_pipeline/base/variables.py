@@ -125,7 +125,7 @@ def _ends(group: str, names: tuple[str, ...]) -> list[Variable]:
 _ALL: list[Variable] = [
     *_table("""
 frames/dn | frame y x | * | DN | raw frames
-frames/excluded | y x | uint8 | 1 | 0 used, 1 excluded (mask, overscan, marker)
+frames/excluded | y x | uint8 | 1 | 0 used, 1 excluded (mask, overscan, marker, stamp)
 # counts per pixel; DN of bin b is origin + b
 histogram/counts | y x bin | * | 1 | number of frames with DN = origin + bin
 histogram/origin | y x | int32 | DN | DN of bin 0

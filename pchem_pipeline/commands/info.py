@@ -75,7 +75,7 @@ def _stack_words(frames: FrameSequence) -> str:
 
 
 def _reader_words(reader: FrameReader) -> str:
-    """Return format, shape, type, bit depth and exposure time of a file, as far as it says."""
+    """Return format, shape, type, bit depth, exposure time and stamps of a file, as far as it says."""
     n, rows, columns = reader.shape
     depth = "bit depth not stated" if reader.bit_depth is None else f"{reader.bit_depth} bits"
     seconds = reader.integration_time
@@ -84,4 +84,6 @@ def _reader_words(reader: FrameReader) -> str:
     if reader.active is not None:
         y0, y1, x0, x1 = reader.active
         size += f" (light-sensitive: rows {y0} to {y1 - 1}, columns {x0} to {x1 - 1})"
-    return f"{described(type(reader))}, {size}, {reader.dtype}, {depth}, {time}"
+    stamped = {"frame stamps": reader.frame_stamps, "time stamps": reader.timestamps}
+    names = [name for name, stamps in stamped.items() if stamps is not None]
+    return ", ".join([described(type(reader)), size, str(reader.dtype), depth, time, *names])

@@ -15,6 +15,7 @@ from pchem_pipeline.frames.reader import FrameReader, shared_notes
 from pchem_pipeline.frames.registry import detect_format, reader_class
 from pchem_pipeline.frames.resolve import resolve_files
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.stamps import stamp_notes
 
 
 @dataclass
@@ -98,6 +99,7 @@ def survey(
         _mark_duplicates(report.good)
     readers = [reader for entry, reader in opened if not entry.problem]
     report.notes += shared_notes(readers)
+    report.notes += stamp_notes(readers, settings.frame_range)
     report.notes += _gaps([entry.path for entry in report.files])
     return readers, report
 

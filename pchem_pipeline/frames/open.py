@@ -14,6 +14,7 @@ from pchem_pipeline.frames.inspect import survey
 from pchem_pipeline.frames.resolve import mask_path
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.stamps import stamped_pixels
 
 
 def open_frames(
@@ -50,9 +51,9 @@ _MARKER = (1 << 32) - 1
 
 
 def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> BoolArray:
-    """Return the pixels (y, x) that ``input.mask`` excludes, overscan, and those with the camera's marker.
+    """Return the pixels (y, x) that ``input.mask`` excludes, overscan, and those with a marker or a stamp.
 
-    The marker is there in the first and the last frame.
+    The marker is in the first and the last frame.
 
     Raises:
         InputError: the mask is no image of the shape of the frames.
@@ -63,6 +64,13 @@ def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) ->
         y0, y1, x0, x1 = frames.active
         excluded[:] = True
         excluded[y0:y1, x0:x1] = False
+    stamped = stamped_pixels(frames)
+    if stamped is not None and frames.within_region(stamped).any():
+        excluded |= frames.within_region(stamped)
+        frames.report.notes.append(
+            f"{frames.paths[0].name}: {np.count_nonzero(stamped)} pixels from the first one on hold a stamp "
+            "that counts the frames, and no samples; excluded"
+        )
     if frames.dtype.itemsize == 4:
         first, last = (frames.stored(t, t + 1, 0, rows)[0] for t in (0, n - 1))
         excluded |= (first == _MARKER) & (last == _MARKER)

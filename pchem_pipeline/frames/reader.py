@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
 from pchem_pipeline.frames.identity import content_identity, quick_identity
@@ -46,6 +46,7 @@ class FrameReader(ABC):
         active: first row, end of the rows, first column and end of the columns of the light-sensitive area,
             where the file says so; the pixels around it are overscan.
         timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
+        frame_stamps: number that the camera gave to each frame, (frames,), where the file says so.
         notes: remarks for the user on what was left out or assumed.
         byte_order: of the bytes of a sample, little or big, where ``input.byte_order`` decides it.
         unwritten: samples of the file were never written, and are read as a fill value.
@@ -69,6 +70,7 @@ class FrameReader(ABC):
     camera: CameraFacts = CameraFacts()
     active: tuple[int, int, int, int] | None = None
     timestamps: FloatArray | None = None
+    frame_stamps: IntArray | None = None
     notes: tuple[str, ...] = ()
     byte_order: str | None = None
     unwritten: bool = False

@@ -24,6 +24,7 @@ _OURS = {
     "hdf5": ("hdf5", "Hdf5Reader"),
     "zarr": ("omezarr", "ZarrReader"),
     "ser": ("ser", "SerReader"),
+    "dcimg": ("dcimg", "DcimgReader"),
     "raw": ("raw", "RawReader"),
 }
 #: first bytes of files that hold others -> what made them

@@ -174,6 +174,15 @@ class FrameSequence(FrameReader):
         _, rows, columns = self._readers[0].shape
         return rows, columns
 
+    def top_rows(self, n_frames: int, n_rows: int) -> NDArray[Any]:
+        """Return the first rows of the first frames as they are in the files, whatever the region."""
+        rows = min(n_rows, self.whole_shape[0])
+        return np.concatenate([reader.read(a, b, 0, rows) for reader, a, b, _ in self.pieces(0, n_frames)])
+
+    def within_region(self, image: BoolArray) -> BoolArray:
+        """Return the part of an image of whole frames that is in the region of interest."""
+        return image[self._y0 : self._y0 + self.shape[1], self._x0 : self._x1]
+
     @property
     def whole_frames(self) -> bool:
         """All rows and columns of the files are wanted."""

@@ -71,7 +71,7 @@ class InputSettings(Section):
     format: str = Field(
         default="auto",
         description="auto (from the content, then the suffix), raw, npy, tiff, fits, hdf5, zarr, ser, "
-        "histogram (ready-made histograms), or the name of a reader from a plug-in",
+        "dcimg, histogram (ready-made histograms), or the name of a reader from a plug-in",
     )
     mode: Literal["copy", "reference"] = Field(
         default="copy",

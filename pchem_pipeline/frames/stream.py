@@ -227,6 +227,7 @@ class HashedFrameStream(FrameStream):
         for part, (y0, _) in zip(parts, self.bands, strict=True):
             own = part[: end - first]
             unstore(own, layout.stored, layout.offset, hasher.path)
+            reader.put_right(own, first, y0)
             self._stack.check_bits(reader, own, y0)
 
     def _decode(self, parts: Sequence[NDArray[Any]], t0: int, ranges: Sequence[tuple[int, int]]) -> None:

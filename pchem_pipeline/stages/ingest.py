@@ -68,7 +68,9 @@ def run(context: StageContext) -> None:
     if reader.excluded is not None:
         context.store.write_array("frames/excluded", reader.excluded)
         number = np.count_nonzero(reader.excluded)
-        context.note(f"{number} of {reader.excluded.size} pixels excluded (mask, overscan or marker 2^32-1)")
+        context.note(
+            f"{number} of {reader.excluded.size} pixels excluded (mask, overscan, marker 2^32-1 or stamp)"
+        )
     keep_ingested(context)
     if settings.mode == "reference":
         _run_whole(context)

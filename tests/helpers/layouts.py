@@ -12,6 +12,7 @@ import numpy as np
 import tifffile
 import zarr
 from astropy.io import fits
+from helpers.dcimg_files import write_dcimg
 from numpy.typing import NDArray
 
 Stack = NDArray[Any]
@@ -128,6 +129,10 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path, Stack], None]]] = {
     "zarr, group": ("zarr", partial(zarr_array, grouped=True)),
     "zarr, group, version 2": ("zarr", partial(zarr_array, version=2, grouped=True)),
     "raw": ("raw", raw),
+    "dcimg": ("dcimg", write_dcimg),
+    "dcimg, version 7": ("dcimg", partial(write_dcimg, version=7)),
+    "dcimg, streamed": ("dcimg", partial(write_dcimg, version=0x2000000, row=0, footer=512)),
+    "dcimg, USB": ("dcimg", partial(write_dcimg, row=None, footer=16)),
 }
 
 

@@ -1,9 +1,9 @@
 """Frames that lie uncompressed in a file: read straight from their offsets into the caller's memory.
 
-Raw files, npy, SER, uncompressed TIFF and uncompressed FITS all come down to a table of byte offsets. Each
-call opens the file, reads by ``preadv`` and closes it: so threads do not disturb each other, a reader can
-be pickled, and thousands of files do not exhaust the file descriptors. The libraries of the formats read into
-arrays of their own.
+Raw files, npy, SER, DCIMG, uncompressed TIFF and uncompressed FITS all come down to a table of byte offsets.
+Each call opens the file, reads by ``preadv`` and closes it: so threads do not disturb each other, a reader
+can be pickled, and thousands of files do not exhaust the file descriptors. The libraries of the formats read
+into arrays of their own.
 """
 
 from __future__ import annotations
@@ -232,6 +232,10 @@ class ContiguousReader(FrameReader):
                 start = int(layout.offsets[t0 + first]) + skip
                 file.read_into(target[first * band : (first + count) * band], start)
         unstore(buffer, layout.stored, layout.offset, path)
+        self.put_right(buffer, t0, y0)
+
+    def put_right(self, buffer: NDArray[Any], t0: int, y0: int) -> None:
+        """Put samples right that are not where the layout says, in frames from t0 and rows from y0 on."""
 
     def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """Fill the buffer from a file without a layout, with samples as they are stored."""

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import tifffile
+from helpers.dcimg_files import write_dcimg
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.commands import info
@@ -24,6 +25,14 @@ def test_formats_effects_and_the_cache_are_listed(monkeypatch):
 def test_files_are_described_and_what_cannot_be_read_says_why(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack")
     (tmp_path / "b.tif").write_bytes(b"hello")
+    stamps = np.r_[5:45][np.r_[:30, 33:40]]
+    write_dcimg(tmp_path / "c.dcimg", FRAMES[:37], stamps=stamps)
+    described, _, note = info.about_files([tmp_path / "c.dcimg"])
+    words = (
+        "dcimg, 37 frames of 8 x 9, uint16, bit depth not stated, no exposure time, frame stamps, time stamps"
+    )
+    assert described == f"{tmp_path / 'c.dcimg'}: {words}"
+    assert "3 are missing (after frame 29)" in note
     good, bad, together = info.about_files([tmp_path / "a.tif", tmp_path / "b.tif"])
     assert "tiff (tifffile), 40 frames of 8 x 9, uint16, bit depth not stated, no exposure time" in good
     assert bad.startswith(f"{tmp_path / 'b.tif'}: ")

@@ -16,7 +16,10 @@ WINDOWS = [(0, 1, 0, 21), (2, 5, 3, 4), (1, 6, 15, 21), (5, 6, 20, 21), (0, 6, 4
 
 
 #: layouts without samples of 32 bits
-AT_MOST_16 = ("tiff, imagej", "tiff, imagej, time", "fits, HCOMPRESS_1")
+AT_MOST_16 = (
+    "tiff, imagej", "tiff, imagej, time", "fits, HCOMPRESS_1", "dcimg", "dcimg, version 7", "dcimg, streamed",
+    "dcimg, USB",
+)  # fmt: skip
 
 
 #: a layout of each way in which samples are stored
