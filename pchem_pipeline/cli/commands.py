@@ -18,7 +18,13 @@ if TYPE_CHECKING:
 
 @takes_command(without=("force", "dry_run", "roi"))
 def apply(
-    target: Target,
+    target: Annotated[
+        Path,
+        typer.Argument(
+            help="a config.yaml, the store of a run (run.zarr), or a folder of runs, of which the one of the "
+            "camera, setting and date of the frames is taken"
+        ),
+    ],
     frames: Annotated[list[str], typer.Argument(help="camera files, globs or folders of the same sensor")],
     output: Annotated[Path, typer.Option("--output", "-o", help="store, or folder of files, to write")],
     what: Annotated[
@@ -36,6 +42,9 @@ def apply(
         typer.Option(help="dataset of an HDF5, zarr or FITS file [default: as in the run]"),
     ] = None,
     format: Annotated[Literal["zarr", "tiff", "fits"], typer.Option(help="format of the output")] = "zarr",
+    max_age: Annotated[
+        float | None, typer.Option(min=0, help="folder of runs: days between run and frames at most")
+    ] = None,
     keep_modes: Annotated[
         bool,
         typer.Option(
@@ -52,9 +61,13 @@ def apply(
     With standard errors, a quality layer and provenance. Continues after an interruption.
     """
     from pchem_pipeline.commands.apply.apply import apply_to_frames
+    from pchem_pipeline.commands.apply.registry import finished_runs, run_for
     from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
     from pchem_pipeline.run.target import find_run
 
+    if target.is_dir() and finished_runs(target):
+        target, why = run_for(target, frames, max_age)
+        typer.echo(f"apply: calibrated with {target}, {why}", err=True)
     wanted = ApplySettings(kinds_of(what), prior, not keep_modes, format, dataset)
     for path in apply_to_frames(find_run(target), frames, output, wanted, replace(command, force=force)):
         typer.echo(path)

@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -223,7 +224,7 @@ def test_frames_of_another_camera_or_temperature(lab, night):
     night_file(lab, "high.tif", gain=10)
     refused = lab("apply", "own.zarr", "high.tif", "--output", "out.zarr")
     assert (refused.code, refused.stderr.count("\n")) == (4, 1)
-    assert "taken with gain = 10, but the run with gain = 0; give a run of the same setting" in refused.stderr
+    assert "gain = 10, but the run has 0; give a run of the same camera and setting" in refused.stderr
     night_file(
         lab,
         "warm.tif",
@@ -240,6 +241,39 @@ def test_frames_of_another_camera_or_temperature(lab, night):
     cold = lab.ok("apply", "own.zarr", "cold.tif", "--output", "cold.zarr", "--what", "electrons")
     assert "camera Camera Y, but Camera X in the run" in cold.stderr
     assert "°C" not in cold.stderr
+
+
+def test_the_run_of_a_folder_is_chosen_by_camera_setting_and_date(lab, night):
+    runs = lab.folder / "runs"
+    kinds = {
+        "old": ("42", "0", -20.0, 1), "new": ("42", "0", -20.0, 8), "high": ("42", "10", -20.0, 9),
+        "warm": ("42", "0", -10.0, 9), "other": ("43", "0", -20.0, 9),
+    }  # fmt: skip
+    for name, (serial, gain, temperature, day) in kinds.items():
+        shutil.copytree(night / "run.zarr", runs / f"{name}.zarr")
+        store = RunStore.open(runs / f"{name}.zarr", writable=True)
+        taken = datetime(2026, 1, day, tzinfo=UTC).timestamp()
+        camera = CameraFacts("Camera X", serial, temperature, taken, {"gain": gain})
+        replace(SensorInfo.read(store), camera=camera).write(store)
+    record = {"serial_number": "42", "gain": 0, "sensor_temperature": -20.5}
+    for date, name, words in (
+        ("2026-01-05", "old", "4.0 days before"), ("2026-01-09", "new", "1.0 days before"),
+        ("2025-12-30", "old", "2.0 days after"),
+    ):  # fmt: skip
+        night_file(lab, "dated.tif", date=date, **record)
+        done = lab.ok("apply", "runs", "dated.tif", "--output", f"{date}.zarr", "--what", "electrons")
+        assert f"calibrated with runs/{name}.zarr, taken {words} the frames" in done.stderr
+    refused = lab("apply", "runs", "dated.tif", "--output", "out.zarr", "--max-age", "1")
+    assert (refused.code, refused.stderr.count("\n")) == (4, 1)
+    assert "taken 2.0 days after the frames, more than --max-age 1" in refused.stderr
+    night_file(lab, "undated.tif", **record)
+    refused = lab("apply", "runs", "undated.tif", "--output", "out.zarr")
+    assert "without a date, so none of new.zarr, old.zarr can be chosen" in refused.stderr
+    night_file(lab, "set.tif", **(record | {"gain": 5}))
+    refused = lab("apply", "runs", "set.tif", "--output", "out.zarr")
+    assert (refused.code, refused.stderr.count("\n")) == (4, 1)
+    assert "no run in runs fits" in refused.stderr
+    assert "high.zarr: gain = 5, but the run has 10" in refused.stderr
 
 
 def applied(shell, rng, camera, exposure, n_frames, until, n_night):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.camera import IMAGE_TYPES
+from pchem_pipeline.frames.camera import IMAGE_TYPES, CameraFacts
 from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.sensor import SensorInfo
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
     from pchem_pipeline.frames.settings import InputSettings
     from pchem_pipeline.run.target import Target
+
+#: K; beyond it offset and dark current are others.
+MOST_WARMER = 2.0
 
 
 def open_like_run(
@@ -107,10 +110,29 @@ def limits_of(frames: FrameSequence, sensor: SensorInfo) -> tuple[int, int] | No
     return replace(sensor, bit_depth=depth, seen_limits=(low or run_low, high or run_high)).adc_limits
 
 
-def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
-    """Return remarks on frames of another camera or temperature, as far as the files say; none where alike.
+def unlike(here: CameraFacts, there: CameraFacts) -> str:
+    """Return in words how another camera, or another setting of it, took frames; empty: alike or not known.
 
     Dark and illuminated frames are alike.
+    """
+    if here.serial and there.serial and here.serial != there.serial:
+        return f"serial number {here.serial}, but the run has {there.serial}"
+    for setting, value in here.setup.items():
+        other = there.setup.get(setting, value)
+        if other != value and setting not in IMAGE_TYPES:
+            return f"{setting} = {value}, but the run has {other}"
+    return ""
+
+
+def warmer(here: CameraFacts, there: CameraFacts) -> float:
+    """Return by how much a sensor is warmer than another time, K; 0 where that is not known."""
+    if here.temperature is None or there.temperature is None:
+        return 0.0
+    return here.temperature - there.temperature
+
+
+def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
+    """Return remarks on frames of another camera or temperature, as far as the files say; none where alike.
 
     Args:
         frames: to be calibrated.
@@ -120,30 +142,17 @@ def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
         InputError: both state a serial number, gain, readout mode or binning, and these differ.
     """
     here, there = frames.camera, sensor.camera
-    name = frames.paths[0]
-    if here.serial and there.serial and here.serial != there.serial:
-        raise InputError(
-            f"{name}: camera with serial number {here.serial}, but the run has {there.serial}; give frames "
-            "of the same camera, or a run of this camera"
-        )
-    for setting, value in here.setup.items():
-        other = there.setup.get(setting, value)
-        if other != value and setting not in IMAGE_TYPES:
-            raise InputError(
-                f"{name}: taken with {setting} = {value}, but the run with {setting} = {other}; give a run "
-                "of the same setting"
-            )
+    if why := unlike(here, there):
+        raise InputError(f"{frames.paths[0]}: {why}; give a run of the same camera and setting")
     remarks = []
     if here.name and there.name and here.name.casefold() != there.name.casefold():
         remarks.append(f"camera {here.name}, but {there.name} in the run")
-    if here.temperature is not None and there.temperature is not None:
-        warmer = here.temperature - there.temperature
-        if abs(warmer) > 2.0:  # K: offset and dark current are others
-            remarks.append(
-                f"sensor temperature {here.temperature:.4g} °C, but {there.temperature:.4g} °C in the "
-                "characterisation: offset, gain and hot pixels may differ; use a characterisation at the "
-                "same temperature"
-            )
+    if abs(warmer(here, there)) > MOST_WARMER:
+        remarks.append(
+            f"sensor temperature {here.temperature:.4g} °C, but {there.temperature:.4g} °C in the "
+            "characterisation: offset, gain and hot pixels may differ; use a characterisation at the same "
+            "temperature"
+        )
     return remarks
 
 

@@ -1,0 +1,74 @@
+"""The run with which frames are to be calibrated, chosen from a folder of runs by what the files say."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+
+from pchem_pipeline.base.errors import InputError, StoreError
+from pchem_pipeline.commands.apply.source import MOST_WARMER, unlike, warmer
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.store.run_store import RunStore
+
+_DAY = 86_400.0  # s
+
+
+def finished_runs(folder: Path) -> dict[Path, SensorInfo]:
+    """Return the sensor of each run with a fit in a folder and in its folders, without damaged ones."""
+    found = {}
+    for path in sorted([*folder.glob("*.zarr"), *folder.glob("*/*.zarr")]):
+        with contextlib.suppress(StoreError):
+            store = RunStore.open(path)
+            if (record := store.records.read("fit")) is not None and record.finished:
+                found[path] = SensorInfo.read(store)
+    return found
+
+
+def run_for(folder: Path, files: Sequence[str], max_age: float | None) -> tuple[Path, str]:
+    """Return the run of a folder for some frames, and why it is the one.
+
+    Of the runs of the same camera, setting, temperature and pixels, the last before the frames were taken;
+    else the first after.
+
+    Args:
+        folder: with the stores of runs, or with folders that have them.
+        files: camera files, globs or folders.
+        max_age: days that may lie between run and frames; None: any number.
+
+    Raises:
+        InputError: no run fits, the one that fits is too old, or dates are needed and not known.
+    """
+    settings = InputSettings(files=tuple(files))
+    with open_frames(settings, Path.cwd(), check_duplicates=False, least=1) as frames:
+        name, camera, shapes = frames.paths[0], frames.camera, {frames.shape[1:], frames.whole_shape}
+    fitting, against = {}, []
+    for path, sensor in finished_runs(folder).items():
+        why = unlike(camera, sensor.camera)
+        if not {sensor.shape, sensor.whole} & shapes:
+            why = f"{sensor.ny} x {sensor.nx} pixels"
+        if abs(warmer(camera, sensor.camera)) > MOST_WARMER:
+            why = f"sensor at {sensor.camera.temperature:.4g} °C"
+        if why:
+            against.append(f"{path.name}: {why}")
+        else:
+            fitting[path] = sensor.camera.taken
+    if not fitting:
+        words = "; ".join(against) or "it has no finished run"
+        raise InputError(f"no run in {folder} fits {name} ({words}); characterise the camera in this setting")
+    if len(fitting) == 1 and max_age is None:
+        return next(iter(fitting)), "the only one of this camera and setting"
+    dated = [(taken - camera.taken, path) for path, taken in fitting.items() if taken and camera.taken]
+    if len(dated) < len(fitting):
+        listed = ", ".join(path.name for path in fitting)
+        raise InputError(f"{name}: files or runs without a date, so none of {listed} can be chosen; name one")
+    age, path = max((each for each in dated if each[0] <= 0.0), default=min(dated))
+    days = abs(age) / _DAY
+    words = f"{days:.1f} days {'before' if age <= 0.0 else 'after'} the frames"
+    if max_age is not None and days > max_age:
+        raise InputError(
+            f"{path}: taken {words}, more than --max-age {max_age:g}; characterise the camera again"
+        )
+    return path, f"taken {words}"
