@@ -271,11 +271,13 @@ def export(
     formats: Annotated[
         str,
         typer.Option(
-            "--format", help="fits, tiff, npz, csv (summary) and emva (table of EMVA 1288 quantities)"
+            "--format",
+            help="fits, tiff, npz, csv (summary), emva (table of EMVA 1288 quantities) and defects (table, "
+            "DS9 regions and mask of the pixels that are not ordinary)",
         ),
     ] = "fits,csv",
 ) -> None:
-    """Write maps as FITS, TIFF or npz, and a CSV summary."""
+    """Write maps as FITS, TIFF or npz, a CSV summary, and a list of defects."""
     from pchem_pipeline.commands.export import export_run
 
     for path in export_run(target, output, _listed(formats.lower(), "--format")):

@@ -1,4 +1,4 @@
-"""``pchem export``: the maps as FITS, TIFF or npz for other programs, and their summary as CSV."""
+"""``pchem export``: maps as FITS, TIFF or npz for other programs, their summary as CSV, and the defects."""
 
 from __future__ import annotations
 
@@ -8,18 +8,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pchem_pipeline.base.variables import Variable, variables_of
 from pchem_pipeline.commands.figures import check_formats, warn_if_old
 from pchem_pipeline.frames.formats.map_files import MapImage, write_fits, write_npz, write_tiff
-from pchem_pipeline.model.fit.status import MEANINGS
+from pchem_pipeline.model.fit.status import MEANINGS, words_of
+from pchem_pipeline.model.maps.defects import OPEN, Defect, Defects
 from pchem_pipeline.report.pages.emva import COLUMNS as EMVA_COLUMNS
 from pchem_pipeline.report.pages.emva import emva_rows
 from pchem_pipeline.run.target import Target, find_run, with_maps
+from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
-#: Formats that maps can be exported to, their CSV summary, and a table in the words of EMVA 1288.
-FORMATS = ("fits", "tiff", "npz", "csv", "emva")
+#: Formats that maps can be exported to, and tables: their summary, EMVA 1288, pixels that are not ordinary.
+_IMAGES, _TABLES = ("fits", "tiff", "npz"), ("csv", "emva", "defects")
+FORMATS = (*_IMAGES, *_TABLES)
 
 _COLUMNS = (
     "n_valid",
@@ -55,7 +60,7 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
     store = with_maps(target.stored())
     warn_if_old(target, ("maps",), "written in this state")
     written: list[Path] = []
-    images = _images(store) if set(formats) - {"csv", "emva"} else []
+    images = _images(store) if set(formats) & set(_IMAGES) else []
     for name in dict.fromkeys(formats):
         if name == "fits":
             sensor = target.sensor(store)
@@ -69,6 +74,8 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
             written += write_npz(folder / "maps.npz", images)
         elif name == "emva":
             written.append(_write_emva(folder, target, store))
+        elif name == "defects":
+            written += _write_defects(folder, stored_defects(store, target.config))
         else:
             written += _write_csv(folder, store)
     return written
@@ -107,8 +114,31 @@ def _write_emva(folder: Path, target: Target, store: RunStore) -> Path:
     """Write what an EMVA 1288 data sheet can take of the run."""
     config = target.config
     maps, status = store.at(group="maps"), store.read("fit/fit_status")
-    found = emva_rows(maps, status, config.input.kind, config.maps.outlier_sigmas)
+    defects = stored_defects(store, config)
+    found = emva_rows(maps, status, config.input.kind, defects, config.maps.outlier_sigmas)
     return _table(folder / "emva1288.csv", [list(EMVA_COLUMNS), *(row.cells() for row in found)])
+
+
+def _write_defects(folder: Path, found: Defects) -> list[Path]:
+    """Write the pixels that are not ordinary as a table, as regions for DS9, and as a mask."""
+    table = found.table
+    columns = [
+        [f"{value:.6g}" if np.isfinite(value) else "" for value in values]
+        if values.dtype.kind == "f"
+        else values
+        for values in table.values()
+    ]
+    # the centre of the first pixel of an image is (1, 1) there
+    boxes = [
+        f"box({x + 1},{y + 1},1,1) # text={{{words_of(Defect(int(found.kinds[y, x])))}}}"
+        for y, x in np.argwhere(found.kinds)
+    ]
+    regions = folder / "defects.reg"
+    write_atomic(regions, "\n".join(["# Region file format: DS9 version 4.1", "image", *boxes, ""]).encode())
+    bits = ", ".join(f"{int(kind)} {words_of(kind)}" for kind in Defect if kind not in OPEN)
+    mask = MapImage("defects", found.mask, "1", f"defects, as bits; 0: none known ({bits})")
+    rows = [list(table), *map(list, zip(*columns, strict=True))]
+    return [_table(folder / "defects.csv", rows), regions, *write_tiff(folder, [mask])]
 
 
 def _table(path: Path, rows: list[list[Any]]) -> Path:

@@ -32,8 +32,9 @@ from pchem_pipeline.report.figures.pixels import has_fit, pixels_chart
 from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_versions
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.run.target import Target, find_run
+from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.runner.session import run_status
+from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.report.pixels import bin_masses, pixel_fits, pixel_index
 from pchem_pipeline.stages.report.stored import read_histograms
@@ -42,6 +43,7 @@ from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
+    import pandas as pd
     import xarray as xr
 
     from pchem_pipeline.config.tree import RunConfig
@@ -237,6 +239,19 @@ class Run:
     def truth(self) -> xr.Dataset:
         """The true parameters of a simulated camera."""
         return self.group("truth")
+
+    def defects(self) -> pd.DataFrame:
+        """Return the pixels that are not ordinary, a row for each kind of each pixel.
+
+        Columns: ``x``, ``y`` (from 0), ``kind``; ``value`` with ``stderr`` in ``unit``, and ``usual``, the
+        median of the sensor; ``fit_status`` in words. ``pchem export --format defects`` writes the same.
+
+        Raises:
+            StoreError: the run has no maps yet.
+        """
+        import pandas as pd
+
+        return pd.DataFrame(stored_defects(with_maps(self._store), self.config).table)
 
     # -- what is done with the sensor ---------------------------------------------------------
 

@@ -90,6 +90,16 @@ class Setting:
 
 
 @dataclass(frozen=True)
+class DefectChange:
+    """A pixel whose kinds of defects differ: its place, and their names in one run and in the other."""
+
+    y: int
+    x: int
+    before: str
+    now: str
+
+
+@dataclass(frozen=True)
 class Pair:
     """A run compared with the first one.
 
@@ -104,7 +114,7 @@ class Pair:
         versions: versions of programs and algorithms that differ.
         changed: whether anything changed.
         changes: what changed, one sentence each.
-        hot_new, hot_gone: pixels (y, x) that are hot in the other alone, and in one alone.
+        defects: pixels with other defects in the other run.
     """
 
     one: RunFacts
@@ -118,8 +128,7 @@ class Pair:
     versions: Sequence[Setting] = ()
     changed: bool = False
     changes: Sequence[str] = ()
-    hot_new: Sequence[tuple[int, int]] = ()
-    hot_gone: Sequence[tuple[int, int]] = ()
+    defects: Sequence[DefectChange] = ()
 
 
 @dataclass(frozen=True)
@@ -132,8 +141,8 @@ class HistoryRow:
         temperature: of the sensor as its frames say, degrees Celsius; None where they do not.
         place: number that the label begins with, or days of the date; NaN where there is none.
         run: what its maps say.
-        hot_pixels: pixels far above the others in exposure, as in the report of the run.
-        hot_new, hot_gone: pixels (y, x) that are hot here and not in the first run, and the reverse.
+        defects: number of pixels of each kind of defect.
+        defects_changed: pixels with other defects than in the first run.
         flags: number of pixels that bear each word of ``fit_status``.
         effects: tags of its model.
         moved: map to number of pixels that moved since the first run; empty for that one itself.
@@ -146,9 +155,8 @@ class HistoryRow:
     temperature: float | None
     place: float
     run: RunFacts
-    hot_pixels: int = 0
-    hot_new: Sequence[tuple[int, int]] = ()
-    hot_gone: Sequence[tuple[int, int]] = ()
+    defects: Mapping[str, int] = field(default_factory=dict)
+    defects_changed: Sequence[DefectChange] = ()
     flags: Mapping[str, int] = field(default_factory=dict)
     effects: tuple[str, ...] = ()
     moved: Mapping[str, int] = field(default_factory=dict)
@@ -180,3 +188,12 @@ class Comparison:
     def changed(self) -> bool:
         """Whether anything changed in any of them."""
         return any(pair.changed for pair in self.pairs)
+
+
+def by_fate(changes: Sequence[DefectChange]) -> dict[str, list[DefectChange]]:
+    """Return the pixels with new defects, without those that they had, and with others."""
+    return {
+        "new": [each for each in changes if not each.before],
+        "gone": [each for each in changes if not each.now],
+        "of another kind": [each for each in changes if each.before and each.now],
+    }

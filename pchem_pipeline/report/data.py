@@ -23,6 +23,7 @@ from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus, flags_of
+from pchem_pipeline.model.maps.defects import Defects
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
 from pchem_pipeline.report.settings import Criteria
@@ -200,6 +201,7 @@ class ReportData:
         missing: part (maps, charge_rate, ensemble, nuced, electrons, components, methods) to the reason of
             its absence.
         discrepancy: what the model is missing, or None where nobody looked.
+        defects: pixels that are not ordinary; None without a fit.
         quick_look: checks of rows, columns, frames, neighbours, lags and codes; None without a fit.
         stability: figures of frames, rows and columns, made of sums as large as several maps; may be empty.
         inspector: returns maps and pixels to look at in the browser, which are asked for last; or None.
@@ -236,6 +238,7 @@ class ReportData:
     interval_level: float = 0.6827
     missing: Mapping[str, str] = field(default_factory=dict)
     discrepancy: DiscrepancyData | None = None
+    defects: Defects | None = None
     quick_look: QuickLook | None = None
     stability: Sequence[Figure] = ()
     inspector: Callable[[], InspectorData] | None = None

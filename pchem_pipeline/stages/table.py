@@ -112,9 +112,9 @@ _ALL = (
     ),
     Stage(
         "report",
-        version=5,
+        version=6,
         upstream=("histogram", "fit", "maps", "ensemble"),
-        settings=("report", "maps", "run.title", "run.allowed_failed_pixels"),
+        settings=("report", "maps", "run.title", "run.allowed_failed_pixels", "input.kind"),
         writes=(),
         run=f"{_HERE}.report.report:run",
         files=("report.html", "report.json", "discrepancy.html"),

@@ -16,6 +16,7 @@ from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.compare.compare import compare_runs, comparison_of
 from pchem_pipeline.commands.compare.history import history_csv
+from pchem_pipeline.commands.notebook import open_run
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.figures.compare import history_figures
@@ -23,6 +24,7 @@ from pchem_pipeline.report.pages.summary import criteria
 from pchem_pipeline.report.style.wording import percent
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.store.run_store import RunStore, stored_config
 
 
@@ -188,18 +190,22 @@ def test_the_history_of_a_camera(shell, copies, finished):
     assert float(rows[2]["conversion_gain_median"]) == pytest.approx(summary["median"])
     assert rows[0]["date"][:2] == "20"
     assert "flag_poor_fit" in rows[0]
-    assert rows[0]["hot_new"] == rows[0]["hot_gone"] == ""
-    assert set(rows[2]["hot_new"].split()) >= {f"{y}/{x}" for y, x in places}
+    assert rows[0]["defects_new"] == rows[0]["defects_gone"] == ""
+    new = rows[2]["defects_new"].split()
+    assert set(new) >= {f"{y}/{x}" for y, x in places}
     known = exposure[np.isfinite(exposure)]
     data = report_data(exposure.shape)
     data = replace(
-        data, maps={**data.maps, "quanta_exposure": exposure}, fit={**data.fit, "fit_status": words}
+        data,
+        maps={**data.maps, "quanta_exposure": exposure},
+        fit={**data.fit, "fit_status": words},
+        defects=stored_defects(third, open_run(third.path).config),
     )
     share = next(each for each in criteria(data) if each.setting == "hot_pixels").found  # of the report
     assert share == percent(int(rows[2]["hot_pixels"]), known.size)
     page = Page((shell.folder / "history" / "compare.html").read_text(encoding="utf-8")).text
     assert "The camera over time" in page
-    assert f"Hot pixels : {len(rows[2]['hot_new'].split())} new, " in page
+    assert re.search(rf"Defects ?: {len(new)} new\b", page)
     assert "-20 C" in page
     for each in ({"labels": ["one"]}, {"rate": 0.0}):
         with pytest.raises(ConfigError, match="--"):

@@ -186,7 +186,10 @@ def test_light_levels_and_no_line(joint):
 
 def test_what_looks_at_a_run_looks_at_this_one(joint, tmp_path):
     shell = Shell(joint)
-    assert "maps.fits" in shell.ok("export", "dark.zarr", "-o", str(tmp_path), "--format", "fits,csv").stdout
+    assert (
+        "maps.fits"
+        in shell.ok("export", "dark.zarr", "-o", str(tmp_path), "--format", "fits,csv,defects").stdout
+    )
     assert "spurious_charge" in (tmp_path / "summary.csv").read_text()
     shutil.copytree(joint / "dark.zarr", joint / "same.zarr")
     here = ("-o", tmp_path)

@@ -5,6 +5,7 @@ import functools
 import numpy as np
 
 from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.model.maps.defects import Defects, Moments, find_defects
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.ensemble import case_name
 
@@ -128,6 +129,13 @@ CASES = tuple(
 )
 
 
+def defects_of(maps, status) -> Defects:
+    """Return the defects that maps show, without the moments of pixels whose gain is not known."""
+    nothing = np.empty(0)
+    moments = Moments(nothing.astype(np.int64), nothing.astype(np.int64), nothing, nothing, nothing)
+    return find_defects(maps, status, moments, None, light=False, sigmas=6.0)
+
+
 @functools.cache
 def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed: int = 1) -> ReportData:
     """A whole report of a sensor of which a share of the pixels failed."""
@@ -172,6 +180,7 @@ def report_data(shape: tuple[int, int] = (48, 64), *, failed: float = 0.01, seed
             "likelihood_gap": np.where(bad, np.nan, 300.0),
         },
         pixels=pixels,
+        defects=defects_of(maps, status),
         misfits={
             "tested": int((~bad).sum()),
             "misfits": 0,

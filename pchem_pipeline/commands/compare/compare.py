@@ -26,7 +26,7 @@ from pchem_pipeline.model.checks.run_differences import (
     reasons_of_change,
 )
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
-from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, RunFacts
+from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, RunFacts, by_fate
 from pchem_pipeline.report.pages.compare import (
     COMPARE_JSON,
     COMPARE_PAGE,
@@ -115,10 +115,7 @@ def comparison_of(
     for target, store in zip(targets, stores, strict=True):
         warn_if_old(target, ("fit", "maps", "ensemble"), f"{store.path} is compared in its present state")
     names = _told_apart([store.path for store in stores])
-    states = [
-        PixelStates.of(store, target.config.maps.outlier_sigmas)
-        for store, target in zip(stores, targets, strict=True)
-    ]
+    states = [PixelStates.of(store, target.config) for store, target in zip(stores, targets, strict=True)]
     runs = list(map(_facts, _letters(len(names)), names, stores, states))
     sides = list(zip(runs, targets, stores, states, strict=True))
     pairs = [_pair(sides[0], side, tolerance, rate, reporter) for side in sides[1:]]
@@ -194,14 +191,15 @@ def _pair(first: _Side, second: _Side, tolerance: float, rate: float, reporter: 
     arrays = _compared_arrays(one_store, other_store, tolerance, reporter) if same_data else []
     reasons = {} if same_data else {name: reasons_of_change(found) for name, found in maps.items()}
     words = _words(one, other, arrays, maps, reasons)
-    new, gone = now.new_since(before, confirm), before.new_since(now, confirm)
-    if new or gone:
-        words.append(f"Hot pixels: {len(new):,} new, {len(gone):,} gone.")
+    defects = now.changes_since(before, confirm)
+    if defects:
+        fates = (f"{len(each):,} {fate}" for fate, each in by_fate(defects).items() if each)
+        words.append(f"Defects: {', '.join(fates)}.")
     return Pair(
         one, other, same_data, arrays, maps, reasons, transitions,
         settings_that_differ(one_target.config, other_target.config),
         versions_that_differ(one_store, other_store),
-        bool(words), words, new, gone,
+        bool(words), words, defects,
     )  # fmt: skip
 
 

@@ -8,23 +8,28 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from pchem_pipeline.base.arrays import BoolArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
-from pchem_pipeline.model.fit.status import FitStatus, flags_of
-from pchem_pipeline.model.maps.maps import GOOD, hot_pixels
-from pchem_pipeline.report.comparison import HistoryRow, Pair, RunFacts
+from pchem_pipeline.model.fit.status import FitStatus, words_of
+from pchem_pipeline.model.maps.defects import FAULTS, Defect
+from pchem_pipeline.model.maps.maps import GOOD
+from pchem_pipeline.report.comparison import DefectChange, HistoryRow, Pair, RunFacts, by_fate
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.run_store import RunStore
+
+if TYPE_CHECKING:
+    from pchem_pipeline.config.tree import RunConfig
 
 
 def history_rows(
@@ -65,9 +70,8 @@ def history_rows(
                 camera.temperature,
                 _number(label) if labels else days,
                 run,
-                int(states[i].hot.sum()),
-                pairs[i - 1].hot_new if i else (),
-                pairs[i - 1].hot_gone if i else (),
+                states[i].defects(),
+                pairs[i - 1].defects if i else (),
                 states[i].flags(),
                 () if version is None else tuple(effect.tag for effect in version.effects),
                 moved,
@@ -102,47 +106,61 @@ class PixelStates:
     """What the pixels of a run are, as its report has them; maps of shape (y, x).
 
     Attributes:
-        hot: which are hot.
-        exposure, stderr: H and its error, e-.
+        kinds: faults, as bits.
+        exposure, noise: H and read noise, each with its error, e-.
         status: words of the fit.
         quality: good, caution or no value.
     """
 
-    hot: BoolArray
-    exposure: NDArray[np.floating]
-    stderr: NDArray[np.floating]
+    kinds: NDArray[np.integer]
+    exposure: tuple[FloatArray, FloatArray]
+    noise: tuple[FloatArray, FloatArray]
     status: NDArray[np.integer]
     quality: NDArray[np.integer]
 
     @classmethod
-    def of(cls, store: RunStore, sigmas: float) -> PixelStates:
-        """Read those of a run; ``sigmas`` is its ``maps.outlier_sigmas``."""
-        status = store.read("fit/fit_status")
-        names = ("quanta_exposure", "quanta_exposure_stderr", "quality")
-        exposure, stderr, quality = map(store.at(group="maps").__getitem__, names)
-        hot = hot_pixels(exposure, stderr, (status & int(flags_of("quanta_exposure"))) != 0, sigmas)
-        return cls(hot, exposure, stderr, status, quality)
+    def of(cls, store: RunStore, config: RunConfig) -> PixelStates:
+        """Read those of a run."""
+        maps = store.at(group="maps")
+        exposure, noise = (
+            (maps[name], maps[f"{name}_stderr"]) for name in ("quanta_exposure", "read_noise_e")
+        )
+        kinds = stored_defects(store, config).kinds & np.uint16(FAULTS)
+        return cls(kinds, exposure, noise, store.read("fit/fit_status"), maps["quality"])
+
+    def defects(self) -> dict[str, int]:
+        """Return how many pixels have each kind of fault."""
+        return {words_of(kind): int(((self.kinds & int(kind)) != 0).sum()) for kind in FAULTS}
 
     def flags(self) -> dict[str, int]:
         """Return how many pixels bear each word of the status."""
         return {str(bit.name).lower(): int(((self.status & int(bit)) != 0).sum()) for bit in FitStatus if bit}
 
-    def new_since(self, first: PixelStates, confirm: CommonFit | None = None) -> tuple[tuple[int, int], ...]:
-        """Return the places of hot ones that were not hot, unless H agrees within its error, if known.
+    def changes_since(self, first: PixelStates, confirm: CommonFit | None = None) -> tuple[DefectChange, ...]:
+        """Return the pixels whose faults differ, unless what these are seen in agrees within its error.
 
         Args:
             first: the pixels of an earlier run.
             confirm: p-values of pixels (y, x) for a common fit of both runs; None: not known.
         """
-        if self.hot.shape != first.hot.shape:
+        if self.kinds.shape != first.kinds.shape:
             return ()
-        error = np.hypot(np.nan_to_num(self.stderr), np.nan_to_num(first.stderr))
-        near = np.abs(self.exposure - first.exposure) <= LIMIT * error
-        y, x = np.nonzero(self.hot & ~first.hot & ~near)
+        changed = self.kinds ^ first.kinds
+        changed[_near(self.exposure, first.exposure)] &= np.uint16(~(Defect.HOT | Defect.DEAD) & FAULTS)
+        changed[_near(self.noise, first.noise)] &= np.uint16(~Defect.NOISY & FAULTS)
+        y, x = np.nonzero(changed)
         if confirm is not None and y.size:
             differs = ~(confirm(y, x) > erfc(LIMIT / np.sqrt(2.0)))
             y, x = y[differs], x[differs]
-        return tuple(zip(y.tolist(), x.tolist(), strict=True))
+        words = (words_of(Defect(int(kinds))) for each in (first, self) for kinds in each.kinds[y, x])
+        found = np.array([*words], np.str_).reshape(2, -1)
+        return tuple(map(DefectChange, y.tolist(), x.tolist(), *found.tolist()))
+
+
+def _near(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]) -> BoolArray:
+    """Tell which values agree within their errors, as far as these are known."""
+    error = np.hypot(np.nan_to_num(one[1]), np.nan_to_num(other[1]))
+    return np.asarray(np.abs(one[0] - other[0]) <= LIMIT * error)
 
 
 def _moved(pair: Pair, one: PixelStates, other: PixelStates) -> tuple[dict[str, int], int, int]:
@@ -175,9 +193,9 @@ def _csv_line(row: HistoryRow, maps: Sequence[str], moved: Sequence[str]) -> dic
         "frames": row.run.n_frames or "",
     }
     found |= dict(zip(("pixels_good", "pixels_caution", "pixels_no_value"), row.run.pixels, strict=True))
-    found["hot_pixels"] = row.hot_pixels
-    for name, places in (("hot_new", row.hot_new), ("hot_gone", row.hot_gone)):
-        found[name] = " ".join(f"{y}/{x}" for y, x in places)
+    found |= {f"{kind}_pixels": n for kind, n in row.defects.items()}
+    for fate, changes in by_fate(row.defects_changed).items():
+        found[f"defects_{fate.replace(' ', '_')}"] = " ".join(f"{each.y}/{each.x}" for each in changes)
     for name in maps:
         values = row.run.summary.get(name, (float("nan"),) * 3)
         for part, value in zip(("median", "median_stderr", "scatter"), values, strict=True):

@@ -14,7 +14,7 @@ from pchem_pipeline.store.run_store import RunStore
 #: Settings that decide results by another way than a stage's list.
 _BESIDE = {
     "input.integration_time": ("maps",),
-    "input.kind": ("maps",),
+    "input.kind": ("maps", "report"),
     "input.files": ("ingest",),
     "input.samples": ("fit",),
     "model.effects": ("fit",),

@@ -139,3 +139,13 @@ def describe(word: int) -> str:
     """
     sentences = [meaning for bit, meaning in MEANINGS.items() if word & bit]
     return "; ".join(sentences) if sentences else "good fit"
+
+
+def words_of(flags: IntFlag) -> str:
+    """Return the names of all bits that are set, in lower case, joined by spaces; of none the name of 0.
+
+    Example:
+        >>> words_of(FitStatus(2 + 128))
+        'too_few_bins adc_limit'
+    """
+    return " ".join(str(bit.name).lower() for bit in flags) or (flags.name or "").lower()

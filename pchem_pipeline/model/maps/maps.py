@@ -129,25 +129,6 @@ def electron_shifts(
     return m, probability
 
 
-def hot_pixels(
-    quanta_exposure: FloatArray, stderr: FloatArray, flagged: BoolArray, sigmas: float
-) -> BoolArray:
-    """Tell which pixels are hot: H above the median by more than so many ``1.4826 MAD`` of unflagged pixels.
-
-    And by more than so many of its own standard errors: a flagged pixel may be hot, but not by the electrons
-    that it is open by.
-
-    Args:
-        quanta_exposure: H, e-; NaN where there is no value.
-        stderr: of the map of H, e-, same shape.
-        flagged: pixels that do not count for median and MAD, same shape.
-        sigmas: ``maps.outlier_sigmas``.
-    """
-    counted = Ordered.of(quanta_exposure, flagged)
-    spread = np.fmax(counted.robust_sd, stderr)
-    return np.asarray(quanta_exposure > counted.median + sigmas * spread)
-
-
 def quality_map(fit_status: NDArray[np.integer[Any]], conversion_gain: FloatArray) -> NDArray[np.uint8]:
     """Grade the pixels: ``GOOD``, ``CAUTION`` (any word in the status) or ``NO_VALUE`` (parameters are NaN).
 

@@ -84,8 +84,8 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
 def ensembles_figures(runs: Sequence[RunFacts]) -> Iterator[Figure]:
     """Return the ensembles of runs over each other, where at least two have one."""
     runs = [run for run in runs if "density" in run.ensemble]
-    tables = ensemble_tables(runs)
-    if len(runs) < 2 or not tables:
+    tables = ensemble_tables(runs) if len(runs) > 1 else ()
+    if not tables:
         return
     highest = (run.ensemble["dn"][int(np.argmax(run.ensemble["density"]))] for run in runs)
     peaks = ", ".join(f"{run.title}: {int(dn)} DN" for run, dn in zip(runs, highest, strict=True))

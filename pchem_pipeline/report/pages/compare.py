@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pchem_pipeline.base.plain import plain
-from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting
+from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting, by_fate
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, draw_here, render_page
@@ -32,6 +32,8 @@ COMPARE_VERSION = 1
 
 #: At most so many sentences on what changed are shown; the JSON has all.
 _MOST_WORDS = 12
+#: At most so many places are shown in a cell, and pixels in a table; files have all.
+_MOST_PLACES, _MOST_PIXELS = 8, 100
 #: Of more runs than so many no maps are drawn pair by pair, and of the ensembles the last ones.
 _MOST_DRAWN = 8
 
@@ -171,6 +173,10 @@ def _pair_numbers(pair: Pair) -> dict[str, Any]:
             for name, each in pair.maps.items()
         },
         "quality_transitions": pair.transitions,
+        "defects": {
+            **{fate.replace(" ", "_"): len(each) for fate, each in by_fate(pair.defects).items()},
+            "pixels": [vars(each) for each in pair.defects],
+        },
         "arrays": [vars(row) for row in pair.arrays],
         "settings": [vars(setting) for setting in pair.settings],
         "versions": [vars(version) for version in pair.versions],
@@ -193,7 +199,7 @@ def history_table(found: Comparison) -> Table:
                 "°C": "" if row.temperature is None else f"{row.temperature:.4g}",
                 "run": row.run.title,
                 "good pixels": f"{row.run.pixels[0]:,}",
-                "hot": _hot_words(row),
+                "defects": _defect_words(row),
                 "flags": ", ".join(f"{name}: {n:,}" for name, n in flagged.items()) or "none",
                 "effects": ", ".join(row.effects) or "none",
                 "changed": f"{row.any_moved:,} of {row.compared:,}" if row.compared else "",
@@ -210,14 +216,14 @@ def history_table(found: Comparison) -> Table:
     )
 
 
-def _hot_words(row: HistoryRow) -> str:
-    """Return the number of hot pixels, and where they differ from those of the first run."""
-    parts = [f"{row.hot_pixels:,}"]
-    for word, places in (("new", row.hot_new), ("gone", row.hot_gone)):
-        if places:
-            shown = ", ".join(f"({y}, {x})" for y, x in places[:8])
-            more = " …" if len(places) > 8 else ""  # all are in history.csv
-            parts.append(f"{len(places):,} {word}: {shown}{more}")
+def _defect_words(row: HistoryRow) -> str:
+    """Return the number of defects by kind, and where they differ from those of the first run."""
+    parts = [", ".join(f"{n:,} {kind}" for kind, n in row.defects.items() if n) or "none"]
+    for fate, changes in by_fate(row.defects_changed).items():
+        if changes:
+            shown = ", ".join(f"({each.y}, {each.x})" for each in changes[:_MOST_PLACES])
+            more = " …" if len(changes) > _MOST_PLACES else ""  # all are in history.csv
+            parts.append(f"{len(changes):,} {fate}: {shown}{more}")
     return "; ".join(parts)
 
 
@@ -246,7 +252,7 @@ def run_table(found: Comparison) -> Table:
 
 def pair_tables(pair: Pair) -> list[Table]:
     """Return the tables of a run against the first one; empty ones are left out."""
-    tables = (_map_table(pair), _transitions(pair), _settings(pair), _versions(pair))
+    tables = (_map_table(pair), _defects(pair), _transitions(pair), _settings(pair), _versions(pair))
     return [table for table in tables if table.rows]
 
 
@@ -277,6 +283,21 @@ def _map_table(pair: Pair) -> Table:
         "Differences of the maps",
         f"{pair.other.label} − {pair.one.label}, pixels with a good fit in both runs. {unit_words}",
         rows,
+    )
+
+
+def _defects(pair: Pair) -> Table:
+    shown = pair.defects[:_MOST_PIXELS]
+    rest = f" The first {len(shown)} of {len(pair.defects):,}." if len(shown) < len(pair.defects) else ""
+    return Table(
+        f"defects-{pair.other.label}",
+        "Defects that changed",
+        f"Kinds as in pchem export --format defects; all pixels: compare.json.{rest}",
+        [
+            {"y": f"{each.y}", "x": f"{each.x}"}
+            | {run.label: kinds or "none" for run, kinds in ((pair.one, each.before), (pair.other, each.now))}
+            for each in shown
+        ],
     )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, FloatArray
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
-from pchem_pipeline.model.maps.maps import hot_pixels
+from pchem_pipeline.model.maps.defects import Defects
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.style.wording import measured, short, unit_text
@@ -54,7 +54,8 @@ class EmvaRow:
 
 def emva_tables(data: ReportData) -> list[Table]:
     """Return the table of the report; of a line of channels or without values there is none."""
-    if data.shape[0] == 1 or data.mostly_flagged or not all(map(data.has_values, _NAMES)):
+    defects, known = data.defects, all(map(data.has_values, _NAMES))
+    if data.shape[0] == 1 or data.mostly_flagged or defects is None or not known:
         return []
     rows = [
         {
@@ -64,7 +65,7 @@ def emva_tables(data: ReportData) -> list[Table]:
             "definition here": row.definition_here,
             "difference to EMVA 1288": row.where_it_differs,
         }
-        for row in emva_rows(data.maps, data.status, data.kind, data.outlier_sigmas)
+        for row in emva_rows(data.maps, data.status, data.kind, defects, data.outlier_sigmas)
     ]
     return [
         Table(
@@ -77,13 +78,16 @@ def emva_tables(data: ReportData) -> list[Table]:
     ]
 
 
-def emva_rows(stored: Arrays, status: NDArray[Any], kind: str, outlier_sigmas: float = 6.0) -> list[EmvaRow]:
+def emva_rows(
+    stored: Arrays, status: NDArray[Any], kind: str, defects: Defects, outlier_sigmas: float = 6.0
+) -> list[EmvaRow]:
     """Return the table of a run; pixels without a value and flagged ones are left out.
 
     Args:
         stored: the maps with their standard errors by name, (y, x).
         status: status words of the fit, (y, x).
         kind: what made the charge: dark, light or unknown.
+        defects: pixels that are not ordinary.
         outlier_sigmas: robust standard deviations above the median H from which a pixel is hot.
     """
     kept = (status & int(FAILED | FLAGGED)) == 0
@@ -93,8 +97,7 @@ def emva_rows(stored: Arrays, status: NDArray[Any], kind: str, outlier_sigmas: f
         return values if values.size else np.full(1, np.nan)
 
     gain, exposure = of("conversion_gain"), stored["quanta_exposure"]
-    is_hot = hot_pixels(exposure, stored["quanta_exposure_stderr"], ~kept, outlier_sigmas)
-    hot = int(is_hot.sum()) / max(int(np.isfinite(exposure).sum()), 1)
+    hot = defects.counts().get("hot", 0) / max(int(np.isfinite(exposure).sum()), 1)
     unknown: tuple[float | None, float | None] = (None, None)
     response, current = unknown, unknown
     if kind == "light":

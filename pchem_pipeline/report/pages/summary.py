@@ -14,8 +14,8 @@ from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.checks.map_parts import Parts
-from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of
-from pchem_pipeline.model.maps.maps import hot_pixels
+from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of, words_of
+from pchem_pipeline.model.maps.defects import FAULTS, FEWEST, Defect
 from pchem_pipeline.report.data import ReportData, reasons_in
 from pchem_pipeline.report.style.ranges import finite
 from pchem_pipeline.report.style.wording import (
@@ -82,14 +82,12 @@ def _flagged_share(data: ReportData) -> _Found:
 
 def _hot(data: ReportData) -> _Found:
     """Return the share of hot pixels; a flagged one is hot, too, whatever electrons it is open by."""
-    if data.few_channels or not data.has_values("quanta_exposure"):
+    if data.few_channels or data.defects is None or not data.has_values("quanta_exposure"):
         return None
-    values, flagged = data.maps["quanta_exposure"], data.flagged_in("quanta_exposure")
-    if flagged[np.isfinite(values)].all():
+    known = np.isfinite(data.maps["quanta_exposure"])
+    if np.count_nonzero(known & ~data.flagged_in("quanta_exposure")) < FEWEST:
         return None
-    stderr = data.maps.get("quanta_exposure_stderr", np.zeros(data.shape))
-    hot = hot_pixels(values, stderr, flagged, data.outlier_sigmas)
-    return float(hot.sum() / np.isfinite(values).sum()), f"hot {data.noun}s"
+    return data.defects.counts().get("hot", 0) / int(known.sum()), f"hot {data.noun}s"
 
 
 def _outlying(data: ReportData) -> _Found:
@@ -366,6 +364,15 @@ def _spaced_codes(data: ReportData) -> Iterator[Flag]:
         yield Flag("serious", f"{text}: the samples look left-justified. Set input.bit_shift: {shift}.")
 
 
+def _defects(data: ReportData) -> Iterator[Flag]:
+    """Count the faults by kind."""
+    counts = {} if data.defects is None else data.defects.counts()
+    names = [words_of(kind) for kind in FAULTS | Defect.TELEGRAPH]
+    if found := [f"{counts[name]:,} {name}" for name in names if name in counts]:
+        listed = f"As a list: pchem export {data.typed_run} --format defects."
+        yield Flag("note", f"Defects: {', '.join(found)}. {listed}", "sensor")
+
+
 def _unfitted(data: ReportData) -> Iterator[Flag]:
     if missing := int(data.unfitted.sum()):
         few = missing <= data.allowed_failed * data.unfitted.size
@@ -533,8 +540,8 @@ def _conditions(data: ReportData) -> Iterator[Flag]:
 
 #: What looks for remarks; a further check is a further row.
 CHECKS: tuple[Callable[[ReportData], Iterator[Flag]], ...] = (
-    _spaced_codes, _levels, _failed_pixels, _unfitted, _flagged, _cautions, _parts, _goodness, _agreement,
-    _quick_look, _discrepancy, _conditions,
+    _spaced_codes, _levels, _failed_pixels, _defects, _unfitted, _flagged, _cautions, _parts, _goodness,
+    _agreement, _quick_look, _discrepancy, _conditions,
 )  # fmt: skip
 
 

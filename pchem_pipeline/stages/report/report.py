@@ -24,6 +24,7 @@ from pchem_pipeline.report.pages.summary import check_sentence
 from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.stage import WHOLE, StageContext, Unit
+from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.stages.quick_look import read_sums, run_quick_look
 from pchem_pipeline.stages.report.inspector import deciding_parameters, inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import (
@@ -124,7 +125,15 @@ def gather(
     stability = hand(functools.partial(stability_figures, sums))
     inspector = hand(lambda: _inspector(run, pixels()[1], max(1, threads - 1)))
     look = run_quick_look(run, sums)
-    return replace(run.data, pixels=pixels()[0], inspector=inspector, quick_look=look, stability=stability())
+    defects = stored_defects(store, config, run.data.maps) if "fit_status" in run.data.fit else None
+    return replace(
+        run.data,
+        pixels=pixels()[0],
+        inspector=inspector,
+        defects=defects,
+        quick_look=look,
+        stability=stability(),
+    )
 
 
 def _of_pixels(run: StoredRun, asked: Sequence[tuple[int, int]]) -> tuple[list[PixelFit], PixelSample]:

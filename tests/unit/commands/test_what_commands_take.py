@@ -13,7 +13,8 @@ from pchem_pipeline.commands.compare.history import PixelStates, history_csv
 from pchem_pipeline.commands.demo import hidden_effect, run_demo
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.framework.region import Region, When
-from pchem_pipeline.report.comparison import HistoryRow, RunFacts
+from pchem_pipeline.model.maps.defects import Defect
+from pchem_pipeline.report.comparison import DefectChange, HistoryRow, RunFacts, by_fate
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.store.records import StageRecord
@@ -40,14 +41,30 @@ def test_labels_are_no_formulas_of_a_spreadsheet():
     assert {line["run"] for line in csv.DictReader(history_csv(rows).splitlines())} == {"'=x.zarr"}
 
 
-def test_a_pixel_is_newly_hot_unless_its_exposure_agrees_within_the_errors_that_are_known():
-    exposure = np.array([[1.0, 6.0, 6.0, 60.0]])
-    nothing = np.zeros((2, 1, 4), np.uint8)
-    hot = PixelStates(exposure > 5.5, exposure, np.array([[0.1, 0.1, 0.1, np.nan]]), *nothing)
-    before = np.array([[1.0, 5.4, 1.0, 1.0]])
-    first = PixelStates(before > 5.5, before, np.full((1, 4), 0.1), *nothing)
-    assert hot.new_since(first) == ((0, 2), (0, 3))
-    assert first.new_since(hot) == ()
+def test_a_pixel_has_a_new_defect_unless_what_it_is_seen_in_agrees_within_the_errors_that_are_known():
+    def states(exposure, stderr, noise, kinds):
+        maps = [np.array([values], np.float64) for values in (exposure, stderr, noise, [0.01] * 5)]
+        nothing = np.zeros((2, 1, 5), np.uint8)
+        return PixelStates(np.array([kinds], np.uint16), (maps[0], maps[1]), (maps[2], maps[3]), *nothing)
+
+    hot, noisy, stuck = int(Defect.HOT), int(Defect.NOISY), int(Defect.STUCK)
+    first = states([1, 5.4, 1, 1, 6], [0.1] * 5, [0.2, 0.2, 0.2, 0.38, 0.2], [0, 0, 0, 0, hot])
+    now = states(
+        [1, 6, 6, 60, np.nan], [0.1, 0.1, 0.1, np.nan, np.nan], [0.4, 0.2, 0.2, 0.4, np.nan],
+        [noisy, hot, hot, hot | noisy, stuck],
+    )  # fmt: skip
+    changes = [(0, "", "noisy"), (2, "", "hot"), (3, "", "hot noisy"), (4, "hot", "stuck")]
+    assert now.changes_since(first) == tuple(DefectChange(0, *each) for each in changes)
+    back = first.changes_since(now)
+    assert [(each.x, each.now, each.before) for each in back] == changes
+    assert {fate: len(each) for fate, each in by_fate(back).items()} == {
+        "new": 0, "gone": 3, "of another kind": 1
+    }  # fmt: skip
+    # of the same histograms a common fit is as good
+    assert now.changes_since(first, lambda y, x: np.where(x == 2, 0.0, 1.0)) == (
+        DefectChange(0, 2, "", "hot"),
+    )
+    assert now.defects() == {"stuck": 1, "saturated": 0, "dead": 0, "hot": 3, "noisy": 2}
 
 
 @pytest.mark.parametrize(

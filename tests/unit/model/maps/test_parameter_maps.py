@@ -14,7 +14,6 @@ from pchem_pipeline.model.maps.maps import (
     NO_VALUE,
     derived_maps,
     electron_shifts,
-    hot_pixels,
     quality_map,
     status_counts,
     summarise,
@@ -113,16 +112,6 @@ def test_no_chance_of_being_off_where_the_gap_is_large():
     others = probability[4] / right[4]
     assert others[m == 1] == pytest.approx(np.exp(-2.0))
     assert others[m == -1] == pytest.approx(np.exp(2.0 - 1000 / 128))
-
-
-def test_hot_pixels_are_far_above_the_unflagged_ones():
-    values = np.array([1.0, 1.1, 0.9, 1.0, 1.2, 50.0, 60.0, np.nan])
-    flagged = np.array([0, 0, 0, 0, 0, 0, 1, 0], bool)
-    stderr = np.array([0.1, 0.1, 0.1, 0.1, np.nan, 3.0, 3.0, np.nan])
-    assert np.flatnonzero(hot_pixels(values, stderr, flagged, 6.0)).tolist() == [5, 6]
-    stderr[6] = 10.0  # it may be what the others are
-    assert np.flatnonzero(hot_pixels(values, stderr, flagged, 6.0)).tolist() == [5]
-    assert not hot_pixels(values, stderr, np.ones(8, bool), 6.0).any()
 
 
 def test_quality_follows_the_status():

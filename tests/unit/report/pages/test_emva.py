@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.report_material import defects_of
 
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.pages.emva import COLUMNS, emva_rows
@@ -36,7 +37,8 @@ class Maps:
 
     def rows(self, kind):
         maps = {name.removeprefix("maps/"): values.copy() for name, values in self.arrays.items()}
-        return emva_rows(maps, maps.pop("fit/fit_status"), kind)
+        status = maps.pop("fit/fit_status")
+        return emva_rows(maps, status, kind, defects_of(maps, status))
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,12 @@
 """The first screen: criteria, flagged pixels, what to type next, and what the quick look adds."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.report_material import report_data
+from helpers.report_material import defects_of, report_data
 
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook, graded
 from pchem_pipeline.effects.framework.effect import Effect
@@ -176,10 +177,13 @@ def test_the_exposure_of_several_samples_says_whose_it_is() -> None:
 def test_hot_pixels_are_counted_though_they_are_flagged() -> None:
     data = flagged(0.03)
     hot = np.where(data.flagged, 60.0, data.maps["quanta_exposure"])
-    found = criteria(replace(data, maps={**data.maps, "quanta_exposure": hot}))
+    maps = {**data.maps, "quanta_exposure": hot}
+    data = replace(data, maps=maps, defects=defects_of(maps, data.status))
+    found = criteria(data)
     share = next(each for each in found if each.setting == "hot_pixels")
     assert share.found.startswith("3")
     assert not share.met
+    assert any(re.match(r"Defects: \d+ hot, .* As a list: pchem export ", flag.text) for flag in flags(data))
 
 
 def test_next_is_what_the_run_lacks() -> None:
