@@ -10,6 +10,7 @@ import os
 import sys
 import threading
 import traceback
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -19,6 +20,7 @@ import typer
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ConfigError, ExitCode, PchEmError
 from pchem_pipeline.cli.commands import apply, methods, plan, twin
+from pchem_pipeline.cli.help import PlainCommand, PlainGroup
 from pchem_pipeline.cli.options import (
     Output,
     Progress,
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.stage import Command
 
 app = typer.Typer(
+    cls=PlainGroup,
     name="pchem",
     help="Characterise deep sub-electron read noise image sensors, pixel by pixel, with PCH-EM.",
     no_args_is_help=True,
@@ -45,21 +48,36 @@ app = typer.Typer(
 )
 
 
-def _stage_command(name: str, summary: str) -> None:
-    """Add the command of one stage; all stages take the same options."""
-
-    @takes_command()
-    def stage(target: Target, *, command: Command) -> None:
-        from pchem_pipeline.run.target import find_run
-        from pchem_pipeline.runner.session import run_stages
-
-        run_stages(find_run(target), [name], command)
-
-    stage.__doc__ = summary
-    app.command(name)(stage)
+def _command(heading: str, name: str | None = None) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Add a command below a heading of ``pchem --help``."""
+    return app.command(name, cls=PlainCommand, rich_help_panel=heading)
 
 
-@app.command()
+@_command("Run")
+def demo(
+    output: Output = Path("pchem-demo"),
+    size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,
+    frames: Annotated[int, typer.Option(min=16, help="number of frames")] = 4000,
+    seed: Annotated[int, typer.Option(min=0, help="random seed")] = 1,
+    hidden: Annotated[
+        str | None,
+        typer.Option(
+            help="hide this effect and search for it, such as row_noise, or row_noise@columns=40:50 in a "
+            "part of the sensor or run"
+        ),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Run all stages on a small simulated sensor.
+
+    Prints estimated and true parameters, and the path of the report.
+    """
+    from pchem_pipeline.commands.demo import run_demo
+
+    say(run_demo(output, size=size, n_frames=frames, seed=seed, hidden=hidden, quiet=quiet))
+
+
+@_command("Run")
 def init(
     path: Annotated[Path, typer.Argument(help="YAML file to write", callback=on_this_machine)] = Path(
         "config.yaml"
@@ -81,48 +99,13 @@ def init(
         typer.echo(written)
 
 
-@app.command()
-@takes_command(reads_files=True)
-def ingest(
-    target: Target,
-    append: Annotated[
-        bool,
-        typer.Option("--append", help="add new files to a finished run; reads only these"),
-    ] = False,
-    *,
-    given: dict[str, Any],
-    command: Command,
-) -> None:
-    """Check the camera files; copy or reference their frames."""
-    from pchem_pipeline.run.target import find_run
-    from pchem_pipeline.runner.session import cropped, run_stages
-
-    run = find_run(target)
-    if append and given:
-        raise ConfigError("--append: new files are read like the others; omit the options")
-    if append:
-        from pchem_pipeline.commands.append import append_frames
-
-        append_frames(run, command)
-    else:
-        run, command = cropped(run.changed("input", **given) if given else run, command)
-        run_stages(run, ["ingest"], command)
-
-
-for _stage in STAGES.values():
-    if _stage.summary:
-        _stage_command(_stage.name, _stage.summary)
-
-
-@app.command()
+@_command("Run")
 @takes_command(reads_files=True)
 def run(
     targets: Annotated[
         list[Path], typer.Argument(help="a config.yaml, a store, or camera files and folders")
     ],
-    store: Annotated[
-        Path | None, typer.Option(help="camera files: store of the run [default: run.zarr]")
-    ] = None,
+    store: Annotated[Path | None, typer.Option(help="store of a new run [default: run.zarr]")] = None,
     until: Annotated[
         str, typer.Option(help="last stage to run", metavar=f"[{'|'.join(pipeline())}]")
     ] = pipeline()[-1],
@@ -131,7 +114,7 @@ def run(
     given: dict[str, Any],
     command: Command,
 ) -> None:
-    """Run all stages, from camera files to report, and print the summary.
+    """Run all stages, from camera files to report.
 
     Stages that are up to date are skipped. stdout has the path of the report, stderr the rest.
     """
@@ -146,41 +129,7 @@ def run(
     run_to_first_screen(target, stages, command, typer.echo, is_new=is_new, strict=strict)
 
 
-@app.command()
-@takes_command(without=("roi",))
-def discrepancy(
-    target: Target,
-    refit: Annotated[
-        bool,
-        typer.Option(
-            "--refit/--no-refit",
-            help="add named effects to the model and run fit, maps, ensemble and report again",
-        ),
-    ] = True,
-    roi: Annotated[
-        str | None, typer.Option(help="search only in the pixels y0:y1,x0:x1 [default: all, or a window]")
-    ] = None,
-    effort: Annotated[
-        float | None,
-        typer.Option(help="factor on the search budget [default: discrepancy.effort]"),
-    ] = None,
-    *,
-    command: Command,
-) -> None:
-    """Search for effects missing from the model, and add what is found.
-
-    Compares the data with simulations of the fitted model. Named effects make a new version of the model.
-    """
-    from pchem_pipeline.commands.discrepancy import find_and_add
-    from pchem_pipeline.run.target import find_run
-
-    command = replace(command, roi=region_of(roi))
-    text = find_and_add(find_run(target), command, refit=refit, effort=effort)
-    if text:
-        say(text)
-
-
-@app.command()
+@_command("Run")
 @takes_command(without=("roi",))
 def joint(
     targets: Annotated[
@@ -209,13 +158,41 @@ def joint(
     run_to_first_screen(target, stages, command, typer.echo, is_new=is_new, strict=strict)
 
 
-app.command()(apply)
-app.command()(twin)
-app.command()(methods)
-app.command()(plan)
+@_command("Run")
+@takes_command(without=("roi",))
+def discrepancy(
+    target: Target,
+    refit: Annotated[
+        bool,
+        typer.Option(
+            "--refit/--no-refit",
+            help="add named effects to the model and run fit, maps, ensemble and report again",
+        ),
+    ] = True,
+    roi: Annotated[
+        str | None, typer.Option(help="search only in the pixels y0:y1,x0:x1 [default: all, or a window]")
+    ] = None,
+    effort: Annotated[
+        float | None,
+        typer.Option(help="factor on the search budget [default: discrepancy.effort]"),
+    ] = None,
+    *,
+    command: Command,
+) -> None:
+    """Search for effects missing from the model.
+
+    Compares the data with simulations of the fitted model. Effects found make a new version of the model.
+    """
+    from pchem_pipeline.commands.discrepancy import find_and_add
+    from pchem_pipeline.run.target import find_run
+
+    command = replace(command, roi=region_of(roi))
+    text = find_and_add(find_run(target), command, refit=refit, effort=effort)
+    if text:
+        say(text)
 
 
-@app.command()
+@_command("Look at results")
 def status(
     target: Target,
     watch: Annotated[bool, typer.Option("--watch", help="update until the running command ends")] = False,
@@ -230,23 +207,23 @@ def status(
     follow(find_run(target), write, follow=watch, as_json=as_json, terminal=terminal)
 
 
-@app.command()
+@_command("Look at results")
 def info(
     places: Annotated[list[Path] | None, typer.Argument(help="camera files and folders")] = None,
 ) -> None:
-    """List formats and effects, or show what camera files are."""
+    """List formats and effects, or describe camera files."""
     from pchem_pipeline.commands.info import about_files, about_program
 
     say("\n".join(about_files(places) if places else about_program()))
 
 
-@app.command()
+@_command("Look at results")
 def model(
     target: Target,
     use: Annotated[int | None, typer.Option(min=1, help="use this version")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="one line of JSON")] = False,
 ) -> None:
-    """List the versions of the model and the results of each; go back to one.
+    """List the versions of the model, or go back to one.
 
     A version comes from the section model of the YAML or from pchem discrepancy.
     """
@@ -264,7 +241,67 @@ def model(
             say("\n".join(model_lines(models)))
 
 
-@app.command()
+@_command("Look at results")
+def view(
+    target: Target,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free port")] = 0,
+    show: Annotated[bool, typer.Option("--open/--no-open", help="open the browser")] = False,
+) -> None:
+    """Show the report with every pixel in the browser.
+
+    A server on this computer, which only reads the run. End it with Ctrl-C.
+    """
+    from pchem_pipeline.commands.view import serve
+
+    def ready(address: str) -> None:
+        typer.echo(address)
+        if show:
+            typer.launch(address)
+
+    serve(target, port, ready)
+
+
+@_command("Look at results")
+def compare(
+    runs: Annotated[list[Path], typer.Argument(help="two runs or more; the first is the reference")],
+    output: Output = Path("compare"),
+    tolerance: Annotated[
+        float, typer.Option(help="same frames: relative difference counted as rounding")
+    ] = 1e-12,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="label of a run in the history, such as a setpoint; once per run, in the same order: its "
+            "number is the axis [default: dates of the files]"
+        ),
+    ] = None,
+    fdr: Annotated[
+        float, typer.Option(help="false-discovery rate for pixels that changed since the first run")
+    ] = 0.01,
+    progress: Progress = "auto",
+) -> None:
+    """Compare runs and write their history.
+
+    Runs on the same frames are compared value by value, others in standard errors. Exit code 3: changed.
+    """
+    from pchem_pipeline.commands.compare.compare import compare_runs
+
+    for path in compare_runs(
+        runs,
+        output,
+        tolerance=tolerance,
+        labels=label or (),
+        rate=fdr,
+        progress=progress,
+    ):
+        typer.echo(path)
+
+
+_command("Look at results")(methods)
+_command("Use results")(apply)
+
+
+@_command("Use results")
 def export(
     target: Target,
     output: Output = Path("export"),
@@ -284,7 +321,7 @@ def export(
         typer.echo(path)
 
 
-@app.command()
+@_command("Use results")
 def figures(
     target: Target,
     output: Output = Path("figures"),
@@ -320,84 +357,55 @@ def _listed(text: str, option: str) -> tuple[str, ...]:
     return names
 
 
-@app.command()
-def view(
+_command("Use results")(twin)
+_command("Plan")(plan)
+
+
+def _stage_command(name: str, summary: str) -> None:
+    """Add the command of one stage; all stages take the same options."""
+
+    @takes_command()
+    def stage(target: Target, *, command: Command) -> None:
+        from pchem_pipeline.run.target import find_run
+        from pchem_pipeline.runner.session import run_stages
+
+        run_stages(find_run(target), [name], command)
+
+    stage.__doc__ = summary
+    _command("Stages of a run", name)(stage)
+
+
+@_command("Stages of a run")
+@takes_command(reads_files=True)
+def ingest(
     target: Target,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port to listen on; 0: any free port")] = 0,
-    show: Annotated[bool, typer.Option("--open/--no-open", help="open the browser")] = False,
+    append: Annotated[
+        bool,
+        typer.Option("--append", help="add new files to a finished run; reads only these"),
+    ] = False,
+    *,
+    given: dict[str, Any],
+    command: Command,
 ) -> None:
-    """Show the report with every pixel in the browser, from a server on this computer.
+    """Check the camera files; copy or reference their frames."""
+    from pchem_pipeline.run.target import find_run
+    from pchem_pipeline.runner.session import cropped, run_stages
 
-    Only reads the run. End it with Ctrl-C.
-    """
-    from pchem_pipeline.commands.view import serve
+    run = find_run(target)
+    if append and given:
+        raise ConfigError("--append: new files are read like the others; omit the options")
+    if append:
+        from pchem_pipeline.commands.append import append_frames
 
-    def ready(address: str) -> None:
-        typer.echo(address)
-        if show:
-            typer.launch(address)
-
-    serve(target, port, ready)
-
-
-@app.command()
-def compare(
-    runs: Annotated[list[Path], typer.Argument(help="two runs or more; the first is the reference")],
-    output: Output = Path("compare"),
-    tolerance: Annotated[
-        float, typer.Option(help="same frames: relative difference counted as rounding")
-    ] = 1e-12,
-    label: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="label of a run in the history, such as a setpoint; once per run, in the same order: its "
-            "number is the axis [default: dates of the files]"
-        ),
-    ] = None,
-    fdr: Annotated[
-        float, typer.Option(help="false-discovery rate for pixels that changed since the first run")
-    ] = 0.01,
-    progress: Progress = "auto",
-) -> None:
-    """Compare runs and write their history; exit code 3 if something changed.
-
-    Runs on the same frames are compared value by value, others in standard errors.
-    """
-    from pchem_pipeline.commands.compare.compare import compare_runs
-
-    for path in compare_runs(
-        runs,
-        output,
-        tolerance=tolerance,
-        labels=label or (),
-        rate=fdr,
-        progress=progress,
-    ):
-        typer.echo(path)
+        append_frames(run, command)
+    else:
+        run, command = cropped(run.changed("input", **given) if given else run, command)
+        run_stages(run, ["ingest"], command)
 
 
-@app.command()
-def demo(
-    output: Output = Path("pchem-demo"),
-    size: Annotated[int, typer.Option(min=8, help="rows and columns of the simulated sensor")] = 64,
-    frames: Annotated[int, typer.Option(min=16, help="number of frames")] = 4000,
-    seed: Annotated[int, typer.Option(min=0, help="random seed")] = 1,
-    hidden: Annotated[
-        str | None,
-        typer.Option(
-            help="hide this effect and search for it, such as row_noise, or row_noise@columns=40:50 in a "
-            "part of the sensor or run"
-        ),
-    ] = None,
-    quiet: Quiet = False,
-) -> None:
-    """Run all stages on a small simulated sensor.
-
-    Prints estimated and true parameters, and the path of the report.
-    """
-    from pchem_pipeline.commands.demo import run_demo
-
-    say(run_demo(output, size=size, n_frames=frames, seed=seed, hidden=hidden, quiet=quiet))
+for _stage in STAGES.values():
+    if _stage.summary:
+        _stage_command(_stage.name, _stage.summary)
 
 
 def _version(wanted: bool) -> None:

@@ -56,9 +56,10 @@ def apply(
     *,
     command: Command,
 ) -> None:
-    """Convert other frames of the sensor to electrons, electron numbers and a map of the exposure.
+    """Convert other frames of the sensor to electrons.
 
-    With standard errors, a quality layer and provenance. Continues after an interruption.
+    Writes electrons, electron numbers and an exposure map, with errors, quality and provenance. Continues
+    after an interruption.
     """
     from pchem_pipeline.commands.apply.apply import apply_to_frames
     from pchem_pipeline.commands.apply.registry import finished_runs, run_for
@@ -102,9 +103,10 @@ def twin(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="replace existing files")] = False,
 ) -> None:
-    """Write a simulated copy of the camera: a YAML for pchem simulate, with maps, effects and ADC.
+    """Write a simulated copy of the camera.
 
-    A sensor of another size has the same distributions and spatial correlations.
+    A YAML file for pchem simulate, with maps, effects and ADC. Another size keeps the distributions and
+    spatial correlations.
     """
     from pchem_pipeline.commands.twin import write_twin
     from pchem_pipeline.run.target import find_run

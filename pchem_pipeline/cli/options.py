@@ -27,56 +27,52 @@ def on_this_machine(path: Path | None) -> Path | None:
     return path
 
 
+#: An option below the heading that all commands of a run have.
+_common = functools.partial(typer.Option, rich_help_panel="Common options")
+
 Target = Annotated[Path, typer.Argument(help="a config.yaml, or the store of a run (run.zarr)")]
-Workers = Annotated[int | None, typer.Option(min=1, help="number of workers [default: compute.workers]")]
-Progress = Annotated[
-    Literal["auto", "on", "off"], typer.Option(help="progress bars; auto: only on a terminal")
-]
+Progress = Annotated[Literal["auto", "on", "off"], _common(help="progress bars; auto: only on a terminal")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="folder to write to", callback=on_this_machine)]
 Strict = Annotated[bool, typer.Option("--strict", help="exit code 3 if the results are not reliable")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="warnings and errors only")]
+Quiet = Annotated[bool, _common("--quiet", "-q", help="warnings and errors only")]
 
 #: Name, type with help, and default of each, in the order of ``--help``.
 _COMMON: tuple[tuple[str, Any, Any], ...] = (
-    ("force", Annotated[bool, typer.Option("--force", help="run again even if up to date")], False),
-    (
-        "dry_run",
-        Annotated[bool, typer.Option("--dry-run", help="print what would be done and why; write nothing")],
-        False,
-    ),
+    ("force", Annotated[bool, _common("--force", help="run again even if up to date")], False),
+    ("dry_run", Annotated[bool, _common("--dry-run", help="print what would be done; write nothing")], False),
     (
         "roi",
         Annotated[
             str | None,
-            typer.Option(
+            _common(
                 help="region y0:y1,x0:x1 in pixels; ingest and run FILES crop to it, other commands process "
                 "only its tiles"
             ),
         ],
         None,
     ),
-    ("workers", Workers, None),
+    (
+        "workers",
+        Annotated[int | None, _common(min=1, help="number of workers [default: compute.workers]")],
+        None,
+    ),
     (
         "backend",
         Annotated[
             Literal["serial", "threads", "processes", "distributed"] | None,
-            typer.Option(help="backend for the work [default: compute.backend]"),
+            _common(help="where the workers run [default: compute.backend]"),
         ],
         None,
     ),
     (
         "max_memory",
-        Annotated[
-            int | None,
-            typer.Option(help="memory limit, MiB, at least 300 [default: compute.max_memory]"),
-        ],
+        Annotated[int | None, _common(help="memory limit, MiB, at least 300 [default: compute.max_memory]")],
         None,
     ),
     (
         "log_json",
         Annotated[
-            Path | None,
-            typer.Option(help="append events as JSON lines to this file", callback=on_this_machine),
+            Path | None, _common(help="append events as JSON lines to this file", callback=on_this_machine)
         ],
         None,
     ),
@@ -115,11 +111,11 @@ def takes_command(
 
     Args:
         without: names of common options that the command does not have, or has in a wording of its own.
-        reads_files: it takes those of camera files too, as one argument ``given``: settings of ``input``.
+        reads_files: it takes the options of camera files too, as one argument ``given``.
     """
     common = [each for each in _COMMON if each[0] not in without]
     of_input = [
-        (name, Annotated[kind | None, typer.Option(help=f"camera files: {words}")], None)
+        (name, Annotated[kind | None, typer.Option(help=words, rich_help_panel="Camera files")], None)
         for name, kind, words in _INPUT
         if reads_files
     ]

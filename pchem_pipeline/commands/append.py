@@ -1,6 +1,6 @@
 """``pchem ingest --append``: further frames of a finished run, without reading the old ones again.
 
-Histograms and summaries go on where they ended, and are in the end those of all frames together, to the bit.
+Histograms and summaries are continued, and equal those of all frames counted at once, to the bit.
 What depends on them becomes stale; the next fit starts from the old answer. The pass changes the arrays in
 place: one that is stopped leaves the run without histograms, and the same command then counts all frames.
 """
@@ -42,17 +42,17 @@ _BEGUN = ".pchem/appending.json"
 
 
 def append_frames(target: Target, command: Command) -> list[StageState]:
-    """Take the frames of the files that came after those of a finished run.
+    """Add the frames of new files to a finished run.
 
     Args:
-        target: the run; its ``input.files`` name the old files and, behind them, the new ones.
+        target: the run; its ``input.files`` name the old files and, after them, the new ones.
         command: what the command line asked for.
 
     Returns:
         The states of ``ingest`` and ``histogram``.
 
     Raises:
-        InputError: the old files are not those of the run, or the new frames do not fit them.
+        InputError: the old files are not the files of the run, or the new frames do not fit them.
         StoreError: the run is not finished as far as its histograms, or was made with other settings.
     """
     begun = target.store / _BEGUN

@@ -95,7 +95,7 @@ def characterise(
 
 
 def fit_counts(counts: NDArray[Any], origin: NDArray[Any] | int = 0, **options: Any) -> FitResult:
-    """Fit plain histograms: one, or those of many pixels.
+    """Fit histograms of one or many pixels.
 
     Args:
         counts: number of samples at each DN, shape (bin,), (n, bin) or (y, x, bin).

@@ -94,10 +94,9 @@ def hidden_effect(asked: str, size: int, n_frames: int) -> Effect:
     """
     tag, at, place = asked.partition("@")
     if tag not in effect_classes():
-        known = ", ".join(effect_classes())
         raise ConfigError(
-            f"--hidden {tag!r}: no such effect; choose one of: {known}; "
-            f"for a part of the sensor or run append @ and a place: {GRAMMAR}"
+            f"--hidden {tag!r}: no such effect; pchem info lists them; for a part of the sensor or run "
+            f"append @ and a place: {GRAMMAR}"
         )
     typical = effect_class(tag).typical()
     if not typical:
@@ -122,13 +121,15 @@ def _search(target: Target, effect: Effect, command: Command, plain: str) -> str
     found = read_verdict(target.store)
     assert found is not None
     numbers = {n: v for n, v in effect.model_dump().items() if isinstance(v, int | float)}
-    reason = type(effect).untestable
+    missed = "" if effect.tag in found.effects else " (not found; take more --frames)"
+    if reason := type(effect).untestable:
+        missed = f" (not detectable in such frames: {reason})"
+    after = comparison_table(RunStore.open(target.store))
+    tables = plain if after == plain else f"with the plain model:\n{plain}\n\nwith the model found:\n{after}"
     return (
         f"{verdict_text(found)}\n\nhidden effect: {effect_words(effect)}"
         f"{''.join(f', {name} = {value:.4g}' for name, value in numbers.items())}"
-        f"{f' (not detectable in such frames: {reason})' if reason else ''}\n\n"
-        f"with the plain model:\n{plain}\n\n"
-        f"with the model found:\n{comparison_table(RunStore.open(target.store))}\n\n"
+        f"{missed}\n\n{tables}\n\n"
         f"verdict: {target.store / 'discrepancy.html'}"
     )
 
@@ -160,7 +161,7 @@ def comparison_table(store: RunStore) -> str:
         lines.append(f"{label:<24}" + "".join(f"{number:>14.4g}" for number in numbers))
     caution, failed = np.count_nonzero(quality == 1), np.count_nonzero(quality == 2)
     lines.append(
-        f"{good.size} pixels: {good.sum()} good (used in the table), {caution} to be used with caution, "
+        f"{good.size} pixels: {good.sum()} good (used in the table), {caution} with caution, "
         f"{failed} without a value"
     )
     return "\n".join(lines)

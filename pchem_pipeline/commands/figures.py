@@ -107,7 +107,7 @@ def figures_of_run(
 def paper_files(
     figure: Figure, formats: Sequence[str], width_mm: float | None = None, dpi: int = 600
 ) -> dict[str, bytes]:
-    """Draw a figure and return its files and those of its tables by name; pure."""
+    """Draw a figure and return its files and the files of its tables by name; pure."""
     drawing = figure.draw(Look(width_mm or figure.width_mm, dpi=dpi))
     files = {
         f"{figure.name}.{kind}": drawing_bytes(drawing, kind, dpi=dpi, title=figure.title) for kind in formats
@@ -127,7 +127,7 @@ def _chosen(found: list[Figure], only: Sequence[str]) -> list[Figure]:
 
 
 def warn_if_old(target: Target, stages: Sequence[str], words: str) -> None:
-    """Warn where results of these stages are not those of the present settings and input."""
+    """Warn if results of these stages are not up to date."""
     for state in run_status(target):
         if state.stage in stages and state.state != "complete":
             Reporter("off").warning(f"{state.stage}: {state.words()}; {words}")

@@ -30,13 +30,13 @@ def run_to_first_screen(
     is_new: bool = False,
     strict: bool = False,
 ) -> None:
-    """Bring stages up to date; then tell the report's first screen on stderr and its path by ``say``.
+    """Bring stages up to date; print the report's summary on stderr and its path by ``say``.
 
     Answers that are serious are one line of warning, also where the command is quiet.
 
     Args:
         target: the run.
-        stages: what is to be done, in order; without the report its store is told alone.
+        stages: stages to run, in order; without the report only the store is printed.
         command: what the command line asked for.
         say: writes a line of results.
         is_new: whether the YAML of the run is to be written first.
@@ -44,7 +44,7 @@ def run_to_first_screen(
 
     Raises:
         NotBelievedError: ``strict``, and an answer is serious.
-        PchEmError: the stages raised it; the first screen is told all the same where there is a report.
+        PchEmError: the stages raised it; the summary is printed all the same if there is a report.
     """
     if command.dry_run:
         run_stages(target, stages, command)
@@ -102,13 +102,12 @@ def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
     lines = [""]
     for answer in numbers["answers"]:
         lines.append(f"{answer['question']} {answer['word']}.")
-        lines += _wrapped(answer["text"], "  ")
-        lines += _criteria(answer["criteria"])
+        lines += _criteria(answer["criteria"]) or _wrapped(answer["text"], "  ")
     if numbers["headline"]:
         lines += ["", *_headline(numbers["headline"])]
-    told = " ".join(answer["text"] for answer in numbers["answers"])
+    shown = " ".join(answer["text"] for answer in numbers["answers"] if not answer["criteria"])
     for flag in numbers["flags"]:
-        if flag["level"] in ("serious", "caution") and flag["text"] not in told:
+        if flag["level"] in ("serious", "caution") and flag["text"] not in shown:
             lines += _wrapped(f"{flag['level'].capitalize()}: {flag['text']}", "  ", "")
     lines.append("")
     for i, step in enumerate(numbers["next"]):

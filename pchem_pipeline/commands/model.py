@@ -146,7 +146,7 @@ def _stale_lines(target: Target) -> list[str]:
 
 
 def _yaml_of(target: Target) -> Path | None:
-    """Return the YAML of a run, where it is there and is of this run: that of a copy names the first one's.
+    """Return the YAML of a run, if it exists and is of this run; a copied store names the YAML of the first.
 
     Raises:
         ConfigError: it is no configuration.
@@ -159,7 +159,7 @@ def _yaml_of(target: Target) -> Path | None:
 
 
 def _kept(store: RunStore, target: Target) -> ModelVersion:
-    """Return the version in force; what stands in the YAML and no command has seen yet becomes one, too."""
+    """Return the version in force; a new model section in the YAML becomes one, too."""
     path = _yaml_of(target)
     if path is not None:
         keep_in_force(store, model_in_force(store, load_config(path).model))

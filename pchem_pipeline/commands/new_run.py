@@ -32,7 +32,7 @@ from pchem_pipeline.store.remote_path import RemotePath, place_of
 from pchem_pipeline.store.run_store import RunStore, stored_config
 
 _YAML = (".yaml", ".yml")
-#: Settings that differ, as many as a message tells.
+#: Number of differing settings that a message lists.
 _SHOWN = 4
 _WIDTH = 70  # characters of a setting that differs
 

@@ -60,8 +60,9 @@ def make_plan(request: PlanRequest) -> str:
     noise = known.get("noise_e") if request.read_noise_e is None else request.read_noise_e
     if noise is None:
         raise ConfigError("--read-noise is missing: give it in e-, quantisation included, or give a run")
-    if not request.targets and request.frames is None:
-        raise ConfigError("--target is missing: give a precision, such as conversion_gain=1%, or --frames")
+    if not request.targets and (request.frames is None or request.samples is not None):
+        other = ", or --frames" if request.samples is None else ""
+        raise ConfigError(f"--target is missing: give a precision, such as conversion_gain=1%{other}")
     exposure = known.get("quanta_exposure") if request.quanta_exposure is None else request.quanta_exposure
     gain = known.get("conversion_gain", 0.09)  # e-/DN, of the cameras that this package was made for
     if request.conversion_gain is not None:
@@ -184,8 +185,6 @@ def _several(
     request: PlanRequest, targets: Sequence[Target], point: Point
 ) -> tuple[list[str], dict[str, Any]]:
     """Plan several samples."""
-    if not targets:
-        raise ConfigError("--target is missing: give a precision, such as conversion_gain=1%")
     plan = plan_samples(
         targets,
         _exposures(str(request.samples)),

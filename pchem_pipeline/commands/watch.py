@@ -20,7 +20,7 @@ def rows(states: Sequence[StageState], progress: Mapping[str, Any] | None) -> li
 
     Args:
         states: of the stages, in order.
-        progress: what that command tells, or None.
+        progress: progress of that command, or None.
     """
     label = "" if progress is None else one_line(str(progress.get("stage", "")))
     running = label.partition(":")[0]

@@ -56,7 +56,7 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.construct_y
 
 
 class FoundModel(Section):
-    """Content of ``RUN.effects.yaml``: the model that counts instead of the one in ``RUN.yaml``."""
+    """Content of ``RUN.effects.yaml``: the model that overrides the one in ``RUN.yaml``."""
 
     model: ModelSettings
     instead_of: ModelSettings
@@ -79,14 +79,14 @@ def load_config(path: Path) -> RunConfig:
     if found.instead_of != config.model:
         file = effects_file(path)
         raise ConfigError(
-            f"{path}: the section model was changed since {file} was written, whose model counts instead; "
-            f"delete {file.name} to use the section as it is now, or undo the change to keep that model"
+            f"{path}: the section model was changed after {file}, which overrides it; delete {file.name} to "
+            "use the section, or undo the change"
         )
     return config.model_copy(update={"model": found.model})
 
 
 def effects_file(path: Path) -> Path:
-    """Return where the model that counts instead of a YAML's own is kept: ``RUN.effects.yaml`` beside it."""
+    """Return the file of the model that overrides the one of a YAML: ``RUN.effects.yaml`` beside it."""
     path = path.resolve()
     return path.with_name(f"{path.stem}{_EFFECTS}")
 

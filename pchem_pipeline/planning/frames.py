@@ -40,14 +40,14 @@ def frames_needed(target: Target, point: Point) -> float:
 
 
 def precision(point: Point, n_frames: float) -> dict[str, float]:
-    """Return the smallest standard deviations from so many frames: relative, that of the bias in e-.
+    """Return the smallest standard deviations from so many frames: relative, of the bias in e-.
 
     Args:
         point: the pixel.
         n_frames: frames of one sample.
 
     Returns:
-        By parameter of :data:`~pchem_pipeline.planning.targets.TARGET_NAMES`; NaN where frames do not tell.
+        By parameter of :data:`~pchem_pipeline.planning.targets.TARGET_NAMES`; NaN if undetermined.
     """
     covariance = _bound(point) / n_frames
     found = {}

@@ -91,7 +91,9 @@ def plan_one_sample(
     best, best_frames = _best(aims, point, max_exposure, max_frames)
     if not exposure_given:
         if not np.isfinite(best) or (targets and not np.isfinite(best_frames)):
-            raise ConfigError(_hopeless(aims[0], point, "at any exposure", ""))
+            raise ConfigError(
+                _hopeless(aims[0], point, "at any exposure", "; try several samples: --samples best")
+            )
         point = replace(point, quanta_exposure=best)
     bounds = tuple(frames_needed(target, point) for target in targets)
     needed = best_frames if not exposure_given else _needed(aims, point, max_frames)

@@ -115,7 +115,7 @@ def _check(targets: Sequence[Target], exposures: Sequence[float]) -> None:
 
 
 def _informations(exposures: Sequence[float], point: Point) -> FloatArray:
-    """Return what one frame of each sample tells about the shared parameters, shape (n, 3, 3)."""
+    """Return the Fisher information of one frame of each sample on the shared parameters, shape (n, 3, 3)."""
     noise, gain = point.read_noise_e, point.conversion_gain
     return np.stack([shared_information(float(h), noise, gain) for h in exposures])
 

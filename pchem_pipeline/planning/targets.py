@@ -65,7 +65,7 @@ class Target:
         }[self.name]
 
     def wanted(self, point: Point) -> float:
-        """Return the standard deviation wanted: relative, that of the bias in e-."""
+        """Return the wanted standard deviation: relative, of the bias in e-."""
         gain, noise = point.conversion_gain, point.read_noise_e
         scale = {
             ("quanta_exposure", "e-"): 1.0 / point.quanta_exposure,

@@ -139,7 +139,7 @@ def verify(
     *,
     every_flag: bool = False,
 ) -> Verification:
-    """Simulate pixels that differ in where their bias lies between two DN, and fit all samples jointly.
+    """Simulate pixels whose biases differ by fractions of a DN, and fit all samples jointly.
 
     Args:
         targets: what was wanted.

@@ -368,8 +368,8 @@ def served_page(page: str) -> str | None:
     before, found, after = page.partition(str(escape(_CONNECT_NOWHERE)))
     if not found or 'id="inspector-app"' not in after:
         return None
-    mark, told = '<meta name="color-scheme"', '<meta name="pchem-view" content="yes">'
-    return f"{before}{escape(_CONNECT_HERE)}{after}".replace(mark, f"{told}\n{mark}", 1)
+    mark, served = '<meta name="color-scheme"', '<meta name="pchem-view" content="yes">'
+    return f"{before}{escape(_CONNECT_HERE)}{after}".replace(mark, f"{served}\n{mark}", 1)
 
 
 def json_for_html(content: Any) -> Markup:

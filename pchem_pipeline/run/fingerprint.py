@@ -134,7 +134,7 @@ def changed_file(record: StageRecord, store: RunStore) -> str:
 def rests_on(record: StageRecord, store: RunStore) -> int | None:
     """Return the number of the model that a result rests on; None where it rests on none, or on one unknown.
 
-    A stage that does not read the model rests on that of its upstream stages.
+    A stage that does not read the model uses the model of its upstream stages.
     """
     if record.model is not None:
         return record.model
@@ -187,9 +187,9 @@ def differences(
         default = config is not None and was is not None and not states(config, key)
         keep = f" (the default; {key}: {was} in the YAML keeps the result)" if default else ""
         words.append(f"{key} {was} -> {now}{keep}")
-    for name in new["upstream"]:
-        if old.get("upstream", {}).get(name) != new["upstream"][name]:
-            words.append(f"{name} was run again")
+    before = old.get("upstream", {})
+    if renewed := [name for name, state in new["upstream"].items() if before.get(name) != state]:
+        words.append(f"new {', '.join(renewed)}")
     if old.get("input") != new["input"]:
         words += _input_changes(old.get("input") or {}, new["input"] or {}, models or {})
     return words

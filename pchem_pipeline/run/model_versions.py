@@ -36,7 +36,7 @@ Region = tuple[slice, slice]
 
 @dataclass(frozen=True)
 class AddedArrays:
-    """Where the exposure lies that effects of a model add to single pixels.
+    """Place of the exposure that effects of a model add to single pixels.
 
     Attributes:
         group: of the store, with ``added_exposure`` and ``added_weight``.

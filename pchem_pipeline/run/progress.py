@@ -321,7 +321,7 @@ class ProgressFile:
 
 
 def read_progress(store: Path) -> dict[str, Any] | None:
-    """Return what the command that works on a run tells, or None where none does: its lock decides.
+    """Return the progress of the command that works on a run, or None if none does: its lock decides.
 
     Numbers and words of other types, and control characters, do not get through.
     """

@@ -49,7 +49,7 @@ def execute(name: str, context: StageContext) -> StageState:
                 f"{context.store.path}: {file} is missing or has changed; {context.store.cure(file)}"
             )
     if before.state == "stale":
-        context.reporter.info(f"{name}: {before.words()} -> running again")
+        context.reporter.info(f"{name}: running again: {before.why}")
     prepared = context.prepared.get(name)
     if prepared is not None and prepared.clock is not None:
         clock = prepared.clock
@@ -130,9 +130,10 @@ def _finish(
 ) -> StageState:
     """Say how a stage ended: the time of this command, and of all commands where that is longer."""
     done = len(context.store.records.done(stage.name, record.fingerprint))
+    some = "" if done >= record.keys else f"{done} of {record.keys} units, "
     earlier = f"; {record.seconds:.1f} s with earlier commands" if record.seconds > seconds + 0.1 else ""
     context.reporter.info(
-        f"{stage.name}: {done} of {record.keys} units in {seconds:.1f} s "
+        f"{stage.name}: {some}{seconds:.1f} s "
         f"({cpu:.1f} s CPU, peak {record.peak_rss_bytes / 2**20:.0f} MiB{earlier})",
         stage=stage.name,
         seconds=seconds,

@@ -169,7 +169,7 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
             found = found_model(path)
             if found is not None and found.model == target.config.model:
                 file = effects_file(path).name
-                reporter.info(f"the model is that of {file}, instead of the one in {path.name}")
+                reporter.info(f"the model is from {file}, not from {path.name}")
         progress_file.show({"stage": ""})
         store.write_config(dump_config(own))  # what a single command was given is no setting of the run
         keep_in_force(store, model_in_force(store, target.config.model))
@@ -208,7 +208,7 @@ def run_status(target: Target, command: Command | None = None) -> list[StageStat
 
 
 def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[StageState]:
-    """Say what would be done and, as far as stages can tell, what it takes, without writing anything."""
+    """Print what would be done and, if known, the time and memory it takes; write nothing."""
     chosen = Command(settings=command.settings)
     known = {state.stage: state for state in run_status(target, chosen)}
     states = [known.get(name, StageState(name, "missing")) for name in stages]
@@ -216,7 +216,7 @@ def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[St
     todo = [state.stage for state in states if state.state != "complete" or command.force]
     for state in states:
         words = "would run" if state.stage in todo else "nothing to do"
-        reporter.info(f"{state.stage}: {state.words()} -> {words}")
+        reporter.info(f"{state.stage}: {words} ({state.words()})")
     target = with_overrides(target, command)
     for plan in filter(None, (STAGES[name].plan for name in todo)):
         for line in imported(plan)(target.config, target.base_dir, todo):

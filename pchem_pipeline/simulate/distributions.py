@@ -15,9 +15,7 @@ from pchem_pipeline.base.settings import Section
 class PatternBase(Section):
     """What every pattern has."""
 
-    relative: bool = Field(
-        default=False, description="true: multiply the parameter by 1 + pattern; false: add the pattern to it"
-    )
+    relative: bool = Field(default=False, description="multiply by 1 + pattern instead of adding it")
 
     @model_serializer(mode="wrap")
     def _kind_first(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -30,27 +28,21 @@ class ColumnPattern(PatternBase):
     """One normal random offset per column, as left by column amplifiers."""
 
     kind: Literal["column"] = Field(default="column", description="shape of the pattern")
-    amplitude: float = Field(
-        gt=0, description="standard deviation over columns, the parameter's unit (none if relative)"
-    )
+    amplitude: float = Field(gt=0, description="standard deviation over columns; no unit if relative")
 
 
 class RowPattern(PatternBase):
     """One normal random offset per row, as left by row drivers."""
 
     kind: Literal["row"] = Field(default="row", description="shape of the pattern")
-    amplitude: float = Field(
-        gt=0, description="standard deviation over rows, the parameter's unit (none if relative)"
-    )
+    amplitude: float = Field(gt=0, description="standard deviation over rows; no unit if relative")
 
 
 class GradientPattern(PatternBase):
     """A plane through the centre of the sensor, for example amplifier glow or heat from one side."""
 
     kind: Literal["gradient"] = Field(default="gradient", description="shape of the pattern")
-    amplitude: float = Field(
-        description="difference from edge to edge, the parameter's unit (none if relative)"
-    )
+    amplitude: float = Field(description="difference from edge to edge; no unit if relative")
     angle: float = Field(default=0.0, description="direction of the rise, degrees from +x towards +y")
 
 
@@ -58,7 +50,7 @@ class RadialPattern(PatternBase):
     """A paraboloid, zero in the centre, for example vignetting."""
 
     kind: Literal["radial"] = Field(default="radial", description="shape of the pattern")
-    amplitude: float = Field(description="value in the corners, the parameter's unit (none if relative)")
+    amplitude: float = Field(description="value in the corners; no unit if relative")
 
 
 Pattern = Annotated[
@@ -74,15 +66,9 @@ class DistributionBase(Section):
     patterns are applied after that and the sum is cut at the bounds.
     """
 
-    minimum: float | None = Field(
-        default=None, description="smallest value allowed, in the parameter's unit; null: none"
-    )
-    maximum: float | None = Field(
-        default=None, description="largest value allowed, in the parameter's unit; null: none"
-    )
-    patterns: tuple[Pattern, ...] = Field(
-        default=(), description="patterns on top: column, row, gradient, radial"
-    )
+    minimum: float | None = Field(default=None, description="smallest allowed value; null: no limit")
+    maximum: float | None = Field(default=None, description="largest allowed value; null: no limit")
+    patterns: tuple[Pattern, ...] = Field(default=(), description="column, row, gradient, radial")
 
     @model_serializer(mode="wrap")
     def _kind_first(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

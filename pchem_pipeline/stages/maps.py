@@ -148,7 +148,7 @@ def _do_tile(tile: Tile, store: RunStore, *, arrays: Callable[..., dict[str, NDA
 
 
 def line_tile(samples: Arrays, line: Line) -> dict[str, NDArray[Any]]:
-    """Return what a line through the exposures of each pixel tells, by path.
+    """Return the results of a line through the exposures of each pixel, by path.
 
     Args:
         samples: ``quanta_exposure`` (sample, y, x) and ``covariance`` (y, x, parameter, parameter) of a tile.

@@ -76,7 +76,7 @@ _ALL = (
         writes=("histogram", "summary"),
         run=f"{_HERE}.histogram.histogram:run",
         single_pass=f"{_HERE}.histogram.single_pass:count_in_one_pass",
-        summary="Make the histogram of each pixel, and sums in time and space.",
+        summary="Make pixel histograms, and sums in time and space.",
         plan=f"{_HERE}.histogram.dry_run:plan_lines",
     ),
     Stage(
@@ -107,7 +107,7 @@ _ALL = (
         settings=("ensemble", "run.tile"),
         writes=("ensemble", "ensemble_tiles"),
         run=f"{_HERE}.ensemble.ensemble:run",
-        summary="Predict the ensemble from the maps and compare it with the data.",
+        summary="Predict the ensemble from the maps and compare with data.",
         may_write_nothing=True,
     ),
     Stage(

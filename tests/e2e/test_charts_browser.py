@@ -4,6 +4,7 @@ import functools
 from dataclasses import replace
 
 import numpy as np
+import PIL.Image
 import pytest
 from helpers.discrepancy_material import discrepancy_data
 from helpers.quick_stacks import stack, sums_of
@@ -190,3 +191,19 @@ def test_a_picture_is_saved_from_the_page(report, tmp_path):
     path = tmp_path / "ensemble.svg"
     download.value.save_as(path)
     assert "<svg" in path.read_text()
+
+
+def test_pictures_are_dark_on_a_dark_screen_and_light_as_files(report, tmp_path):
+    page = report(1200, color_scheme="dark")
+    figure = page.locator("#figure-map_bias")
+    path = tmp_path / "shown.png"
+    figure.locator("img").screenshot(path=path)
+    with PIL.Image.open(path) as shown:
+        assert max(shown.convert("RGB").getpixel((20, 20))) < 60
+    for kind in ("SVG", "PNG"):
+        with page.expect_download() as download:
+            figure.get_by_role("button", name=f"Save map_bias as {kind}").click()
+        download.value.save_as(tmp_path / kind)
+    assert "prefers-color-scheme" not in (tmp_path / "SVG").read_text()
+    with PIL.Image.open(tmp_path / "PNG") as saved:
+        assert min(saved.convert("RGB").getpixel((20, 20))) > 250

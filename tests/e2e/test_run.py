@@ -40,7 +40,7 @@ def test_a_folder_of_tiffs_becomes_a_report(shell, frames):
     assert "fit_status" in summary
     # without a terminal there is no progress bar, only a line per stage
     assert "\r" not in result.stderr
-    assert [line.split(":")[0] for line in result.stderr.splitlines() if " units in " in line] == STAGES
+    assert [line.split(":")[0] for line in result.stderr.splitlines() if " s CPU, peak " in line] == STAGES
     assert begun(shell) == STAGES
     again = shell.ok("run", "runs/dark.yaml")
     said = again.stderr.splitlines()
@@ -65,7 +65,7 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
     assert rows["fit"] == "stale - fit.gap_threshold 5.0 → 6.0  (with model 1)"
     assert rows["report"].startswith("stale")
     dry = shell.ok("run", "run.yaml", "--dry-run")
-    assert "fit: stale - fit.gap_threshold 5.0 → 6.0 → would run" in dry.stderr
+    assert "fit: would run (stale - fit.gap_threshold 5.0 → 6.0)" in dry.stderr
     shell.ok("run", "run.yaml", "--until", "ensemble")
     after = {stage: record(shell.folder / "run.zarr", stage) for stage in STAGES}
     same = [stage for stage in STAGES if before[stage] == after[stage]]

@@ -56,7 +56,7 @@ _VERSION = 4
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
-#: Share of the samples at a limit of the ADC beyond which offsets cannot be told: with 6 % of them the stated
+#: Share of the samples at a limit of the ADC beyond which offsets are not known: with 6 % of them the stated
 #: probabilities of electron numbers are as right as without, with 32 % they are 0.1 too high.
 _MOST_CUT = 0.2
 
@@ -318,7 +318,7 @@ def _rows_of_band(context: StageContext, job: Job, bytes_of_pixel: int) -> int:
 
 
 def _with_moments(context: StageContext, job: Job, calibration: Calibration) -> tuple[Job, Calibration]:
-    """Find the errors of the calibration where the curvature of its likelihood does not tell them."""
+    """Compute the errors of the calibration where the curvature of its likelihood is not enough."""
     run = RunStore.open(job.run)
     if not doubtful_pixels(run, calibration).any():
         return job, calibration
@@ -335,7 +335,7 @@ def _with_moments(context: StageContext, job: Job, calibration: Calibration) -> 
 def _with_offsets(context: StageContext, job: Job, calibration: Calibration) -> Job:
     """Find the offsets of frames, rows and columns; return the job that takes them away."""
     n, ny, nx = job.source.shape
-    # some frames tell the scene
+    # some frames suffice for the scene
     chosen = np.unique(np.linspace(0, n - 1, 256).astype(int)).tolist()
     mean = sum(job.source.read(t, t + 1)[0].astype(np.float64) for t in chosen) / len(chosen)
     job = replace(job, scene=scene_of(np.asarray(mean), calibration))
@@ -374,7 +374,7 @@ def _counted(context: StageContext, job: Job, calibration: Calibration) -> Job:
 
     n, ny, _ = job.source.shape
     most = context.config.histogram.max_bins
-    # the first 64 frames tell how wide the histograms are
+    # the first 64 frames set the width of the histograms
     bins = job.parts * bins_of(job.source, 64, most // job.parts, _CHUNK_ROWS)
     job = replace(job, bins=min(most, bins), window=min(job.window, n))
     ends = ("", "_stderr", "_stderr_counting", "_stderr_calibration")

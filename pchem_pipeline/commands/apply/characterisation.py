@@ -83,7 +83,7 @@ def read_calibration(
 def doubtful_pixels(
     store: RunStore, calibration: Calibration, region: tuple[slice, slice] = (slice(None), slice(None))
 ) -> BoolArray:
-    """Tell which pixels' errors the curvature of the likelihood does not tell, shape (y, x).
+    """Return the pixels whose errors the curvature of the likelihood does not give, shape (y, x).
 
     None of a run of several exposures, which settle the bias, or of one that keeps no histograms.
     """

@@ -171,7 +171,7 @@ def check_level(some: NDArray[Any], calibration: Calibration, name: Path) -> lis
         name: of their first file.
 
     Raises:
-        InputError: the mean lies so far below the bias that the frames are no frames of these pixels.
+        InputError: the mean is too far below the bias for frames of these pixels.
     """
     mean = some.mean(axis=0, dtype=np.float64)
     known = calibration.usable

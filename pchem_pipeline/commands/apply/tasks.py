@@ -67,7 +67,7 @@ def moments_piece(piece: Piece, output: RunStore, *, job: Job, settings: FitSett
 
 
 def offsets_piece(piece: Piece, output: RunStore, *, job: Job) -> dict[str, Any]:
-    """Find and write the offsets of some frames; the summary tells how well they are known."""
+    """Find and write the offsets of some frames; the summary has their errors."""
     calibration = _calibration(output, job, _WHOLE, job.cut)
     left, largest = np.zeros(len(job.modes.parts)), 0.0
     ends, known = [0, np.iinfo(np.int64).max] if job.limits is None else list(job.limits), calibration.usable

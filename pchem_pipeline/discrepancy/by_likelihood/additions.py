@@ -152,7 +152,7 @@ class AddedSets:
                 gap = self.gap(self._refit((*before.members, other)))
             except ValueError:
                 continue
-            why = f"it predicts unseen samples worse, by {-behind:.3g} ± {error:.2g}"
+            why = f"it predicts unseen samples worse, by {-behind:.3g} ± {error:.2g} nats"
             if other.tag in named.equals:
                 why = "it predicts unseen samples as well: these histograms do not decide"
             found.append(Rival(effect=other.tag, gap_after=gap.value, behind=behind, why=why))

@@ -252,7 +252,7 @@ class Extension:
             says = STATISTICS[self.first.names[worst]].says(left)
             why = f"it leaves a misfit of {sigma_text(left)}: {says}"
         elif other.error is not None:
-            why = f"it fits the pixel histograms worse, by {-other.behind:.1f} ± {other.error:.1f}"
+            why = f"it fits the pixel histograms worse, by {-other.behind:.1f} ± {other.error:.1f} nats"
         else:
             why = "it fits all statistics together worse"
         return Rival(effect=other.effect.tag, gap_after=gap.value, behind=other.behind, why=why)

@@ -13,9 +13,8 @@ class ModelSettings(Section):
 
     effects: EffectList = Field(
         default=(),
-        description="effects beyond the PCD with which pixels are fitted and ensembles predicted; "
-        "pchem discrepancy writes those that it names to RUN.effects.yaml, which counts instead of this "
-        "section; a simulated camera has its own list, simulate.effects",
+        description="effects added to the PCD in fit and ensemble; pchem discrepancy writes the effects "
+        "found to RUN.effects.yaml, which overrides this section; a simulated camera has simulate.effects",
     )
     set_aside_e: tuple[tuple[float | None, float | None], ...] = Field(
         default=(),

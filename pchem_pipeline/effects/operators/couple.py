@@ -480,34 +480,32 @@ class ResponseTerm(Section):
     of: Source = Field(default="sample", description="what is followed: a sample, or a row, column, frame")
     place: tuple[int, int, int] = Field(
         default=(0, 0, 0),
-        description="where it is from the sample that follows: frames, rows, columns (before it: negative)",
+        description="distance from the sample that follows: frames, rows, columns; negative: earlier",
     )
     weight: float = Field(default=1.0, ge=-1, le=1, description="relative response, no unit")
-    number: int = Field(
-        default=1, ge=1, description="how many samples a row, column or frame has, for the law of the pixels"
-    )
+    number: int = Field(default=1, ge=1, description="samples per row, column or frame, for the PCD")
     mirrored: tuple[Axis, ...] = Field(
         default=(),
         max_length=2,
-        description="along what the sensor is mirrored: the place is then from the sample's mirror image",
+        description="axes of a mirror image, from which the place is then counted",
     )
     above: float = Field(
         default=0.0,
         ge=0,
-        description="charge of a sample up to which it is not followed, e-; 0: all of it is",
+        description="only charge above this is followed, e-; 0: all",
     )
     columns: tuple[int, int] | None = Field(
-        default=None, description="first column of those that follow, and the one behind; null: all"
+        default=None, description="columns that follow, first and last + 1; null: all"
     )
 
     @model_validator(mode="after")
     def _of_the_past(self) -> Self:
         if self.place[0] > 0 or any(self.place[axis] for axis in _ALONG[self.of]):
-            raise ValueError("place: of this frame or before it; 0 along what is followed as a whole")
+            raise ValueError("place: give no later frame, and 0 along a row, column or frame")
         if self.of == "sample" and not any(self.place) and not self.mirrored:
             raise ValueError("place: a sample does not follow itself")
         if self.of != "sample" and (self.above or self.mirrored):
-            raise ValueError("above, mirrored: of single samples only")
+            raise ValueError("above and mirrored need of: sample")
         return self
 
     @property

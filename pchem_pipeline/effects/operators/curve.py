@@ -160,9 +160,9 @@ class AdcInl(Effect, tag="adc_inl"):
         default=100.0, ge=4, le=1e6, description="sine: period of the deviation, DN; two bends per period"
     )
     phase: Radians = Field(default=0.0, ge=-100, le=100, description="sine: phase at 0 DN, rad")
-    first_dn: Dn = Field(default=0.0, description="curve: where the first value of `curve` lies, DN")
+    first_dn: Dn = Field(default=0.0, description="curve: DN of the first value of `curve`")
     spacing_dn: Dn = Field(
-        default=10.0, gt=0, le=1e6, description="curve: from one value of `curve` to the next, DN"
+        default=10.0, gt=0, le=1e6, description="curve: spacing of the values of `curve`, DN"
     )
     curve: tuple[float, ...] = Field(
         default=(),
@@ -541,8 +541,8 @@ class Clipping(Effect, tag="clipping"):
         "adc_dnl": "a shifted bias: a limit is fixed in DN, with no samples beyond",
         "adc_inl": "a shifted bias or more light: clipping affects one code, INL all",
     }
-    low: Code | None = Field(default=None, ge=0, description="smallest DN; null: that of the ADC")
-    high: Code | None = Field(default=None, ge=0, description="largest DN; null: that of the ADC")
+    low: Code | None = Field(default=None, ge=0, description="smallest DN; null: limit of the ADC")
+    high: Code | None = Field(default=None, ge=0, description="largest DN; null: limit of the ADC")
 
     @model_validator(mode="after")
     def _limits_in_order(self) -> Self:

@@ -381,7 +381,7 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
     correlation_frames: Frames = Field(
         default=0.0,
         ge=0,
-        description="time in which the memory of a fluctuation falls to 1/e, frames; 0: every frame anew",
+        description="correlation time (to 1/e), frames; 0: independent frames",
     )
     period_frames: Frames | None = Field(
         default=None, gt=1, description="period of a sine, frames; null: random fluctuations"

@@ -64,54 +64,53 @@ class NoiseMode(Section):
     signal_dn: float = Field(
         default=1.0,
         gt=0,
-        description="gain, light: mean signal over the bias at which it has its size; noise: read noise at "
-        "which it has, DN",
+        description="gain, light: mean signal above the bias at which noise_dn holds, DN; noise: read noise "
+        "at which it holds, DN",
     )
     burst: float | None = Field(
         default=None,
         gt=0,
         lt=1,
-        description="share of the frames, rows, columns or samples that have all of it; null: it is Gaussian",
+        description="share of the samples, rows, columns or frames with the noise; null: all, Gaussian",
     )
-    negative: bool = Field(default=False, description="burst: whether it takes away")
+    negative: bool = Field(default=False, description="burst: lowers the signal")
     shape: tuple[tuple[float, ...], ...] = Field(
         default=(),
         max_length=16,
-        description="of a frame: relative size in equal blocks of the sensor, rows of blocks; none: alike",
+        description="of a frame: relative size in equal blocks of the sensor, rows of blocks; empty: uniform",
     )
     profile: tuple[float, ...] = Field(
         default=(),
         max_length=32,
-        description="relative size along a row (column), at points evenly spaced from its first to its last "
-        "pixel; none: alike",
+        description="relative size along a row or column, at evenly spaced points; empty: uniform",
     )
 
     extent: tuple[Span, Span] | None = Field(
         default=None,
-        description="shape, profile: rows and columns over which it reaches, first and end; null: all",
+        description="shape, profile: range of rows and of columns, ends excluded; null: all",
     )
     wave: Cycles | None = Field(
         default=None,
-        description="cycles per frame, row and column of a sine whose phase runs on; null: it is noise",
+        description="cycles per frame, row and column of a sine; null: noise",
     )
 
     @model_validator(mode="after")
     def _of_its_axes(self) -> Self:
         if len(self.lags) != len(self.correlation):
-            raise ValueError("give one correlation for each of lags")
+            raise ValueError("lags and correlation differ in length; give one correlation per lag")
         fixed = [axis for axis, dim in enumerate(("frame", "y", "x")) if dim not in DIMS[self.of]]
         if any(not any(lag) or any(lag[axis] for axis in fixed) for lag in self.lags):
             raise ValueError(f"lags of a {self.of} are (frames, rows, columns), not all 0, and 0 within it")
         if self.profile and (
             self.of not in ("row", "column") or len(self.profile) < 2 or not any(self.profile)
         ):
-            raise ValueError("profile: of a row or column, two points or more, not all 0")
+            raise ValueError("profile: needs of: row or column, and two points or more, not all 0")
         if self.shape and (self.of != "frame" or len({len(row) for row in self.shape}) != 1):
-            raise ValueError("shape: of a frame, rows of equally many blocks")
+            raise ValueError("shape: needs of: frame, and rows of equally many blocks")
         if self.extent is not None and any(first >= end for first, end in self.extent):
-            raise ValueError("extent: rows and columns, the first below the end")
+            raise ValueError("extent: each range needs a first below its end")
         if self.burst is not None and self.lags:
-            raise ValueError("burst: each by itself; leave lags out")
+            raise ValueError("burst: bursts are uncorrelated; leave lags out")
         if self.wave is not None and (
             self.lags
             or self.burst is not None

@@ -562,19 +562,19 @@ class ElectronMode(Section):
     """
 
     fate: Fate = Field(
-        description="lost, moved (to the place), followed (by others, at the place), or emptied (all of them)"
+        description="lost, moved (to place), followed (by further electrons, at place), or emptied (all lost)"
     )
     weight: float = Field(default=1.0, gt=0, description="relative frequency, no unit")
     place: tuple[int, int, int] = Field(
-        default=(0, 0, 0), description="where: frames later, rows and columns from the electron's pixel"
+        default=(0, 0, 0), description="distance from the electron's sample: frames later, rows, columns"
     )
 
     @model_validator(mode="after")
     def _of_the_future(self) -> Self:
         if self.place[0] < 0 or (self.fate == "moved") > any(self.place):
-            raise ValueError("place: of this frame or a later one; electrons are moved to another sample")
+            raise ValueError("place: give this frame or a later one; moved electrons need another sample")
         if self.fate == "emptied" and any(self.place):
-            raise ValueError("place: a sample that is emptied has none")
+            raise ValueError("place: leave it out with emptied")
         return self
 
     def describe(self, chance: float) -> str:

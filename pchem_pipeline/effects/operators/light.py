@@ -421,7 +421,7 @@ class DarkCurrentRts(Effect, tag="dark_current_rts"):
         description="additional exposure of the upper level, mean over these pixels, e-",
     )
     steps: Literal["equal", "exponential"] = Field(
-        default="equal", description="equal: step_e in each of these pixels; exponential: distributed so"
+        default="equal", description="equal: step_e in each of these pixels; exponential: step_e is the mean"
     )
     dwell_low_frames: Frames = Field(
         default=200.0, ge=0.5, description="mean time in the lower level, frames"

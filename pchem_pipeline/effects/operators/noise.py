@@ -395,14 +395,14 @@ class RtsNoise(Effect, tag="rts_noise"):
     )
     spread: Literal["equal", "lognormal", "exponential"] = Field(
         default="equal",
-        description="equal: the same step in all these pixels; lognormal: the stated one is the median, with "
-        "a standard deviation of 0.4 of the logarithm; exponential: distributed so",
+        description="equal: the same step in all these pixels; lognormal: step_e is the median, "
+        "standard deviation of the logarithm 0.4; exponential: step_e is the mean",
     )
     probability: Ratio = Field(
         default=0.2,
         ge=0,
         le=1,
-        description="correlated: that the trap changes its state within a sample; single: that it is full",
+        description="probability; correlated: that the trap changes within a sample; single: that it is full",
     )
     sampling: Literal["correlated", "single"] = Field(
         default="correlated",
@@ -421,8 +421,8 @@ class RtsNoise(Effect, tag="rts_noise"):
         default=0.0,
         ge=0,
         le=3,
-        description="single: standard deviation of the logarithms of the mean times full and empty, which "
-        "differ from trap to trap; 0: alike in all",
+        description="single: scatter between traps of the mean times full and empty (standard deviation of "
+        "the logarithm); 0: none",
     )
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:

@@ -285,7 +285,7 @@ class ReadoutAlternation(OffsetEffect, tag="readout_alternation"):
     #: at 0.024 DN, with both signs
     typical_values = ({"alternation_dn": 0.024}, {"alternation_dn": -0.024})
     alternation_dn: Dn = Field(
-        ge=-1e6, le=1e6, description="offset of even frames, and minus that of odd ones, DN"
+        ge=-1e6, le=1e6, description="offset of even frames, DN; odd frames: the opposite"
     )
 
     def offsets(self, context: EffectContext) -> FloatArray:

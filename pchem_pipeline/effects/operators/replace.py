@@ -606,22 +606,22 @@ class MixtureShift(Section):
     same frame are as they were before any move.
     """
 
-    weight: float = Field(default=1.0, ge=0, description="relative frequency of this move, no unit")
-    shift_dn: int = Field(default=0, description="by how much, DN")
+    weight: float = Field(default=1.0, ge=0, description="relative frequency of this shift, no unit")
+    shift_dn: int = Field(default=0, description="shift, DN")
     towards: tuple[int, int, int] | None = Field(
-        default=None, description="place of the neighbour: frames, rows, columns from the sample"
+        default=None, description="neighbour to shift towards: frames, rows, columns from the sample"
     )
-    part: float = Field(default=1.0, ge=0, le=1, description="part of the difference to it, no unit")
+    part: float = Field(default=1.0, ge=0, le=1, description="share of the difference, no unit")
     within_dn: int | None = Field(
-        default=None, ge=0, description="only samples that differ from it by no more, DN; null: all"
+        default=None, ge=0, description="largest difference to the neighbour, DN; null: any"
     )
 
     @model_validator(mode="after")
     def _of_the_past(self) -> Self:
         if self.towards is not None and (self.towards[0] > 0 or not any(self.towards)):
-            raise ValueError("towards: another sample, of this frame or an earlier one")
+            raise ValueError("towards: give another sample of this frame or an earlier one")
         if self.towards is not None and self.shift_dn < 0:
-            raise ValueError("shift_dn: towards a neighbour it is not negative")
+            raise ValueError("shift_dn: give 0 or more with towards")
         return self
 
     def of(self, own: IntArray, other: IntArray | None) -> IntArray:
@@ -671,14 +671,14 @@ class Empirical(Effect, tag="empirical"):
     #: a hundredth of the samples 8 DN too low
     typical_values = ({"share": 0.01, "moves": (MixtureShift(shift_dn=-8),)},)
     share: Ratio = Field(ge=0, le=1, description="share of shifted samples, no unit")
-    moves: tuple[MixtureShift, ...] = Field(min_length=1, max_length=16, description="how; one of them each")
+    moves: tuple[MixtureShift, ...] = Field(min_length=1, max_length=16, description="kinds of shifts")
     together: Together = Field(
-        default="sample", description="what is moved alike: each sample by itself, a row, a column or a frame"
+        default="sample", description="what is shifted together: single samples, rows, columns or frames"
     )
     squares: tuple[int, int] | None = Field(
         default=None,
-        description="squares of 2 x 2 pixels come as their mean, rounded down, from rows and "
-        "columns of this parity on (0 even, 1 odd); null: none does",
+        description="replace squares of 2 x 2 pixels by their mean, rounded down; parity of "
+        "their first row and column (0 even, 1 odd); null: none",
     )
 
     @model_validator(mode="after")
@@ -686,9 +686,7 @@ class Empirical(Effect, tag="empirical"):
         if not sum(move.weight for move in self.moves) > 0:
             raise ValueError("empirical: give at least one of moves a weight above 0")
         if self.squares and (self.together != "sample" or self.moves != (MixtureShift(),)):
-            raise ValueError(
-                "empirical: squares come as their mean and are not moved: leave moves at one of nothing"
-            )
+            raise ValueError("empirical: squares are averaged, not shifted; give moves: [{}]")
         return self
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:

@@ -65,7 +65,7 @@ class Mark:
 
     Attributes:
         colour: of the mark.
-        label: in the legend; on the page its values are told under it.
+        label: in the legend; on the page its values are shown below it.
         listed: whether the legend on paper has it too.
         width: of its line, points (1/72 inch).
         dash: style of its line.
@@ -327,7 +327,7 @@ def window(axis: Axis, values: Iterator[Values], base: float | None = None) -> t
     Args:
         axis: the axis.
         values: of its marks, any shapes.
-        base: a value that the axis ends at where nothing lies beyond it.
+        base: end of the axis if no value is beyond it.
     """
     parts = [np.asarray(each, dtype=np.float64).ravel() for each in values]
     known = np.concatenate(parts) if parts else np.empty(0)

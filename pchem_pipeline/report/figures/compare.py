@@ -121,7 +121,7 @@ def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
 
 
 def difference_chart(z: FloatArray, n_changed: int, title: str, *, same_data: bool) -> Chart:
-    """Return the difference of a map of two runs in standard errors, and its histogram beside chance.
+    """Return the difference of a map of two runs in standard errors, and its histogram beside N(0, 1).
 
     Args:
         z: the difference in standard errors, (y, x).

@@ -27,7 +27,7 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.figures.pixels import shown_bins
-from pchem_pipeline.report.style.wording import power_of_ten, scientific, short
+from pchem_pipeline.report.style.wording import measured, percent, power_of_ten, scientific, short
 
 #: Suffix of a prediction to (name in the legend, hue, line style).
 PREDICTIONS: dict[str, tuple[str, str, Dash]] = {
@@ -90,6 +90,12 @@ def electron_figures(data: ReportData) -> Iterator[Figure]:
     if "electron_mass" not in arrays:
         return
     mass, pmf = arrays["electron_mass"], arrays["electron_pmf"]
+    words, facts = "", data.ensemble_facts
+    if facts.get("error_rate") is not None:
+        rate, error = 100.0 * float(facts["error_rate"]), 100.0 * float(facts.get("error_rate_stderr") or 0.0)
+        words += f" Wrong estimates (truth known): {measured(rate, error, '%')}."
+    if facts.get("expected_error_rate") is not None:
+        words += f" Expected from the fit: {percent(float(facts['expected_error_rate']), 1.0)} wrong."
     first = ", ".join(f"k = {k}: {mass[k]:.4f} against {pmf[k]:.4f}" for k in range(min(5, mass.size)))
     names = ("k", "electron_counts", "electron_mass", "electron_pmf", "electron_pmf_map")
     table = DataTable({name: arrays[name] for name in names if name in arrays}, {"k": "e-"})
@@ -99,7 +105,7 @@ def electron_figures(data: ReportData) -> Iterator[Figure]:
         "Estimated electron numbers",
         "Gray: share of each estimated electron number. Dots: probability p(k) from the map of H. Crosses: "
         "expected share of the estimates, which confuse neighbouring numbers. Below: estimate minus "
-        "expectation; gray: 2 sigma of sampling noise.",
+        f"expectation; gray: 2 sigma of sampling noise.{words}",
         f"Share of each electron number among the estimates against the prediction; {first}.",
         (table,),
         electrons_chart(table),
@@ -121,25 +127,13 @@ def component_figures(data: ReportData) -> Iterator[Figure]:
         "Standard deviation of the component of electron number k, raw (left or top) and after non-"
         "uniformity correction (right or bottom). For each line a set of parameters is constant over the "
         "pixels; gray: the remaining of the sixteen sets. Where a line is flat the peaks are resolved at "
-        f"every signal.{bias_remark(data)}",
+        "every signal.",
         "Standard deviation of the ensemble's component k, nothing held constant: "
         f"{short(float(width[0]))} DN at k = 0, "
         f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
         (table,),
         components_chart(table, [c for c in _HIGHLIGHTED if c in cases]),
         PAGE_MM,
-    )
-
-
-def bias_remark(data: ReportData) -> str:
-    """Return how pixels enter whose bias may be an electron off; empty where there are none."""
-    lost = float(data.ensemble_facts.get("pixels_of_open_bias", 0.0))
-    if lost < 0.05:
-        return ""
-    return (
-        " Pixels whose bias can be off by an electron have a lower weight (tanh(d/2), d: log-likelihood "
-        "ratio to the next best fit; 0 if it can be off by more or the gain is open), together "
-        f"{short(lost, 2)} {data.noun}s less."
     )
 
 

@@ -91,7 +91,7 @@ def _map(data: ReportData, name: str) -> Figure:
     tables = map_tables(values, name, data.maps.get(f"{name}_stderr"), known)
     return Figure(
         f"map_{name}",
-        "summary" if name == "read_noise_e" else "maps",
+        "summary" if name in ("read_noise_e", "conversion_gain") else "maps",
         symbol(name)[1].capitalize(),
         _CAPTIONS[name],
         _map_alt(data, name, "Values of the channels" if strip else "Histogram and map"),
@@ -297,11 +297,11 @@ def status_chart(
 
 
 def _share(part: int, whole: int) -> str:
-    return f"{part:,} ({percent(part, whole)})"
+    return f"{part:,} ({percent(part, whole)})".replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def _goodness_chart(table: DataTable, false_discovery_rate: float) -> Chart:
-    """Return the p-values of all pixels against what chance gives, and a map of the goodness of fit."""
+    """Return the p-values of all pixels against a uniform distribution, and a map of the goodness of fit."""
     bins = 20
     deviate, known = table["misfit"], finite(table["p"])
     counts, edges = np.histogram(known, bins, (0.0, 1.0))

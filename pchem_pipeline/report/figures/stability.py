@@ -1,6 +1,6 @@
 """Figures of stability and structure: means of frames, rows and columns, and their spectra.
 
-All are made of the sums that the stage ``histogram`` keeps; what chance alone does is drawn beside them.
+Made of the sums that the stage ``histogram`` keeps, with their expectation from sampling noise.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _frame_figure(sums: StackSums) -> Figure:
     means, power = frame_table(sums), power_table(sums)
     together = math.ceil(sums.n_frames / _MOST_POINTS)
     averaged = f" over {together} frames each" if together > 1 else " of each frame"
-    error = float(means["error of chance"][0])
+    error = float(means["expected error"][0])
     scatter = float(means["mean"].std())
     alt = (
         f"Mean of {count(sums.n_frames, 'frame')}: {short(float(means['mean'].mean()), 5)} DN, scatter "
@@ -64,7 +64,7 @@ def _profile_figure(sums: StackSums) -> Figure | None:
         return None
     words = []
     for table in tables:
-        low, high = (table[name] for name in ("chance from", "chance to"))
+        low, high = (table[name] for name in ("expected from", "expected to"))
         outside = int(((table["mean signal"] < low) | (table["mean signal"] > high)).sum())
         words.append(f"{outside} of {count(low.size, table.part)} outside 2 sigma")
     return Figure(
@@ -106,8 +106,8 @@ def frame_table(sums: StackSums) -> DataTable:
     lengths = np.diff(np.append(starts, sums.n_frames))
     means = np.add.reduceat(sums.frame_mean, starts) / lengths
     error = _chance(sums) / np.sqrt(lengths)
-    columns = {"frame": sums.numbers[starts], "mean": means, "error of chance": error}
-    return DataTable(columns, {"mean": "DN", "error of chance": "DN"})
+    columns = {"frame": sums.numbers[starts], "mean": means, "expected error": error}
+    return DataTable(columns, {"mean": "DN", "expected error": "DN"})
 
 
 def _chance(sums: StackSums) -> float:
@@ -142,8 +142,8 @@ def profile_table(sums: StackSums, axis: int) -> DataTable:
     columns = {
         "yx"[axis]: np.arange(medians.size),
         "mean signal": medians,
-        "chance from": np.full(medians.size, middle - reach),
-        "chance to": np.full(medians.size, middle + reach),
+        "expected from": np.full(medians.size, middle - reach),
+        "expected to": np.full(medians.size, middle + reach),
     }
     return DataTable(columns, {"yx"[axis]: "pixel"} | dict.fromkeys(list(columns)[1:], "DN"), _LINES[axis])
 
@@ -191,14 +191,14 @@ def _spectrum(power: FloatArray, length: int, part: str, unit: str) -> DataTable
 
 def _frames_chart(means: DataTable, power: DataTable) -> Chart:
     """Return the chart of the mean of the frames, and its spectrum below."""
-    centre, error = float(means["mean"].mean()), means["error of chance"]
+    centre, error = float(means["mean"].mean()), means["expected error"]
     spectrum = (
         Line(power["frequency"], power["largest"], colour="sky", width=0.6, label="largest"),
         Line(power["frequency"], power["power"], label="mean power"),
         _one(),
     )
     some = bool((power["power"] > 0.0).any())  # of frames that are all alike there is none
-    panel = Panel(Axis("power / chance", log=some), spectrum)
+    panel = Panel(Axis("power / expected", log=some), spectrum)
     below = Stack((panel,), Axis("frequency (1/frame)", log=True), height_mm=44.0)
     ends = centre - 2 * error, centre + 2 * error
     return Chart((_series(means["frame"], means["mean"], ends, "mean", "frame", 0.7), below))
@@ -207,8 +207,8 @@ def _frames_chart(means: DataTable, power: DataTable) -> Chart:
 def _series(
     x: FloatArray, y: FloatArray, ends: tuple[FloatArray, FloatArray], what: str, axis: str, width: float
 ) -> Stack:
-    """Return a series in DN over the band in which chance leaves it."""
-    band = Band(x, *ends, colour="band", label="chance")
+    """Return a series in DN over the band of 2 sigma of sampling noise."""
+    band = Band(x, *ends, colour="band", label="±2 sigma")
     panel = Panel(Axis(f"{what} (DN)"), (band, Line(x, y, width=width, label=what)))
     return Stack((panel,), Axis(axis), height_mm=44.0)
 
@@ -218,7 +218,7 @@ def _profiles_chart(tables: Sequence[DataTable]) -> Chart:
     stacks = []
     for table in tables:
         name = next(iter(table.columns))
-        ends = table["chance from"], table["chance to"]
+        ends = table["expected from"], table["expected to"]
         axis = f"{table.part} {name} (pixel)"
         stacks.append(_series(table[name], table["mean signal"], ends, "median", axis, 0.8))
     return Chart(tuple(stacks))
@@ -236,7 +236,7 @@ def _spectra_chart(fixed: Sequence[DataTable], temporal: Sequence[DataTable]) ->
             colour = "blue" if line == "row" else "vermilion"
             lines.append(Line(table["frequency"], power, colour=colour, width=0.8, label=f"{line}s"))
         known = np.concatenate([[1.0], *(line.y[np.isfinite(line.y)] for line in lines)])
-        y = Axis("power / chance", min(0.8 * known.min(), 0.09), max(1.25 * known.max(), 11.0), log=True)
+        y = Axis("power / expected", min(0.8 * known.min(), 0.09), max(1.25 * known.max(), 11.0), log=True)
         panel = Panel(y, (*lines, _one()), legend="upper right", columns=2, room=(3.0, 3.0))
         x = Axis("frequency (1/row, 1/column)", 0.0, 0.5)
         stacks.append(Stack((panel,), x, title, height_mm=44.0))
@@ -244,5 +244,5 @@ def _spectra_chart(fixed: Sequence[DataTable], temporal: Sequence[DataTable]) ->
 
 
 def _one() -> Level:
-    """Return the line of chance."""
+    """Return the line of sampling noise."""
     return Level(1.0, colour="ink", width=0.6, dash="--")

@@ -73,7 +73,6 @@ def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
             _rivals(data),
             _separate(found.steps),
         ],
-        "shown": [_gaps(found)],
         "parameters": [_parameters(data), _moved(found)],
         "limits": [_untestable(data), _unexplained(found.unexplained), _defects(found), _examined(data)],
     }
@@ -112,7 +111,6 @@ def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
                 "sigma": signed(place.z),
                 "p": probability_text(place.p),
                 "where": place_text(place) or "everywhere",
-                "statistic": place.statistic,
             }
         )
     more = f" The first {_MOST_PLACES} of {len(places)}." if len(places) > _MOST_PLACES else ""
@@ -127,9 +125,9 @@ def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
 def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     rows = []
     best = max((c.score for c in step.candidates if math.isfinite(c.score)), default=math.nan)
-    several = len(step.candidates) > 1
     # an empirical description has no competitors
-    for candidate in step.candidates[: 0 if step.verdict == "described" else _MOST_CANDIDATES]:
+    several = len(step.candidates) > 1 and step.verdict != "described"
+    for candidate in step.candidates[: _MOST_CANDIDATES if several else 0]:
         behind = candidate.score - best
         given = {
             name: f"{value:.3g}" if isinstance(value, int | float) else str(value)
@@ -142,22 +140,21 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
                 "name": data.titles.get(candidate.effect, ""),
                 "log-likelihood": measured(candidate.score, candidate.stderr),
                 "difference": short(behind) if -math.inf < behind < 0 else "best" if behind == 0 else "",
-                "probability": probability_text(candidate.probability) if several else "only candidate",
+                "probability": probability_text(candidate.probability),
                 "parameters": ", ".join(f"{name} {value}" for name, value in given.items()),
             }
         )
     if step.effect:
         outcome = f"{step.effect} was named"
     elif data.found.verdict == "ambiguous":
-        outcome = "these data do not decide" if several else "not confirmed by the final samples"
+        outcome = "these data do not decide"
     else:
         outcome = "none explains the data"
     title = f"Candidates, step {index + 1}" if len(data.found.steps) > 1 else "Candidates"
     return Table(
         f"discrepancy-candidates-{index + 1}",
         f"{title}: {outcome}",
-        "Held-out log-likelihood and its standard error, difference to the best (nats, larger is better) and "
-        "posterior probability.",
+        "",
         rows,
     )
 
@@ -166,8 +163,7 @@ def _rivals(data: DiscrepancyData) -> Table:
     return Table(
         "discrepancy-rivals",
         "Rejected effects",
-        "The next best effects, each fitted instead of the named one: difference of the held-out "
-        "log-likelihood, nats, and reason of the rejection.",
+        "The next best effects, each fitted instead of the named one.",
         [
             {
                 "effect": rival.effect,
@@ -192,33 +188,6 @@ def _separate(steps: Sequence[Step]) -> Table:
         "Measurements that decide",
         "What distinguishes the effects above from similar ones.",
         [{"similar effect": rival, "measurement: difference": text} for rival, text in found],
-    )
-
-
-def _gaps(found: Verdict) -> Table:
-    rows = []
-    for i, step in enumerate(found.steps):
-        low, high = step.gap_interval_after
-        interval = f" ({micronats(low)} to {micronats(high)})" if math.isfinite(low) else ""
-        none = "none reduces it" if step.effect else "not fitted"
-        other = step.runner_up
-        rows.append(
-            {
-                "step": f"{i + 1}: {found.added(step) or step.verdict}",
-                "before": micronats(step.gap_before),
-                "after": f"{micronats(step.gap_after)}{interval}",
-                "floor": micronats(step.gap_floor),
-                "next best effect instead": (
-                    none if other is None else f"{micronats(other.gap_after)} ({other.effect})"
-                ),
-            }
-        )
-    return Table(
-        "discrepancy-gap",
-        "Gap by step",
-        "Gap on held-out frames, micronats per sample, with 95 % interval. The next best effect "
-        "was fitted instead of the named effect.",
-        rows,
     )
 
 
@@ -268,7 +237,7 @@ def _moved(found: Verdict) -> Table:
                 {
                     "parameter": f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
                     "effect added": f"{step.likeliest}{_how(step, found)}",
-                    "change": short(each.median, 2),
+                    "change": short(each.median, 2) if abs(each.in_stderr) >= _NOT_MOVED else "0",
                     "in standard errors": signed(each.in_stderr),
                 }
             )
@@ -303,7 +272,6 @@ def _unexplained(places: Sequence[Place]) -> Table:
                 "disagreement": place.sentence or place.statistic,
                 "sigma": signed(place.z),
                 "where": place_text(place),
-                "statistic": place.statistic,
             }
             for place in places[:_MOST_PLACES]
         ],
@@ -332,37 +300,16 @@ def _surveyed(name: str, data: DiscrepancyData) -> str:
 
 
 def _examined(data: DiscrepancyData) -> Table:
-    found, rows = data.found, []
-    for key, words in (
-        ("frames", "frames"),
-        ("train", "training frames"),
-        ("test", "test frames"),
-        ("final", "frames for the final gap"),
-        ("rows", "rows"),
-        ("columns", "columns"),
-    ):
-        value = getattr(found.examined, key)
-        rows.append((words, f"{value[0]} to {value[1] - 1}" if isinstance(value, tuple) else f"{value:,}"))
-    examined = found.examined
+    examined, rows = data.found.examined, []
     if math.isfinite(examined.share):
-        rows.append(("share of the run's samples", percent(examined.share, 1.0)))
-        rows.append(("share surveyed for deviating regions", percent(examined.surveyed, 1.0)))
+        rows.append(("share of the samples", percent(examined.surveyed, 1.0)))
         rows += [(f"share: {kind}", percent(share, 1.0)) for kind, share in examined.surveyed_by.items()]
     for place in examined.places:
         words = Region.model_validate(place.region).describe()
-        rows.append(
-            (f"whole sensor: {_surveyed(place.map, data)}", f"{words} (p {probability_text(place.p)})")
-        )
-    if examined.elsewhere is not None:
-        there = examined.elsewhere
-        rows.append(("tested again", f"{there.words()}: {there.deviates or 'the model holds'}"))
-    if found.replicates:
-        rows.append(("simulated replicates", f"{found.replicates:,}"))
-    if math.isfinite(found.work):
-        rows.append(("counted work of the search, CPU s of a core of about 2020", f"{found.work:,.0f}"))
-    rows += [(f"version: {name}", str(version)) for name, version in found.versions.items()]
+        rows.append((_surveyed(place.map, data), f"{words} (p {probability_text(place.p)})"))
+    rows += [(f"version: {name}", str(version)) for name, version in data.found.versions.items()]
     cells = [{"item": item, "value": value} for item, value in rows]
-    return Table("discrepancy-examined", "Samples examined", "", cells)
+    return Table("discrepancy-examined", "Survey of the whole sensor", "", cells)
 
 
 #: File of the verdict's own page in the folder of a run.
@@ -389,8 +336,8 @@ PARTS = (
     Section(
         "evidence",
         "Identification of the effect",
-        "Log-likelihood of each fitted candidate on test frames, relative to the best; larger is better. A "
-        "difference below three standard errors is not decisive.",
+        "Log-likelihood of each fitted candidate on test frames, nats; larger is better. A difference below "
+        "three standard errors is not decisive.",
         "No candidates were compared: data and model agree within sampling noise.",
     ),
     Section(
@@ -408,7 +355,7 @@ PARTS = (
     Section(
         "limits",
         "Limits of these data",
-        "Effects that no number of frames of one constant exposure can show, and the samples examined.",
+        "Effects that no number of frames of one constant exposure can show, and regions that deviate.",
         "Nothing was recorded.",
     ),
 )
@@ -438,8 +385,9 @@ def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
     first = _signature(data.found)
     words = {"where": {} if data.found.where else {"title": "Data and model side by side"}}
     if any(step.verdict == "described" for step in data.found.steps):
-        described = "No known effect explains the disagreement; the empirical description has no rivals."
-        words["evidence"] = {"empty": described}
+        words["evidence"] = {"empty": "No known effect explains the disagreement."}
+    elif data.found.steps:
+        words["evidence"] = {"empty": "There is only one candidate."}
     parts = []
     for part in PARTS:
         shown = [each for each in figures if each.section == part.id and each.name not in first]
@@ -620,9 +568,7 @@ def _closing(found: Verdict) -> Iterator[Flag]:
     elif gap.after <= gap.floor and gap.standing_out:
         families = families_words(gap.standing_out)
         yield Flag("caution", f"A significant discrepancy remains in {families}.")
-    elif gap.after <= gap.floor:
-        yield Flag("good", "The remaining gap is within sampling noise.")
-    else:
+    elif gap.after > gap.floor:
         left = percent(1.0 - gap.closed_fraction, 1.0)
         words = f"{micronats(gap.after)} micronats per sample, sampling noise up to {micronats(gap.floor)}"
         level: Level = "caution" if found.verdict == "named_in_part" else "note"

@@ -24,7 +24,7 @@ _NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_n
 
 @dataclass(frozen=True)
 class EmvaRow:
-    """A quantity of EMVA 1288; ``value`` is None where this run cannot tell it."""
+    """A quantity of EMVA 1288; ``value`` is None if this run does not determine it."""
 
     quantity: str
     symbol: str

@@ -18,6 +18,7 @@ from markupsafe import Markup, escape
 from pchem_pipeline.report.charts.on_page import page_charts
 from pchem_pipeline.report.figures.figure import Figure, csv_text
 from pchem_pipeline.report.inspector import content_policy, json_for_html, text_of
+from pchem_pipeline.report.style.palette import dark_rules
 from pchem_pipeline.report.style.wording import short_name, visible
 
 if TYPE_CHECKING:
@@ -173,8 +174,9 @@ def draw_figure(figure: Figure) -> Drawn:
     from pchem_pipeline.report.charts.on_paper import Look, drawing_bytes
 
     drawing = figure.draw(Look(figure.width_mm, svg_text=True))
+    svg = drawing_bytes(drawing, "svg").replace(b"</style>", f"{dark_rules()}</style>".encode(), 1)
     # what needs no escape in a data URL within an attribute
-    picture = quote(drawing_bytes(drawing, "svg"), safe=" !$()*+,-./:;=?@[]^_`{|}~")
+    picture = quote(svg, safe=" !$()*+,-./:;=?@[]^_`{|}~")
     # 4.5 px for a millimetre on paper
     width, height = (round(4.5 * 25.4 * side) for side in drawing.get_size_inches())
     return Drawn(f"data:image/svg+xml,{picture}", width, height)

@@ -41,7 +41,7 @@ PAGE = (
         kind="summary",
     ),
     Section("maps", "Parameter maps"),
-    # what it shows lies at the end of the page
+    # its data are at the end of the page
     Section("inspector", "Look at pixels", kind="inspector"),
     Section(
         "exposures",
@@ -86,7 +86,7 @@ PAGE = (
     Section(
         "components",
         "Why the peaks of the ensemble blur",
-        "Where pixels differ in gain, the peak of an electron number is the wider, the larger the number.",
+        "Where the gain differs between pixels, peaks widen with the electron number.",
         folded=True,
     ),
     Section("uncertainty", "How precise are the numbers?", folded=True),
@@ -164,7 +164,6 @@ def _summary(data: ReportData) -> dict[str, Any]:
     remarks = flags(data)
     return {
         "answers": answers(data, remarks),
-        "caption": f"unflagged {data.noun}s" if data.often_flagged else f"{data.noun}s",
         "numbers": key_numbers(data),
         "sentence": "" if pixel_counts(data).fitted else sentence(data),
         "stepped_back": key_numbers(data, with_flagged=True) if data.mostly_flagged else [],
@@ -233,7 +232,7 @@ def citation(data: ReportData) -> dict[str, str]:
     version = known.get("pchem-pipeline") or metadata.version("pchem-pipeline")
     libraries = ", ".join(f"{name} {known[name]}" for name in ("numpy", "numba") if name in known)
     text = (
-        f"{sentence(data)} Estimates and standard errors are those of maximum likelihood (PCH-EM), made with "
+        f"{sentence(data)} Estimates and standard errors: maximum likelihood (PCH-EM), "
         f"pchem_pipeline {version}{f' with {libraries}' if libraries else ''}."
     )
     if digest := data.run.get("digest of the input"):

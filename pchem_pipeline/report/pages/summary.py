@@ -60,7 +60,9 @@ def criteria(data: ReportData) -> list[Criterion]:
         value = None if limit is None else measure(data)
         if value is not None:
             number, words = value
-            found.append(Criterion(setting, words, show(number), f"≤ {show(limit)}", number <= limit))
+            met, shown = number <= limit, show(number)
+            shown = shown if met or shown != show(limit) else f"> {shown}"  # rounded to the limit
+            found.append(Criterion(setting, words, shown, f"≤ {show(limit)}", met))
     return found
 
 
@@ -104,7 +106,7 @@ def _outlying(data: ReportData) -> _Found:
 
 
 def _gain_spread(data: ReportData) -> _Found:
-    """Return the spread of the gain between pixels over its median, without that of the pixels' errors."""
+    """Return the spread of the gain between pixels over its median, corrected for their errors."""
     if data.few_channels or not data.has_values("conversion_gain"):
         return None
     summary = data.summary("conversion_gain")
@@ -193,7 +195,7 @@ KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "quanta_exposure",
 _RMSE_GOOD, _RMSE_BAD = 1.3, 3.0
 #: Share of pixels with one reason for caution from which the first screen says so.
 _CAUTION_SHARE = 0.01
-#: Read noise, e-, above which electrons cannot be told apart.
+#: Read noise, e-, above which electrons cannot be counted.
 _TOO_NOISY = 0.5
 
 

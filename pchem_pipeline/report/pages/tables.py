@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import Any
 
@@ -13,8 +14,8 @@ import numpy as np
 from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
 from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.maps.maps import summarise
-from pchem_pipeline.report.data import ReportData, Samples, reasons_in, truth_errors
-from pchem_pipeline.report.figures.ensemble import HALVES, PREDICTIONS, bias_remark
+from pchem_pipeline.report.data import ReportData, Samples, truth_errors
+from pchem_pipeline.report.figures.ensemble import HALVES, PREDICTIONS
 from pchem_pipeline.report.figures.methods import crossing_text, percent_text
 from pchem_pipeline.report.figures.samples import AXES, middle
 from pchem_pipeline.report.pages.summary import check_title
@@ -58,8 +59,8 @@ class Table:
 def result_tables(data: ReportData) -> list[Table]:
     """Return the tables of results that the data allow."""
     makers = (
-        _channels, _parameters, _flagged, _against_truth, _rmse, _moments, _electrons, _misfits, _intervals,
-        _status, _samples, _plan, _quick_look,
+        _channels, _parameters, _flagged, _against_truth, _moments, _misfits, _intervals, _samples, _plan,
+        _quick_look,
     )  # fmt: skip
     return [table for make in makers if (table := make(data)) is not None and table.rows]
 
@@ -90,7 +91,7 @@ def _quick_look(data: ReportData) -> Table:
 def _limit_text(check: Check) -> str:
     if not math.isfinite(check.limit):
         return "not known"
-    return f"{short(check.limit, 2)}{f' {check.unit}' if check.unit != '1' else ''}"
+    return check_size(replace(check, size=check.limit, size_e=math.nan, share=math.nan))
 
 
 def _chance_text(p: float) -> str:
@@ -120,7 +121,7 @@ def _parameter_row(data: ReportData, name: str) -> Row:
         "median": measured(summary.median, summary.median_stderr),
         "spread": short(summary.robust_sd),
         f"error per {data.noun}": "not known" if error is None else short(error, 2),
-        **{f"{p:g} %": short(summary.percentiles[p], 4) for p in data.percentiles},
+        **{f"{p:g} %": short(summary.percentiles[p], 4) for p in data.percentiles if p != 50.0},
         "outliers": f"{summary.n_low + summary.n_high:,}",
         "pixels": f"{summary.n_valid:,}",
     }
@@ -179,8 +180,8 @@ def _against_truth(data: ReportData) -> Table:
     return Table(
         "truth",
         "Estimates against the truth",
-        "Simulated data only. Pull: (estimate − truth) / standard error; mean 0 and standard deviation 1 if "
-        f"estimates are unbiased and errors correct.{_left_out(data)}",
+        "Simulated data only. Pull: (estimate − truth) / standard error; mean 0 if estimates are unbiased, "
+        f"scatter (standard deviation) 1 if errors are correct.{_left_out(data)}",
         list(_truth_rows(data)),
     )
 
@@ -194,7 +195,7 @@ def _truth_rows(data: ReportData) -> Iterator[Row]:
             "estimated median": short(found.median, 4),
             "RMSE": short(found.rmse),
             "mean pull": measured(float(pull.mean()), float(1 / np.sqrt(n))) if n else "not known",
-            "sd of pulls": measured(float(pull.std()), float(1 / np.sqrt(2 * n))) if n else "not known",
+            "scatter of pulls": measured(float(pull.std()), float(1 / np.sqrt(2 * n))) if n else "not known",
         }
 
 
@@ -209,40 +210,26 @@ RMSES = {
 }
 
 
-def _rmse(data: ReportData) -> Table:
-    rmse: Mapping[str, float] = data.ensemble_facts.get("rmse", {})
-    rows = []
-    for name, (words, unit) in RMSES.items():
-        if rmse.get(name) is None or name.endswith("noise_floor"):
-            continue
-        floor = rmse.get("nuced_noise_floor" if name.startswith("nuced") else "noise_floor")
-        rows.append(
-            {
-                "prediction": words,
-                "RMSE": f"{scientific(rmse[name], 3)} {unit}",
-                "sampling noise": f"{scientific(floor, 3)} {unit}" if floor else "not known",
-                "ratio": short(rmse[name] / floor) if floor else "not known",
-            }
-        )
-    return Table(
-        "rmse",
-        "Ensemble prediction against data",
-        "Root mean square difference of densities, and its expectation from sampling noise alone.",
-        rows,
-        "ensemble",
-    )
-
-
 def _moments(data: ReportData) -> Table:
-    remark = bias_remark(data)
-    bias = f" Variance of the bias:{remark}" if remark else ""
     return Table(
         "moments",
         "Moments of the ensemble",
         "From the parameter maps (Hendrickson et al. 2023, Appendix A) and from the data with their "
-        f"standard error.{bias}",
+        f"standard error.{_bias_remark(data)}",
         [_moment_row(row) for row in data.moments],
         "ensemble",
+    )
+
+
+def _bias_remark(data: ReportData) -> str:
+    """Return how pixels count whose bias may be an electron off; empty where there are none."""
+    lost = float(data.ensemble_facts.get("pixels_of_open_bias", 0.0))
+    if lost < 0.05:
+        return ""
+    return (
+        " In the variance of the bias, pixels whose bias can be off by an electron have a lower weight "
+        "(tanh(d/2), d: log-likelihood ratio to the next best fit; 0 if it can be off by more or the gain is "
+        f"open): {short(lost, 2)} {data.noun}s fewer in total."
     )
 
 
@@ -262,43 +249,8 @@ def _moment_row(row: Mapping[str, Any]) -> Row:
         "moment": f"{row['quantity']} ({unit})" if unit else str(row["quantity"]),
         "from the maps": expected,
         "from the data": seen,
-        "difference / standard error": difference,
+        "difference in standard errors": difference,
     }
-
-
-def _electrons(data: ReportData) -> Table | None:
-    arrays, facts = data.ensemble, data.ensemble_facts
-    if "electron_mass" not in arrays:
-        return None
-    k = np.asarray(arrays["k"])
-    mass, pmf = np.asarray(arrays["electron_mass"]), np.asarray(arrays["electron_pmf"])
-    expected = np.asarray(arrays["electron_pmf_map"]) if "electron_pmf_map" in arrays else None
-    seen = np.flatnonzero(mass > 1e-3)
-    last = int(seen[-1]) if seen.size else 0
-    samples = float(np.sum(arrays["electron_counts"])) if "electron_counts" in arrays else 0.0
-    errors = np.sqrt(mass * (1.0 - mass) / samples) if samples else np.full(mass.shape, np.nan)
-    words = ""
-    if facts.get("error_rate") is not None:
-        rate, error = 100.0 * float(facts["error_rate"]), 100.0 * float(facts.get("error_rate_stderr") or 0.0)
-        words += f" {measured(rate, error)} % of the estimates are wrong (truth known)."
-    if facts.get("expected_error_rate") is not None:
-        expected_errors = percent(float(facts["expected_error_rate"]), 1.0)
-        words += f" Expected from the fitted parameters: {expected_errors}."
-    return Table(
-        "electron-table",
-        "Electron numbers",
-        f"Share of each estimated electron number, and its prediction.{words}",
-        [
-            {
-                "k": str(int(k[i])),
-                "estimated": measured(float(mass[i]), float(errors[i])) if samples else f"{mass[i]:.5f}",
-                "predicted p(k)": f"{pmf[i]:.5f}",
-                "expected share": f"{expected[i]:.5f}" if expected is not None else "",
-            }
-            for i in range(min(last + 1, 24))  # ``report.json`` has all
-        ],
-        "electrons",
-    )
 
 
 def _misfits(data: ReportData) -> Table | None:
@@ -317,8 +269,8 @@ def _misfits(data: ReportData) -> Table | None:
                 data.noun: f"channel {row['x']}" if data.shape[0] == 1 else f"y = {row['y']}, x = {row['x']}",
                 "χ²": f"{row['chi2']:.1f}",
                 "degrees of freedom": f"{row['dof']:.1f}".removesuffix(".0"),
-                "p": scientific(float(row["p"])),
-                "q": scientific(float(row["q"])),
+                "p": _chance_text(float(row["p"])),
+                "q": _chance_text(float(row["q"])),
                 "misfit": "yes" if float(row["q"]) <= float(facts["false_discovery_rate"]) else "no",
             }
             for row in facts["worst"]
@@ -365,27 +317,6 @@ def _interval_rows(data: ReportData) -> Iterator[Row]:
                 ends = [short(float(np.nanmedian(part / errors))) for part in (values - low, high - values)]
             row |= dict(zip(("profile: below", "profile: above"), ends, strict=True))
         yield row
-
-
-def _status(data: ReportData) -> Table:
-    status, unfitted = data.status, int(data.unfitted.sum())
-    good = int((status == 0).sum()) - int((data.unfitted & (status == 0)).sum())
-    rows = [("good fit", good, f"{good:,}")]
-    if unfitted:
-        rows.append(("not fitted yet", unfitted, "none"))
-    for bit, text, n in reasons_in(status):
-        usable = int((~data.failed & (status & int(bit) != 0)).sum())
-        rows.append((text, n, f"{usable:,}, with caution" if usable else "none"))
-    return Table(
-        "failures",
-        "Fit status by reason",
-        "A pixel with several reasons counts for each.",
-        [
-            {"reason": reason, "pixels": f"{n:,}", "share": percent(n, status.size), "with a value": usable}
-            for reason, n, usable in rows
-        ],
-        "status",
-    )
 
 
 def _samples(data: ReportData) -> Table | None:
@@ -534,13 +465,13 @@ _HEADS = {
     "pixels with a result": "pixels",
     "median g (e⁻/DN)": "g, e-/DN",
     "bias of g (%)": "g bias %",
-    "rms error of g (%)": "g rmse %",
+    "rms error of g (%)": "g rms %",
     "robust spread of g (1.4826 MAD, %)": "g spread %",
     "bound (%)": "g bound %",
-    "error / bound": "rmse/bound",
-    "rms error of the read noise (%)": "s_e rmse %",
-    "rms error of H (%)": "H rmse %",
-    "µs per pixel": "us/pixel",
+    "error / bound": "rms/bound",
+    "rms error of the read noise (%)": "noise rms %",
+    "rms error of H (%)": "H rms %",
+    "µs per pixel": "µs/pixel",
 }
 
 
@@ -554,14 +485,14 @@ def methods_text(result: Mapping[str, Any]) -> str:
     lines = [f"{result['pixels']:,} pixels, errors against {against}"]
     lines += [f"sample {i}: {_sample(sample)}" for i, sample in enumerate(result["samples"])]
     first, *others = _HEADS.values()
-    head = f"{first:<34}" + "".join(f"{column:>12}" for column in others)
+    head = f"{first:<30}" + "".join(f"{column:>12}" for column in others)
     lines += ["", head, "-" * len(head)]
     for row in method_rows(result):
         lines.append(
-            f"{row[0]:<34}" + (f"  {row[1]}" if len(row) == 2 else "".join(f"{c:>12}" for c in row[1:]))
+            f"{row[0]:<30}" + (f"  {row[1]}" if len(row) == 2 else "".join(f"{c:>12}" for c in row[1:]))
         )
     if result["study"]:
-        lines += ["", crossing_text(result["study"])]
+        lines += ["", *textwrap.wrap(crossing_text(result["study"]), 100)]
     return "\n".join(lines)
 
 

@@ -1,12 +1,12 @@
 """Colours of figures by what they stand for, for light and dark paper, and scales of colours for maps.
 
-Colours of lines are those of Okabe and Ito (2008), which the colour-blind can tell apart; maps use
-``viridis``, whose lightness rises evenly, differences a diverging scale whose ends everyone can tell apart.
+Colours of lines: Okabe and Ito (2008), distinct for the colour-blind; maps use ``viridis``, whose lightness
+rises evenly, differences a diverging scale.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ class Palette:
         faint: small notes.
         blue, vermilion, green, orange, sky, purple, yellow: lines and marks.
         bars: areas of histograms.
-        band: where chance puts values.
+        band: 2 sigma of sampling noise.
         grid: lines of a grid.
         no_value: pixels without a value in maps, outside the range of ``MAP_COLOURS`` in hue and saturation.
         mark: what the verdict points to.
@@ -77,6 +77,15 @@ DARK = Palette(
     no_value="#4A4A4A",
     mark="#7A7320",
 )
+
+
+def dark_rules() -> str:
+    """Return a style sheet for a drawing on light paper (SVG) that makes it dark on a dark screen."""
+    rules = [f"text{{fill:{DARK.ink}}}"]
+    for of in ("fill", "stroke"):
+        for light, dark in zip(astuple(LIGHT)[:-1], astuple(DARK)[:-1], strict=True):  # mark is yellow, too
+            rules.append(f'[style*="{of}: {light.lower()}"]{{{of}:{dark}!important}}')
+    return f"@media screen and (prefers-color-scheme:dark){{{''.join(rules)}}}"
 
 
 def shades() -> NDArray[np.uint8]:

@@ -478,7 +478,7 @@
       if (state.corner) finishRectangle();
       else {
         state.corner = { from: at, to: at };
-        say("First corner set; move to the other one and press s again.");
+        say("First corner set; move to the opposite corner and press s again.");
         redraw();
       }
     } else if (event.key === "Escape") { state.corner = null; select(null); }
@@ -978,7 +978,7 @@
       notes.push(`Values to ${facts.keptTo}; this ${facts.noun}'s histogram is not in the file, which`);
       notes.push(`holds ${whole(facts.sample.n)} of ${whole(n)}. To see all: ${facts.command}`);
     } else if (facts.model && !pixel.mass && parametersOf(pixel)) {
-      notes.push(`The curve of the model ${facts.model} is not in the file for this ${facts.noun}: ${facts.command}`);
+      notes.push(`To see the fitted curve of this ${facts.noun} (model ${facts.model}): ${facts.command}`);
     }
     byId("inspector-note").textContent = notes.join(" ");
     byId("inspector-nearest").hidden = pixel.counts !== null;

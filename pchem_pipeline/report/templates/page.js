@@ -16,7 +16,11 @@
 
   // -- figures as files ------------------------------------------------------------------------
   const SVG = "data:image/svg+xml,";
-  const savePng = async (image, name) => {
+  // files are for paper: without the rules of a dark screen
+  const svgOf = (image) => decodeURIComponent(image.src.slice(SVG.length)).replace(/@media screen[^]*?(?=<\/style>)/, "");
+  const savePng = async (shown, name) => {
+    const image = new Image();
+    image.src = SVG + encodeURIComponent(svgOf(shown));
     await image.decode();
     const scale = 2400 / image.naturalWidth, canvas = document.createElement("canvas");
     canvas.width = 2400;
@@ -44,9 +48,7 @@
       made.addEventListener("click", act);
       row.append(made);
     };
-    if (image.src.startsWith(SVG)) {
-      button("SVG", `${name} as SVG`, () => save(decodeURIComponent(image.src.slice(SVG.length)), "image/svg+xml", `${name}.svg`));
-    }
+    button("SVG", `${name} as SVG`, () => save(svgOf(image), "image/svg+xml", `${name}.svg`));
     button("PNG", `${name} as PNG`, () => savePng(image, `${name}.png`));
     for (const [part, content] of tables[name] ?? []) {
       const file = `${name}${part ? `_${part}` : ""}.csv`;

@@ -38,7 +38,7 @@ def verdict_text(found: Verdict) -> str:
     """
     lines = [*_wrapped(f"{found.word.upper()}: {found.sentence}", "  ")]
     agrees = found.verdict in ("consistent", "cannot_tell")
-    lines += _places("largest: " if agrees else "where: ", found.where, _MOST_PLACES)
+    lines += _places("largest deviation" if agrees else "disagreement", found.where, _MOST_PLACES)
     for number, step in enumerate(found.steps, 1):
         lines += _step(step, number if len(found.steps) > 1 else 0, found)
     lines += _gap(found)
@@ -52,39 +52,29 @@ def verdict_text(found: Verdict) -> str:
         lines += _wrapped(found.examined.elsewhere.says())
     if found.doubt and found.steps:
         lines += _wrapped(f"not tested, and no sizes in e-: {found.doubt}")
-    if found.unexplained:
-        lines += _places("unexplained: ", found.unexplained, _MOST_LEFT)
+    lines += _places("unexplained", found.unexplained, _MOST_LEFT)
     for tag, why in found.defects.items():
         lines += _wrapped(f"DEFECT: candidate {tag} failed and was not compared: {why}")
     if found.untestable:
-        lines += _listed("not testable with such frames", list(found.untestable), 0)
+        lines += _wrapped(f"not testable with such frames: {', '.join(found.untestable)}")
     return "\n".join(lines)
 
 
 def _wrapped(text: str, indent: str = "  ") -> list[str]:
     # line breaks in a plug-in's message would break the columns
     words = _BEFORE_UNIT.sub(_HELD, typeset(" ".join(text.split())))
-    lines = textwrap.wrap(words, _WIDTH - 7, subsequent_indent=indent, break_long_words=True) or [""]
+    lines = textwrap.wrap(words, _WIDTH, subsequent_indent=indent, break_long_words=True) or [""]
     return [line.replace(_HELD, " ") for line in lines]
-
-
-def _listed(words: str, items: Sequence[str], more: int) -> list[str]:
-    return _wrapped(f"{words}: {', '.join(items)}{f' and {more} more' if more > 0 else ''}")
 
 
 def _places(title: str, places: Sequence[Place], most: int) -> list[str]:
     lines = []
-    indent = " " * len("where: ")
-    for i, place in enumerate(places[:most]):
+    for place in places[:most]:
         spots = _spots(place)
         words = f"{place.sentence or place.statistic} ({sigma_text(place.z)}{f'; {spots}' if spots else ''})"
-        first, *rest = _wrapped(words)
-        if i == 0 and len(title) > len(indent):
-            lines.append(title.rstrip())
-        lead = title if i == 0 and len(title) == len(indent) else indent
-        lines += [lead + first, *(indent + line for line in rest)]
+        lines += _wrapped(f"{title}: {words}")
     more = len(places) - most
-    return [*lines, f"{indent}and {more} more"] if more > 0 else lines
+    return [*lines, f"{title}: {more} more (see discrepancy.json)"] if more > 0 else lines
 
 
 def _spots(place: Place) -> str:
@@ -116,7 +106,8 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
             f"{name} = {fitted_or_chosen(p.value, p.stderr, p.unit)}" for name, p in step.parameters.items()
         ]
         values += [f"{name} = {word}" for name, word in step.form.items()]
-        lines += _listed(f"{step.likeliest} in {step.place}" if step.place else step.likeliest, values, 0)
+        place = f" in {step.place}" if step.place else ""
+        lines += _wrapped(f"{step.likeliest}{place}: {', '.join(values)}")
     if step.effect:
         lines += [line for rival in step.rivals for line in _rejected(rival)]
     elif found.verdict == "ambiguous":
@@ -143,19 +134,15 @@ def _gap(found: Verdict) -> list[str]:
     gap = found.gap
     if not math.isfinite(gap.before):
         return []
-    words = f"disagreement: {micronats(gap.before)}"
+    words = f"gap between data and model: {micronats(gap.before)}"
     if found.steps and math.isfinite(gap.after):
         words += f" → {micronats(gap.after)}"
-    words += f" ×10⁻⁶ of log-likelihood per sample (sampling noise makes up to {micronats(gap.floor)}"
-    if found.steps and gap.within_chance:
-        words += ": no more before and after"
-    elif found.steps and math.isfinite(gap.closed_fraction):
+    words += f" micronats per sample (sampling noise: up to {micronats(gap.floor)})"
+    if found.steps and not gap.within_chance and math.isfinite(gap.closed_fraction):
         nearest = " by the closest effect" if found.verdict == "unexplained" else ""
-        words += f"; {share_text(gap.closed_fraction)} explained{nearest}"
-    words += ")"
+        words += f", {share_text(gap.closed_fraction)} closed{nearest}"
     for step in found.steps:
-        if step.within_chance or not step.effect:
-            continue  # reductions of sampling noise mean nothing
-        if (other := step.runner_up) is not None:
-            words += f"; instead of {step.effect}: {micronats(other.gap_after)} with {other.effect}"
+        # reductions of sampling noise mean nothing
+        if step.effect and not step.within_chance and (other := step.runner_up) is not None:
+            words += f"; with {other.effect} instead of {step.effect}: {micronats(other.gap_after)}"
     return _wrapped(words)

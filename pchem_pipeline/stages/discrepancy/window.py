@@ -1,6 +1,6 @@
 """Which part of a stack is looked at closely: where the summaries of all its samples disagree most.
 
-Where they disagree clearly few samples are enough to tell what makes it.
+Where they disagree clearly, few samples identify the cause.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class TileFit:
         effects: of the run's model; the plain fit is where the one under their law starts.
         set_aside: codes that the fit leaves out, e- on the comb of the fit with the PCD.
         bias: of several samples, which hold no electrons; empty for one sample.
-        shown: the sample whose H stands in ``fit``.
+        shown: the sample whose H is in ``fit``.
     """
 
     settings: FitSettings = field(default_factory=FitSettings)

@@ -41,7 +41,7 @@ class _AlongTime:
     """Gathers the pieces of one array along its first axis, and writes them by whole chunks."""
 
     def __init__(self, store: Path, name: str, rows: slice, done: int = 0) -> None:
-        """Begin at the first frame or block, or behind those that are there.
+        """Begin at the first frame or block that is not counted yet.
 
         Args:
             store: path of the run.
@@ -113,7 +113,7 @@ class StackCounter:
         self._counters = [_BandCounter(job, rows) for rows in bands]
 
     def resume(self, n_frames: int) -> None:
-        """Go on behind the frames that the run has counted.
+        """Continue after the frames that the run has counted.
 
         Args:
             n_frames: their number.
@@ -178,7 +178,7 @@ class _BandCounter:
                 self._moved = MovedFrames()
 
     def resume(self, n_frames: int) -> None:
-        """Go on behind the frames that the run has counted, see `StackCounter.resume`."""
+        """Continue after the frames that the run has counted, see `StackCounter.resume`."""
         opened, self._spectrum = open_store(self._store), None  # that of the first frames is there
         region = self._rows, slice(None)
         held = RowHistograms(**opened.at(region, "histogram"))

@@ -43,7 +43,6 @@ class Plan:
         workers: number of workers.
         single_pass: the camera files are read once; else twice, by bands of rows.
         input_bytes: of the camera files.
-        read_bytes: of the camera files, in all.
         written_bytes: into the store, about.
         held_bytes: largest resident memory of the process.
         allowed_bytes: memory that it may take.
@@ -56,7 +55,6 @@ class Plan:
     workers: int
     single_pass: bool
     input_bytes: int
-    read_bytes: int
     written_bytes: int
     held_bytes: int
     allowed_bytes: int
@@ -64,13 +62,13 @@ class Plan:
     def words(self) -> list[str]:
         """Return the plan as ``--dry-run`` prints it."""
         n, ny, nx = self.shape
-        how = "once" if self.single_pass else "twice, in bands of rows (once with more compute.max_memory)"
+        how = "" if self.single_pass else ", twice, in bands of rows (once with more compute.max_memory)"
         return [
             f"plan: {n} frames of {ny} x {nx} pixels, {self.tiles} tile{'s' * (self.tiles > 1)} of "
             f"{min(self.tile[0], ny)} x {min(self.tile[1], nx)}, "
             f"{self.bins} bins, {self.workers} worker{'s' * (self.workers > 1)}",
-            f"plan: reads {self.input_bytes / 1e9:.3g} GB of camera files {how}: "
-            f"{self.read_bytes / 1e9:.3g} GB in all; writes about {self.written_bytes / 1e9:.2g} GB",
+            f"plan: reads {self.input_bytes / 1e9:.3g} GB of camera files{how}; "
+            f"writes about {self.written_bytes / 1e9:.2g} GB",
             f"plan: needs at most {self.held_bytes / 2**20:.0f} MiB of memory, for any number of frames; "
             f"{self.allowed_bytes / 2**20:.0f} MiB allowed",
         ]
@@ -100,7 +98,7 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     from pchem_pipeline.frames.resolve import input_paths
 
     frames = open_frames(config.input, base_dir)
-    n, ny, nx = frames.shape
+    ny, nx = frames.shape[1:]
     workers = config.compute.count()
     size = sum(file_size(path) for path in input_paths(config.input, base_dir))
     limit = most_bins(config.histogram.max_bins, frames.dtype)
@@ -111,10 +109,6 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     single_pass = whole <= allowed
     bands = BASE_BYTES + min(whole - BASE_BYTES, workers * band_bytes(config, workers))
     report = _REPORT_BYTES + _REPORT_PIXEL_BYTES * ny * nx
-    first = min(config.histogram.window_frames, n) / n
-    ensemble = n if config.ensemble.frames == "all" else min(config.ensemble.frames, n)
-    again = ensemble / n + (0 if single_pass else 1 + first)
-    copies = config.input.mode == "copy"
     return Plan(
         shape=frames.shape,
         bins=bins,
@@ -123,7 +117,6 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
         workers=workers,
         single_pass=single_pass,
         input_bytes=size,
-        read_bytes=round(size * (1 + (0 if copies else again))),
         written_bytes=_written(config, frames.shape, frames.dtype),
         held_bytes=max(whole if single_pass else bands, report),
         allowed_bytes=allowed,

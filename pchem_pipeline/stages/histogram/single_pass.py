@@ -137,7 +137,7 @@ def _fits(context: StageContext, frames: FrameSequence, bins: int) -> bool:
 
 
 def _count(context: StageContext, frames: FrameSequence, stream: HashedFrameStream) -> bool:
-    """Count all frames; tell whether memory was enough for the bins that the first ones show."""
+    """Count all frames; return whether memory was enough for the bins that the first ones need."""
     config, workers = context.config, context.config.compute.count()
     blocks = iter(stream)
     first = next(blocks)

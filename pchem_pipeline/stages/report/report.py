@@ -48,7 +48,7 @@ def run(context: StageContext) -> None:
     """Write the report.
 
     Raises:
-        ConfigError: a pixel of ``report.pixels`` lies outside the sensor.
+        ConfigError: a pixel of ``report.pixels`` is outside the sensor.
         StoreError: an array is missing or the store cannot be written.
     """
     ny, nx = context.sensor.shape

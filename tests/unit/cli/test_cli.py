@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.commands import invoke
+from typer.main import get_command
 
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ConfigError, ExitCode, InputError, StoreError
@@ -110,6 +111,20 @@ def test_help_has_a_short_name_and_the_package_is_the_command():
         [sys.executable, "-m", "pchem_pipeline", "--version"], capture_output=True, text=True
     )
     assert answer.stdout == f"pchem {__version__}\n"
+
+
+def test_help_groups_commands_and_options_and_cuts_no_first_line():
+    text = invoke("--help").stdout
+    for name, command in get_command(app.app).commands.items():
+        assert f"\n  {name:11}  {command.help.splitlines()[0]}\n" in text
+    headings = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert headings == [
+        "Options:", "Run:", "Look at results:", "Use results:", "Plan:", "Stages of a run:"
+    ]  # fmt: skip
+    own, common = invoke("run", "--help").stdout.split("Common options:")
+    assert "--until" in own
+    assert "--bit-depth" in own.partition("Camera files:")[2]
+    assert "--workers" in common
 
 
 def test_init_writes_a_valid_file_once(tmp_path, monkeypatch):

@@ -70,7 +70,7 @@ def test_a_dry_run_writes_no_yaml(tmp_path, file, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = invoke("run", file, "--dry-run")
     assert result.exit_code == 0
-    assert "ingest: missing → would run" in result.stderr
+    assert "ingest: would run (missing)" in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == [file.name]
 
 

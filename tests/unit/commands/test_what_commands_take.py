@@ -70,7 +70,7 @@ def test_a_pixel_has_a_new_defect_unless_what_it_is_seen_in_agrees_within_the_er
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ("rownoise@columns=2:5", r"'rownoise': no such effect; choose one of: adc_dnl, .*row_noise"),
+        ("rownoise@columns=2:5", r"'rownoise': no such effect; pchem info lists them; .*columns=A:B"),
         ("row_noise@colums=2:5", "columns=A:B"),
         ("row_noise@columns=2:9000", "the sensor has"),
         ("clipping", "has no typical strength"),

@@ -184,7 +184,7 @@ def test_status_tells_the_model_that_each_result_rests_on(run):
     assert not (run.parent / "run.zarr/model/0002.json").exists()  # a look changes nothing
     run_stages(find_run(path), ["fit"], QUIET)
     assert states(path)["fit"] == ("complete", 2)
-    assert states(path)["maps"] == ("stale - fit was run again", 1)
+    assert states(path)["maps"] == ("stale - new fit", 1)
     shown = invoke("status", path).stdout
     assert "fit         complete  (with model 2)" in shown.splitlines()
     shown = invoke("status", path, "--json").stdout
@@ -200,7 +200,7 @@ def test_a_verdict_is_put_in_force_and_taken_back(run):
     assert words == f"{held}; to go back: pchem model {run} --use 1"
     assert run.read_text(encoding="utf-8") == text
     shown = invoke("fit", run).stderr
-    assert "the model is that of run.effects.yaml, instead of the one in run.yaml" in shown
+    assert "the model is from run.effects.yaml, not from run.yaml" in shown
     assert load_config(run).model == settings(ROW) == target.config.model
     assert states(run)["fit"] == ("complete", 2)
     # what the search found is not what it started from

@@ -123,7 +123,7 @@ def test_a_changed_setting_redoes_the_stages_that_read_it(make):
     state = status(FAKES["fit"], changed)
     assert state.words() == "stale - fit.gap_threshold 5.0 -> 7.0"
     execute("fit", changed)
-    assert status(FAKES["maps"], changed).words() == "stale - fit was run again"
+    assert status(FAKES["maps"], changed).words() == "stale - new fit"
     execute("maps", changed)
     assert changed.store.read("maps/bias")[0, 0] == 14
 
@@ -194,7 +194,7 @@ def test_an_undivided_stage_starts_again_when_upstream_grew(make):
     BROKEN.clear()
     execute("fit", make())
     execute("maps", make())
-    assert status(FAKES["ensemble"], make()).words() == "stale - maps was run again"
+    assert status(FAKES["ensemble"], make()).words() == "stale - new maps"
 
 
 def test_tiles_redo_a_part_only_with_force(make):

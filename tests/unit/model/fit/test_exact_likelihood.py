@@ -148,7 +148,7 @@ def test_a_run_says_how_many_pixels_rounding_biases_and_that_a_default_would_do_
         gains[likelihood] = store.read("fit/conversion_gain")
     assert (gains["density"] != gains["auto"]).all()
     change = "density → auto (the default; fit.likelihood: density in the YAML keeps the result)"
-    assert f"fit: stale - fit.likelihood {change} → running again" in capsys.readouterr().err
+    assert f"fit: running again: fit.likelihood {change}" in capsys.readouterr().err
     path.write_text(common + "fit: {likelihood: exact}\n")
     [words] = [state.words() for state in run_status(find_run(path)) if state.stage == "fit"]
     assert words == "stale - fit.likelihood auto -> exact"

@@ -173,7 +173,7 @@ def test_fit_status_map_has_a_legend_of_words(shape: tuple[int, int]) -> None:
 def test_pixels_that_no_fit_has_reached_are_not_called_good() -> None:
     status, missing = np.zeros((6, 8), dtype=np.uint16), np.zeros((6, 8), dtype=bool)
     missing[:2] = True
-    words = texts(draw_chart(LOOK, status_chart(status, reasons_in(status), missing)))
+    words = texts(draw_chart(LOOK, status_chart(status, reasons_in(status), missing))).replace("\xa0", " ")
     assert "not fitted yet: 16 (33 %)" in words
     assert "good fit: 32 (67 %)" in words
 
@@ -283,7 +283,7 @@ def test_independent_pixels_give_the_power_of_chance(clean: StackSums) -> None:
     power = power_table(clean)["power"]
     assert np.all(power > 0)
     # a frame's mean scatters as chance says: n - 1 degrees of freedom
-    ratio = frame_table(clean)["mean"].var() / frame_table(clean)["error of chance"][0] ** 2
+    ratio = frame_table(clean)["mean"].var() / frame_table(clean)["expected error"][0] ** 2
     assert abs(ratio - 1.0) < 5.0 * np.sqrt(2.0 / N)
     for table in line_spectra(clean):
         each = table["power"]
@@ -325,7 +325,7 @@ def test_what_moves_in_time_and_what_repeats_in_space_is_seen() -> None:
     assert spectrum["frequency"][np.argmax(spectrum["largest"])] == pytest.approx(0.2, rel=0.05)
     assert spectrum["largest"].max() > 100.0
     columns = profile_table(sums, 1)
-    outside = columns["mean signal"] > columns["chance to"]
+    outside = columns["mean signal"] > columns["expected to"]
     assert outside[::8].all()
     assert outside.sum() < 12
     pattern = next(each for each in pattern_spectra(sums) if each.part == "pattern_column")

@@ -20,13 +20,15 @@ def test_the_verdict_comes_first_and_lines_are_short(verdict):
 
 def test_what_a_named_effect_is_told_with():
     text = " ".join(verdict_text(verdict_of("named")).split())
-    assert "where: row means of the readout residuals scatter more than independent pixels (84 sigma)" in text
+    assert (
+        "disagreement: row means of the readout residuals scatter more than independent pixels (84 sigma)"
+        in text
+    )
     assert "148 to 152 DN" in text
-    assert "and 1 more" in text
+    assert "disagreement: 1 more (see discrepancy.json)" in text
     assert "row_noise_dn = 0.3512 ± 0.0041 DN" in text
-    assert "disagreement: 477 → 0.4 ×10⁻⁶ of log-likelihood per sample (sampling noise makes" in text
-    assert "makes up to 0.66; 99.92 % explained)" in text
-    assert "instead of row_noise: 120 with periodic_pickup" in text
+    assert "gap between data and model: 477 → 0.4 micronats per sample (sampling noise: up to 0.66)" in text
+    assert "0.66), 99.92 % closed; with periodic_pickup instead of row_noise: 120" in text
     assert "DEFECT: candidate odd_plugin failed and was not compared: ValueError: boom" in text
 
 
@@ -51,9 +53,10 @@ def test_a_verdict_says_why_the_next_rivals_lost():
 
 
 def test_an_unexplained_verdict_says_what_is_left():
-    lines = verdict_text(verdict_of("unexplained")).splitlines()
-    at = lines.index("unexplained:")
-    assert "adjacent codes deviate from the model with opposite signs (22 sigma)" in lines[at + 1]
+    text = verdict_text(verdict_of("unexplained"))
+    assert (
+        "unexplained: counts of adjacent codes deviate from the model with opposite signs (22 sigma)" in text
+    )
     assert "unexplained:" not in verdict_text(verdict_of("named"))
 
 
@@ -66,7 +69,7 @@ def test_numbers_that_are_not_known_are_said_so():
     gap = dict.fromkeys(("before", "after", "floor", "closed_fraction"))
     steps = [{**step("row_noise", "named", 477.0, 31.0), "rivals": [], "candidates": []}]
     text = verdict_text(verdict_of("named", gap=gap, steps=steps, where=[{"statistic": "code.top"}]))
-    assert "disagreement:" not in text
+    assert "gap between" not in text
     assert "code.top (sigma not known)" in text
 
 
@@ -79,8 +82,8 @@ def test_a_gap_that_chance_makes_is_not_said_to_be_closed():
     weak = {**step("row_noise", "named", 0.6, 0.0), "gap_floor": 1e-6}
     gap = {**verdict_of("named").gap.model_dump(), "before": 0.6e-6, "after": 0.0, "floor": 1e-6}
     text = " ".join(verdict_text(verdict_of("named", steps=[weak], gap=gap)).split())
-    assert "disagreement: 0.6 → 0 ×10⁻⁶ of log-likelihood per sample" in text
-    assert "(sampling noise makes up to 1: no more before and after)" in text
+    assert "gap between data and model: 0.6 → 0 micronats per sample (sampling noise: up to 1)" in text
+    assert "closed" not in text
     assert "instead of" not in text
 
 
