@@ -41,7 +41,10 @@ def apply(
         str | None,
         typer.Option(help="dataset of an HDF5, zarr or FITS file [default: as in the run]"),
     ] = None,
-    format: Annotated[Literal["zarr", "tiff", "fits"], typer.Option(help="format of the output")] = "zarr",
+    format: Annotated[
+        Literal["zarr", "tiff", "fits"],
+        typer.Option(help="format of the output; fits: a file for each input file, with SCI, ERR and DQ"),
+    ] = "zarr",
     max_age: Annotated[
         float | None, typer.Option(min=0, help="folder of runs: days between run and frames at most")
     ] = None,

@@ -115,6 +115,10 @@ class FrameReader(ABC):
         self.camera, self.bit_depth = facts.camera, facts.bit_depth
         self.integration_time, self.time_words = facts.duration or (None, "")
 
+    def cards(self) -> tuple[Any, ...]:
+        """Return the cards of a FITS file that are not of its samples or their place; else none."""
+        return ()
+
     def identity(self) -> dict[str, Any]:
         """Return name, size and xxh3_128 content hash of every file, and one digest over all; for JSON."""
         return content_identity(self.paths)

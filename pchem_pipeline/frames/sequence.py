@@ -184,6 +184,11 @@ class FrameSequence(FrameReader):
         return image[self._y0 : self._y0 + self.shape[1], self._x0 : self._x1]
 
     @property
+    def corner(self) -> tuple[int, int]:
+        """First row and column of the region of interest in the files."""
+        return self._y0, self._x0
+
+    @property
     def whole_frames(self) -> bool:
         """All rows and columns of the files are wanted."""
         return (self._y0, self._x0, *self.shape[1:]) == (0, 0, *self.whole_shape)

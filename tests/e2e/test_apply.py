@@ -149,12 +149,128 @@ def test_tiff_and_fits_hold_what_zarr_holds(lab):
                 about = json.loads(file.imagej_metadata["Info"])
                 assert about["unit"] == "e-"
                 assert about["provenance"]["run"] == "run.zarr"
-        image = fits.getdata(lab.folder / "out_fits" / f"{name}.fits")
-        np.testing.assert_array_equal(image, values)
-    header = fits.getheader(lab.folder / "out_fits" / "electrons.fits")
-    assert header["BUNIT"] == "e-"
-    assert "run_digest" in "".join(header["HISTORY"])
+        of_all = name in ("exposure", "quality")
+        with fits.open(lab.folder / "out_fits" / f"{name if of_all else 'night'}.fits") as file:
+            image = file[0 if of_all or name == "electrons" else name].data
+            np.testing.assert_array_equal(image, values)
+    with fits.open(lab.folder / "out_fits" / "exposure.fits") as file:
+        np.testing.assert_array_equal(file["ERR"].data, found.exposure_stderr)
+        assert file["SCI"].header["BUNIT"] == file["ERR"].header["BUNIT"] == "electron"
+    with fits.open(lab.folder / "out_fits" / "night.fits") as file:
+        assert [image.shape for image in file[:3]] == [found.electrons.shape] * 3
+        assert file["ELECTRON_NUMBER"].header["NONUMBER"] == found.electron_number.attrs["no_number"]
     assert not list(lab.folder.glob(".*unfinished*"))
+
+
+def exposures(lab, *folders):
+    """Write frames of the night as FITS files of one exposure each, as at a telescope; return the headers."""
+    from astropy.io import fits
+
+    headers = []
+    for number, name in enumerate(folders):
+        image = fits.PrimaryHDU(tifffile.imread(lab.folder / "night.tif")[number])
+        image.header.update(
+            {
+                "OBJECT": "M 13",
+                "FILTER": "V",
+                "EXPTIME": (1.0, "[s] shutter"),
+                "BITDEPTH": 14,
+                "DATAMAX": 16383,
+            }
+            | {"DATE-OBS": f"2026-03-0{number + 1}T21:00:00.125", "RADESYS": "ICRS", "BUNIT": "adu"}
+            | {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 12.5, "CRPIX2": 8.5}
+            | {"CRVAL1": 250.4 + 0.01 * number, "CRVAL2": 36.46, "CD1_1": -1e-4, "CD1_2": 2e-5}
+            | {"CD2_1": 2e-5, "CD2_2": 1e-4, "HISTORY": "guided", "HIERARCH LAB DOME": "open"}
+        )
+        path = lab.folder / name
+        path.parent.mkdir(exist_ok=True)
+        image.writeto(path)
+        headers.append(image.header)
+    return headers
+
+
+@pytest.mark.filterwarnings("ignore:'datfix'")  # MJD-OBS from DATE-OBS
+def test_each_exposure_becomes_a_fits_file_as_astronomers_know_it(lab):
+    from astropy import units
+    from astropy.io import fits
+    from astropy.nddata import CCDData, StdDevUncertainty
+    from astropy.wcs import WCS
+
+    names = ["m13.001.fits", "m13.002.fits"]
+    headers = exposures(lab, *(f"raw/{name}" for name in names))
+    given = ["apply", "run.zarr", "raw", "--what", "electrons,exposure", "--output"]
+    lab.ok(*given, "out.zarr")
+    said = lab.ok(*given, "out", "--format", "fits")
+    assert {f"out/{name}" for name in (*names, "exposure.fits", "provenance.json")} <= set(
+        said.stdout.split()
+    )
+    found = opened(lab.folder / "out.zarr").load()
+    for number, (name, header) in enumerate(zip(names, headers, strict=True)):
+        ccd = CCDData.read(lab.folder / "out" / name, hdu_uncertainty="ERR", hdu_mask="DQ")
+        electrons = found.electrons[number].values
+        assert ccd.unit == units.electron
+        np.testing.assert_array_equal(ccd.data, electrons)
+        np.testing.assert_array_equal(ccd.mask, found.quality != 0)
+        assert ccd.mask[3, 5]
+        assert isinstance(ccd.uncertainty, StdDevUncertainty)
+        powers = electrons[None] ** np.arange(3)[:, None, None]
+        variance = found.electrons_stderr_read.values**2 + (found.calibration_variance.values * powers).sum(0)
+        np.testing.assert_allclose(ccd.uncertainty.array, np.sqrt(variance), rtol=1e-5)
+        corners = np.array([[0, 0], [SHAPE[1], SHAPE[0]]])
+        world = WCS(header).wcs_pix2world(corners, 0)
+        np.testing.assert_allclose(ccd.wcs.wcs_pix2world(corners, 0), world, rtol=0, atol=1e-10)
+        with fits.open(lab.folder / "out" / name) as file:
+            file.verify("exception")
+            kept, dq = file["SCI"].header, file["DQ"]
+            for card in ("OBJECT", "FILTER", "EXPTIME", "DATE-OBS", "CRVAL1", "CD1_2", "LAB DOME"):
+                assert (kept[card], kept.comments[card]) == (header[card], header.comments[card])
+            assert "guided" in kept["HISTORY"]
+            assert "DATAMAX" not in kept
+            assert kept["PCHEMRUN"] == "run.zarr"
+            assert kept["PCHEMSHA"] == found.attrs["provenance"]["run_digest"]
+            bits = {dq.header[card]: 1 << int(card[5:]) for card in dq.header["DQBIT*"]}
+            assert dq.data[3, 5] & bits["too_few_bins"]
+            np.testing.assert_array_equal(dq.data, found.quality)
+            assert "peaks_overlap" not in bits  # of electron numbers only
+    # of all exposures: what they have alike, and no half of the world coordinates
+    ccd = CCDData.read(lab.folder / "out" / "exposure.fits", hdu_uncertainty="ERR", hdu_mask="DQ")
+    np.testing.assert_array_equal(ccd.data, found.exposure)
+    np.testing.assert_array_equal(ccd.uncertainty.array, found.exposure_stderr)
+    assert ccd.wcs is None
+    assert (ccd.header["OBJECT"], ccd.header["DATE-OBS"]) == ("M 13", headers[0]["DATE-OBS"])
+    assert not {"CTYPE1", "CRVAL2", "CD1_1"} & set(ccd.header)
+    # what is there stays
+    again = lab.refused(2, *given, "out", "--format", "fits", "--what", "electrons")
+    assert "out exists and was made from other frames or with other settings" in again
+    assert "up to date" in lab.ok(*given, "out", "--format", "fits").stderr
+
+
+def test_files_that_would_overwrite_others_are_refused(lab):
+    exposures(lab, "a/1.fits", "b/1.fits", "c/quality.fits")
+    name = "its calibrated frames would have the name of"
+    for *given, output, words in (
+        ("a", "b", "out", f"b/1.fits: {name} those of"),
+        ("c", "out", f"c/quality.fits: {name} a map, quality.fits"),
+        ("a", "a", f"a/1.fits: {name} the file itself, 1.fits"),
+    ):
+        refused = lab("apply", "run.zarr", *given, "--output", output, "--format", "fits", "--force")
+        assert (refused.code, refused.stderr.count("\n")) == (4, 1)
+        assert words in refused.stderr
+        assert not (lab.folder / "out").exists()
+
+
+@pytest.mark.filterwarnings("ignore:'datfix'")  # MJD-OBS from DATE-OBS
+def test_a_tiff_file_gives_a_fits_file_with_what_is_known_of_the_camera(lab):
+    from astropy.nddata import CCDData
+
+    facts = {"camera": "Câm X", "sensor_temperature": -20.5, "exposure_time": 250, "exposure_time_unit": "ms"}
+    night_file(lab, "one.tif", start_time="2026-03-01T21:00:00.125", **facts)
+    lab.ok("apply", "run.zarr", "one.tif", "--output", "out", "--what", "numbers", "--format", "fits")
+    ccd = CCDData.read(lab.folder / "out" / "one.fits", hdu_uncertainty="ERR", hdu_mask="DQ")
+    assert (ccd.shape, ccd.mask.shape, str(ccd.unit)) == ((20, *SHAPE), (20, *SHAPE), "electron")
+    assert ccd.uncertainty is None
+    known = {"EXPTIME": 0.25, "DATE-OBS": "2026-03-01T21:00:00.125", "INSTRUME": "C?m X", "CCD-TEMP": -20.5}
+    assert {card: ccd.header[card] for card in known} == known
 
 
 def test_killed_it_goes_on_and_gives_the_same(lab):

@@ -21,7 +21,8 @@ from pchem_pipeline.commands.apply.characterisation import (
     read_calibration,
     with_moments,
 )
-from pchem_pipeline.commands.apply.finish import finish_maps, write_files
+from pchem_pipeline.commands.apply.files import check_names, write_files
+from pchem_pipeline.commands.apply.finish import finish_maps
 from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
 from pchem_pipeline.commands.apply.source import check_camera, check_level, limits_of, open_like_run, some_of
 from pchem_pipeline.commands.apply.tasks import (
@@ -56,6 +57,7 @@ _VERSION = 4
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
+_BLOCK_SAMPLES = 1 << 26
 #: Share of the samples at a limit of the ADC beyond which offsets are not known: with 6 % of them the stated
 #: probabilities of electron numbers are as right as without, with 32 % they are 0.1 too high.
 _MOST_CUT = 0.2
@@ -71,7 +73,7 @@ def apply_to_frames(
     Args:
         target: the run.
         files: camera files, globs, folders or URLs.
-        output: a zarr store, or a folder of TIFF or FITS files.
+        output: a zarr store, or a folder of TIFF or FITS files, see `write_files`.
         wanted: what to write.
         command: of the command line; ``force`` replaces an output that is there.
 
@@ -92,6 +94,8 @@ def apply_to_frames(
         stack.enter_context(reporter.compilation(STAGE, target.config.compute.max_memory))
         job, calibration, content, remarks = _make_job(run, target, files, wanted)
         output = place_of(output) if wanted.format == "zarr" else local_path(output)
+        if wanted.format == "fits":
+            check_names(job.source, output)
         place = output if wanted.format == "zarr" else output.with_name(f".{output.name}.unfinished.zarr")
         if wanted.format != "zarr" and _is_done(output, content, command):
             reporter.info(f"apply: {output} is up to date")
@@ -106,7 +110,7 @@ def apply_to_frames(
             how = f'xarray.open_zarr("{output}", group="applied", consolidated=False)'
             reporter.info(f"apply: open it with {how}")
             return [output]
-        written = write_files(store, output, wanted.format, content)
+        written = write_files(store, output, wanted.format, job.source, content)
     shutil.rmtree(place, ignore_errors=True)
     return written
 
@@ -149,6 +153,9 @@ def _make_job(
             f"{overlap} of {known.sum()} pixels have a read noise above {PEAKS_OVERLAP_E} e-: their most "
             "probable electron number is often wrong; use expected_number"
         )
+    depth, *_ = _chunks(frames.shape)
+    if wanted.format != "zarr":  # files are written by blocks of whole frames
+        depth = max(1, min(depth, _BLOCK_SAMPLES // (frames.shape[1] * frames.shape[2])))
     job = Job(
         target.store,
         frames,
@@ -156,7 +163,7 @@ def _make_job(
         wanted.prior,
         limits=limits,
         modes=modes,
-        depth=_chunks(frames.shape)[0],
+        depth=depth,
         expected=numbers and overlap > 0,
     )
     # outputs of versions that did not know it are gone on with

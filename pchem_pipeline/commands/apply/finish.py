@@ -1,29 +1,24 @@
-"""What ``pchem apply`` writes when all frames are done: maps, coordinates, quality, and images as files."""
+"""What ``pchem apply`` writes when all frames are done: maps, coordinates and quality."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
-from pchem_pipeline.base.variables import Variable, variables_of
 from pchem_pipeline.commands.apply.settings import Job
-from pchem_pipeline.frames.formats.map_files import Cube, write_fits_cube, write_tiff_cube
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.run.progress import Reporter
-from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
 from pchem_pipeline.use.electrons import calibration_variance, read_stderr, stderr_at
 
 #: Bits of ``applied/quality``: those of ``fit_status``, and from the 17th on its own.
-_FLAGS: dict[str, tuple[int, str]] = {
+FLAGS: dict[str, tuple[int, str]] = {
     **{str(bit.name).lower(): (int(bit), text) for bit, text in MEANINGS.items()},
     "at_adc_limit": (1 << 16, "samples at a limit of the ADC in these frames"),
     "peaks_overlap": (
@@ -149,65 +144,10 @@ def _write_quality(output: RunStore, calibration: Calibration, raised: Mapping[s
     """Write why pixels have no value, or deserve caution, with attributes by the CF conventions."""
     quality = calibration.fit_status.astype(np.uint32)
     for name, where in raised.items():
-        quality |= np.where(where, np.uint32(_FLAGS[name][0]), np.uint32(0))
+        quality |= np.where(where, np.uint32(FLAGS[name][0]), np.uint32(0))
     words = {
-        "flag_masks": [mask for mask, _ in _FLAGS.values()],
-        "flag_meanings": " ".join(_FLAGS),
-        "sentences": {name: text for name, (_, text) in _FLAGS.items()},
+        "flag_masks": [mask for mask, _ in FLAGS.values()],
+        "flag_meanings": " ".join(FLAGS),
+        "sentences": {name: text for name, (_, text) in FLAGS.items()},
     }
     output.write_array("applied/quality", quality, words)
-
-
-# -- images as files -------------------------------------------------------------------------------
-
-
-def write_files(store: RunStore, folder: Path, kind: str, content: dict[str, Any]) -> list[Path]:
-    """Write a file for each array, and what they were made of.
-
-    Args:
-        store: with the group ``applied``.
-        folder: made if needed.
-        kind: tiff or fits.
-        content: provenance, as JSON data.
-
-    Raises:
-        StoreError: the folder cannot be written.
-        MissingDependencyError: astropy is not installed.
-    """
-    written = []
-    for variable in variables_of("applied"):
-        if variable.name in ("frame", "y", "x") or not store.has(variable.path):
-            continue
-        path = folder / f"{variable.name}.{'tif' if kind == 'tiff' else 'fits'}"
-        cube = _cube(store, variable, content, single=kind == "tiff")
-        write_tiff_cube(path, cube) if kind == "tiff" else write_fits_cube(path, cube)
-        written.append(path)
-    write_json(folder / "provenance.json", content)
-    return [*written, folder / "provenance.json"]
-
-
-def _cube(store: RunStore, variable: Variable, content: dict[str, Any], *, single: bool) -> Cube:
-    array = store.array(variable.path)
-    shape = array.shape if len(array.shape) == 3 or not single else (1, *array.shape)
-    dtype = np.dtype(array.dtype)
-    if single and dtype == np.float64:
-        dtype = np.dtype(np.float32)  # the largest that ImageJ reads
-    facts = {**content, **{key: array.attrs[key] for key in ("sentences", "no_number") if key in array.attrs}}
-    return Cube(
-        variable.name,
-        _blocks(store, variable.path, len(array.shape), array.chunks[0]),
-        shape,
-        dtype,
-        variable.unit,
-        variable.long_name,
-        facts,
-    )
-
-
-def _blocks(store: RunStore, name: str, rank: int, depth: int) -> Iterator[NDArray[Any]]:
-    """Yield blocks of images."""
-    if rank != 3:
-        yield store.read(name)[None]
-        return
-    for start in range(0, store.array(name).shape[0], depth):
-        yield store.read(name, (slice(start, start + depth), slice(None), slice(None)))

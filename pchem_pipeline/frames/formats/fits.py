@@ -13,7 +13,7 @@ import math
 import re
 import threading
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -36,12 +36,12 @@ from pchem_pipeline.frames.camera import (
     texts_of,
 )
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
+from pchem_pipeline.frames.formats.fits_files import UNSIGNED_ZERO, FitsImage, camera_cards, write_images
 from pchem_pipeline.frames.formats.kinds import check_coded, check_unpacked_size, chosen_pieces, full_window
 from pchem_pipeline.frames.reader import changed
 from pchem_pipeline.frames.registry import check_unpacked, require
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
-from pchem_pipeline.store.files import whole_file
 
 _TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "INTTIME", "ITIME")
 #: of these the first counts where the others are absent: with dead time, or without it
@@ -53,8 +53,11 @@ _SETUP_KEYWORDS = ("GAIN", "OFFSET", "READMODE", "READOUTM", "XBINNING", "YBINNI
 #: of these the first counts
 _SECTION_KEYWORDS = ("TRIMSEC", "DATASEC")
 _TEMPERATURE_KEYWORDS = ("CCD-TEMP", "DET-TEMP", "DETTEMP", "CCDTEMP", "SENSTEMP", "SET-TEMP")
-#: BITPIX -> BZERO of unsigned integers of that size
-_UNSIGNED_ZERO = {16: 1 << 15, 32: 1 << 31}
+#: of the samples, or of the place of an image in its file
+_SAMPLE_KEYWORDS = (
+    *("BUNIT", "BLANK", "DATAMIN", "DATAMAX", "CHECKSUM", "DATASUM"),
+    *("EXTNAME", "EXTVER", "EXTLEVEL", "INHERIT"),
+)
 #: astropy's compressed images share a file handle and are not made for threads
 _LOCK = threading.Lock()
 
@@ -67,8 +70,6 @@ class FitsReader(ContiguousReader):
     kind = "FITS file"
     suffixes: ClassVar[tuple[str, ...]] = (".fits", ".fit", ".fts", ".fz")
     magic: ClassVar[tuple[bytes, ...]] = (b"SIMPLE  =",)
-
-    _compressed: int | None = None
 
     def inspect(self, path: Path, settings: InputSettings) -> None:
         """See `ContiguousReader.inspect`."""
@@ -83,7 +84,7 @@ class FitsReader(ContiguousReader):
         from astropy.io import fits
 
         with fits.open(path, memmap=False, do_not_scale_image_data=True, lazy_load_hdus=True) as hdus:
-            number, hdu, primary = _image(path, hdus, settings)
+            self._number, hdu, primary = _image(path, hdus, settings)
             header = hdu.header
             sizes = [header[f"NAXIS{axis}"] for axis in range(header["NAXIS"], 0, -1)]
             compressed = isinstance(hdu, fits.CompImageHDU)
@@ -93,7 +94,7 @@ class FitsReader(ContiguousReader):
             self.notes = _value_notes(path, header, n)
             if compressed:
                 self.notes += _coding_notes(
-                    path, number, stored.itemsize * math.prod(hdu.tile_shape), biased=bool(zero)
+                    path, self._number, stored.itemsize * math.prod(hdu.tile_shape), biased=bool(zero)
                 )
                 self.rows_per_read = min(rows, int(hdu.tile_shape[-2]))
             start = 0 if compressed else int(hdu.fileinfo()["datLoc"])
@@ -102,7 +103,7 @@ class FitsReader(ContiguousReader):
         if compressed:
             if end > size:
                 raise InputError(f"{path}: truncated: {end} bytes needed, the file has {size}; copy it again")
-            self._compressed, self._size = number, size
+            self._size = size
             check_coded(path, self.shape, hdu.tile_shape, stored.itemsize, size)
             return
         offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=start)
@@ -125,6 +126,21 @@ class FitsReader(ContiguousReader):
         depths = (bits_of(header.get(name)) for header in last for name in _DEPTH_KEYWORDS)
         self.take_facts(StatedFacts(_camera(last), duration, first_of(depths)))
 
+    def cards(self) -> tuple[Any, ...]:
+        """See `FrameReader.cards`."""
+        from astropy.io import fits
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # as above
+            with fits.open(self.paths[0], memmap=False, lazy_load_hdus=True) as hdus:
+                header = hdus[self._number].header.copy(strip=True)
+                if self._number:
+                    header.extend(hdus[0].header, unique=True)
+            header = fits.Header.fromstring(header.tostring())  # what breaks the standard is mended
+        for name in _SAMPLE_KEYWORDS:
+            header.remove(name, ignore_missing=True)
+        return tuple(header.cards)
+
     def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """See `ContiguousReader.decode_into`."""
         from astropy.io import fits
@@ -133,7 +149,7 @@ class FitsReader(ContiguousReader):
         if path.stat().st_size != self._size:
             raise changed(path, "the size of the file changed")
         with _LOCK, fits.open(path, memmap=False) as hdus:
-            values = hdus[self._compressed].section[full_window(self._full, t0, t1, y0, y1)]
+            values = hdus[self._number].section[full_window(self._full, t0, t1, y0, y1)]
         buffer[...] = np.asarray(values).reshape(buffer.shape)
 
 
@@ -257,7 +273,7 @@ def _samples(path: Path, header: Any, compressed: bool) -> tuple[np.dtype[Any], 
     if bits < 0:
         return np.dtype(f">f{-bits // 8}"), 0
     stored = np.dtype("u1") if bits == 8 else np.dtype(f">i{bits // 8}")
-    top = _UNSIGNED_ZERO.get(bits, 0)
+    top = UNSIGNED_ZERO.get(bits, 0)
     plain = not compressed and not isinstance(zero, str) and zero == int(zero)
     if scale != 1 or not (zero in (0, top) or (plain and 0 < zero < top)):
         raise InputError(f"{path}: scaled data (BSCALE {scale}, BZERO {zero}), no raw DN; write raw integers")
@@ -267,49 +283,7 @@ def _samples(path: Path, header: Any, compressed: bool) -> tuple[np.dtype[Any], 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
     """Write frames as one cube (one frame: one image); see `frames.writing.write_frames`."""
     shape, dtype, integration_time, bit_depth = stack
-    cards: dict[str, Any] = {}
-    if integration_time is not None:
-        cards["EXPTIME"] = (integration_time, "[s] integration time")
+    cards = camera_cards(CameraFacts(), integration_time)
     if bit_depth is not None:
-        cards["BITDEPTH"] = (bit_depth, "bits of the ADC")
-    write_image(path, blocks, shape if shape[0] > 1 else shape[1:], dtype, cards)
-
-
-def write_image(
-    path: Path,
-    blocks: Iterable[NDArray[Any]],
-    shape: Sequence[int],
-    dtype: np.dtype[Any],
-    cards: dict[str, Any],
-) -> None:
-    """Write an array that comes by blocks as the primary image.
-
-    Args:
-        path: the file.
-        blocks: of its images, in order.
-        shape: of the whole.
-        dtype: floating point or unsigned.
-        cards: further keywords.
-
-    Raises:
-        StoreError: the folder cannot be written.
-        MissingDependencyError: astropy is not installed.
-    """
-    require("astropy.io.fits", "fits", "FITS files")
-    from astropy.io import fits
-
-    bits, zero = 8 * dtype.itemsize, 0 if dtype.kind == "f" else _UNSIGNED_ZERO.get(8 * dtype.itemsize, 0)
-    header = fits.Header(
-        [("SIMPLE", True), ("BITPIX", -bits if dtype.kind == "f" else bits), ("NAXIS", len(shape))]
-    )
-    header.update({f"NAXIS{axis}": length for axis, length in enumerate(reversed(shape), 1)})
-    header.update({"BSCALE": 1, "BZERO": zero} if zero else {})
-    for name, value in cards.items():
-        header[name] = value
-    with whole_file(path) as part, part.open("wb") as stream:
-        stream.write(header.tostring().encode("ascii"))
-        for block in blocks:
-            values = np.asarray(block, dtype)
-            values = values ^ dtype.type(zero) if zero else values
-            stream.write(np.ascontiguousarray(values, dtype.newbyteorder(">")).data)
-        stream.write(bytes(-math.prod(shape) * dtype.itemsize % 2880))
+        cards.append(("BITDEPTH", bit_depth, "bits of the ADC"))
+    write_images(path, [FitsImage(blocks, shape if shape[0] > 1 else shape[1:], dtype, cards)])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.formats.fits import write_image
+from pchem_pipeline.frames.formats.fits_files import FitsImage, header_alone, image_cards, write_images
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.store.files import whole_file
 
@@ -53,21 +53,11 @@ def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) 
         StoreError: the folder cannot be written.
         MissingDependencyError: astropy is not installed.
     """
-    require("astropy.io.fits", "fits", "FITS files")
-    from astropy.io import fits
-
-    primary = fits.PrimaryHDU()
-    for key, value in header.items():
-        if value is not None:
-            primary.header[key] = value
-    units = [primary]
+    images = [header_alone([(key, value) for key, value in header.items() if value is not None])]
     for image in maps:
-        hdu = fits.ImageHDU(image.values, name=image.name.upper())
-        hdu.header["BUNIT"] = image.unit
-        hdu.header["COMMENT"] = image.long_name
-        units.append(hdu)
-    with whole_file(path) as part:
-        fits.HDUList(units).writeto(part)
+        cards = image_cards(image.name, image.unit, image.long_name)
+        images.append(FitsImage([image.values], image.values.shape, image.values.dtype, cards))
+    write_images(path, images)
     return [path]
 
 
@@ -118,12 +108,12 @@ def write_npz(path: Path, maps: Sequence[MapImage]) -> list[Path]:
 
 @dataclass(frozen=True)
 class Cube:
-    """An array and what it is.
+    """A stack of images and what it is.
 
     Attributes:
         name: as in the store.
         blocks: arrays (any number of images, rows, columns), in order.
-        shape: (images, rows, columns) of all together; FITS takes a map of (rows, columns), too.
+        shape: (images, rows, columns) of all together.
         dtype: type of the samples.
         unit: physical unit.
         long_name: one sentence.
@@ -167,23 +157,6 @@ def write_tiff_cube(path: Path, cube: Cube) -> None:
             with tifffile.TiffWriter(part, bigtiff=True) as file:
                 for image in images:
                     file.write(image, photometric="minisblack", contiguous=True, metadata=about)
-
-
-def write_fits_cube(path: Path, cube: Cube) -> None:
-    """Write an image of the axes of the array, the unit in ``BUNIT``, the provenance as ``HISTORY``.
-
-    Raises:
-        StoreError: the folder cannot be written.
-        MissingDependencyError: astropy is not installed.
-    """
-    cards = {
-        "BUNIT": cube.unit,
-        "OBJECT": cube.name,
-        "COMMENT": cube.long_name,
-        "CREATOR": "pchem-pipeline",
-        "HISTORY": json.dumps(dict(cube.facts)),
-    }
-    write_image(path, cube.blocks, cube.shape, cube.dtype, cards)
 
 
 def read_image(path: Path) -> FloatArray:

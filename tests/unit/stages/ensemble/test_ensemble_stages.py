@@ -398,7 +398,7 @@ def test_export(finished, tmp_path):
     gain = finished.store.read("maps/conversion_gain")
     with fits.open(tmp_path / "out" / "maps.fits") as file:
         np.testing.assert_array_equal(file["CONVERSION_GAIN"].data, gain)
-        assert file["CONVERSION_GAIN"].header["BUNIT"] == "e-/DN"
+        assert file["CONVERSION_GAIN"].header["BUNIT"] == "electron / adu"
         assert file[0].header["NFRAMES"] == FRAMES
         assert file["FIT_STATUS"].data[FAILED_PIXEL] == int(FitStatus.NOT_CONVERGED)
     np.testing.assert_allclose(imread(tmp_path / "out" / "conversion_gain.tif"), gain, rtol=1e-7)
