@@ -256,7 +256,8 @@ class Effect(Section):
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it as it acts on some rows and columns that are taken for a sensor of their own.
 
-        For effects with places among their parameters; a region is cut elsewhere.
+        For effects with places among their parameters, or a pattern that begins at row or column 0; a region
+        is cut elsewhere.
 
         Args:
             rows: first, and behind the last.

@@ -147,7 +147,8 @@ class TimeSeries:
     """What is kept along time; None of it exists for ready-made histograms.
 
     Frames come in blocks of ``block_frames`` consecutive frames; different blocks may be far apart.
-    Lagged products never cross the edge of a block.
+    Lagged products never cross the edge of a block. Means of rows, columns and quadrants without
+    usable pixels are 0.
 
     Attributes:
         frames: frame numbers in the run, increasing, shape (n,).
