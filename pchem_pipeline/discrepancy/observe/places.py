@@ -149,7 +149,7 @@ def part_evidence(
     window: SensorWindow | None = None,
     fitted: bool = True,
 ) -> Evidence:
-    """Return the evidence of a part alone, with the rows and columns of the whole.
+    """Return the evidence of a part alone, a sensor that ends with it: row 0 is its first.
 
     Args:
         frames: codes (n, y, x), DN.
@@ -167,8 +167,12 @@ def part_evidence(
     chosen = part.frames(numbers)
     length = min(block_frames, max(int(chosen.sum()) // (2 * MINIMUM_BLOCKS), 1))
     stack = frames if chosen.all() else frames[chosen]
-    window = window or SensorWindow.whole(frames.shape)
-    exclude = ~(window.mask(part.region) & maps.usable)
+    inside = (window or SensorWindow.whole(frames.shape)).mask(part.region)
+    if inside.any() and not inside.all():
+        lines = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
+        y, x = (slice(int(each[0]), int(each[-1]) + 1) for each in lines)
+        stack, maps, inside = stack[:, y, x], maps.of((y, x)), inside[y, x]
+    exclude = ~(inside & maps.usable)
     return observe(
         stack, numbers[chosen], n_run=n_run, block_frames=length, exclude=exclude, start=maps, fitted=fitted
     )

@@ -215,6 +215,30 @@ def test_an_effect_in_a_tap_of_a_window_is_named_with_its_place():
     assert step.place == "columns 64 to 68"
 
 
+@pytest.mark.parametrize("window", [None, SensorWindow((7, 31), (4, 28), (64, 64))])
+def test_what_is_guessed_in_a_part_has_its_phase_on_the_sensor(window):
+    """A part is a sensor of its own: its first row is row 0, which is another one of the whole."""
+    top = 0 if window is None else window.rows[0]
+    per_row, per_frame, phase, rows = 0.23, 0.31, 0.7, slice(5, 18)
+
+    def pickup(rng, shape):
+        turns = per_row * (np.arange(shape[1]) + top) + per_frame * np.arange(shape[0])[:, None]
+        wave = np.zeros(shape)
+        wave[:, rows] = 2.0 * np.sin(2 * np.pi * turns + phase)[:, rows, None]
+        return wave
+
+    frames, numbers = camera(21, pickup, (24, 24), 1200), np.arange(1200)
+    maps = observe(frames, numbers, n_run=1200, block_frames=50).maps
+    part = Part(Region(rows=((rows.start + top, rows.stop + top),)))
+    own = part_evidence(frames, numbers, maps, part, n_run=1200, block_frames=50, window=window)
+    guess = effect_classes()["periodic_pickup"].estimate(own)[0]
+    found = (window or SensorWindow.whole((24, 24))).found(guess, part)
+    assert found.region == part.region
+    assert found.amplitude_dn == pytest.approx(2.0, rel=0.2)
+    assert found.cycles_per_row == pytest.approx(per_row, abs=0.002)
+    assert abs(np.angle(np.exp(1j * (found.phase - phase)))) < 0.15
+
+
 def split_of(frames):
     return ObservedFrames.of(stacked(frames)).frames
 

@@ -146,7 +146,7 @@ def test_simulated_squares_are_the_mean_of_their_samples() -> None:
     equal = (squares == mean[:, :, None, :, None]).all(axis=(2, 4))
     assert abs(equal.mean() - 0.3) < 5 * np.sqrt(0.21 / equal.size) + 0.01
     np.testing.assert_array_equal(found[:, 0], own[:, 0])
-    with pytest.raises(ValidationError, match="not moved"):
+    with pytest.raises(ValidationError, match="not shifted"):
         Empirical(share=0.3, moves=(MixtureShift(shift_dn=3),), squares=(1, 0))
 
 

@@ -180,7 +180,7 @@ def test_what_cannot_be_is_refused() -> None:
         ElectronMode(fate="followed", place=(-1, 0, 0))
     with pytest.raises(ValidationError, match="another sample"):
         ElectronMode(fate="moved")
-    with pytest.raises(ValidationError, match="has none"):
+    with pytest.raises(ValidationError, match="leave it out"):
         ElectronMode(fate="emptied", place=(0, 0, 1))
 
 
