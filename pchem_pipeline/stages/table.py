@@ -133,7 +133,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=15,
+        version=16,
         upstream=("ingest",),
         settings=("discrepancy",),
         writes=("discrepancy",),
