@@ -12,6 +12,7 @@ from scipy.special import stdtr
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.simulate.chain import simulate_block
@@ -81,11 +82,18 @@ def recovered_strength(
         seed: of the first stack; those of the others follow.
 
     Raises:
-        ConfigError: the effect has no strength, or depends on rows or frames that it does not declare.
+        ConfigError: the effect has no strength, its signature names no statistic, or it depends on rows or
+            frames that it does not declare.
         InputError: the frames are too few, or not as described.
     """
     if not effect.strength:
         raise ConfigError(f"effect {effect.tag!r} has no strength; name the field that scales it")
+    if unknown := [name for name in effect.signature if name not in STATISTICS]:
+        raise ConfigError(
+            f"effect {effect.tag!r}: its signature names no statistics: "
+            f"{', '.join(unknown)}; they are listed "
+            "in pchem_pipeline/discrepancy/observe/catalogue.py"
+        )
     _check_reach(effect, shape, seed)
     found = np.full(stacks, np.nan)
     for i in range(stacks):
@@ -99,7 +107,7 @@ def recovered_strength(
 
 def _check_reach(effect: Effect, shape: tuple[int, int], seed: int) -> None:
     """Raise an error where single rows or later frames are not what they are in the whole: bands differ."""
-    middle, later = shape[0] // 2, _BLOCK // 2
+    middle, later = shape[0] // 2 | 1, _BLOCK // 2  # odd: parities differ
     whole = _simulated(effect, _BLOCK, shape, seed)
     band = _simulated(effect, _BLOCK, shape, seed, top=middle)
     block = _simulated(effect, _BLOCK, shape, seed, first=later)

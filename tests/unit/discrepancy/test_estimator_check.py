@@ -86,7 +86,29 @@ class FrameBefore(ColumnNoise):
         return values + 0.5 * np.roll(values, 1, axis=0)
 
 
-@pytest.mark.parametrize(("effect", "declared"), [(RowBefore, "reach_rows"), (FrameBefore, "reach_frames")])
+class EveryOtherRowOfABand(ColumnNoise):
+    """Counts rows from the first one of the band that it is given."""
+
+    def apply(self, values, context):
+        """Return each second row one DN higher."""
+        return values + np.arange(values.shape[1])[:, None] % 2
+
+
+class Misspelled(ColumnNoise):
+    """Has a signature that no statistic has."""
+
+    signature = ("space.colum.readout.variance",)
+
+
+def test_a_signature_without_its_statistic_is_refused():
+    with pytest.raises(ConfigError, match=r"names no statistics: space\.colum\.readout\.variance"):
+        recovered_strength(Misspelled(column_noise_dn=1.0), **STACKS)
+
+
+@pytest.mark.parametrize(
+    ("effect", "declared"),
+    [(RowBefore, "reach_rows"), (FrameBefore, "reach_frames"), (EveryOtherRowOfABand, "reach_rows")],
+)
 def test_an_effect_that_reads_more_than_it_declares_is_refused(effect, declared):
     with pytest.raises(ConfigError, match=f"set `{declared}` to how many"):
         recovered_strength(effect(column_noise_dn=1.0), **STACKS)
