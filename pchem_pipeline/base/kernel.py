@@ -124,7 +124,7 @@ def types_of(arguments: tuple[Any, ...]) -> list[Any]:
 
 
 def _borrowed(kind: Any) -> bool:
-    """Tell whether values of a type hold no array."""
+    """Return whether values of a type hold no array."""
     if isinstance(kind, numba.types.BaseTuple):
         return all(_borrowed(each) for each in kind.types)
     return not isinstance(kind, numba.types.Array)

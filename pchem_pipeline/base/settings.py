@@ -42,7 +42,7 @@ class Section(BaseModel):
 
 
 def holds_secret(place: str) -> bool:
-    """Tell whether a URL holds a password, a key or a signature: YAML, log and pages would show it."""
+    """Return whether a URL holds a password, a key or a signature: YAML, log and pages would show it."""
     return _SECRETS.match(place) is not None
 
 

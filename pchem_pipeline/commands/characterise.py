@@ -190,7 +190,7 @@ def _blocks(frames: Any) -> Iterator[NDArray[Any]]:
 
 
 def _same(path: Path, frames: Any, dtype: np.dtype[Any]) -> bool:
-    """Tell whether a file holds these frames."""
+    """Return whether a file holds these frames."""
     there = np.load(path, mmap_mode="r")
     if there.shape != tuple(frames.shape) or there.dtype != dtype:
         return False

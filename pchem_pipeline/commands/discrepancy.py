@@ -83,7 +83,7 @@ def _changed_medians(
 
 
 def _of_histograms(target: Target) -> bool:
-    """Tell whether the search looks at histograms, not at frames: ready-made ones, or several samples'."""
+    """Return whether the search looks at histograms, not at frames: ready-made ones, or several samples'."""
     if not target.store.exists():
         return False
     store = target.stored()

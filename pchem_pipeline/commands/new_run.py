@@ -186,7 +186,7 @@ def first_try(target: Target) -> Iterator[None]:
 
 
 def _came_to_nothing(place: Path, path: Path) -> bool:
-    """Tell whether a run was tried, finished no stage, and nobody edited its YAML since."""
+    """Return whether a run was tried, finished no stage, and nobody edited its YAML since."""
     if not (place / ".pchem").is_dir():
         return False
     store = RunStore.open(place)

@@ -81,7 +81,7 @@ def watch(
     terminal: bool = False,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Tell how far a run is.
+    """Return how far a run is.
 
     Args:
         target: the run.

@@ -232,7 +232,7 @@ def yaml_text(content: Mapping[str, Any]) -> str:
 
 
 def states(config: RunConfig, dotted: str) -> bool:
-    """Tell whether a YAML states a setting such as ``fit.likelihood``, or leaves it at its default."""
+    """Return whether a YAML states a setting such as ``fit.likelihood``, or leaves it at its default."""
     value: Any = config
     for name in dotted.split("."):
         if not isinstance(value, BaseModel):

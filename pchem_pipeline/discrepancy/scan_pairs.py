@@ -130,7 +130,7 @@ def _most_significant(samples: Samples, log_limit: float) -> Shared | None:
 
 
 def _holds(place: Shared, log_limit: float) -> bool:
-    """Tell whether a place is significant, and little of it is elsewhere."""
+    """Return whether a place is significant, and little of it is elsewhere."""
     return place.log_p <= log_limit and abs(place.outside) < _CONTRAST * place.inside
 
 

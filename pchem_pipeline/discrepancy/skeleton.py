@@ -82,7 +82,7 @@ class Explainer(ABC, Generic[Explanation]):
 
     @abstractmethod
     def suspects(self, null: NullModel) -> bool:
-        """Tell whether candidates are worth asking although no statistic deviates beyond chance."""
+        """Return whether candidates are worth asking although no statistic deviates beyond chance."""
 
     @abstractmethod
     def explain(self, null: NullModel, disagreed: bool) -> Explanation | None:
@@ -105,35 +105,35 @@ class Explainer(ABC, Generic[Explanation]):
         return 0.0
 
 
-def silent(_: str) -> None:
-    """Tell nobody."""
+def no_progress(_: str) -> None:
+    """Report nothing."""
 
 
-def search(by: Explainer[Explanation], tell: Callable[[str], None] = silent) -> Discrepancy:
+def search(by: Explainer[Explanation], progress: Callable[[str], None] = no_progress) -> Discrepancy:
     """Find where data disagree with the fitted model, name the effects, and add them to the model.
 
     Args:
         by: tells effects apart; it has drawn the model.
-        tell: hears what is done next.
+        progress: is given what is done next.
     """
     data, present = by.prepared, by.model
     first, z, significance = data.first, data.z, data.settings.significance
-    tell("measuring how far model and data disagree")
+    progress("measuring how far model and data disagree")
     before = by.gap(first)
     places = locate(data.evidence, first, z.both, significance)
     null, limit = first, ""
     still = disagreed = disagrees(null, z, significance)
     if still or (not data.doubt and by.suspects(null)):
         try:
-            tell("comparing candidates")
+            progress("comparing candidates")
             explanation = by.explain(null, still)
             if explanation is not None:
-                tell("refitting the pixels with the likeliest effects")
+                progress("refitting the pixels with the likeliest effects")
                 null = by.add(explanation, null) or null
         except EffortSpentError as spent:
             limit = data.effort.limit_words(spent, by.candidates)
         still = disagrees(null, z, significance, by.tolerance())
-    tell("measuring the remaining disagreement")
+    progress("measuring the remaining disagreement")
     added = by.close(before, null, still)
     if not disagreed and before.at_floor and not any(each.named for each in added.additions):
         # data that agree with the model are not made doubtful by what they do not confirm

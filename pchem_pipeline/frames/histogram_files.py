@@ -70,7 +70,7 @@ class _Channel:
 
 
 def is_histogram_input(settings: InputSettings, base_dir: Path) -> bool:
-    """Tell whether the input is ready-made histograms: by ``input.format``, or CSV and npz with auto.
+    """Return whether the input is ready-made histograms: by ``input.format``, or CSV and npz with auto.
 
     Raises:
         InputError: a path is missing, or frames and histograms are mixed.

@@ -22,7 +22,7 @@ _GLOB = re.compile(r"[*?\[]")
 
 
 def is_remote(entry: str) -> bool:
-    """Tell whether an entry of ``input.files`` is a URL."""
+    """Return whether an entry of ``input.files`` is a URL."""
     return bool(_URL.match(entry))
 
 

@@ -104,7 +104,7 @@ def stamped_pixels(frames: FrameSequence) -> BoolArray | None:
 
 
 def _counts_frames(pixels: NDArray[Any]) -> bool:
-    """Tell whether a byte of the pixels (frame, x) rises by one from frame to frame, in binary or in BCD."""
+    """Return whether a byte of the pixels (frame, x) rises by one per frame, in binary or in BCD."""
     used = int(np.bitwise_or.reduce(pixels, axis=None))
     shift = max((used & -used).bit_length() - 1, 0)  # left-justified
     values = np.ascontiguousarray(pixels >> shift).view(np.uint8)

@@ -200,7 +200,7 @@ class HashedFrameStream(FrameStream):
         self._decode(parts, t0, decode)
 
     def _is_plain(self, reader: FrameReader) -> bool:
-        """Tell whether whole frames lie plainly in the file, one behind the other."""
+        """Return whether whole frames lie plainly in the file, one behind the other."""
         if not (isinstance(reader, ContiguousReader) and self._stack.whole_frames):
             return False
         layout = reader.layout

@@ -256,7 +256,7 @@ class ReportData:
 
     @property
     def few_channels(self) -> bool:
-        """Tell whether this is a line of so few channels that a histogram over them says nothing."""
+        """Return whether this is a line of so few channels that a histogram over them says nothing."""
         return self.shape[0] == 1 and self.shape[1] < FEW_CHANNELS
 
     @cached_property
@@ -281,7 +281,7 @@ class ReportData:
         return self._with_bits(FLAGGED)
 
     def flagged_in(self, name: str) -> BoolArray:
-        """Tell which pixels the data leave open in one map: a gain is known where the bias is not."""
+        """Return which pixels the data leave open in one map: a gain is known where the bias is not."""
         return self._with_bits(flags_of(name))
 
     def _with_bits(self, bits: FitStatus) -> BoolArray:
@@ -293,12 +293,12 @@ class ReportData:
 
     @property
     def mostly_flagged(self) -> bool:
-        """Tell whether the gain of most pixels is open: medians of the rest describe no sensor."""
+        """Return whether the gain of most pixels is open: medians of the rest describe no sensor."""
         return self.flagged_share("conversion_gain") > 0.5
 
     @property
     def mostly_coarse(self) -> bool:
-        """Tell whether rounding, which the fit did not count, biases the estimates of most pixels."""
+        """Return whether rounding, which the fit did not count, biases the estimates of most pixels."""
         return bool(np.mean(self.status & int(FitStatus.COARSE_STEPS) != 0) > 0.5)
 
     @property
@@ -308,7 +308,7 @@ class ReportData:
 
     @property
     def often_flagged(self) -> bool:
-        """Tell whether more pixels are flagged than the criteria allow: the others are a selection."""
+        """Return whether more pixels are flagged than the criteria allow: the others are a selection."""
         limit = self.criteria.flagged_pixels
         return self.flagged_share() > (0.1 if limit is None else limit)
 
@@ -320,11 +320,11 @@ class ReportData:
         return int(np.gcd.reduce(np.diff(seen).astype(np.int64))) if seen.size >= _FEWEST_CODES else 1
 
     def has_values(self, name: str) -> bool:
-        """Tell whether a map exists and at least one pixel has a value in it."""
+        """Return whether a map exists and at least one pixel has a value in it."""
         return name in self.maps and self.summary(name, with_flagged=True).n_valid > 0
 
     def has_median(self, name: str) -> bool:
-        """Tell whether a map exists whose median is not of a selection: most pixels are known in it."""
+        """Return whether a map exists whose median is not of a selection: most pixels are known in it."""
         return self.has_values(name) and self.flagged_share(name) <= 0.5
 
     @cached_property

@@ -151,7 +151,7 @@ def rests_on(record: StageRecord, store: RunStore) -> int | None:
 
 
 def _grew(content: dict[str, Any], record: StageRecord) -> bool:
-    """Tell whether the only change is that upstream stages finished more units of the same work.
+    """Return whether the only change is that upstream stages finished more units of the same work.
 
     Tiled stages then keep what they have and do the rest; undivided ones start again.
     """

@@ -69,7 +69,7 @@ def known_identity(context: StageContext) -> dict[str, Any]:
 
 
 def identity_is_new(context: StageContext) -> bool:
-    """Tell whether nothing is known of the input yet."""
+    """Return whether nothing is known of the input yet."""
     return not (context.store.path / _KNOWN).exists()
 
 

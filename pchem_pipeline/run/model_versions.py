@@ -112,7 +112,7 @@ class ModelVersion:
         return self.settings.effects
 
     def holds(self, settings: ModelSettings) -> bool:
-        """Tell whether it is the model of these settings, whatever they were written with."""
+        """Return whether it is the model of these settings, whatever they were written with."""
         if self.model == settings.model_dump(mode="json"):
             return True
         try:

@@ -89,7 +89,7 @@ def nothing_left_of_a_refusal(place: Path) -> Iterator[None]:
 
 
 def _is_empty(place: Path) -> bool:
-    """Tell whether no stage has done anything in a store, which may be bare or not exist."""
+    """Return whether no stage has done anything in a store, which may be bare or not exist."""
     if not (place / ".pchem").is_dir():
         return not place.exists() or {each.name for each in place.iterdir()} <= {"zarr.json"}
     records = RunStore.open(place).records

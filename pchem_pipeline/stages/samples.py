@@ -46,7 +46,7 @@ class OpenSample:
     histogram: str
 
     def shares_frames(self, other: OpenSample) -> bool:
-        """Tell whether it has frames of the same files, and of the same dataset in them, as another."""
+        """Return whether it has frames of the same files, and of the same dataset in them, as another."""
         hashes = self._hashes()
         if not hashes or not all(hashes) or hashes != other._hashes():
             return False

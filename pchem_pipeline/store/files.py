@@ -59,7 +59,7 @@ def storage_error(error: OSError, path: object) -> StoreError:
 
 
 def is_fatal(error: BaseException) -> bool:
-    """Tell whether an error will hit every other tile as well (disk full, no permission)."""
+    """Return whether an error will hit every other tile as well (disk full, no permission)."""
     return isinstance(error, OSError) and error.errno in _CURES
 
 

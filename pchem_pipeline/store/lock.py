@@ -68,7 +68,7 @@ def locked(run: Path, private: Path) -> Iterator[None]:
 
 
 def is_locked(run: Path, private: Path) -> bool:
-    """Tell whether a living process holds the lock of a run, as far as this machine can know."""
+    """Return whether a living process holds the lock of a run, as far as this machine can know."""
     if isinstance(private, RemotePath):
         try:
             return not _is_left_behind(_owner(run, private / _OBJECT))
@@ -132,7 +132,7 @@ def _free(lock: RemotePath) -> str:
 
 
 def _is_left_behind(held: dict[str, Any]) -> bool:
-    """Tell whether the owner was a process of this machine, and is gone."""
+    """Return whether the owner was a process of this machine, and is gone."""
     pid = held.get("pid")
     if held.get("machine") != _machine() or not isinstance(pid, int) or pid <= 0:
         return False

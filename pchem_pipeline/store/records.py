@@ -167,7 +167,7 @@ class Records:
             return set()
 
     def has_all(self, record: StageRecord) -> bool:
-        """Tell whether all units of a stage are finished that it has as far as its record knows."""
+        """Return whether all units of a stage are finished that it has as far as its record knows."""
         return len(self.done(record.stage, record.fingerprint)) >= record.keys
 
     def summaries(self, stage: str, fingerprint: str) -> dict[str, dict[str, Any]]:

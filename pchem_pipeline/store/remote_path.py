@@ -127,17 +127,17 @@ class RemotePath(_Pure):
 
     @_asked
     def exists(self, **unused: Any) -> bool:
-        """Tell whether there is an object or a folder of that name."""
+        """Return whether there is an object or a folder of that name."""
         return bool(self.storage.exists(str(self)))
 
     @_asked
     def is_dir(self, **unused: Any) -> bool:
-        """Tell whether something lies below that name."""
+        """Return whether something lies below that name."""
         return bool(self.storage.isdir(str(self)))
 
     @_asked
     def is_file(self, **unused: Any) -> bool:
-        """Tell whether there is an object of that name."""
+        """Return whether there is an object of that name."""
         return bool(self.storage.isfile(str(self)))
 
     def mkdir(self, mode: int = 0o777, parents: bool = False, exist_ok: bool = False) -> None:

@@ -139,7 +139,7 @@ class RunStore:
     # -- arrays -------------------------------------------------------------------------------
 
     def has(self, name: str) -> bool:
-        """Tell whether the array or group ``name`` exists."""
+        """Return whether the array or group ``name`` exists."""
         with self._translated(name):
             return name in self._root
 
@@ -446,7 +446,7 @@ def _refuse_links(path: Path) -> None:
 
 
 def _holds_other_files(path: Path) -> bool:
-    """Tell whether there is more at a path than a store that has just begun, or is being made, or a run."""
+    """Return whether there is more at a path than a store that has just begun, or is being made, or a run."""
     if not path.is_dir():
         return path.exists() and not path.is_dir()  # another process may make the folder meanwhile
     if (path / _PRIVATE).is_dir():  # its description was lost

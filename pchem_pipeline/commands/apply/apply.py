@@ -185,7 +185,7 @@ def _make_job(
 
 
 def _is_done(output: Path, content: dict[str, Any], command: Command) -> bool:
-    """Tell whether a folder of files is what is wanted.
+    """Return whether a folder of files is what is wanted.
 
     Raises:
         ConfigError: it is something else.

@@ -158,7 +158,7 @@ class PixelStates:
 
 
 def _near(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArray]) -> BoolArray:
-    """Tell which values agree within their errors, as far as these are known."""
+    """Return which values agree within their errors, as far as these are known."""
     error = np.hypot(np.nan_to_num(one[1]), np.nan_to_num(other[1]))
     return np.asarray(np.abs(one[0] - other[0]) <= LIMIT * error)
 

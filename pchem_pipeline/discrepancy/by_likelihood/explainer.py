@@ -25,7 +25,7 @@ from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import CONVINCING, Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.skeleton import Explainer, Prepared, search, silent
+from pchem_pipeline.discrepancy.skeleton import Explainer, Prepared, no_progress, search
 from pchem_pipeline.discrepancy.verdict import Discrepancy
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
@@ -43,7 +43,7 @@ def find_in_histograms(
     *,
     model: Sequence[Effect] = (),
     width: int | None = None,
-    tell: Callable[[str], None] = silent,
+    progress: Callable[[str], None] = no_progress,
 ) -> Discrepancy:
     """Find where histograms disagree with the fitted model, name the effects, and add them.
 
@@ -55,7 +55,7 @@ def find_in_histograms(
         settings: the section ``discrepancy``; the defaults if None.
         model: effects that the model has already; none of them is added again.
         width: pixels in a row of the sensor; None: it has one row.
-        tell: hears what is done next.
+        progress: is given what is done next.
 
     Returns:
         The verdict, with everything that supports it.
@@ -68,11 +68,11 @@ def find_in_histograms(
     settings = settings or DiscrepancySettings()
     classes = candidate_classes(settings)
     rng = np.random.default_rng(settings.seed)
-    tell("computing the statistics of each part")
+    progress("computing the statistics of each part")
     observed = ObservedHistograms.of(samples, rng)
     times = [sample.integration_time for sample in samples]
-    tell("simulating the fitted model")
-    found = search(HistogramExplainer.begin(observed, settings, classes, tuple(model), times, rng), tell)
+    progress("simulating the fitted model")
+    found = search(HistogramExplainer.begin(observed, settings, classes, tuple(model), times, rng), progress)
     n, n_illuminated = samples[0].counts.shape[0], sum(not sample.bias for sample in samples)
     row = width or n
     shape = n // row, row
@@ -165,7 +165,7 @@ class HistogramExplainer(Explainer[Explanation]):
         return self.whole.gap(self.whole.plain)
 
     def suspects(self, null: NullModel) -> bool:
-        """Tell whether several samples fit badly together although no statistic of one deviates."""
+        """Return whether several samples fit badly together although no statistic of one deviates."""
         return self.observed.joint and not self.gap(null).at_floor
 
     def explain(self, null: NullModel, disagreed: bool) -> Explanation | None:

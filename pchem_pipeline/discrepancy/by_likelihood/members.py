@@ -150,7 +150,7 @@ class Member:
             return self
 
     def excludes(self, other: Member) -> bool:
-        """Tell whether both cannot be in one model: one effect, or two laws of the electron number."""
+        """Return whether both cannot be in one model: one effect, or two laws of the electron number."""
         return self.tag == other.tag or "poisson" not in (self.law.law, other.law.law)
 
 
@@ -188,7 +188,7 @@ def law_of(
 
 
 def leads_in_histograms(effect: type[Effect]) -> bool:
-    """Tell whether the statistic that an effect moves most is one that histograms have."""
+    """Return whether the statistic that an effect moves most is one that histograms have."""
     return not effect.signature or effect.signature[0].partition(".")[0] in _FAMILIES
 
 

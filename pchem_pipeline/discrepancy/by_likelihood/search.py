@@ -99,7 +99,7 @@ def _rest(sets: SetComparison, best: FittedSet) -> float:
 
 
 def combs_coincide(parameters: FloatArray) -> bool:
-    """Tell whether the peaks of all pixels lie at the same DN: codes cannot be told from electrons then.
+    """Return whether the peaks of all pixels lie at the same DN: codes cannot be told from electrons then.
 
     Args:
         parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
@@ -164,7 +164,7 @@ def _apart(member: Member, there: Member) -> float:
 
 
 def _alike(one: Member, other: Member) -> bool:
-    """Tell whether two fits of an effect agree in sign and roughly in strength, neither at a limit."""
+    """Return whether two fits of an effect agree in sign and roughly in strength, neither at a limit."""
     if one.at_limit or other.at_limit:
         return False
     if not one.effect.strength or one.kind != other.kind:

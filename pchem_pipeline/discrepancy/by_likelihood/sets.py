@@ -73,7 +73,7 @@ class FittedSet:
         return next((m for m in self.members if m.tag == tag), None)
 
     def likelier_than(self, other: FittedSet) -> BoolArray:
-        """Tell which pixels it explains clearly better than another fit, (n,)."""
+        """Return which pixels it explains clearly better than another fit, (n,)."""
         return np.asarray(self.fit.log_likelihood > other.fit.log_likelihood + CLEARLY)
 
     def stderr(self, member: Member) -> dict[str, float]:
@@ -220,7 +220,7 @@ class SetComparison:
         return self.attempt([m for m in found.members if m.tag != tag], found.fit.parameters)
 
     def beats(self, one: FittedSet, part: FittedSet, least: float = 0.0) -> bool:
-        """Tell whether a set predicts better than a part of it, beyond chance and by more than the price.
+        """Return whether a set predicts better than a part of it, beyond chance and by more than the price.
 
         And, where it misfits, by that share of what it explains: others leave as much, that are not quite
         those in the data.

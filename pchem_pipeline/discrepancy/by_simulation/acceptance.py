@@ -58,7 +58,7 @@ class Acceptance:
         return self.gaps.gap(self.z.final, mean, replicates)
 
     def widens(self, added: Refitted) -> bool:
-        """Tell whether a set, its strengths as the data ask for, leaves a wider gap than without it."""
+        """Return whether a set, its strengths as the data ask for, leaves a wider gap than without it."""
         mean = added.mean + np.expm1(added.change) @ added.parts
         before = self.gap_at(self.first.mean, self.first.replicates)
         return self.gap_at(mean, added.vectors).interval[0] > before.value
@@ -91,7 +91,7 @@ class Acceptance:
         return tuple(h for h, is_there in zip(added.hypotheses, there, strict=True) if is_there)
 
     def _counted(self, added: Refitted) -> BoolArray:
-        """Tell which effects account for a count beyond chance, which the final frames have, too."""
+        """Return which effects account for a count beyond chance, which the final frames have, too."""
         first, z = self.first, self.z
         size = np.abs(added.parts)
         others = size.sum(axis=0) - size

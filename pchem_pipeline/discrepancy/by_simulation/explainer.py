@@ -51,7 +51,7 @@ from pchem_pipeline.discrepancy.null import (
 )
 from pchem_pipeline.discrepancy.observe.places import SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.skeleton import Explainer, Prepared, search, silent
+from pchem_pipeline.discrepancy.skeleton import Explainer, Prepared, no_progress, search
 from pchem_pipeline.discrepancy.verdict import Discrepancy
 from pchem_pipeline.effects.framework.compose import added_exposures, along_chain
 from pchem_pipeline.effects.framework.effect import Effect
@@ -73,7 +73,7 @@ def find_discrepancies(
     model: Sequence[Effect] = (),
     mapper: Mapper = serial,
     window: SensorWindow | None = None,
-    tell: Callable[[str], None] = silent,
+    progress: Callable[[str], None] = no_progress,
 ) -> Discrepancy:
     """Find where frames disagree with the fitted model, name the effects, and add them.
 
@@ -87,7 +87,7 @@ def find_discrepancies(
         model: effects that the model has already; none of them is added again.
         mapper: runs the simulated stacks; None of the answers depends on how.
         window: of the sensor that the frames are; None: all of it.
-        tell: hears what is done next.
+        progress: is given what is done next.
 
     Returns:
         The verdict, with everything that supports it.
@@ -109,10 +109,10 @@ def find_discrepancies(
         window=window,
     )
     classes = candidate_classes(settings)
-    tell("computing the statistics of each part")
+    progress("computing the statistics of each part")
     observed = ObservedFrames.of(frames)
-    tell("simulating the fitted model")
-    return search(FrameExplainer.begin(observed, settings, classes, tuple(model), mapper), tell)
+    progress("simulating the fitted model")
+    return search(FrameExplainer.begin(observed, settings, classes, tuple(model), mapper), progress)
 
 
 @dataclass
@@ -189,7 +189,7 @@ class FrameExplainer(Explainer[Screened]):
         return self.accept.gap(null)
 
     def suspects(self, null: NullModel) -> bool:
-        """Tell whether some statistic deviates so far that a candidate may explain it with others."""
+        """Return whether some statistic deviates so far that a candidate may explain it with others."""
         return suspicious(null, self.prepared.z)
 
     def explain(self, null: NullModel, disagreed: bool) -> Screened | None:

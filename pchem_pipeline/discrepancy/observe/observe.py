@@ -215,7 +215,7 @@ def _fitted(
 
 
 def _without_steps(gain: FloatArray, usable: BoolArray) -> BoolArray:
-    """Tell which pixels have a comb that whole DN hardly show, where most pixels have a coarser one, (n,).
+    """Return which pixels have a comb that whole DN hardly show, where most pixels have a coarser one, (n,).
 
     Of noise that hides the electrons, as in the dark, in reference columns or in noisy pixels, a few of many
     fits make such a comb by chance. Replicates of what they found would be of other pixels; and in samples

@@ -179,7 +179,7 @@ def _plain(file: Any, name: str) -> Any:
 
 
 def is_own(group: Any, name: str) -> bool:
-    """Tell whether a group has something in its own file under a name."""
+    """Return whether a group has something in its own file under a name."""
     import h5py
 
     return isinstance(group.get(name, getlink=True), h5py.HardLink)
@@ -209,7 +209,7 @@ def _elsewhere(path: Path, names: set[str]) -> tuple[str, ...]:
 
 
 def _is_whole(path: Path, source: Any) -> bool:
-    """Tell whether a part of a virtual dataset is there and as large as it was."""
+    """Return whether a part of a virtual dataset is there and as large as it was."""
     if "%" in source.file_name:
         return True
     try:
@@ -221,7 +221,7 @@ def _is_whole(path: Path, source: Any) -> bool:
 
 
 def _fits(part: Any, source: Any) -> bool:
-    """Tell whether a part has all samples that are taken from it; those without an end take what is there."""
+    """Return whether a part has all samples taken from it; those without an end take what is there."""
     from h5py import h5s
 
     try:

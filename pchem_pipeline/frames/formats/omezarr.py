@@ -36,7 +36,7 @@ _DESCRIBED = ("zarr.json", ".zarray", ".zattrs", ".zgroup", ".zmetadata")
 
 
 def is_zarr(path: Path) -> bool:
-    """Tell whether a path is a folder with the metadata of a zarr store."""
+    """Return whether a path is a folder with the metadata of a zarr store."""
     return path.is_dir() and any((path / name).exists() for name in ("zarr.json", ".zarray", ".zgroup"))
 
 

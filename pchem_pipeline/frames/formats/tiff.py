@@ -119,7 +119,7 @@ class TiffReader(ContiguousReader):
 
 
 def _reaches_beyond(page: Any, size: int) -> bool:
-    """Tell whether a strip or tile of a page is not within the file."""
+    """Return whether a strip or tile of a page is not within the file."""
     offsets, counts = (np.array(each, np.int64) for each in (page.dataoffsets, page.databytecounts))
     return bool(((offsets < 0) | (counts < 0) | (counts > size - offsets)).any())
 
@@ -243,7 +243,7 @@ def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) 
 
 
 def _adjoining(page: Any, total: int) -> bool:
-    """Tell whether the strips of a page follow each other without a gap and make up the whole page."""
+    """Return whether the strips of a page follow each other without a gap and make up the whole page."""
     offsets, counts = page.dataoffsets, page.databytecounts
     ends = [offset + count for offset, count in zip(offsets, counts, strict=True)]
     return bool(sum(counts) == total and list(offsets[1:]) == ends[:-1])

@@ -246,7 +246,7 @@ class Reasons:
     pixels: bool
 
     def __bool__(self) -> bool:
-        """Tell whether there is any."""
+        """Return whether there is any."""
         return self.shifted or self.spread or self.pixels
 
 

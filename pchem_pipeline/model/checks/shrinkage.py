@@ -120,11 +120,11 @@ class NoisePool:
         return cls(noise, _Prior.of(*some.looseness()), _slope(some.of(near), noise.centre))
 
     def weak(self, pixels: Judged, settings: FitSettings) -> BoolArray:
-        """Tell which pixels are weakly identified for either of the :meth:`reasons`, shape (n,)."""
+        """Return which pixels are weakly identified for either of the :meth:`reasons`, shape (n,)."""
         return np.logical_or(*self.reasons(pixels, settings))
 
     def reasons(self, pixels: Judged, settings: FitSettings) -> tuple[BoolArray, BoolArray]:
-        """Tell which pixels have rough errors or too much noise, and which too small a gap, shape (n,) each.
+        """Return which pixels have rough errors or too much noise, and which too small a gap, (n,) each.
 
         False for those without a value.
 

@@ -51,13 +51,13 @@ def rounding_bias(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic
 
 
 def rounding_may_matter(variance: FloatArray, n_frames: NDArray[np.generic]) -> BoolArray:
-    """Tell where peaks, or whole histograms, of these variances (DN^2) are not so wide that they are safe."""
+    """Return where peaks, or whole histograms, of these variances (DN^2) are not wide enough."""
     with np.errstate(invalid="ignore", over="ignore"):
         return np.asarray(np.sqrt(np.asarray(n_frames, np.float64)) > _SAFE * variance**2)
 
 
 def biased_by_rounding(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic]) -> BoolArray:
-    """Tell in which pixels rounding biases the density's estimates by more than :data:`LARGEST_BIAS`.
+    """Return in which pixels rounding biases the density's estimates by more than :data:`LARGEST_BIAS`.
 
     Args:
         parameters: (H, g, mu, sigma) estimated with the density, each (n,); NaN: not fitted, not counted.

@@ -460,7 +460,7 @@ class _Batch:
         return found[0], found[1]
 
     def _at_limits(self, laws: Sequence[SampleLaw]) -> BoolArray:
-        """Tell in which pixels codes pile up at a limit of the law."""
+        """Return in which pixels codes pile up at a limit of the law."""
         (low, high), found = self._extremes, np.zeros(self.n, np.bool_)
         for j, each in enumerate(laws):
             # of some pixels there may be no limit: NaN is below and above nothing
@@ -469,7 +469,7 @@ class _Batch:
         return found
 
     def _coarse(self, plain: FitResult) -> BoolArray:
-        """Tell in which pixels rounding biases the density's estimates, of any sample, or may deny them."""
+        """Return in which pixels rounding biases the density's estimates, of any sample, or may deny them."""
         columns, words = plain.columns, plain.fit_status
         found = (words & int(FitStatus.COARSE_STEPS | FitStatus.NOT_CONVERGED)) != 0
         found |= self._aliased(plain)
@@ -486,7 +486,7 @@ class _Batch:
         return np.asarray(found)
 
     def _aliased(self, plain: FitResult) -> BoolArray:
-        """Tell in which pixels the comb of frequency ``1 - g`` may be the right one.
+        """Return in which pixels the comb of frequency ``1 - g`` may be the right one.
 
         Between 1.2 and 6 DN per electron there is such a comb. With the same variance V its skewness is at
         most ``1 / (sqrt(V) (1 - g))``; where that of the fit, ``H / (g^3 V^1.5)``, is higher by five of its
@@ -579,7 +579,7 @@ class _Batch:
         return freedom
 
     def _reaches_adc(self, beyond: int = 0) -> BoolArray:
-        """Tell which pixels have samples at the limits of the ADC or ``beyond``, those left out included."""
+        """Return which pixels have samples at the limits of the ADC or ``beyond``, left out or not."""
         assert self.adc_limits is not None
         low, high = self._extremes
         first, last = self.adc_limits[0] - beyond, self.adc_limits[1] + beyond
@@ -618,7 +618,7 @@ def _count_near(given: Histograms) -> None:
 
 
 def _reshapes(law: SampleLaw) -> bool:
-    """Tell whether a law changes more than the width of peaks: the plain fit may then be an electron off."""
+    """Return whether a law changes more than the width of peaks: plain fits may be an electron off."""
     one_peak = law.satellite_weights.shape[1] == 1
     one_law = bool(np.all(np.asarray(law.law) == "poisson")) and law.exposure_weights.shape[-1] == 1
     return not (one_peak and one_law and not np.any(law.curvature) and not np.any(law.variance_per_electron2))

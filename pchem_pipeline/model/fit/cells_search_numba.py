@@ -200,7 +200,7 @@ def _climb_known(pixel: Pixel, tools: Tools, near: FloatArray, best: FloatArray)
 
 @kernel
 def _flat_at_two(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> bool:
-    """Tell whether the log-likelihood of a single sample is flat towards 2 DN per electron.
+    """Return whether the log-likelihood of a single sample is flat towards 2 DN per electron.
 
     Whole numbers do not tell 1/a from 1 - 1/a: it has no slope at 2 DN, and near it no standard error.
     """

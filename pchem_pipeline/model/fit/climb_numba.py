@@ -165,7 +165,7 @@ def brightest(theta: FloatArray) -> float:
 
 @kernel(borrows=True)
 def sensible(theta: FloatArray, longest_step: float, cells: bool) -> bool:
-    """Tell whether parameters that are sought are where they can be told from those of Gaussians."""
+    """Return whether parameters that are sought are where they can be told from those of Gaussians."""
     n = theta.size - N_BLOCK + 1
     a = theta[n + STEP]
     noise = math.exp(0.5 * theta[n + LOG_VARIANCE]) / a
@@ -176,7 +176,7 @@ def sensible(theta: FloatArray, longest_step: float, cells: bool) -> bool:
 
 @kernel(borrows=True)
 def same_place(left: FloatArray, right: FloatArray, cells: bool) -> bool:
-    """Tell whether two points belong to one maximum.
+    """Return whether two points belong to one maximum.
 
     The bias is the same within 0.3 e-, and so is the mean of the brightest sample; with the density of one
     sample the step within 10 %. Of cells of few DN per electron maxima are closer: a tenth of that.
@@ -192,7 +192,7 @@ def same_place(left: FloatArray, right: FloatArray, cells: bool) -> bool:
 
 @kernel(borrows=True)
 def find_held(theta: FloatArray, at: FloatArray, fixed: BoolArray, limits: Limits, held: BoolArray) -> None:
-    """Tell which parameters stay: those fixed, and at a bound that the likelihood pushes against."""
+    """Return which parameters stay: those fixed, and at a bound that the likelihood pushes against."""
     n = at.shape[0]
     noise = satellite = 0.0
     for j in range(n):
@@ -327,7 +327,7 @@ def _tie_of(theta: FloatArray, goal: Goal, flags: BoolArray, limits: Limits, rou
 def _end_of(
     theta: FloatArray, known: FloatArray, loglik: float, rise: float, limits: Limits, goal: Goal
 ) -> int:
-    """Tell how a climb ends whose next step is Newton's own, or that it goes on."""
+    """Return how a climb ends whose next step is Newton's own, or that it goes on."""
     if rise < limits.tolerance:
         return CONVERGED
     if rise < _SURELY_LOWER and loglik + 2.0 * _SURELY_LOWER < goal.known < math.inf:

@@ -20,7 +20,7 @@ def electrons_of(origin: NDArray[np.integer], width: int, gain: FloatArray, bias
 
 
 def inside(intervals: Sequence[Interval], electrons: FloatArray) -> BoolArray:
-    """Tell which places on the comb lie in one of the intervals."""
+    """Return which places on the comb lie in one of the intervals."""
     found = np.zeros(electrons.shape, np.bool_)
     for low, high in intervals:
         within = np.ones(electrons.shape, np.bool_)

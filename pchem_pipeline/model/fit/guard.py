@@ -189,12 +189,12 @@ class _Guard:
                 self.fit(some, quickly)
 
     def _cut(self, pixels: Pixels) -> BoolArray:
-        """Tell which pixels have just had their ends, or what a gap cuts off, left out."""
+        """Return which pixels have just had their ends, or what a gap cuts off, left out."""
         cut = (self.attempt[pixels] == _ENDS) | (self.attempt[pixels] == _CORE)
         return np.asarray(cut & (self.passes[pixels] == 0))
 
     def suspicious(self, pixels: Pixels) -> BoolArray:
-        """Tell which fits may have been led by outliers: by single samples or as a whole."""
+        """Return which fits may have been led by outliers: by single samples or as a whole."""
         out = self.answers.out[pixels]
         fitted = np.isfinite(self.answers.parameters[pixels]).all(axis=1) & np.isfinite(out[:, OUTLYING])
         # of such a goodness of fit outliers may be to blame
@@ -223,7 +223,7 @@ class _Guard:
         return np.concatenate(begun)
 
     def _outside(self, pixels: Pixels, attempt: int) -> BoolArray:
-        """Tell which bins an attempt leaves out: both ends, what a gap cuts off, or none."""
+        """Return which bins an attempt leaves out: both ends, what a gap cuts off, or none."""
         counts = self.given.counts[pixels]
         outside = np.zeros(counts.shape, np.bool_)
         for j in range(self.given.dark.size if attempt < _N_ATTEMPTS else 0):

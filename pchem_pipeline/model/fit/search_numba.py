@@ -330,7 +330,7 @@ def side_lobe(pixel: Pixel, theta: FloatArray) -> float:
 def settled(
     pixel: Pixel, theta: FloatArray, clear: bool, above_null: float, out: FloatArray
 ) -> tuple[bool, bool]:
-    """Tell whether a maximum fits well, its gain settled, and whether other starts may lead to a higher one.
+    """Return whether a maximum fits well, its gain settled, and whether others may be higher.
 
     They do not where the fit is good and far above one Gaussian, nor where it is poor and the side lobe all
     the same far out of the noise, which a misfit raises by sqrt(chi2 / freedom): then the model is wrong, and
@@ -512,7 +512,7 @@ def judge(
 
 @kernel(borrows=True)
 def rival_moves_gain(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float, runner_up: float) -> bool:
-    """Tell whether a rival within the smallest gap of a single sample's maximum has another gain.
+    """Return whether a rival within the smallest gap of a single sample's maximum has another gain.
 
     An electron more or fewer hardly moves the gain where peaks are resolved, which then bring many nats by
     themselves. Any other rival has a gain of its own.
@@ -580,7 +580,7 @@ def fall_and_parabola(
 
 @kernel
 def ripple_by_chance(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> bool:
-    """Tell whether the standard errors of several samples rest on peaks that may be seen by chance.
+    """Return whether the standard errors of several samples rest on peaks that may be seen by chance.
 
     They then exclude read noises that the likelihood does not. One without peaks, 0.8 e-, has the same
     variances with a bias and exposures that are off by the difference of the squares, e-.

@@ -58,7 +58,7 @@ class Samples:
         return len(self.dark)
 
     def illuminated(self, n_rows: int) -> BoolArray:
-        """Tell which rows are of samples with electrons, shape (n_rows,)."""
+        """Return which rows are of samples with electrons, shape (n_rows,)."""
         return np.asarray(np.tile(~np.array(self.dark), n_rows // self.n))
 
     @property

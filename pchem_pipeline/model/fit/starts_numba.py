@@ -431,7 +431,7 @@ def combs_of_step(pixel: Pixel, evaluate: Any, a: float, scratch: Scratch) -> in
 
 @kernel(borrows=True)
 def _holds_one(histogram: Histogram, theta: FloatArray) -> bool:
-    """Tell whether the peak of one electron is there: a comb of half the step has nothing where this has it.
+    """Return whether the peak of one electron is there: a comb of half the step has none.
 
     Within a fourth of a step of it are more than 0.4 of its ``N H exp(-H)`` samples, the tail of the bias
     peak taken off.

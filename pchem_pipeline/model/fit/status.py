@@ -87,7 +87,7 @@ def with_rivals_named(words: IntArray, *, dark: bool, several: bool = False) -> 
 
 
 def moves_gain(exposure: FloatArray, noise: FloatArray) -> BoolArray:
-    """Tell where a bias that is an electron off has a gain of its own, too, off by more than 3 %.
+    """Return where a bias that is an electron off has a gain of its own, too, off by more than 3 %.
 
     With one electron more or less, mean and variance of the sample ask for a gain changed by ``1 / (2 H)``;
     the peaks hold the gain with ``4 pi^2 H exp(-4 pi^2 s_e^2)`` times that information. Little is left of the

@@ -14,7 +14,7 @@ from pchem_pipeline.base.arrays import BoolArray, FloatArray
 def usable_pixels(
     quanta_exposure: FloatArray, conversion_gain: FloatArray, bias: FloatArray, read_noise_dn: FloatArray
 ) -> BoolArray:
-    """Tell which pixels have parameters that define a density (Hendrickson et al. 2023, eq. X_density).
+    """Return which pixels have parameters that define a density (Hendrickson et al. 2023, eq. X_density).
 
     Args:
         quanta_exposure: H, e-, any shape; the others have the same shape.

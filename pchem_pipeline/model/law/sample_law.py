@@ -390,7 +390,7 @@ _NARROW = 0.02
 
 
 def _same(one: NDArray[Any], other: NDArray[Any]) -> bool:
-    """Tell whether arrays are equal; no limit is the same as no limit."""
+    """Return whether arrays are equal; no limit is the same as no limit."""
     return one.dtype.kind == other.dtype.kind and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
 
 

@@ -92,7 +92,7 @@ class Defects:
 
 
 def needs_moments(status: NDArray[Any], conversion_gain: FloatArray) -> BoolArray:
-    """Tell which pixels :class:`Moments` are needed of: gain not known, or samples at a limit of the ADC.
+    """Return which pixels :class:`Moments` are needed of: gain not known, or samples at a limit of the ADC.
 
     Pixels without samples have none.
 

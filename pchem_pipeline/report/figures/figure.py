@@ -152,7 +152,7 @@ _BINS, _POINTS = 60, 301
 
 
 def is_strip(shape: tuple[int, ...]) -> bool:
-    """Tell whether a sensor is a line of channels, drawn as points instead of an image."""
+    """Return whether a sensor is a line of channels, drawn as points instead of an image."""
     return min(shape) < _STRIP
 
 

@@ -135,7 +135,7 @@ def _density(pixel: PixelFit, dn: IntArray) -> FloatArray:
 
 
 def has_fit(parameters: Mapping[str, float]) -> bool:
-    """Tell whether the four parameters of the PCD are all known and describe a density."""
+    """Return whether the four parameters of the PCD are all known and describe a density."""
     values = _theta(parameters)
     return bool(np.all(np.isfinite(values))) and values[1] > 0 and values[3] > 0 and values[0] >= 0
 

@@ -56,24 +56,27 @@ def run(context: StageContext) -> None:
         StoreError: the store refuses.
     """
     sensor, (before, roi) = context.sensor, _start(context)
-    with context.reporter.phases(_STAGE) as tell, context.stop.at_once():
+    with context.reporter.phases(_STAGE) as progress, context.stop.at_once():
         try:
             if sensor.kind == "frames":
-                _run_frames(context, before, roi, tell)
+                _run_frames(context, before, roi, progress)
             else:
-                _run_histograms(context, before, tell)
+                _run_histograms(context, before, progress)
         except _Ended as ended:
             raise ended.error from ended.error.__cause__
 
 
 def _run_frames(
-    context: StageContext, before: Sequence[Effect], roi: tuple[int, ...] | None, tell: Callable[[str], None]
+    context: StageContext,
+    before: Sequence[Effect],
+    roi: tuple[int, ...] | None,
+    progress: Callable[[str], None],
 ) -> None:
     source = open_source(context)
     block_length(source.shape[0], context.config.discrepancy.block_frames)
     model = (*before, *_limits(context, before))
-    settings, seen, whole = _surveyed(context, source, model, roi, tell)
-    search = _Search(context, source, model, roi, seen, tell)
+    settings, seen, whole = _surveyed(context, source, model, roi, progress)
+    search = _Search(context, source, model, roi, seen, progress)
     window, found = search.found(settings, "")
     elsewhere = search.elsewhere(settings, "elsewhere-", window, found)
     if elsewhere is not None and elsewhere.deviates and whole != settings:
@@ -100,7 +103,7 @@ class _Search:
         model: its effects, the limits of the ADC among them.
         roi: rows and columns that the user asked for.
         seen: what was seen of the whole sensor.
-        tell: hears what is done next.
+        progress: is given what is done next.
         work: CPU seconds of all of it, by count.
     """
 
@@ -109,7 +112,7 @@ class _Search:
     model: Sequence[Effect]
     roi: tuple[int, ...] | None
     seen: Survey
-    tell: Callable[[str], None]
+    progress: Callable[[str], None]
     work: float = 0.0
 
     def found(self, settings: DiscrepancySettings, prefix: str) -> tuple[Window, Discrepancy]:
@@ -122,7 +125,7 @@ class _Search:
             **self._taken(window),
             model=tuple(self.model),
             mapper=_Mapper(self.context, prefix),
-            tell=self.tell,
+            progress=self.progress,
         )
         self.work += found.verdict.work
         return window, found
@@ -137,7 +140,7 @@ class _Search:
         other = other_window(window, self.source.shape, self.roi)
         if other is None or found.verdict.verdict != "named":
             return None
-        self.tell("checking the model in another window")
+        self.progress("checking the model in another window")
         frames = FrameStack.of(
             read_window(self.source, other), other.times, settings.block_frames, **self._taken(other)
         )
@@ -174,7 +177,7 @@ def _surveyed(
     source: FrameSource,
     model: Sequence[Effect],
     roi: tuple[int, ...] | None,
-    tell: Callable[[str], None],
+    progress: Callable[[str], None],
 ) -> tuple[DiscrepancySettings, Survey, DiscrepancySettings]:
     """Look at the whole sensor, once; return that between two settings.
 
@@ -198,7 +201,7 @@ def _surveyed(
                     f"({settings.max_pixels} without this limit)"
                 )
             settings = less
-        tell("scanning all pixels and frames")
+        progress("scanning all pixels and frames")
         seen = _survey(context, source, settings)
         if seen.left_out:
             context.note(
@@ -249,12 +252,12 @@ def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...
     return (Clipping(low=low, high=high),)
 
 
-def _run_histograms(context: StageContext, before: Sequence[Effect], tell: Callable[[str], None]) -> None:
+def _run_histograms(context: StageContext, before: Sequence[Effect], progress: Callable[[str], None]) -> None:
     """Do the same with ready-made histograms, or with those of several samples together, in one unit."""
     samples = _samples(context) if context.sensor.samples else [_histograms(context.store)]
     model = (*before, *_limits(context, before))
     found = find_in_histograms(
-        samples, context.config.discrepancy, width=context.sensor.nx, model=model, tell=tell
+        samples, context.config.discrepancy, width=context.sensor.nx, model=model, progress=progress
     )
     _write(context, found, before)
     context.run_units([WHOLE])

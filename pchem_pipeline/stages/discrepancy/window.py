@@ -283,7 +283,7 @@ def fewer_samples(
 def is_clear(
     frames: NDArray[np.unsignedinteger], numbers: IntArray, *, n_run: int, block_frames: int
 ) -> bool:
-    """Tell whether frames disagree with the plain model beyond any doubt, without simulating it.
+    """Return whether frames disagree with the plain model beyond any doubt, without simulating it.
 
     Args:
         frames: codes (frame, y, x), DN.

@@ -113,7 +113,7 @@ def hashed_frames(
 
 
 def _is_wanted(context: StageContext) -> bool:
-    """Tell whether both stages are to be done from the start."""
+    """Return whether both stages are to be done from the start."""
     config, records = context.config, context.store.records
     return (
         context.command.roi is None
@@ -124,14 +124,14 @@ def _is_wanted(context: StageContext) -> bool:
 
 
 def _blocks_are_chunks(context: StageContext, frames: FrameSequence) -> bool:
-    """Tell whether the blocks of the stream are whole chunks of the copy, where there is one."""
+    """Return whether the blocks of the stream are whole chunks of the copy, where there is one."""
     block = min(context.config.histogram.window_frames, frames.shape[0])
     chunk = ingest.chunk_shape(frames.shape, frames.dtype.itemsize)[0]
     return context.config.input.mode == "reference" or block == frames.shape[0] or block % chunk == 0
 
 
 def _fits(context: StageContext, frames: FrameSequence, bins: int) -> bool:
-    """Tell whether the memory allowed is enough."""
+    """Return whether the memory allowed is enough."""
     need = single_pass_bytes(context.config, frames.shape, frames.dtype, bins)
     return need <= allowed_bytes(context.config, context.config.compute.count())
 

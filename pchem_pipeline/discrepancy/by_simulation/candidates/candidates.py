@@ -160,7 +160,7 @@ class ReplicateSimulator:
         return [each for each in found if id(each) not in left_out]
 
     def _overlap(self, one: Effect, other: Effect, shape: tuple[int, int]) -> bool:
-        """Tell whether two effects meet in some pixel in some frame."""
+        """Return whether two effects meet in some pixel in some frame."""
         pixels = one.region is None or other.region is None or one.region.overlap(other.region, shape) > 0
         n_run = self.acquisition.n_run
         return pixels and (one.when is None or other.when is None or one.when.overlap(other.when, n_run) > 0)

@@ -62,7 +62,7 @@ class _Detail:
 
 
 def may_be_tuned(refitter: Refitter, one: Refitted) -> bool:
-    """Tell whether what a set leaves lies where effects move it whose numbers are not known."""
+    """Return whether what a set leaves lies where effects move it whose numbers are not known."""
     places = sorted({place for place, _ in _numbers(refitter, one.hypotheses)})
     if not places:
         return False

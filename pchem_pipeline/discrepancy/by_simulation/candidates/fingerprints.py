@@ -123,7 +123,7 @@ class SetFit:
         return np.array([c * h.fingerprint for c, h in zip(self.factors, self.hypotheses, strict=True)])
 
     def settled(self, close: float) -> bool:
-        """Tell whether all strengths are what the data ask for, to ``close`` or half a standard error."""
+        """Return whether all strengths are what the data ask for, to ``close`` or half a standard error."""
         return bool(np.all(np.abs(self.factors - 1.0) < np.maximum(close, self.stderr / 2.0)))
 
     def at_best(self) -> tuple[Hypothesis, ...]:
@@ -206,7 +206,7 @@ def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -
 
 
 def counted(parts: FloatArray, shift: FloatArray, noise: Noise) -> BoolArray:
-    """Tell which effects an exact count asks for, however few events it has, shape (e,).
+    """Return which effects an exact count asks for, however few events it has, shape (e,).
 
     Args:
         parts: shifts of the statistics by effect, shape (e, m).
@@ -230,7 +230,7 @@ def held_out_gain(
 
 
 def share_place(effects: Iterable[Effect]) -> bool:
-    """Tell whether several effects act in one part of the sensor or run.
+    """Return whether several effects act in one part of the sensor or run.
 
     Effects that have nothing to do with each other meet in one tap or range of frames by coincidence only:
     where several are needed there, they mimic one cause, and none of them is it.
@@ -251,7 +251,7 @@ def seconds(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def meets_itself(members: Iterable[Hypothesis]) -> bool:
-    """Tell whether an effect is more than once in a set without regions that tell its places apart."""
+    """Return whether an effect is more than once in a set without regions that tell its places apart."""
     pairs = itertools.combinations([h.effect for h in members], 2)
     return any(a.tag == b.tag and (None in (a.region, b.region) or a.region == b.region) for a, b in pairs)
 
@@ -321,7 +321,7 @@ def _all_needed(fit: SetFit, shift: FloatArray, noise: Noise) -> bool:
 
 
 def seen_among(part: FloatArray, others: FloatArray, shift: FloatArray, noise: Noise) -> bool:
-    """Tell whether a statistic deviates from what other effects make of it, in the direction of an effect.
+    """Return whether a statistic deviates from what other effects make of it, in the direction of an effect.
 
     Args:
         part: what the effect does to the statistics, shape (m,).

@@ -221,7 +221,7 @@ def _of_usual_noise(near: FloatArray, fitted: FloatArray) -> FloatArray:
 
 
 def _likelier(one: FitResult, other: FitResult) -> BoolArray:
-    """Tell which pixels a fit explains clearly better than another one, shape (n,)."""
+    """Return which pixels a fit explains clearly better than another one, shape (n,)."""
     with np.errstate(invalid="ignore"):
         return np.asarray(one.log_likelihood > other.log_likelihood + CLEARLY)
 

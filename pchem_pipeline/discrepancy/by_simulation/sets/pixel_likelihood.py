@@ -375,7 +375,7 @@ def _multistart(sets: SetComparison, fitted: FittedSet) -> FittedSet:
 
 
 def identifiable_from_histograms(effect: Effect) -> bool:
-    """Tell whether the law of a sample holds all numbers of an effect that its histograms show first."""
+    """Return whether the law of a sample holds all numbers of an effect that its histograms show first."""
     kind = type(effect)
     if not effect.everywhere or kind.rough_law or kind.random_realisation:
         return False
@@ -391,7 +391,7 @@ def identifiable_from_histograms(effect: Effect) -> bool:
 
 
 def _refuses(error: Exception) -> bool:
-    """Tell whether an effect says that its numbers do not go together, or are no law of the pixels."""
+    """Return whether an effect says that its numbers do not go together, or are no law of the pixels."""
     return isinstance(error.__cause__ or error, ValueError | ConfigError)
 
 

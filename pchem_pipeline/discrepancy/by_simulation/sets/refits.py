@@ -214,7 +214,7 @@ class Steps(DampedSteps[Refitted]):
         return True
 
     def _goes_on(self, now: Refitted) -> bool:
-        """Tell whether the data ask for more of the same on both sides of a dip."""
+        """Return whether the data ask for more of the same on both sides of a dip."""
         return self.further < _FURTHER and self.length >= 1.0 and float(now.change @ self.step) > 0.0
 
 
@@ -376,7 +376,7 @@ class Refitter:
         return np.asarray(foreseen + beyond_chance(apart.mean(axis=0) - foreseen, error))
 
     def passes_goodness_of_fit(self, one: Refitted) -> bool:
-        """Tell whether a set leaves no statistic beyond chance, nor all of them together (chi-square)."""
+        """Return whether a set leaves no statistic beyond chance, nor all of them together (chi-square)."""
         p, number = float(self.null.p_of(one.rest, _SPLITS).min()), one.rest.size
         together = float(chi_square(2.0 * (one.chance - one.score) + number, number))
         return look_elsewhere(p, self.null.effective_tests) > FALSE_ALARM and together < BEYOND_DOUBT
@@ -389,7 +389,7 @@ class Refitter:
         return found
 
     def residual_is_small(self, one: Refitted) -> bool:
-        """Tell whether a set leaves nothing, or so little of what there was that it may be its details."""
+        """Return whether a set leaves nothing, or so little of what there was that it may be its details."""
         little = one.chance - one.score < _LITTLE * (one.chance - self.nothing)
         return little or self.passes_goodness_of_fit(one)
 
@@ -510,7 +510,7 @@ def price(effects: Iterable[Effect]) -> float:
 
 
 def is_expensive(effects: Iterable[Effect]) -> bool:
-    """Tell whether a refit with effects takes long: those look for levels or a path in every pixel."""
+    """Return whether a refit with effects takes long: those look for levels or a path in every pixel."""
     return any(type(effect).random_realisation for effect in effects)
 
 
