@@ -139,8 +139,11 @@ def joint(
     bias: Annotated[list[Path] | None, typer.Option(help="run of bias frames (repeatable)")] = None,
     store: Annotated[Path | None, typer.Option(help="store of the fit [default: joint.zarr]")] = None,
     against: Annotated[
-        Literal["integration_time", "none"] | None,
+        Literal["integration_time", "light_level", "none"] | None,
         typer.Option(help="quantity on the x axis of H; none: no charge rate [default: integration_time]"),
+    ] = None,
+    level: Annotated[
+        str | None, typer.Option(help="light level of each run in any unit, such as 0,1,2.4: H against it")
     ] = None,
     strict: Strict = False,
     *,
@@ -153,7 +156,8 @@ def joint(
     from pchem_pipeline.commands.first_screen import run_to_first_screen
     from pchem_pipeline.commands.new_run import find_joint
 
-    target, is_new = find_joint(targets, bias or [], store, against)
+    levels = () if level is None else _listed(level, "--level")
+    target, is_new = find_joint(targets, bias or [], store, against, levels)
     stages = pipeline_of(target.config)
     run_to_first_screen(target, stages, command, typer.echo, is_new=is_new, strict=strict)
 

@@ -214,6 +214,7 @@ def find_joint(
     bias: Sequence[Path] = (),
     store: Path | None = None,
     against: str | None = None,
+    levels: Sequence[str] = (),
 ) -> tuple[Target, bool]:
     """Return the run of several samples that ``targets`` name, and whether they are those samples.
 
@@ -230,9 +231,10 @@ def find_joint(
                 f"{targets[0]} is a single run; a joint fit needs several: give all runs, or a YAML with "
                 "input.samples"
             )
-        for option, value in (("run.store", store), ("input.against", against)):
+        stated = {"run.store": store, "input.against": against, "input.samples": levels or None}
+        for option, value in stated.items():
             if value is not None:
-                name = option.partition(".")[2]
+                name = "level" if value is levels else option.partition(".")[2]
                 raise ConfigError(f"--{name}: only with runs; {targets[0]} sets {option}, change it there")
         return found, False
     place = place_of(store or Path("joint.zarr")).resolve()
@@ -240,9 +242,29 @@ def find_joint(
     samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, folder)} for each in runs]
     for sample in samples[len(targets) :]:
         sample["bias"] = True
+    if levels:
+        against = against or "light_level"
+        for sample, level in zip(samples, _light_levels(levels, len(targets), against), strict=False):
+            sample["light_level"] = level
     given: dict[str, Any] = {"samples": samples}
     if against is not None or len(targets) == 1:
         given["against"] = against or "none"  # a line needs two exposures
     for each in runs:
         find_run(each)
     return _stated_run(place, given, "joint"), True
+
+
+def _light_levels(levels: Sequence[str], n: int, against: str) -> list[float]:
+    """Return the light levels of n runs.
+
+    Raises:
+        ConfigError: they are no numbers, not as many as the runs, or not wanted.
+    """
+    if against != "light_level":
+        raise ConfigError(f"--level: only with --against light_level, not {against}; omit one of them")
+    if len(levels) != n:
+        raise ConfigError(f"--level: {len(levels)} levels for {n} runs; give one for each, such as 0,1,2.4")
+    try:
+        return [float(level) for level in levels]
+    except ValueError:
+        raise ConfigError(f"--level: {','.join(levels)} are no numbers; give such as 0,1,2.4") from None

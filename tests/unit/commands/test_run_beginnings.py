@@ -154,6 +154,26 @@ def test_a_joint_fit_goes_on_with_its_edited_yaml(tmp_path, monkeypatch):
     assert Path("j.yaml").read_text() == edited
 
 
+def test_light_levels_are_those_of_the_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b", "dark"):
+        Path(f"{name}.yaml").write_text(f"run: {{store: {name}.zarr}}\ninput: {{files: [{name}.tif]}}\n")
+    runs, dark = [Path("a.yaml"), Path("b.yaml")], [Path("dark.yaml")]
+    target, _ = begun(find_joint, runs, dark, store=Path("j.zarr"), levels=("1", "2.4"))
+    found = target.config.input
+    assert found.against == "light_level"
+    assert [sample.light_level for sample in found.samples] == [1.0, 2.4, None]
+    for options, words in (
+        ({"levels": ("1",)}, "1 levels for 2 runs"),
+        ({"levels": ("1", "bright")}, "no numbers"),
+        ({"levels": ("1", "2"), "against": "integration_time"}, "only with --against light_level"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            find_joint(runs, store=Path("k.zarr"), **options)
+    with pytest.raises(ConfigError, match="--level: only with runs"):
+        find_joint([Path("j.yaml")], levels=("1", "2"))
+
+
 def test_a_refusal_that_names_a_setting_says_where_settings_are(tmp_path, monkeypatch):
     """The YAML of a first try that is refused is taken away: `pchem init` makes it."""
     monkeypatch.chdir(tmp_path)
