@@ -318,7 +318,7 @@ def export(
         ),
     ] = "fits,csv",
 ) -> None:
-    """Write maps as FITS, TIFF or npz, a CSV summary, and a list of defects."""
+    """Write maps, their summary and the list of defects."""
     from pchem_pipeline.commands.export import export_run
 
     for path in export_run(target, output, _listed(formats.lower(), "--format")):
