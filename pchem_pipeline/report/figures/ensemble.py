@@ -272,7 +272,7 @@ def _tail_stack(half: _Drawn) -> Stack:
     lines = half.lines(where, models, width=0.9, listed=False)
     panel = Panel(Axis("", low, high, log=True), (half.bars(where, listed=False), *lines))
     x = Axis(f"signal ({half.unit})")
-    return Stack((panel,), x, "all values, logarithmic", height_mm=78.0, wide=True)
+    return Stack((panel,), x, "all values, log scale", height_mm=78.0, wide=True)
 
 
 def electrons_chart(table: DataTable) -> Chart:
