@@ -65,12 +65,12 @@ def apply(
     after an interruption.
     """
     from pchem_pipeline.commands.apply.apply import apply_to_frames
-    from pchem_pipeline.commands.apply.registry import finished_runs, run_for
+    from pchem_pipeline.commands.apply.registry import run_for
     from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
     from pchem_pipeline.run.target import find_run
 
-    if target.is_dir() and finished_runs(target):
-        target, why = run_for(target, frames, max_age)
+    target, why = run_for(target, frames, max_age)
+    if why:
         typer.echo(f"apply: calibrated with {target}, {why}", err=True)
     wanted = ApplySettings(kinds_of(what), prior, not keep_modes, format, dataset)
     for path in apply_to_frames(find_run(target), frames, output, wanted, replace(command, force=force)):

@@ -15,7 +15,7 @@ from pchem_pipeline.base.kernel_cache import cache_folder
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.inspect import survey
-from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.open import joined
 from pchem_pipeline.frames.reader import FrameReader, described
 from pchem_pipeline.frames.registry import reader_class, reader_names
 from pchem_pipeline.frames.resolve import HISTOGRAM_SUFFIXES
@@ -57,7 +57,7 @@ def about_files(places: Sequence[Path]) -> Iterator[str]:
         yield from report.notes
         return
     try:
-        with open_frames(settings.model_copy(update={"on_bad_file": "skip"}), here, least=1) as frames:
+        with joined(readers, report, settings, here, least=1) as frames:
             yield _stack_words(frames)
             yield from dict.fromkeys((*frames.notes, *frames.report.notes))
     except InputError as error:

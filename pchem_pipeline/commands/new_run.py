@@ -231,10 +231,12 @@ def find_joint(
                 f"{targets[0]} is a single run; a joint fit needs several: give all runs, or a YAML with "
                 "input.samples"
             )
-        stated = {"run.store": store, "input.against": against, "input.samples": levels or None}
-        for option, value in stated.items():
+        for name, option, value in (
+            ("store", "run.store", store),
+            ("against", "input.against", against),
+            ("level", "input.samples", levels or None),
+        ):
             if value is not None:
-                name = "level" if value is levels else option.partition(".")[2]
                 raise ConfigError(f"--{name}: only with runs; {targets[0]} sets {option}, change it there")
         return found, False
     place = place_of(store or Path("joint.zarr")).resolve()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ from pchem_pipeline.base.arrays import BoolArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.formats.map_files import read_image
-from pchem_pipeline.frames.inspect import survey
+from pchem_pipeline.frames.inspect import InputReport, survey
+from pchem_pipeline.frames.reader import FrameReader
 from pchem_pipeline.frames.resolve import mask_path
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
@@ -39,9 +41,22 @@ def open_frames(
     """
     readers, report = survey(settings, base_dir, check_duplicates=check_duplicates)
     report.raise_if_refused(settings.on_bad_file)
+    return joined(readers, report, settings, base_dir, check=check_duplicates, least=least)
+
+
+def joined(
+    readers: Sequence[FrameReader],
+    report: InputReport,
+    settings: InputSettings,
+    base_dir: Path,
+    *,
+    check: bool = True,
+    least: int = 2,
+) -> FrameSequence:
+    """Join the readers of a survey to one stack; ``check``: look at some samples, see `open_frames`."""
     frames = FrameSequence(readers, settings, report, least)
     frames.exclude(_excluded(frames, settings, base_dir))
-    if check_duplicates:
+    if check:
         report.notes += first_look(frames, settings)
     return frames
 

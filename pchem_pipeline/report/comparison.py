@@ -190,7 +190,7 @@ class Comparison:
         return any(pair.changed for pair in self.pairs)
 
 
-def by_fate(changes: Sequence[DefectChange]) -> dict[str, list[DefectChange]]:
+def by_change(changes: Sequence[DefectChange]) -> dict[str, list[DefectChange]]:
     """Return the pixels with new defects, without those that they had, and with others."""
     return {
         "new": [each for each in changes if not each.before],

@@ -6,12 +6,12 @@ import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from pchem_pipeline.base.errors import InputError, StoreError
+from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.commands.apply.source import MOST_WARMER, unlike, warmer
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore, stored_config
 
 _DAY = 86_400.0  # s
 
@@ -27,25 +27,31 @@ def finished_runs(folder: Path) -> dict[Path, SensorInfo]:
     return found
 
 
-def run_for(folder: Path, files: Sequence[str], max_age: float | None) -> tuple[Path, str]:
-    """Return the run of a folder for some frames, and why it is the one.
+def run_for(target: Path, files: Sequence[str], max_age: float | None) -> tuple[Path, str]:
+    """Return the run for some frames, and why it is that one: of a folder of runs; else ``target`` itself.
 
     Of the runs of the same camera, setting, temperature and pixels, the last before the frames were taken;
     else the first after.
 
     Args:
-        folder: with the stores of runs, or with folders that have them.
+        target: a run, or a folder with the stores of runs, or with folders that have them.
         files: camera files, globs or folders.
         max_age: days that may lie between run and frames; None: any number.
 
     Raises:
+        ConfigError: ``max_age`` without a folder of runs.
         InputError: no run fits, the one that fits is too old, or dates are needed and not known.
     """
+    runs = finished_runs(target) if target.is_dir() and stored_config(target) is None else {}
+    if not runs and max_age is not None:
+        raise ConfigError(f"--max-age: {target} is no folder of finished runs; omit it")
+    if not runs:
+        return target, ""
     settings = InputSettings(files=tuple(files))
     with open_frames(settings, Path.cwd(), check_duplicates=False, least=1) as frames:
         name, camera, shapes = frames.paths[0], frames.camera, {frames.shape[1:], frames.whole_shape}
     fitting, against = {}, []
-    for path, sensor in finished_runs(folder).items():
+    for path, sensor in runs.items():
         why = unlike(camera, sensor.camera)
         if not {sensor.shape, sensor.whole} & shapes:
             why = f"{sensor.ny} x {sensor.nx} pixels"
@@ -56,8 +62,9 @@ def run_for(folder: Path, files: Sequence[str], max_age: float | None) -> tuple[
         else:
             fitting[path] = sensor.camera.taken
     if not fitting:
-        words = "; ".join(against) or "it has no finished run"
-        raise InputError(f"no run in {folder} fits {name} ({words}); characterise the camera in this setting")
+        raise InputError(
+            f"no run in {target} fits {name} ({'; '.join(against)}); characterise the camera in this setting"
+        )
     if len(fitting) == 1 and max_age is None:
         return next(iter(fitting)), "the only one of this camera and setting"
     dated = [(taken - camera.taken, path) for path, taken in fitting.items() if taken and camera.taken]

@@ -26,7 +26,7 @@ from pchem_pipeline.model.checks.run_differences import (
     reasons_of_change,
 )
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
-from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, RunFacts, by_fate
+from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, RunFacts, by_change
 from pchem_pipeline.report.pages.compare import (
     COMPARE_JSON,
     COMPARE_PAGE,
@@ -193,8 +193,8 @@ def _pair(first: _Side, second: _Side, tolerance: float, rate: float, reporter: 
     words = _words(one, other, arrays, maps, reasons)
     defects = now.changes_since(before, confirm)
     if defects:
-        fates = (f"{len(each):,} {fate}" for fate, each in by_fate(defects).items() if each)
-        words.append(f"Defects: {', '.join(fates)}.")
+        counts = (f"{len(each):,} {change}" for change, each in by_change(defects).items() if each)
+        words.append(f"Defects: {', '.join(counts)}.")
     return Pair(
         one, other, same_data, arrays, maps, reasons, transitions,
         settings_that_differ(one_target.config, other_target.config),

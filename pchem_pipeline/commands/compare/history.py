@@ -21,7 +21,7 @@ from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
 from pchem_pipeline.model.fit.status import FitStatus, words_of
 from pchem_pipeline.model.maps.defects import FAULTS, Defect
 from pchem_pipeline.model.maps.maps import GOOD
-from pchem_pipeline.report.comparison import DefectChange, HistoryRow, Pair, RunFacts, by_fate
+from pchem_pipeline.report.comparison import DefectChange, HistoryRow, Pair, RunFacts, by_change
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.defects import stored_defects
@@ -194,8 +194,8 @@ def _csv_line(row: HistoryRow, maps: Sequence[str], moved: Sequence[str]) -> dic
     }
     found |= dict(zip(("pixels_good", "pixels_caution", "pixels_no_value"), row.run.pixels, strict=True))
     found |= {f"{kind}_pixels": n for kind, n in row.defects.items()}
-    for fate, changes in by_fate(row.defects_changed).items():
-        found[f"defects_{fate.replace(' ', '_')}"] = " ".join(f"{each.y}/{each.x}" for each in changes)
+    for kind, changes in by_change(row.defects_changed).items():
+        found[f"defects_{kind.replace(' ', '_')}"] = " ".join(f"{each.y}/{each.x}" for each in changes)
     for name in maps:
         values = row.run.summary.get(name, (float("nan"),) * 3)
         for part, value in zip(("median", "median_stderr", "scatter"), values, strict=True):

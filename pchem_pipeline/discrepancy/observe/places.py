@@ -1,6 +1,6 @@
 """The leading statistics in a part of the sensor or of the run, for data and replicates alike.
 
-A part is seen as a sensor of its own: its rows and columns moved together, its frames alone, beside the fit
+A part is seen as a sensor of its own, which ends with its rows and columns, its frames alone, beside the fit
 of all frames, since those of a part may be too few for a fit of their own. An effect that acts there only
 moves these statistics as one that acts everywhere moves those of the whole, which tells the two apart.
 """
@@ -8,7 +8,7 @@ moves these statistics as one that acts everywhere moves those of the whole, whi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -195,18 +195,13 @@ def part_statistics(
     # of all effects, in the order of the catalogue
     wanted = {name for effect in effect_classes().values() for name in effect.signature[:_LEADING]}
     leading = [name for name in STATISTICS if name in wanted]
-    window = window or SensorWindow.whole(frames.shape)
+    n_run = int(numbers[-1]) + 1  # on which no statistic depends
     for part in parts:
-        mask = window.mask(part.region)
-        rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-        own = maps.of(np.ix_(rows, columns))
-        own = replace(own, usable=own.usable & mask[np.ix_(rows, columns)])
-        small = frames if mask.all() else frames[:, rows[:, None], columns]
-        in_time, n_run = Part(None, part.when), int(numbers[-1]) + 1  # on which no statistic depends
         try:
             evidence = part_evidence(
-                small, numbers, own, in_time, n_run=n_run, block_frames=block_frames, fitted=False
-            )
+                frames, numbers, maps, part,
+                n_run=n_run, block_frames=block_frames, window=window, fitted=False,
+            )  # fmt: skip
         except (PchEmError, ConfigError):
             continue
         found |= {f"{name}@{part.text}": evidence.z[name] for name in leading if name in evidence.z}

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pchem_pipeline.base.plain import plain
-from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting, by_fate
+from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting, by_change
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, draw_here, render_page
@@ -174,7 +174,7 @@ def _pair_numbers(pair: Pair) -> dict[str, Any]:
         },
         "quality_transitions": pair.transitions,
         "defects": {
-            **{fate.replace(" ", "_"): len(each) for fate, each in by_fate(pair.defects).items()},
+            **{change.replace(" ", "_"): len(each) for change, each in by_change(pair.defects).items()},
             "pixels": [vars(each) for each in pair.defects],
         },
         "arrays": [vars(row) for row in pair.arrays],
@@ -219,11 +219,11 @@ def history_table(found: Comparison) -> Table:
 def _defect_words(row: HistoryRow) -> str:
     """Return the number of defects by kind, and where they differ from those of the first run."""
     parts = [", ".join(f"{n:,} {kind}" for kind, n in row.defects.items() if n) or "none"]
-    for fate, changes in by_fate(row.defects_changed).items():
+    for kind, changes in by_change(row.defects_changed).items():
         if changes:
             shown = ", ".join(f"({each.y}, {each.x})" for each in changes[:_MOST_PLACES])
             more = " …" if len(changes) > _MOST_PLACES else ""  # all are in history.csv
-            parts.append(f"{len(changes):,} {fate}: {shown}{more}")
+            parts.append(f"{len(changes):,} {kind}: {shown}{more}")
     return "; ".join(parts)
 
 

@@ -14,7 +14,7 @@ from pchem_pipeline.commands.demo import hidden_effect, run_demo
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.model.maps.defects import Defect
-from pchem_pipeline.report.comparison import DefectChange, HistoryRow, RunFacts, by_fate
+from pchem_pipeline.report.comparison import DefectChange, HistoryRow, RunFacts, by_change
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.store.records import StageRecord
@@ -57,7 +57,7 @@ def test_a_pixel_has_a_new_defect_unless_what_it_is_seen_in_agrees_within_the_er
     assert now.changes_since(first) == tuple(DefectChange(0, *each) for each in changes)
     back = first.changes_since(now)
     assert [(each.x, each.now, each.before) for each in back] == changes
-    assert {fate: len(each) for fate, each in by_fate(back).items()} == {
+    assert {fate: len(each) for fate, each in by_change(back).items()} == {
         "new": 0, "gone": 3, "of another kind": 1
     }  # fmt: skip
     # of the same histograms a common fit is as good
