@@ -22,14 +22,7 @@ from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import CLEAR, PRICE
-from pchem_pipeline.model.fit.shared import (
-    Ascent,
-    Samples,
-    SharedFit,
-    SharedProblem,
-    Tangent,
-    fit_shared,
-)
+from pchem_pipeline.model.fit.shared import Ascent, Samples, SharedFit, SharedProblem, fit_shared
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _LARGEST_SET = 4  # effects
@@ -244,22 +237,23 @@ class SetComparison:
 
     def promising(self, base: FittedSet, candidates: Sequence[Member]) -> list[Member]:
         """Return candidates, each moved by a first-order step, by the rise that this promises (Rao 1948)."""
-        tangent = Tangent.at(
-            self.problem(base.members), self.samples.theta(base.fit.parameters), base.fit.shared
-        )
+        theta = self.samples.theta(base.fit.parameters)
+        slopes = self.problem(base.members).slopes(theta, base.fit.shared)
         ranked = []
         for member in candidates:
             if any(member.excludes(m) for m in base.members) or member.tag in self.failed:
                 continue
             # an effect of a plug-in may raise anything: the others are compared all the same
             try:
-                ranked.append(self._first_step(base, tangent, member))
+                ranked.append(self._first_step(base, *slopes, member))
             except Exception as error:
                 self.failed[member.tag] = error_words(error)
         ranked.sort(key=lambda pair: -pair[0])
         return [member for rise, member in ranked if rise >= 0.0]
 
-    def _first_step(self, base: FittedSet, tangent: Tangent, member: Member) -> tuple[float, Member]:
+    def _first_step(
+        self, base: FittedSet, log_masses: FloatArray, derivatives: FloatArray, member: Member
+    ) -> tuple[float, Member]:
         """Return the rise that a candidate promises, and the candidate there; below 0 on the wrong side of 0.
 
         Of its strength and the pixels' own parameters; what is in the set stays.
@@ -270,9 +264,10 @@ class SetComparison:
         shared[0] *= _SECANT
         problem = self.problem((*base.members, member))
         moved = problem.log_masses(theta, np.concatenate([base.fit.shared, shared]))
-        slope = (moved - tangent.log_masses) / shared[0]
-        derivatives = np.concatenate([tangent.derivatives[:, :4], slope[:, None, :]], axis=1)
-        expansion = Tangent(problem, tangent.log_masses, derivatives).expansion(self.train)
+        slope = (moved - log_masses) / shared[0]
+        expansion = problem.expansion(
+            log_masses, np.concatenate([derivatives[:, :4], slope[:, None]], axis=1)
+        )
         ascent = Ascent(theta, np.zeros(1), expansion, np.array([[-np.inf, np.inf]]), np.ones(1))
         variance = float(ascent.covariance()[1][0, 0])
         if not variance > 0.0:

@@ -145,11 +145,6 @@ class SharedProblem:
     scale: FloatArray
     samples: Samples = field(default_factory=Samples)
 
-    @property
-    def n_shared(self) -> int:
-        """Number of shared parameters."""
-        return int(self.scale.size)
-
     def masses(self, theta: FloatArray, shared: FloatArray) -> FloatArray:
         """Return the mass of every code, those left out included, shape (n, B)."""
         own = to_parameters(self.samples.rows(theta))
@@ -162,13 +157,36 @@ class SharedProblem:
         inside = np.maximum(mass.sum(axis=1, keepdims=True), LEAST_SEEN)
         return np.where(self.kept, np.log(np.maximum(mass, LEAST_SEEN) / inside), 0.0)
 
-    def expansion(self, theta: FloatArray, shared: FloatArray) -> Expansion:
-        """Return the log-likelihood of each pixel to second order.
+    def slopes(self, theta: FloatArray, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the log masses, (n, B), and their derivatives, own four parameters first, (n, 4 + d, B).
 
         Raises:
             ValueError: fields of the law do not go together.
         """
-        return Tangent.at(self, theta, shared).expansion(self.counts)
+        base, own = self.log_masses(theta, shared), to_parameters(self.samples.rows(theta))
+        n, width = base.shape
+        slopes = np.zeros((n, 4 + shared.size, width))
+        mass, found = sample_slopes(self.law(shared, own), list(own.T), self.origin, width)
+        found[:, 1] /= own[:, 1:2]  # of the logarithm of 1/g
+        kept = self.kept[:, None, :]
+        inside = np.where(self.kept, mass, 0.0).sum(axis=1)
+        change = np.where(kept, found, 0.0).sum(axis=2) / np.maximum(inside, LEAST_SEEN)[:, None]
+        relative = found / np.maximum(mass, LEAST_SEEN)[:, None, :] - change[:, :, None]
+        slopes[:, :4] = np.where(kept & (mass > LEAST_SEEN)[:, None, :], relative, 0.0)
+        for index, (scale, (_, highest)) in enumerate(zip(self.scale, self.bounds, strict=True)):
+            moved, step = shared.copy(), _STEP * scale
+            step = -step if moved[index] + step > highest else step
+            moved[index] += step
+            slopes[:, 4 + index] = (self.log_masses(theta, moved) - base) / step
+        return base, slopes
+
+    def expansion(self, log_masses: FloatArray, derivatives: FloatArray) -> Expansion:
+        """Return the log-likelihood of each pixel to second order, where the law has these slopes."""
+        seen, mass = np.where(self.kept, self.counts, 0), np.where(self.kept, np.exp(log_masses), 0.0)
+        score, information = score_and_information(derivatives, mass, seen)
+        information, score = self.samples.by_pixel(information, score)
+        value = (seen * log_masses).sum(axis=1).reshape(-1, self.samples.n).sum(axis=1)
+        return Expansion(value, score, information)
 
 
 @dataclass(frozen=True)
@@ -194,14 +212,9 @@ class SharedFit:
     samples: Samples = field(default_factory=Samples)
 
     @property
-    def row_theta(self) -> FloatArray:
-        """(log H, log 1/g, mu, log sigma_R^2) of the rows, shape (n J, 4)."""
-        return self.samples.rows(self.theta)
-
-    @property
     def parameters(self) -> FloatArray:
         """(H, g, mu, sigma) of the rows, shape (n J, 4); e-, e-/DN, DN, DN."""
-        return to_parameters(self.row_theta)
+        return to_parameters(self.samples.rows(self.theta))
 
     @property
     def stderr(self) -> FloatArray:
@@ -209,7 +222,7 @@ class SharedFit:
         slopes = self.samples.slopes
         found = np.einsum("jap,npq,jaq->nja", slopes, self.own_covariance, slopes, optimize=True)
         h, g, _, sigma = self.parameters.T
-        per = np.stack([h, g, np.ones_like(h), 0.5 * np.exp(self.row_theta[:, 3]) / sigma], axis=1)
+        per = np.stack([h, g, np.ones_like(h), 0.5 * (sigma - QUANTISATION_VARIANCE / sigma)], axis=1)
         return np.asarray(np.sqrt(np.maximum(found.reshape(-1, 4), 0.0)) * per)
 
 
@@ -247,18 +260,16 @@ def fit_shared(
     theta = problem.samples.theta(parameters)
     shared = np.clip(np.asarray(shared, np.float64), problem.bounds[:, 0], problem.bounds[:, 1])
     limits = _limits(theta, problem.samples.n_exposures)
-    ascent = Ascent(theta, shared, problem.expansion(theta, shared), problem.bounds, problem.scale)
-    arrived = ascent.climb(
-        lambda theta, shared, rows: problem.expansion(theta, shared).of(rows),
-        limits,
-        limits[1] - limits[0],
-        max_steps,
-        tolerance,
-    )
+
+    def expand(theta: FloatArray, shared: FloatArray, rows: IntArray) -> Expansion:
+        return problem.expansion(*problem.slopes(theta, shared)).of(rows)
+
+    start = expand(theta, shared, np.arange(len(theta)))
+    ascent = Ascent(theta, shared, start, problem.bounds, problem.scale)
+    arrived = ascent.climb(expand, limits, limits[1] - limits[0], max_steps, tolerance)
     own, common = ascent.covariance()
-    return SharedFit(
-        ascent.theta, ascent.shared, own, common, ascent.expansion.value, arrived, problem.samples
-    )
+    value = ascent.expansion.value
+    return SharedFit(ascent.theta, ascent.shared, own, common, value, arrived, problem.samples)
 
 
 @dataclass
@@ -406,36 +417,6 @@ class Ascent:
         return inverse, through, common - np.einsum("nad,nae->de", border, through)
 
 
-@dataclass(frozen=True)
-class Tangent:
-    """The law at a point, to first order.
-
-    Attributes:
-        problem: histograms and law.
-        log_masses: given that the code is kept, shape (n, B); 0 where it is not.
-        derivatives: of the log masses of the rows, their own four parameters first, shape (n, 4 + d, B).
-    """
-
-    problem: SharedProblem
-    log_masses: FloatArray
-    derivatives: FloatArray
-
-    @classmethod
-    def at(cls, problem: SharedProblem, theta: FloatArray, shared: FloatArray) -> Tangent:
-        """Evaluate at a point."""
-        base = problem.log_masses(theta, shared)
-        return cls(problem, base, _differences(problem, theta, shared, base))
-
-    def expansion(self, counts: NDArray[np.integer]) -> Expansion:
-        """Return the log-likelihood of histograms, shape (n, B), to second order."""
-        kept, samples = self.problem.kept, self.problem.samples
-        seen, mass = np.where(kept, counts, 0), np.where(kept, np.exp(self.log_masses), 0.0)
-        score, information = score_and_information(self.derivatives, mass, seen)
-        information, score = samples.by_pixel(information, score)
-        value = (seen * self.log_masses).sum(axis=1).reshape(-1, samples.n).sum(axis=1)
-        return Expansion(value, score, information)
-
-
 def _damped(information: FloatArray, damping: FloatArray) -> FloatArray:
     diagonal = np.einsum("naa->na", information)
     more = damping[:, None] * diagonal + 1e-12 * (1.0 + diagonal)
@@ -456,27 +437,3 @@ def _limits(theta: FloatArray, n_exposures: int) -> tuple[FloatArray, FloatArray
     high = np.concatenate([theta[:, : m + 2] + reach, widest], axis=1)
     low[:, :m] -= _REACH_EXPOSURE
     return low, np.maximum(high, theta)
-
-
-def _differences(
-    problem: SharedProblem, theta: FloatArray, shared: FloatArray, base: FloatArray
-) -> FloatArray:
-    """Return the derivatives of the log masses of the rows, own parameters first, shape (n, 4 + d, B)."""
-    n, width = base.shape
-    slopes = np.zeros((n, 4 + problem.n_shared, width))
-    own = to_parameters(problem.samples.rows(theta))
-    mass, found = sample_slopes(problem.law(shared, own), list(own.T), problem.origin, width)
-    found[:, 1] /= own[:, 1:2]  # of the logarithm of 1/g
-    kept = problem.kept[:, None, :]
-    inside = np.where(problem.kept, mass, 0.0).sum(axis=1)
-    change = np.where(kept, found, 0.0).sum(axis=2) / np.maximum(inside, LEAST_SEEN)[:, None]
-    relative = found / np.maximum(mass, LEAST_SEEN)[:, None, :] - change[:, :, None]
-    slopes[:, :4] = np.where(kept & (mass > LEAST_SEEN)[:, None, :], relative, 0.0)
-    for index in range(problem.n_shared):
-        moved = shared.copy()
-        step = _STEP * problem.scale[index]
-        if moved[index] + step > problem.bounds[index, 1]:
-            step = -step
-        moved[index] += step
-        slopes[:, 4 + index] = (problem.log_masses(theta, moved) - base) / step
-    return slopes
