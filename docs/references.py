@@ -212,6 +212,10 @@ def _effect(effect: type[Any]) -> Iterator[str]:
     if effect.source:
         yield f"Source: {_escaped(effect.source)}."
         yield ""
+    if effect.factors:
+        changes, shared_by, varies = effect.factors
+        yield f"Changes: {changes}. Shared by: {shared_by}. Varies: {varies}."
+        yield ""
     if effect.untestable:
         yield f"Not testable with one constant exposure: {_escaped(effect.untestable)}."
         yield ""

@@ -100,6 +100,7 @@ class Addition:
             candidates=self.candidates[:1] if self.alone and not self.confirmed else self.candidates,
             parameters=schema.parameters_of(self.effect, self.stderr),
             form=schema.form_of(self.effect),
+            factors=self.factors,
             place=place_words(self.effect),
             gap_before=self.before.value,
             gap_after=self.after.value,
@@ -112,6 +113,17 @@ class Addition:
             separate=self._separate(),
             pulls=self.pulls,
         )
+
+    @property
+    def factors(self) -> dict[str, tuple[str, ...]]:
+        """The values of each factor among the effects that the data leave; one value is certain."""
+        if not self.fits:
+            return {}
+        left = [effect_classes()[c.effect].factors for c in self.candidates if c.effect in effect_classes()]
+        if self.named:
+            left = [type(self.effect).factors]
+        values = zip(*(each for each in left if each is not None), strict=True)
+        return dict(zip(schema.FACTORS, (tuple(dict.fromkeys(each)) for each in values), strict=False))
 
     def _separate(self) -> dict[str, str]:
         """Return, by effect, the measurement that would distinguish it from this one."""
@@ -390,7 +402,9 @@ def _none(found: Findings) -> str:
 def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Describe effects between which the data do not decide, and unconfirmed ones."""
     data, additions = found.samples, found.added.additions
-    unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in additions if not each.alone]
+    open_ones = [each for each in additions if not each.alone]
+    unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in open_ones]
+    factors = "".join(_factor_words(each.factors) for each in open_ones)
     doubtful = [each for each in additions if each.alone and each.fits and not each.confirmed]
     weak = _and([_sized(each.effect, sizes) for each in doubtful])
     certain = all(each.certain for each in doubtful)
@@ -400,7 +414,14 @@ def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, sc
     if not unknown:
         return f"{also} may lack {weak}: {why}; take more samples{rest}."
     weak = f"; it may lack {weak}: {why}" if weak else ""
-    return f"{also} lacks {_and(unknown)}: these {data} do not decide which{weak}{rest}."
+    return f"{also} lacks {_and(unknown)}: these {data} do not decide which{factors}{weak}{rest}."
+
+
+def _factor_words(factors: Mapping[str, tuple[str, ...]]) -> str:
+    """State which factors of an effect are certain, and what the others may be."""
+    certain = ", ".join(values[0] for values in factors.values() if len(values) == 1)
+    left = [f"{schema.FACTORS[key]} ({' or '.join(v)})" for key, v in factors.items() if len(v) > 1]
+    return (f"; certain: {certain}" if certain else "") + (f"; open: {_and(left)}" if left else "")
 
 
 def _sized(effect: Effect, sizes: Mapping[Effect, schema.Size | None]) -> str:

@@ -33,6 +33,8 @@ RARE = 0.5
 _TIMES = 2.0  # read noises from which a size is given as a multiple instead of in per cent
 #: Largest number of statistics whose pulls before and after are stored and drawn.
 MOST_PULLS = 12
+#: Factors of an effect in words.
+FACTORS = {"changes": "what changes", "shared_by": "what shares it", "varies": "how it varies"}
 #: File of the verdict in the folder of a run.
 VERDICT_FILE = "discrepancy.json"
 
@@ -369,6 +371,7 @@ class Step(_Part):
         candidates: effects compared, the likeliest first.
         parameters: parameters of the named or the likeliest effect.
         form: its text fields that differ from their default.
+        factors: what changes, who shares it, how it varies; of several effects all values, and one is certain.
         place: region and frames in words; empty: everywhere, always.
         gap_before, gap_after, gap_floor: gap on the final samples without and with it, nats per sample.
         gap_interval_after: 95 % interval of the gap with it.
@@ -388,6 +391,7 @@ class Step(_Part):
     candidates: tuple[Candidate, ...]
     parameters: dict[str, Measured]
     form: dict[str, str] = {}
+    factors: dict[str, tuple[str, ...]] = {}
     place: str = ""
     gap_before: Number
     gap_after: Number

@@ -113,6 +113,14 @@ Radians = Annotated[float, Unit("rad")]
 Micrometres = Annotated[float, Unit("um")]
 
 
+class Factors(NamedTuple):
+    """What an effect changes, who shares one value of it, and how that varies, each in words."""
+
+    changes: str
+    shared_by: str
+    varies: str
+
+
 class SharedOffset(NamedTuple):
     """An offset of all pixels of a frame, of a row, of a column, or along a wave across the sensor.
 
@@ -157,6 +165,7 @@ class Effect(Section):
             voltage, then what bends it, then the steps of the converter, then its limits.
         title: its name in the literature.
         source: where it is described.
+        factors: what it changes, who shares it, and how it varies; None of a description, which measures them.
         signature: the statistics (names in :mod:`pchem_pipeline.discrepancy.observe.catalogue`) that it moves
             first, the most telling one first.
         strength: the parameter that scales it; 0 is no effect (a clipping limit and its like have none: "").
@@ -183,6 +192,7 @@ class Effect(Section):
     along: ClassVar[int] = 0
     title: ClassVar[str] = ""
     source: ClassVar[str] = ""
+    factors: ClassVar[Factors | None] = None
     signature: ClassVar[tuple[str, ...]] = ()
     strength: ClassVar[str] = ""
     power: ClassVar[float] = 1.0

@@ -22,6 +22,7 @@ from pchem_pipeline.effects.framework.effect import (
     Dn,
     Effect,
     Electrons,
+    Factors,
     Plane,
     Ratio,
 )
@@ -55,6 +56,7 @@ class InterpixelCapacitance(Effect, tag="interpixel_capacitance"):
     plane = Plane.ANALOG
     title = "interpixel capacitance (IPC)"
     source = "Moore, Ninkov and Forrest 2004; Donlon, Ninkov and Baum 2018"
+    factors = Factors("offset", "each pixel", "with the charge of its neighbours")
     signature = ("space.x.rk", "space.y.rk", "space.x.rr", "space.y.rr", "space.x.kk", "space.y.kk")
     strength = "coupling"
     reach_rows = 1
@@ -135,6 +137,7 @@ class AnalogMemory(Effect, tag="analog_memory"):
     plane = Plane.ANALOG
     title = "analog memory (incomplete reset)"
     source = "Janesick 2001 (incomplete reset); Boone et al. 2018 (memory of readout chains)"
+    factors = Factors("offset", "each pixel", "with the charge of the frame before")
     signature = (
         "time.cross.readout_charge", "time.lag1.readout.mean", "time.lag1.charge.mean",
         "time.cross.readout_charge.chi",
@@ -232,6 +235,7 @@ class BinaryOffset(Effect, tag="binary_offset"):
     along = 2
     title = "binary offset (bit-dependent ADC memory)"
     source = "Boone et al. 2018, PASP 130, 064504"
+    factors = Factors("offset", "each pixel", "with the code read before")
     signature = ("space.x.bits", "space.x.rk", "space.x.rr")
     strength = "offset_dn"
     separate: ClassVar[Mapping[str, str]] = {
@@ -338,6 +342,7 @@ class BlackClamp(Effect, tag="black_clamp"):
     plane = Plane.ADC
     title = "frame-dependent black-level clamp"
     source = "Andor iXon manual (baseline clamp); Janesick 2001 (optically black pixels)"
+    factors = Factors("offset", "pixels of a frame", "with the charge of the clamp's pixels")
     signature = ("frame.covariance", "frame.readout.variance", "frame.charge.variance", "space.x.rk")
     strength = "follow"
     reach_rows = ALL_ROWS  # the clamp may be anywhere

@@ -31,6 +31,7 @@ from pchem_pipeline.effects.framework.effect import (
     Count,
     Dn,
     Effect,
+    Factors,
     Lsb,
     PerElectron,
     Plane,
@@ -68,6 +69,7 @@ class Nonlinearity(Effect, tag="nonlinearity"):
     plane = Plane.ANALOG
     title = "nonlinearity of the pixel's response"
     source = "Janesick 2007 (V/V and V/e- nonlinearity)"
+    factors = Factors("response", "each pixel", "with the charge of the sample")
     signature = ("shape.He1C2.mean", "code.smooth", "shape.He3C1.mean", "shape.He1C2.slope", "shape.C3.mean")
     strength = "step_change"
     separate: ClassVar[Mapping[str, str]] = {
@@ -135,6 +137,7 @@ class AdcInl(Effect, tag="adc_inl"):
     along = 1
     title = "integral nonlinearity of the ADC (INL)"
     source = "IEEE Std 1241 (terminology and test methods for analog-to-digital converters)"
+    factors = Factors("code", "all pixels", "constant")
     signature = (
         "code.smooth", "shape.goodness.mean", "shape.He1C2.mean", "shape.He1C2.chi", "shape.He3.mean",
     )  # fmt: skip
@@ -283,6 +286,7 @@ class AdcDnl(Effect, tag="adc_dnl"):
     along = 2
     title = "differential nonlinearity of the ADC (DNL), bit weight error, missing codes"
     source = "IEEE Std 1241; Harpsoe et al. 2012, A&A 542, A23; Boone et al. 2018, PASP 130, 064504"
+    factors = Factors("code", "all pixels", "constant")
     signature = (
         "code.rough", "code.alternating", "code.period2", "code.period4", "code.period8", "code.period16",
         "shape.goodness.mean",
@@ -456,6 +460,7 @@ class GainStitch(Effect, tag="gain_stitch"):
     along = 1
     title = "stitch point of two gains"
     source = "arXiv:2412.10109 (pCam6060); arXiv:2510.14484 (Marana 4.2)"
+    factors = Factors("code", "all pixels", "constant")
     signature = ("code.smooth", "shape.goodness.mean", "shape.He1C2.mean", "shape.C3.mean")
     strength = "gain_change"
     separate: ClassVar[Mapping[str, str]] = {
@@ -536,6 +541,7 @@ class Clipping(Effect, tag="clipping"):
     along = 3
     title = "clipping (black-level clamping, saturation)"
     source = "Tobin 1958, Econometrica 26, 24 (censored observations); EMVA 1288 (saturation)"
+    factors = Factors("code", "all pixels", "constant")
     signature = ("code.top", "code.bottom", "code.largest", "shape.goodness.cnt")
     separate: ClassVar[Mapping[str, str]] = {
         "adc_dnl": "a shifted bias: a limit is fixed in DN, with no samples beyond",

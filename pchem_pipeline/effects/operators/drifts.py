@@ -23,6 +23,7 @@ from pchem_pipeline.effects.estimators.series import (
 from pchem_pipeline.effects.framework.effect import (
     Dn,
     Effect,
+    Factors,
     Frames,
     Plane,
     Ratio,
@@ -144,6 +145,7 @@ class BiasDrift(Drift, OffsetEffect, tag="bias_drift"):
 
     title = "bias (pedestal) drift"
     source = "Rauscher 2015, PASP 127, 1144 (pedestal drift); Janesick 2001, ch. 7"
+    factors = Factors("offset", "all pixels", "drifting")
     signature = ("frame.readout.trend", "frame.readout.slow", "frame.readout.lag1", "time.lag1.readout.mean")
     strength = "drift_dn"
     separate: ClassVar[Mapping[str, str]] = {
@@ -214,6 +216,7 @@ class GainDrift(Drift, tag="gain_drift"):
     plane = Plane.ANALOG
     title = "conversion gain drift"
     source = "EMVA 1288 (stability of the gain); Janesick 2007"
+    factors = Factors("gain", "all pixels", "drifting")
     signature = (
         "frame.gain.trend", "frame.gain.slow", "frame.readout.trend", "frame.readout.slow",
         "frame.charge.trend", "frame.charge.slow",
@@ -277,6 +280,7 @@ class ExposureDrift(Drift, tag="exposure_drift"):
     plane = Plane.EXPOSURE
     title = "illumination or dark-current drift"
     source = "Widenhorn et al. 2002, Proc. SPIE 4669, 193 (dark current and temperature)"
+    factors = Factors("light", "all pixels", "drifting")
     signature = ("frame.charge.trend", "frame.charge.slow", "time.block.charge.chi", "frame.charge.lag1")
     strength = "drift"
     separate: ClassVar[Mapping[str, str]] = {
@@ -361,6 +365,7 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
     plane = Plane.EXPOSURE
     title = "illumination flicker (intensity noise)"
     source = "EMVA Standard 1288, release 4.0 (2021), sec. 6; Petermann 1988, Laser Diode Modulation"
+    factors = Factors("light", "all pixels", "new in each frame")
     signature = ("frame.charge.variance", "frame.charge.line", "frame.charge.largest", "frame.charge.lag1")
     strength = "rms"
     power = 2.0

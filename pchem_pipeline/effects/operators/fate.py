@@ -14,7 +14,7 @@ from pchem_pipeline.base.settings import Section
 from pchem_pipeline.base.units import per_cent
 from pchem_pipeline.effects.framework.compose import in_place
 from pchem_pipeline.effects.framework.draws import OF_PIXEL, binomial_upper, regrouped, sent_to_neighbours
-from pchem_pipeline.effects.framework.effect import DEPTH, Effect, Electrons, Plane, Ratio
+from pchem_pipeline.effects.framework.effect import DEPTH, Effect, Electrons, Factors, Plane, Ratio
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -45,6 +45,7 @@ class SpuriousCharge(Effect, tag="spurious_charge"):
         "Janesick 2001, Scientific Charge-Coupled Devices, ch. 7; "
         "Barak et al. 2022, Phys. Rev. Applied 17, 014022"
     )
+    factors = Factors("electron number", "each pixel", "new in each frame")
     strength = "mean_e"
     untestable = (
         "sums of Poisson electrons are Poisson, so that it is part of H; a series of integration times would "
@@ -82,6 +83,7 @@ class ChargeLag(Effect, tag="charge_lag"):
     plane = Plane.CHARGE
     title = "charge transfer lag"
     source = "Fossum and Hondongwa 2014, IEEE J. Electron Devices Soc. 2, 33; Mirasol 1963"
+    factors = Factors("electron number", "each pixel", "with the charge of the frame before")
     strength = "fraction"
     reach_frames = 1
     untestable = (
@@ -122,6 +124,7 @@ class ChargeDiffusion(Effect, tag="charge_diffusion"):
     plane = Plane.CHARGE
     title = "charge diffusion"
     source = "Janesick 2001, Scientific Charge-Coupled Devices, ch. 4"
+    factors = Factors("electron number", "each pixel", "with the charge of its neighbours")
     strength = "fraction"
     reach_rows = 1
     untestable = (
@@ -166,6 +169,7 @@ class OpticalCrosstalk(Effect, tag="optical_crosstalk"):
     plane = Plane.CHARGE
     title = "optical crosstalk (luminescence)"
     source = "Rech et al. 2008, Opt. Express 16, 8381; Otte et al. 2009, Nucl. Instrum. Methods A 610, 105"
+    factors = Factors("electron number", "each pixel", "with the charge of its neighbours")
     signature = ("space.x.kk", "space.y.kk")
     strength = "probability"
     reach_rows = 1
@@ -215,6 +219,7 @@ class BranchingCounts(Effect, tag="branching_counts"):
     plane = Plane.CHARGE
     title = "branching (generalised Poisson) counts"
     source = "Consul and Jain 1973, Technometrics 15, 791; Vinogradov 2012, Nucl. Instrum. Methods A 695, 247"
+    factors = Factors("electron number", "each pixel", "with the charge of the sample")
     signature = ("shape.C2.mean", "shape.C3.mean", "code.smooth")
     strength = "branching"
     separate: ClassVar[Mapping[str, str]] = {
@@ -280,6 +285,7 @@ class OverdispersedCounts(Effect, tag="overdispersed_counts"):
     plane = Plane.CHARGE
     title = "over-dispersed counts"
     source = "Mandel 1959, Proc. Phys. Soc. 74, 233; Goodman 1985, Statistical Optics, ch. 9"
+    factors = Factors("light", "each pixel", "new in each frame")
     signature = ("shape.C2.mean", "shape.C2.slope", "code.smooth", "shape.C3.mean")
     strength = "relative_variance"
     separate: ClassVar[Mapping[str, str]] = {
@@ -423,6 +429,7 @@ class Trapping(Effect, tag="trapping"):
     source = (
         "Shockley and Read 1952, Phys. Rev. 87, 835; Massey et al. 2010, Mon. Not. R. Astron. Soc. 401, 371"
     )
+    factors = Factors("electron number", "single pixels", "with the charge of the frame before")
     signature = ("time.lag1.charge.mean", "shape.C2.mean", "shape.C3.mean", "time.lag2.charge.mean")
     strength = "capture"
     separate: ClassVar[Mapping[str, str]] = {

@@ -29,6 +29,7 @@ from pchem_pipeline.effects.framework.effect import (
     Effect,
     Electrons,
     ElectronsPerFrame,
+    Factors,
     Frames,
     Plane,
     Ratio,
@@ -56,6 +57,7 @@ class Glow(Effect, tag="glow"):
     plane = Plane.EXPOSURE
     title = "local glow or light leak"
     source = "Janesick 2001, Scientific Charge-Coupled Devices (amplifier luminescence)"
+    factors = Factors("light", "a spot", "in bursts or growing")
     signature = (
         "space.row.charge.lag1", "space.column.charge.lag1", "space.row.charge.variance",
         "space.column.charge.variance", "frame.charge.quadrants", "space.x.kk", "time.block.charge.chi",
@@ -192,6 +194,7 @@ class Persistence(Effect, tag="persistence"):
     plane = Plane.EXPOSURE
     title = "image persistence"
     source = "Smith et al. 2008, Proc. SPIE 7021, 70210J"
+    factors = Factors("light", "a part of the sensor", "fading")
     signature = ("frame.charge.quadrants", "frame.charge.trend", "time.block.charge.chi", "frame.charge.slow")
     strength = "peak_e"
     may_be_at_bound = ("slow_share", "centre_y", "centre_x")
@@ -398,6 +401,7 @@ class DarkCurrentRts(Effect, tag="dark_current_rts"):
     source = (
         "Hopkins and Hopkinson 1993, IEEE Trans. Nucl. Sci. 40, 1567; Goiffon et al. 2009, ibid. 56, 2132"
     )
+    factors = Factors("light", "single pixels", "jumping")
     signature = ("time.block.charge.cnt", "time.lag1.charge.cnt", "time.block.charge.chi", "shape.C2.cnt")
     strength = "fraction"
     resample_pixels = True

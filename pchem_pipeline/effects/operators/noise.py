@@ -11,14 +11,7 @@ from scipy import special
 
 from pchem_pipeline.effects.framework.context import RandomSource
 from pchem_pipeline.effects.framework.draws import OF_PIXEL, between_grid_points, frame_key, two_states
-from pchem_pipeline.effects.framework.effect import (
-    Count,
-    Effect,
-    Electrons,
-    Frames,
-    Plane,
-    Ratio,
-)
+from pchem_pipeline.effects.framework.effect import Count, Effect, Electrons, Factors, Frames, Plane, Ratio
 from pchem_pipeline.effects.types import (
     AnyArray,
     EffectContext,
@@ -50,6 +43,7 @@ class FlickerNoise(Effect, tag="flicker_noise"):
     plane = Plane.ANALOG
     title = "flicker (1/f) noise of the pixels"
     source = "van Vliet 1976; Kansy 1980 (double sampling of 1/f noise); McWhorter 1957"
+    factors = Factors("offset", "each pixel", "correlated from frame to frame")
     signature = (
         "time.block.readout.chi", "time.lag1.readout.mean", "time.lag2.readout.mean",
         "time.lag3.readout.mean",
@@ -150,6 +144,7 @@ class HeavyTailedNoise(Effect, tag="heavy_tailed_noise"):
         "Tukey 1960 (contaminated normal); Wang, Rao, Mierop and Theuwissen 2006, Leyris et al. 2006 (tails "
         "of CMOS read noise)"
     )
+    factors = Factors("read noise", "each pixel", "new in each frame")
     signature = ("tail.low.count", "shape.He4.mean", "tail.low.pixels", "shape.He3.mean", "shape.He3C1.mean")
     strength = "share"
     separate: ClassVar[Mapping[str, str]] = {
@@ -213,6 +208,7 @@ class NoiseSkew(Effect, tag="noise_skew"):
     plane = Plane.ANALOG
     title = "skewed read noise (exponentially modified Gaussian)"
     source = "Grushka 1972 (exponentially modified Gaussian)"
+    factors = Factors("read noise", "each pixel", "new in each frame")
     signature = ("shape.He3.mean", "shape.He2C1.mean", "shape.He3C1.mean", "shape.He4.mean", "code.smooth")
     strength = "share"
     power = 3.0
@@ -293,6 +289,7 @@ class SignalDependentNoise(Effect, tag="signal_dependent_noise"):
     plane = Plane.ANALOG
     title = "signal-dependent noise (gain or excess noise)"
     source = "McIntyre 1966 (multiplication noise); Eckert et al. 2010 (peaks of SiPM spectra)"
+    factors = Factors("read noise", "each pixel", "with the charge of the sample")
     signature = (
         "shape.He2C1.mean", "shape.He3.mean", "shape.He2C1.slope", "shape.He4.mean", "shape.He2C2.mean",
     )  # fmt: skip
@@ -367,6 +364,7 @@ class RtsNoise(Effect, tag="rts_noise"):
         "Kandiah and Whiting 1978; Wang, Rao, Mierop and Theuwissen 2006; Leyris et al. 2006 (three levels "
         "behind correlated double sampling)"
     )
+    factors = Factors("offset", "single pixels", "jumping")
     signature = (
         "shape.peaks.cnt", "shape.He4.chi", "shape.He3.chi", "shape.C2.cnt", "tail.low.count",
         "time.block.readout.cnt",

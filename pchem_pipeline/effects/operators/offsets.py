@@ -24,6 +24,7 @@ from pchem_pipeline.effects.framework.effect import (
     Count,
     Dn,
     Effect,
+    Factors,
     PerFrame,
     Plane,
     Radians,
@@ -157,6 +158,7 @@ class RowNoise(SharedNoise, tag="row_noise"):
 
     title = "row noise (row temporal noise)"
     source = "Gow et al. 2007, IEEE Trans. Electron Devices 54, 1321"
+    factors = Factors("offset", "pixels of a row", "new in each frame")
     signature = ("space.row.readout.variance", "space.x.rr")
     strength = "row_noise_dn"
     shared_by = "row"
@@ -182,6 +184,7 @@ class ColumnNoise(SharedNoise, tag="column_noise"):
 
     title = "column noise (column temporal noise)"
     source = "Gow et al. 2007, IEEE Trans. Electron Devices 54, 1321"
+    factors = Factors("offset", "pixels of a column", "new in each frame")
     signature = ("space.column.readout.variance", "space.y.rr")
     strength = "column_noise_dn"
     shared_by = "column"
@@ -208,6 +211,7 @@ class FrameNoise(SharedNoise, tag="frame_noise"):
 
     title = "frame noise (frame-to-frame offset noise)"
     source = "Janesick 2001, Scientific Charge-Coupled Devices; Rauscher 2015, PASP 127, 1144"
+    factors = Factors("offset", "pixels of a frame", "new in each frame")
     signature = ("frame.readout.variance", "frame.readout.largest", "space.x.rr", "space.y.rr")
     strength = "frame_noise_dn"
     shared_by = "frame"
@@ -276,6 +280,7 @@ class ReadoutAlternation(OffsetEffect, tag="readout_alternation"):
 
     title = "even-odd readout alternation (ping-pong offset)"
     source = "Black and Hodges 1980, IEEE J. Solid-State Circuits 15, 1022 (interleaved ADCs)"
+    factors = Factors("offset", "pixels of a frame", "alternating")
     signature = ("frame.readout.alternating", "frame.readout.lag1")
     strength = "alternation_dn"
     separate: ClassVar[Mapping[str, str]] = {
@@ -321,6 +326,7 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
 
     title = "periodic pickup (pattern noise, EMI)"
     source = "Jansen et al. 2003, HST Calibration Workshop (herring-bone noise of the STIS CCD)"
+    factors = Factors("offset", "a wave over the sensor", "periodic")
     signature = (
         "space.row.readout.line", "frame.readout.line", "space.column.readout.line",
         "space.sample.readout.line", "space.sample.readout.spectrum", "space.row.readout.variance",
@@ -460,6 +466,7 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
 
     title = "1/f noise along the readout"
     source = "Rauscher 2015, PASP 127, 1144 (correlated pink noise)"
+    factors = Factors("offset", "pixels read one after the other", "new in each frame")
     signature = (
         "space.row.readout.lag1", "space.row.readout.variance", "space.x.rr", "space.y.rr",
         "frame.readout.quadrants",
@@ -557,6 +564,7 @@ class BiasJumps(OffsetEffect, tag="bias_jumps"):
 
     title = "bias jumps (popcorn mesa noise)"
     source = "WFPC2 Data Handbook (STScI), bias jumps; Rauscher 2015, PASP 127, 1144"
+    factors = Factors("offset", "a part of the sensor", "jumping")
     signature = (
         "frame.readout.quadrants", "frame.readout.slow", "frame.readout.lag1", "time.lag1.readout.mean",
     )  # fmt: skip

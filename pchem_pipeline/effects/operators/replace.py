@@ -21,6 +21,7 @@ from pchem_pipeline.effects.framework.effect import (
     Code,
     Count,
     Effect,
+    Factors,
     Plane,
     Ratio,
     Replacement,
@@ -68,6 +69,7 @@ class BitErrors(Effect, tag="bit_errors"):
     plane = Plane.READOUT
     title = "stuck, missing or flipping bit"
     source = "Eldred 1959, J. ACM 6, 33 (stuck-at faults); Boone et al. 2018, PASP 130, 064504"
+    factors = Factors("code", "each pixel", "in single samples")
     signature = (
         "code.smooth", "tail.low.count", "code.period16", "code.period8", "code.period4",
         "shape.goodness.mean",
@@ -194,6 +196,7 @@ class RepeatedFrames(Effect, tag="repeated_frames"):
     along = 2
     title = "repeated (duplicated) frames"
     source = "GenICam / GigE Vision frame identifiers; exact-equality test of successive frames"
+    factors = Factors("code", "pixels of a frame", "in single frames")
     signature = ("frame.repeated", "frame.repeated_rows", "time.lag1.charge.mean", "time.lag1.readout.mean")
     strength = "probability"
     separate: ClassVar[Mapping[str, str]] = {
@@ -304,6 +307,7 @@ class RepeatedLines(Effect, tag="repeated_lines"):
     along = 2
     title = "repeated rows or columns"
     source = "exact-equality test of neighbouring lines; GenICam / GigE Vision (packet resend)"
+    factors = Factors("code", "pixels of a row or column", "in single frames")
     signature = ("space.repeated.rows", "space.repeated.columns")
     strength = "share"
     separate: ClassVar[Mapping[str, str]] = {
@@ -373,6 +377,7 @@ class MisplacedLines(Effect, tag="misplaced_lines"):
     along = 2
     title = "misplaced rows or columns"
     source = "GenICam / GigE Vision (packet resend); likelihood ratio of lines at other places"
+    factors = Factors("code", "pixels of a row or column", "in single frames")
     signature = ("space.misplaced.rows", "space.misplaced.columns")
     strength = "share"
     reach_rows = 2  # whether a row changes places with the next depends on the two before
@@ -498,6 +503,7 @@ class PixelCorrection(Effect, tag="pixel_correction"):
     along = 1
     title = "in-camera pixel correction (hot pixels, spurious noise)"
     source = "Hamamatsu DCAM-API (HOTPIXELCORRECT_LEVEL); Andor SDK3 (SpuriousNoiseFilter)"
+    factors = Factors("code", "each pixel", "with the codes of its neighbours")
     signature = ("space.predicted.equal", "space.predicted.above", "shape.C3.mean")
     strength = "share"
     reach_rows = 1

@@ -15,6 +15,7 @@ from pchem_pipeline.effects.framework.effect import (
     Effect,
     Electrons,
     ElectronsPerUm,
+    Factors,
     Micrometres,
     PerFrame,
     Plane,
@@ -75,6 +76,7 @@ class CosmicRays(Effect, tag="cosmic_rays"):
     plane = Plane.CHARGE
     title = "cosmic rays and radioactivity"
     source = "Groom 2002, Exp. Astron. 14, 45"
+    factors = Factors("electron number", "pixels along a track", "in single frames")
     signature = ("tail.high.count", "tail.high.clusters", "tail.high.pixels")
     strength = "tracks_per_frame"
     separate: ClassVar[Mapping[str, str]] = {

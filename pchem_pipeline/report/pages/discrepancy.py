@@ -9,6 +9,7 @@ from dataclasses import replace
 
 from pchem_pipeline.base.units import typeset
 from pchem_pipeline.discrepancy.verdict import (
+    FACTORS,
     RARE,
     GapChange,
     Place,
@@ -70,6 +71,7 @@ def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
         "where": [_where(data, found.where)],
         "evidence": [
             *[_candidates(data, step, i) for i, step in enumerate(found.steps)],
+            _factors(found.steps),
             _rivals(data),
             _separate(found.steps),
         ],
@@ -177,6 +179,24 @@ def _rivals(data: DiscrepancyData) -> Table:
             for step in data.found.steps
             if step.effect
             for rival in step.rivals
+        ],
+    )
+
+
+def _factors(steps: Sequence[Step]) -> Table:
+    return Table(
+        "discrepancy-factors",
+        "What is certain of an effect that has no name",
+        "Factors in which the candidates agree are certain.",
+        [
+            {
+                "factor": FACTORS[name],
+                "value": " or ".join(values),
+                "": "certain" if len(values) == 1 else "open",
+            }
+            for step in steps
+            if any(len(values) > 1 for values in step.factors.values())
+            for name, values in step.factors.items()
         ],
     )
 

@@ -406,6 +406,27 @@ def test_rivals_that_frames_cannot_tell_apart_come_with_the_measurement_that_can
     assert says in addition.step(None).separate[rival]
 
 
+def test_what_the_likeliest_effects_have_in_common_is_certain() -> None:
+    row, pickup = (effect_class(tag).typical()[0] for tag in ("row_noise", "periodic_pickup"))
+    candidates = (Candidate.of(row, 0.0, 0.0, 0.6), Candidate.of(pickup, -1.0, 4.0, 0.4))
+    gap = Gap(9e-5, 3e-5, (0.0, 0.0), {})
+    addition = Addition(row, False, "", candidates, {}, gap, gap, (), ())
+    assert addition.step(None).factors == {
+        "changes": ("offset",),
+        "shared_by": ("pixels of a row", "a wave over the sensor"),
+        "varies": ("new in each frame", "periodic"),
+    }
+    null = _null(np.random.default_rng(4))
+    z = Measured(*(np.zeros(null.mean.size),) * 3)
+    found = Findings("frames", z, null, null, gap, [], False, Added((addition,), gap))
+    assert found.state == "ambiguous"
+    words = _sentence(found, {})
+    assert "do not decide which; certain: offset; open: what shares it (pixels of a row or a wave" in words
+    named = replace(addition, alone=True, candidates=candidates[:1])
+    assert named.step(None).factors["shared_by"] == ("pixels of a row",)
+    assert replace(addition, against="it does not fit").step(None).factors == {}
+
+
 def test_a_statistic_says_what_its_sign_says() -> None:
     assert "skewed to low DN" in Place.of("shape.He3.mean", z=-17.0).sentence
     assert "skewed to high DN" in Place.of("shape.He3.mean", z=17.0).sentence

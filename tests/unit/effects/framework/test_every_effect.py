@@ -106,6 +106,7 @@ def test_every_effect_is_described(tag):
     kind = KINDS[tag]
     assert kind.title
     assert kind.source
+    assert (kind.factors is None) == tag.startswith("empirical")
     assert kind.power > 0
     assert kind.strength in kind.model_fields or tag == "clipping"
     assert bool(kind.untestable) == (tag in UNTESTABLE)
