@@ -371,7 +371,7 @@ class Step(_Part):
         candidates: effects compared, the likeliest first.
         parameters: parameters of the named or the likeliest effect.
         form: its text fields that differ from their default.
-        factors: what changes, who shares it, how it varies; of several effects all values, and one is certain.
+        factors: what changes, what shares it, how it varies; of several effects all values; one is certain.
         place: region and frames in words; empty: everywhere, always.
         gap_before, gap_after, gap_floor: gap on the final samples without and with it, nats per sample.
         gap_interval_after: 95 % interval of the gap with it.
@@ -625,18 +625,22 @@ def read_verdict(folder: Path) -> Verdict | None:
 
 
 def parameters_of(effect: Effect, errors: Mapping[str, float]) -> dict[str, Measured]:
-    """Return the parameters of an effect, with the standard errors of those that have one.
+    """Return the fitted or chosen parameters of an effect, with the standard errors of those that have one.
+
+    Those at their default say nothing, or have no meaning in this form of the effect.
 
     Args:
         effect: with its fitted parameters.
         errors: standard errors by parameter.
     """
+    fields = type(effect).model_fields
     return {
         name: Measured(
             value=value, stderr=errors.get(name, _NAN), unit=effect.unit(name).removeprefix("none")
         )
         for name, value in effect.model_dump(exclude={"tag"}).items()
         if isinstance(value, int | float) and not isinstance(value, bool)
+        if name in (*errors, effect.strength) or value != fields[name].default
     }
 
 

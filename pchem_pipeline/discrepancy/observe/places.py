@@ -71,7 +71,9 @@ class SensorWindow:
             (y0, x0), (y1, x1) = inside.min(axis=0).tolist(), (inside.max(axis=0) + 1).tolist()
             rows, columns = (rows[0] + y0, rows[0] + y1), (columns[0] + x0, columns[0] + x1)
         effect = effect.to_sensor(rows, columns, self.shape)
-        return effect if part is None else effect.at_place(part.region, part.when)
+        if part is None:
+            return effect
+        return effect.at_place(None if effect.localised else part.region, part.when)
 
     def on_sensor(self, region: Region | None) -> Region | None:
         """Return a region of the window as one of the sensor.

@@ -114,7 +114,7 @@ Micrometres = Annotated[float, Unit("um")]
 
 
 class Factors(NamedTuple):
-    """What an effect changes, who shares one value of it, and how that varies, each in words."""
+    """What an effect changes, which samples share one value of it, and how that varies, in words."""
 
     changes: str
     shared_by: str
@@ -165,7 +165,7 @@ class Effect(Section):
             voltage, then what bends it, then the steps of the converter, then its limits.
         title: its name in the literature.
         source: where it is described.
-        factors: what it changes, who shares it, and how it varies; None of a description, which measures them.
+        factors: what it changes, what shares it, how it varies; None of a description, which measures them.
         signature: the statistics (names in :mod:`pchem_pipeline.discrepancy.observe.catalogue`) that it moves
             first, the most telling one first.
         strength: the parameter that scales it; 0 is no effect (a clipping limit and its like have none: "").
@@ -241,6 +241,11 @@ class Effect(Section):
     def everywhere(self) -> bool:
         """Whether it acts on all pixels, in all frames."""
         return self.region is None and self.when is None
+
+    @property
+    def localised(self) -> bool:
+        """Whether its own parameters say where it acts, so that a region would only cut it off."""
+        return False
 
     @property
     def key(self) -> tuple[str, Region | None, When | None]:

@@ -142,6 +142,14 @@ def test_the_form_of_an_effect_is_told_where_it_is_not_the_usual_one() -> None:
     assert form_of(effect_class("row_noise").model_validate({"row_noise_dn": 1.0, **here})) == {}
 
 
+def test_a_parameter_at_its_default_is_left_out() -> None:
+    afterglow = {"peak_e": 0.2, "decay_frames": 400.0}
+    imaged = effect_class("persistence").model_validate(afterglow | {"image": [[0.0, 1.0]]})
+    assert set(parameters_of(imaged, {})) == set(afterglow)
+    spot = effect_class("persistence").model_validate(afterglow | {"radius": 0.1})
+    assert set(parameters_of(spot, {"centre_y": 0.02})) == {*afterglow, "radius", "centre_y"}
+
+
 def test_a_parameter_has_the_standard_error_that_is_known() -> None:
     effect = effect_class("row_noise").model_validate({"row_noise_dn": 0.35})
     found = parameters_of(effect, {"row_noise_dn": 0.004})

@@ -239,6 +239,19 @@ def test_what_is_guessed_in_a_part_has_its_phase_on_the_sensor(window):
     assert abs(np.angle(np.exp(1j * (found.phase - phase)))) < 0.15
 
 
+def test_what_is_a_spot_by_itself_is_not_cut_off_by_the_part_that_showed_it():
+    part = Part(Region(rows=((5, 18),)), When(range=((100, 300),)))
+    guess = effect_classes()["glow"].model_validate({"peak_e": 2.0, "centre_y": 0.5, "radius": 0.3})
+    found = SensorWindow.whole((26, 24)).found(guess, part)
+    assert found.region is None
+    assert found.when == part.when
+    assert found.centre_y == pytest.approx((5 + 0.5 * 13) / 26, abs=0.03)
+    image = effect_classes()["persistence"].model_validate(
+        {"peak_e": 2.0, "decay_frames": 90.0, "image": [[0.0, 1.0]]}
+    )
+    assert SensorWindow.whole((26, 24)).found(image, part).region == part.region
+
+
 def split_of(frames):
     return ObservedFrames.of(stacked(frames)).frames
 
