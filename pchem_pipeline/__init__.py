@@ -21,19 +21,27 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pchem_pipeline.base.errors import PchEmError
     from pchem_pipeline.commands.characterise import characterise, fit_counts
-    from pchem_pipeline.commands.notebook import open_run
+    from pchem_pipeline.commands.notebook import Pixel, Run, open_run
+    from pchem_pipeline.discrepancy.verdict import Verdict
     from pchem_pipeline.model.fit.api import fit_histograms
     from pchem_pipeline.model.fit.result import FitResult
     from pchem_pipeline.model.fit.settings import FitSettings
     from pchem_pipeline.model.fit.status import FitStatus
+    from pchem_pipeline.report.charts.on_paper import Drawing
     from pchem_pipeline.store.run_store import RunStore
+    from pchem_pipeline.use.twin import Twin
 
 __all__ = [
+    "Drawing",
     "FitResult",
     "FitSettings",
     "FitStatus",
     "PchEmError",
+    "Pixel",
+    "Run",
     "RunStore",
+    "Twin",
+    "Verdict",
     "__version__",
     "characterise",
     "fit_counts",
@@ -44,11 +52,16 @@ __all__ = [
 __version__ = "0.2.0"
 
 _HOMES = {
+    "Drawing": "report.charts.on_paper",
     "FitResult": "model.fit.result",
     "FitSettings": "model.fit.settings",
     "FitStatus": "model.fit.status",
     "PchEmError": "base.errors",
+    "Pixel": "commands.notebook",
+    "Run": "commands.notebook",
     "RunStore": "store.run_store",
+    "Twin": "use.twin",
+    "Verdict": "discrepancy.verdict",
     "characterise": "commands.characterise",
     "fit_counts": "commands.characterise",
     "fit_histograms": "model.fit.api",
@@ -61,3 +74,8 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names, so that they are completed before they are used."""
+    return sorted(__all__)

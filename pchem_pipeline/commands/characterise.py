@@ -13,18 +13,17 @@ import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.commands.in_memory import stack_of, write_stack
 from pchem_pipeline.commands.new_run import settings_of, settings_there
 from pchem_pipeline.commands.notebook import open_run, require_xarray
 from pchem_pipeline.config.load import dump_config, make_config, write_config
-from pchem_pipeline.frames.writing import write_frames
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
@@ -74,14 +73,13 @@ def characterise(
         IncompleteRunError: more pixels have no value than the settings allow; the store has the run.
     """
     require_xarray("characterise")
-    frames = frames if hasattr(frames, "shape") else np.asarray(frames)
-    _check(frames)
+    frames = stack_of(frames, least=2)
     temporary = None if store is not None else Path(tempfile.mkdtemp(prefix="pchem-"))
     try:
         place = (Path(store) if store is not None else temporary / "run.zarr").resolve()  # type: ignore[operator]
         given = {"integration_time": integration_time, "bit_depth": bit_depth, "kind": kind}
         target = _target(place, given, settings or {})
-        _write(target, frames)
+        write_stack(target.base_dir / target.config.input.files[0], frames)
         stages = up_to(until, pipeline_of(target.config))
         run_stages(target, stages, Command(workers=workers, progress=progress, quiet=progress == "off"))
         run = open_run(place)
@@ -116,23 +114,6 @@ def fit_counts(counts: NDArray[Any], origin: NDArray[Any] | int = 0, **options: 
     return fit_histograms(flat, first, **options)
 
 
-def _check(frames: Any) -> None:
-    """Refuse what is no stack of whole DN.
-
-    Raises:
-        ConfigError: the message says what it should be.
-    """
-    shape: tuple[int, ...] = tuple(getattr(frames, "shape", ()))
-    dtype = np.dtype(getattr(frames, "dtype", object))
-    if len(shape) != 3 or shape[0] < 2:
-        raise ConfigError(
-            f"frames of shape {shape}: give an array (frame, y, x) of at least 2 frames, better some "
-            "thousands"
-        )
-    if dtype.kind not in "ui":
-        raise ConfigError(f"frames of {dtype}: PCH-EM needs raw DN of the ADC; give integers")
-
-
 def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mapping[str, Any]]) -> Target:
     """Return the run, its YAML beside the store.
 
@@ -153,50 +134,3 @@ def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mappin
         place.parent.mkdir(parents=True, exist_ok=True)
         write_config(path, dump_config(config))
     return Target(config, path.parent, place, path)
-
-
-def _write(target: Target, frames: Any) -> None:
-    """Write the frames beside the store; the same ones are left alone, so that nothing becomes stale."""
-    path = target.base_dir / target.config.input.files[0]
-    n, rows, columns = frames.shape
-    dtype = _stored_type(frames)
-    if path.exists() and _same(path, frames, dtype):
-        return
-    write_frames("npy", path, (block.astype(dtype) for block in _blocks(frames)), (n, rows, columns), dtype)
-
-
-def _stored_type(frames: Any) -> np.dtype[Any]:
-    """Return the unsigned type that holds the frames.
-
-    Raises:
-        ConfigError: a DN is negative or too large.
-    """
-    dtype = np.dtype(frames.dtype)
-    if dtype.kind == "u" and dtype.itemsize <= 4:
-        return np.dtype(f"u{dtype.itemsize}")
-    low = min(int(block.min()) for block in _blocks(frames))
-    high = max(int(block.max()) for block in _blocks(frames))
-    if low < 0 or high >= 2**32:
-        raise ConfigError(f"frames from {low} to {high} DN: give DN from 0 to 2^32 - 1")
-    return np.dtype(np.uint16 if high < 2**16 else np.uint32)
-
-
-def _blocks(frames: Any) -> Iterator[NDArray[Any]]:
-    """Yield the frames in blocks that fit into memory."""
-    n, rows, columns = frames.shape
-    size = max(1, (64 << 20) // max(1, rows * columns * np.dtype(frames.dtype).itemsize))
-    for first in range(0, n, size):
-        yield np.asarray(frames[first : first + size])
-
-
-def _same(path: Path, frames: Any, dtype: np.dtype[Any]) -> bool:
-    """Return whether a file holds these frames."""
-    there = np.load(path, mmap_mode="r")
-    if there.shape != tuple(frames.shape) or there.dtype != dtype:
-        return False
-    first = 0
-    for block in _blocks(frames):
-        if not np.array_equal(there[first : first + len(block)], block):
-            return False
-        first += len(block)
-    return True

@@ -9,7 +9,9 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -19,13 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError, install_hint, quoted
-from pchem_pipeline.base.variables import PARAMETERS, variable_at
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.figures import gather_run, millimetres
+from pchem_pipeline.commands.in_memory import paths_of, stack_of, write_stack
 from pchem_pipeline.model.fit.result import html_table
+from pchem_pipeline.model.fit.status import FitStatus, words_of
 from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD
-from pchem_pipeline.report.charts.chart import COLUMN_MM
-from pchem_pipeline.report.charts.on_paper import Look, draw_chart
+from pchem_pipeline.report.charts.chart import COLUMN_MM, Chart
+from pchem_pipeline.report.charts.on_paper import Look, draw_chart, draw_panels
 from pchem_pipeline.report.data import PixelFit
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.pixels import has_fit, pixels_chart
@@ -48,7 +52,6 @@ if TYPE_CHECKING:
 
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.discrepancy.verdict import Verdict
-    from pchem_pipeline.report.charts.on_paper import Drawing
     from pchem_pipeline.report.figures.figure import Figure
     from pchem_pipeline.run.progress import ProgressMode
     from pchem_pipeline.use.twin import Twin
@@ -101,27 +104,41 @@ class Run:
         self.shape: tuple[int, int] = self._sensor.shape
         self.n_frames: int = self._sensor.n_frames
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Run, (self._target,)
+
     def __repr__(self) -> str:
         states = run_status(self._target)
         open_ = ", ".join(f"{state.stage} {state.state}" for state in states if state.state != "complete")
-        return f"<Run {self.path.name}: {self._size()}; {open_ or 'complete'}>"
+        answers, medians = self._first_screen()
+        lines = [f"<Run {self.path.name}: {self._size()}; {open_ or 'complete'}>"]
+        lines += [" ".join(f"{question} {word}." for question, word, _ in answers)] if answers else []
+        lines += ["median " + ", ".join(f"{label} {value}" for label, value, _ in medians)] if medians else []
+        return "\n".join(lines)
 
     def _repr_html_(self) -> str:
         """Return what the first screen of the report says, for a notebook."""
-        found = read_json(self.path / "report.json", "run again to write it")
-        states = ", ".join(f"{name} {words}" for name, words in self.status().items())
+        answers, medians = self._first_screen()
         head = f"<b>{escape(self.path.name)}</b>: {escape(self._size())}"
-        if found is None:
+        if not answers:
+            states = ", ".join(f"{name} {words}" for name, words in self.status().items())
             return f"<p>{head}<br>{escape(states)}</p>"
+        said = "".join(
+            f"<p>{escape(question)} <b>{escape(word)}</b>. {escape(text)}</p>"
+            for question, word, text in answers
+        )
+        return f"<p>{head}</p>{said}{html_table(('median', 'value', '5 to 95 %'), medians)}"
+
+    def _first_screen(self) -> tuple[list[tuple[str, str, str]], list[tuple[str, str, str]]]:
+        """Return the answers (question, word, text) and the medians (label, value, spread) of the report."""
+        found = read_json(self.path / "report.json", "run again to write it")
+        if found is None:
+            return [], []
         try:
-            answers = "".join(
-                f"<p>{escape(each['question'])} <b>{escape(each['word'])}</b>. {escape(each['text'])}</p>"
-                for each in found["answers"]
-            )
-            rows = [(each["label"], each["value"], each["spread"]) for each in found["headline"]]
+            answers = [(each["question"], each["word"], each["text"]) for each in found["answers"]]
+            return answers, [(each["label"], each["value"], each["spread"]) for each in found["headline"]]
         except (KeyError, TypeError, AttributeError) as error:
             raise StoreError(f"{self.path / 'report.json'} is damaged; run again to write it") from error
-        return f"<p>{head}</p>{answers}{html_table(('median', 'value', '5 to 95 %'), rows)}"
 
     def _size(self) -> str:
         ny, nx = self.shape
@@ -154,7 +171,7 @@ class Run:
         Arrays over the sensor have coordinates ``y`` and ``x`` (pixel), those over DN or electrons theirs.
 
         Args:
-            name: such as ``"maps"``; see the table of the store in the README.
+            name: such as ``"maps"``; the reference of the store lists all.
 
         Raises:
             StoreError: the run does not have it.
@@ -172,7 +189,13 @@ class Run:
             for file in record.files:
                 if file.startswith(f"{name}/") and "." in file and not (self.path / file).exists():
                     raise StoreError(f"{self.path / file} is missing; {self._store.cure(name)}")
-        found = lazy_dataset(self._store, name)
+        return self._lazy(self._store, name)
+
+    def _lazy(self, store: RunStore, group: str) -> xr.Dataset:
+        """Return a group of a store; arrays over the whole sensor get coordinates."""
+        from pchem_pipeline.commands.lazy_arrays import lazy_dataset
+
+        found = lazy_dataset(store, group)
         for axis, length in zip(("y", "x"), self.shape, strict=True):
             if found.sizes.get(axis) == length:
                 found = found.assign_coords({axis: (axis, np.arange(length), {"units": "pixel"})})
@@ -212,7 +235,7 @@ class Run:
 
     @property
     def samples(self) -> xr.Dataset:
-        """What each of several exposures has of its own; coordinate ``sample``: names of their runs.
+        """What each of several exposures has of its own; the coordinate ``sample`` names their runs.
 
         Raises:
             StoreError: the run has one sample only.
@@ -222,7 +245,7 @@ class Run:
 
     @property
     def histogram(self) -> xr.Dataset:
-        """Counts of every pixel: ``counts`` (y, x, bin), the DN of bin 0 is ``origin``."""
+        """Counts of every pixel, ``counts`` (y, x, bin); the DN of bin 0 is ``origin``."""
         return self.group("histogram")
 
     @property
@@ -239,6 +262,22 @@ class Run:
     def truth(self) -> xr.Dataset:
         """The true parameters of a simulated camera."""
         return self.group("truth")
+
+    def table(self) -> pd.DataFrame:
+        """Return the maps as a table, a row for each pixel.
+
+        Columns: ``y``, ``x`` (from 0), each parameter and its ``_stderr``, NaN without a value; ``quality``
+        (0: good, 1: caution, 2: no value) and ``fit_status`` in words. ``table().attrs`` has the units.
+
+        Raises:
+            StoreError: the run has no maps yet.
+        """
+        maps = self.maps
+        found = maps.to_dataframe().reset_index()
+        words = {int(word): words_of(FitStatus(int(word))) for word in np.unique(found["fit_status"])}
+        found["fit_status"] = found["fit_status"].map(words)
+        found.attrs = {str(name): maps[name].attrs["units"] for name in maps.data_vars}
+        return found
 
     def defects(self) -> pd.DataFrame:
         """Return the pixels that are not ordinary, a row for each kind of each pixel.
@@ -257,42 +296,63 @@ class Run:
 
     def apply(
         self,
-        frames: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
-        output: str | os.PathLike[str],
+        frames: Any,
+        output: str | os.PathLike[str] | None = None,
         *,
         what: str = "all",
         prior: str = "frames",
         force: bool = False,
     ) -> xr.Dataset:
-        """Calibrate other frames of the sensor, as ``pchem apply`` does, and return the result, lazily.
+        """Calibrate other frames of the sensor, as ``pchem apply`` does.
 
         Args:
-            frames: camera files, globs or folders.
-            output: zarr store to write; one that holds the same already is only opened.
+            frames: camera files, globs or folders; or whole DN in memory: (frame, y, x) or one frame (y, x),
+                anything that :func:`characterise` takes.
+            output: zarr store to write, from which the result is read when it is used; one that holds the
+                same already is only opened, and frames in memory are written beside it. None: the result is
+                in memory.
             what: electrons, numbers, exposure, separated by commas, or all.
             prior: exposure that the electron numbers are expected to have, as on the command line.
             force: replace calibrated frames that are there.
 
+        Returns:
+            Electrons, electron numbers and exposure with their standard errors and units, see
+            ``docs/howto/use_the_sensor.md``.
+
         Raises:
             InputError: the frames do not fit the run.
-            ConfigError: the output is something else.
+            ConfigError: the frames are no whole DN, or the output is something else.
         """
         from pchem_pipeline.commands.apply.apply import apply_to_frames
         from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
         from pchem_pipeline.run.stage import Command
 
-        files = [frames] if isinstance(frames, (str, os.PathLike)) else list(frames)
-        command = Command(force=force, quiet=True, progress="off")
         wanted = ApplySettings(kinds_of(what), prior)
-        [place] = apply_to_frames(self._target, [str(f) for f in files], Path(output), wanted, command)
-        return lazy_dataset(RunStore.open(place), "applied")
+        with tempfile.TemporaryDirectory(prefix="pchem-") as folder:
+            place = Path(folder, "applied.zarr") if output is None else Path(output)
+            files = paths_of(frames)
+            if files is None:
+                stack = stack_of(frames, least=1)
+                files = [str(write_stack(place.with_name(f"{place.name}-frames.npy"), stack))]
+            command = Command(force=force, quiet=True, progress="off")
+            [place] = apply_to_frames(self._target, files, place, wanted, command)
+            found = self._lazy(RunStore.open(place), "applied")
+            return found.load() if output is None else found
 
     @property
-    def verdict(self) -> Verdict | None:
-        """What the model is missing, as the last search found it; None where nobody looked."""
+    def verdict(self) -> Verdict:
+        """What the model is missing, as the last search found it.
+
+        Raises:
+            StoreError: nobody has searched yet.
+        """
         from pchem_pipeline.discrepancy.verdict import read_verdict
 
-        return read_verdict(self.path)
+        found = read_verdict(self.path)
+        if found is None:
+            name = quoted(self._target.config_path or self.path)
+            raise StoreError(f"{self.path}: effects were not searched for yet; run: pchem discrepancy {name}")
+        return found
 
     def discrepancy(
         self, *, refit: bool = False, effort: float | None = None, progress: ProgressMode = "off"
@@ -313,9 +373,7 @@ class Run:
 
         command = Command(progress=progress, quiet=progress == "off")
         find_and_add(self._target, command, refit=refit, effort=effort)
-        found = self.verdict
-        assert found is not None
-        return found
+        return self.verdict
 
     def twin(self, *, redraw: int | None = None, shape: tuple[int, int] | None = None) -> Twin:
         """Return the camera as it was measured, to simulate with: ``run.twin().frames(scene, n)``.
@@ -366,56 +424,45 @@ class Run:
         """The figures of the report and of the discrepancy page by name, undrawn, with their numbers."""
         return {figure.name: figure for figure in run_figures(gather_run(self._target))}
 
-    def figure(self, name: str, width: float | str | None = None) -> Drawing:
+    def figure(self, name: str, width: float | str | None = None, *, ax: Any = None) -> Any:
         """Draw a figure of the report or of the discrepancy page, such as ``ensemble`` or ``map_bias``.
 
         Args:
             name: one of :attr:`figures`.
             width: mm, or a text such as ``"3.5in"``; None: the figure's own.
+            ax: axes of matplotlib to draw into, one for each panel. None: a figure of its own.
+
+        Returns:
+            ``ax``, or the :class:`Drawing`, which a notebook shows and ``savefig`` saves.
 
         Raises:
-            ConfigError: the run has no such figure, or no figure can be so wide.
+            ConfigError: the run has no such figure, no figure can be so wide, or ``ax`` are no axes of it.
         """
         if name not in self.figures:
             raise ConfigError(f"this run has no figure {name}; it has {', '.join(self.figures)}")
         figure = self.figures[name]
-        return figure.draw(Look(figure.width_mm if width is None else millimetres(str(width))))
+        return _drawn(figure.chart, figure.width_mm if width is None else width, ax)
 
 
-def lazy_dataset(store: RunStore, group: str) -> xr.Dataset:
-    """Return a group of a store as a dataset that reads when it is used; damage is one line then.
-
-    xarray's own way reads a chunk that is missing as NaN or 0, and raises the errors of zarr.
-    """
-    import xarray as xr
-    from xarray.backends import BackendArray
-    from xarray.core.indexing import IndexingSupport, LazilyIndexedArray, explicit_indexing_adapter
-
-    class Lazy(BackendArray):
-        def __init__(self, name: str) -> None:
-            array = store.array(name)
-            self.name, self.shape, self.dtype = name, array.shape, array.dtype
-
-        def __getitem__(self, key: Any) -> Any:
-            return explicit_indexing_adapter(key, self.shape, IndexingSupport.BASIC, self.read)
-
-        def read(self, region: Any) -> NDArray[Any]:
-            return store.read(self.name, region)
-
-    found = {}
-    try:
-        for name in store.arrays(group):
-            array = store.array(f"{group}/{name}")
-            lazy = LazilyIndexedArray(Lazy(f"{group}/{name}"))
-            dims = variable_at(f"{group}/{name}").dims
-            found[name] = xr.Variable(dims, lazy, dict(array.attrs))
-        return xr.Dataset(found, attrs=store.attributes(group))
-    except ValueError as error:  # shapes of other arrays
-        raise StoreError(f"{store.path / group} is damaged ({error}); {store.cure(group)}") from error
+def _drawn(chart: Chart, width: float | str, ax: Any) -> Any:
+    """Draw a chart into axes and return these; without axes return a drawing of its own."""
+    if ax is None:
+        return draw_chart(Look(millimetres(str(width))), chart)
+    draw_panels(ax, chart)
+    return ax
 
 
 class Pixel(PixelFit):
-    """One pixel: its parameters with standard errors, its histogram, and what is drawn of it."""
+    """One pixel: its parameters with standard errors, its histogram, and what is drawn of it.
+
+    Attributes:
+        y, x: row and column; for ready-made histograms ``y = 0`` and ``x`` is the channel.
+        parameters: ``quanta_exposure`` (e-), ``conversion_gain`` (e-/DN), ``bias`` (DN), ``read_noise_dn``
+            (DN) and ``read_noise_e`` (e-); NaN without a fit.
+        stderr: standard errors under the same names.
+        status: why it has no fit, or one to be used with caution; empty: a good fit.
+        goodness_p: probability of a larger chi-square if the model holds; NaN if unknown.
+    """
 
     def __repr__(self) -> str:
         words = []
@@ -461,10 +508,22 @@ class Pixel(PixelFit):
             attrs={"units": "1", "long_name": words},
         )
 
-    def plot(self, width: float | str = COLUMN_MM) -> Drawing:
+    def plot(self, *, ax: Any = None, width: float | str = COLUMN_MM) -> Any:
         """Draw the histogram with its fit and the residuals, as the report does.
 
         Args:
-            width: of the figure, mm, or a text such as ``"3.5in"``.
+            ax: axes of matplotlib to draw into: one for the histogram, or two for the residuals, too. None: a
+                figure of its own.
+            width: of that figure, mm, or a text such as ``"3.5in"``.
+
+        Returns:
+            ``ax``, or the :class:`Drawing`, which a notebook shows and ``savefig`` saves.
+
+        Raises:
+            ConfigError: no figure can be so wide, or ``ax`` are no axes of it.
         """
-        return draw_chart(Look(millimetres(str(width))), pixels_chart([self]))
+        chart = pixels_chart([self])
+        if ax is not None and np.size(ax) == 1:
+            [stack] = chart.stacks
+            chart = Chart((replace(stack, panels=stack.panels[:1]),))
+        return _drawn(chart, width, ax)

@@ -98,6 +98,8 @@ def test_plain_histograms_in_one_call(frames):
     np.testing.assert_array_equal(found.bias, pchem_pipeline.fit_counts(counts, np.full(72, 50)).bias)
     assert pchem_pipeline.fit_counts(counts[0], 50).bias == found.bias[:1]
     assert abs(np.median(found.conversion_gain) - 0.1) < 0.002
+    assert repr(found).startswith("<FitResult of 72 histograms, 7")
+    assert "median H = 1." in repr(found)
     shown = found._repr_html_()
     assert shown.count("<tr>") == 11
     assert "and 62 more" in shown

@@ -1,5 +1,6 @@
 """The documentation is built with warnings as errors, and names what there is."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -51,3 +52,25 @@ def test_pages_are_readable_as_they_are():
         for link in re.findall(r"\]\(([\w./]+\.md)\)", text):
             generated = "reference/" in link
             assert generated or (page.parent / link).exists(), f"{page}: {link}"
+
+
+def _texts():
+    """Yield every text of the package, with … for what is filled in."""
+    for path in (ROOT / "pchem_pipeline").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            parts = node.values if isinstance(node, ast.JoinedStr) else [node]
+            words = [part.value if isinstance(part, ast.Constant) else "…" for part in parts]
+            if all(isinstance(word, str) for word in words):
+                yield "".join(words)
+
+
+def test_the_messages_that_are_explained_are_those_of_the_program():
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    messages = re.findall(r"^\*\*`(.+)`\*\*$", page, re.M)
+    assert len(messages) == len(set(messages)) >= 20
+    texts = [text for text in _texts() if len(text) > 10]
+    for message in messages:
+        assert any(message in text for text in texts), message
+    for section, key in re.findall(r"`(\w+)\.(\w+)(?:: \w+)?`", page):
+        if section in RunConfig.model_fields and key not in ("yaml", "zarr"):
+            assert key in RunConfig.model_fields[section].annotation.model_fields, key

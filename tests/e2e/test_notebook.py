@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -9,11 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from helpers.places import ROOT
+from matplotlib.figure import Figure
 
 import pchem_pipeline
-from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError
+from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependencyError, StoreError
 from pchem_pipeline.commands.figures import figures_of_run
+from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.charts.on_paper import drawing_bytes
 from pchem_pipeline.store.run_store import RunStore
 
@@ -100,12 +104,120 @@ def test_figures_are_those_of_pchem_figures(run, finished, tmp_path):
         run.figure("nothing")
 
 
+def test_plots_go_into_axes_of_the_user(run):
+    figure = Figure(layout="constrained")
+    axes = figure.subplots(2, 2)
+    pixel = run.pixel(3, 5)
+    assert pixel.plot(ax=axes[0, 0]) is axes[0, 0]
+    run.maps.read_noise_e.plot(ax=axes[0, 1], add_colorbar=False)
+    below = axes[1]
+    assert pixel.plot(ax=below) is below
+    assert figure.axes == axes.ravel().tolist()
+    for shown in (axes[0, 0], axes[1, 0]):
+        bars, fit = shown.patches[0].get_data(), shown.lines[0].get_xydata()
+        seen = pixel.histogram.sel(dn=(bars.edges[:-1] + 0.5).round().astype(int)[5:-5])
+        np.testing.assert_allclose(bars.values[5:-5], seen / 1200)
+        assert 0.9 < np.trapezoid(fit[:, 1], fit[:, 0]) < 1.01
+    assert axes[0, 0].get_xlabel() == "signal (DN)"
+    assert axes[1, 1].get_ylabel().startswith("residual")
+    for name, found in run.figures.items():
+        others = Figure().subplots(1, sum(len(stack.panels) for stack in found.chart.stacks))
+        assert run.figure(name, ax=others) is others
+        assert all(each.has_data() for each in np.ravel(others))
+
+
+@pytest.mark.parametrize(
+    ("ax", "words"),
+    [
+        (Figure(), "ax: Figure; give 1 axes of matplotlib"),
+        (Figure().subplots(3), r"ax: Axes, Axes, Axes; give 2 axes .* plt\.subplots\(2\)"),
+        ([], "ax: nothing; give 2 axes"),
+    ],
+)
+def test_other_axes_are_refused(run, ax, words):
+    with pytest.raises(ConfigError, match=words):
+        run.pixel(3, 5).plot(ax=ax)
+
+
+def test_the_table_has_a_row_for_each_pixel(run, store):
+    table = run.table()
+    quality, status = store.read("maps/quality"), store.read("fit/fit_status")
+    assert list(table.columns[:2]) == ["y", "x"]
+    assert len(table) == 20 * 28
+    for name in ("bias", "bias_stderr", "read_noise_e", "quality"):
+        np.testing.assert_array_equal(table[name], store.read(f"maps/{name}")[table.y, table.x])
+    assert (table.fit_status == "ok").sum() == (status == 0).sum() == (quality == 0).sum()
+    doubtful = table.fit_status.str.contains("bias_ambiguous").values
+    np.testing.assert_array_equal(doubtful, (status.ravel() & FitStatus.BIAS_AMBIGUOUS) != 0)
+    assert 0 < doubtful.sum() < 100
+    assert table.attrs["conversion_gain"] == "e-/DN"
+
+
+def test_frames_in_memory_are_calibrated_as_files_are(run, camera, tmp_path):
+    [path, *_] = sorted((camera / "frames").glob("*.tif"))
+    frames = tifffile.imread(path)
+    found = run.apply(frames.astype(np.int64), what="electrons,exposure")
+    assert found.electrons.variable._in_memory
+    assert (found.electrons.attrs["units"], found.x.attrs["units"]) == ("e-", "pixel")
+    assert {"electrons_stderr_read", "exposure_stderr"} <= set(found.data_vars)
+    same = run.apply(path, what="electrons,exposure")
+    assert found.drop_attrs().identical(same.drop_attrs())
+    one = run.apply(frames[0], what="electrons")
+    np.testing.assert_array_equal(one.electrons.values, found.electrons.values[:1])
+    kept = run.apply(frames, tmp_path / "night.zarr", what="electrons")
+    made = (tmp_path / "night.zarr" / "applied" / "electrons" / "zarr.json").stat().st_mtime_ns
+    again = run.apply(list(frames), tmp_path / "night.zarr", what="electrons")
+    assert (tmp_path / "night.zarr" / "applied" / "electrons" / "zarr.json").stat().st_mtime_ns == made
+    assert not again.electrons.variable._in_memory
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(kept)).electrons, found.electrons)
+
+
+@pytest.mark.parametrize(
+    ("frames", "error", "words"),
+    [
+        (np.zeros((3, 4, 5), np.uint16), InputError, "frames of 4 x 5 pixels, the run run.zarr has 20 x 28"),
+        (np.zeros((3, 20, 28)), ConfigError, "frames of float64: PCH-EM needs raw DN"),
+        (np.zeros(7, int), ConfigError, r"frames of shape \(7,\): give an array \(frame, y, x\)$"),
+        ([], ConfigError, "input.files is empty"),
+    ],
+)
+def test_what_is_no_frame_of_the_run_is_refused(run, frames, error, words):
+    with pytest.raises(error, match=words):
+        run.apply(frames)
+
+
+def test_all_that_a_run_returns_is_pickled(run):
+    def copy(thing):
+        return pickle.loads(pickle.dumps(thing))
+
+    assert copy(run.maps).identical(run.maps)
+    assert copy(run).maps.identical(run.maps)
+    pixel = run.pixel(3, 5)
+    assert repr(copy(pixel)) == repr(pixel)
+    assert copy(pixel).histogram.identical(pixel.histogram)
+    assert copy(run.figures).keys() == run.figures.keys()
+    np.testing.assert_array_equal(copy(run.twin()).frames(1.0, 2), run.twin().frames(1.0, 2))
+    for name in run.figures:
+        assert copy(run.figure(name))._repr_png_() == run.figure(name)._repr_png_()
+
+
+def test_they_are_told_in_few_words(run):
+    first, answers, medians = repr(run).split("\n")
+    assert first == "<Run run.zarr: 20 x 28 pixels, 1,200 frames; complete>"
+    assert answers.startswith("Is the sensor within limits? ")
+    told = run.group("maps").attrs["summary"]["read_noise_e"]["median"]
+    assert f"median read noise {told:.4f} ± " in medians
+    assert len(repr(run.figures)) < 100 * len(run.figures)
+    assert repr(run.figures["ensemble"]) == "<Figure ensemble: Ensemble histogram and its prediction>"
+
+
 def test_what_is_missing_is_said(run, finished, tmp_path, monkeypatch):
     with pytest.raises(StoreError, match="has no truth yet; for the state of the run: pchem status"):
         _ = run.truth
     with pytest.raises(StoreError, match="does not exist"):
         pchem_pipeline.open_run(tmp_path / "none.zarr")
-    assert repr(run).startswith("<Run run.zarr: 20 x 28 pixels, 1,200 frames; ")
+    with pytest.raises(StoreError, match=r"not searched for yet; run: pchem discrepancy .*run\.yaml"):
+        _ = run.verdict
     assert run.status()["report"] == "complete"
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(MissingDependencyError, match="pip install 'xarray>="):
@@ -128,6 +240,7 @@ def test_the_tutorial_runs(finished, tmp_path):
     shutil.copytree(finished, tmp_path / "pchem-demo" / "demo.zarr")
     shutil.copy(TUTORIAL, tmp_path)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    environment.pop("MPLBACKEND", None)  # that of notebooks shows what pyplot holds
     result = subprocess.run(
         [Path(sys.executable).with_name("jupyter-execute"), "--inplace", "tutorial.ipynb"],
         cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300,
@@ -141,7 +254,7 @@ def test_the_tutorial_runs(finished, tmp_path):
     )
     assert f"bias             {median:9.4f} DN" in text
     kinds = [kind for output in outputs for kind in output.get("data", {})]
-    assert kinds.count("image/png") == 3
+    assert kinds.count("image/png") == 4  # nothing is shown twice
     assert (tmp_path / "ensemble.pdf").exists()
     assert not any(output["output_type"] == "error" or output.get("name") == "stderr" for output in outputs)
 

@@ -92,6 +92,16 @@ class FitResult(PixelParameters):
     satellite_weight: FloatArray
     intervals: FloatArray | None = None
 
+    def __repr__(self) -> str:
+        good = self.fit_status == 0
+        words = f"{self.bias.size} histograms, {np.count_nonzero(good)} with a good fit"
+        if good.any():
+            units = {"H": "e-", "g": "e-/DN", "mu": "DN", "sigma": "DN"}
+            medians = np.median(self.columns[good][:, [0, -3, -2, -1]], axis=0)
+            numbers = zip(units.items(), medians, strict=True)
+            words += f": median {', '.join(f'{name} = {n:.5g} {unit}' for (name, unit), n in numbers)}"
+        return f"<FitResult of {words}>"
+
     def _repr_html_(self) -> str:
         """Return the first fits as a table, for a notebook."""
         n = self.columns.shape[1] - 3

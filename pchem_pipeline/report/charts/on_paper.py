@@ -27,6 +27,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullLocator, ScalarFormatter
 
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
     SHADES,
@@ -110,7 +111,7 @@ class Look:
 
 
 class Drawing(MatplotlibFigure):
-    """A drawn figure that is saved in its own look, and that notebooks show."""
+    """A figure of matplotlib that is saved in its own look, and that notebooks show."""
 
     look: Look = Look()
 
@@ -237,6 +238,38 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
     return drawing
 
 
+def draw_panels(given: Any, chart: Chart) -> None:
+    """Draw the panels of a chart into axes of another figure, in the style of that figure.
+
+    Args:
+        given: axes, one or an array of any shape: one for each panel, in order.
+        chart: what is drawn.
+
+    Raises:
+        ConfigError: they are no axes, or not as many as the chart has panels.
+    """
+    panels = [(stack, panel) for stack in chart.stacks for panel in stack.panels]
+    several = np.ravel(np.asarray(given, dtype=object)).tolist()
+    if len(several) != len(panels) or not all(isinstance(axes, Axes) for axes in several):
+        what = ", ".join(type(axes).__name__ for axes in several) or "nothing"
+        raise ConfigError(
+            f"ax: {what}; give {len(panels)} axes of matplotlib, such as plt.subplots({len(panels)})[1]"
+        )
+    for axes, (stack, panel) in zip(several, panels, strict=True):
+        inch = axes.figure.dpi
+        own = 25.4 * axes.get_window_extent().width / inch
+        look = Look(25.4 * axes.figure.bbox.width / inch)
+        with mpl.rc_context({"legend.fontsize": "small", "legend.frameon": False}):
+            shown = replace(panel, y=tick_rows(panel.y, own))
+            handles = _draw_panel(axes, shown, stack, look, last=panel is stack.panels[-1])
+            if keys := _keys(chart, Look(own)):
+                axes.legend([*keys.values()], [*keys], loc="upper left", bbox_to_anchor=(0.0, -0.2))
+            elif any(chart.legend) and handles:
+                axes.legend([*handles.values()], [*handles])
+        if panel is stack.panels[0] and stack.title:
+            axes.set_title(stack.title, loc="left", fontsize="small")
+
+
 def _drawn(look: Look, chart: Chart) -> Drawing:
     columns = len(chart.widths) if look.wide else 1
     stacks = [stack for stack in chart.stacks if look.wide or not stack.wide]
@@ -353,8 +386,7 @@ def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
     one, set_scale = getattr(axes, f"{name}axis"), getattr(axes, f"set_{name}scale")
     if axis.log:
         set_scale("log")
-        # characters: a formula takes ten times as long
-        one.set_major_formatter(lambda place, _: power_of_ten(round(np.log10(place))) or "1")
+        one.set_major_formatter(_decade)  # characters: a formula takes ten times as long
     elif axis.linear_to:
         set_scale("symlog", linthresh=axis.linear_to, linscale=1.5)
     if axis.ticks:
@@ -365,6 +397,10 @@ def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
         one.set_major_locator(MaxNLocator(most, integer=True))
     if not axis.ticks and isinstance(one.get_major_formatter(), ScalarFormatter):
         one.get_major_formatter().set_useOffset(False)
+
+
+def _decade(place: float, _: object) -> str:
+    return power_of_ten(round(np.log10(place))) or "1"
 
 
 def _end(axes: Axes, name: str, axis: Axis) -> None:

@@ -116,6 +116,9 @@ class Figure:
     chart: Chart
     width_mm: float = COLUMN_MM
 
+    def __repr__(self) -> str:
+        return f"<Figure {self.name}: {self.title}>"
+
     @property
     def wide(self) -> bool:
         """Whether it takes the whole width of a page."""

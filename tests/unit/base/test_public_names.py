@@ -17,7 +17,8 @@ from pchem_pipeline.base.units import per_cent
 def test_the_public_names_are_these():
     names = {"FitResult", "FitSettings", "FitStatus", "PchEmError", "RunStore", "__version__"}
     names |= {"characterise", "fit_counts", "fit_histograms", "open_run"}
-    assert set(pchem_pipeline.__all__) == names
+    names |= {"Drawing", "Pixel", "Run", "Twin", "Verdict"}
+    assert set(pchem_pipeline.__all__) == names == set(dir(pchem_pipeline))
     for name in names:
         assert getattr(pchem_pipeline, name) is not None
     with pytest.raises(AttributeError, match="no attribute 'offset'"):
