@@ -313,12 +313,12 @@ def export(
         str,
         typer.Option(
             "--format",
-            help="fits, tiff, npz, csv (summary), emva (table of EMVA 1288 quantities) and defects (table, "
-            "DS9 regions and mask of the pixels that are not ordinary)",
+            help="fits, tiff, npz, csv (summary), emva (table of EMVA 1288 quantities), defects (table, DS9 "
+            "regions and mask of the pixels that are not ordinary), pyme, navigate, decode, picasso",
         ),
     ] = "fits,csv",
 ) -> None:
-    """Write maps, their summary and the list of defects."""
+    """Write maps, tables and files for other programs."""
     from pchem_pipeline.commands.export import export_run
 
     for path in export_run(target, output, _listed(formats.lower(), "--format")):

@@ -1,4 +1,4 @@
-"""``pchem export``: maps as FITS, TIFF or npz for other programs, their summary as CSV, and the defects."""
+"""``pchem export``: maps as FITS, TIFF or npz, tables, and calibrations for other programs."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.base.variables import Variable, variables_of
+from pchem_pipeline.commands.adapters import ADAPTERS, Calibration
 from pchem_pipeline.commands.figures import check_formats, warn_if_old
 from pchem_pipeline.frames.formats.map_files import MapImage, write_fits, write_npz, write_tiff
 from pchem_pipeline.model.fit.status import MEANINGS, words_of
@@ -22,9 +23,9 @@ from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
-#: Formats that maps can be exported to, and tables: their summary, EMVA 1288, pixels that are not ordinary.
+#: Images of maps, tables (summary, EMVA 1288, pixels that are not ordinary), and files for other programs.
 _IMAGES, _TABLES = ("fits", "tiff", "npz"), ("csv", "emva", "defects")
-FORMATS = (*_IMAGES, *_TABLES)
+FORMATS = (*_IMAGES, *_TABLES, *ADAPTERS)
 
 _COLUMNS = (
     "n_valid",
@@ -76,6 +77,8 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
             written.append(_write_emva(folder, target, store))
         elif name == "defects":
             written += _write_defects(folder, stored_defects(store, target.config))
+        elif name in ADAPTERS:
+            written += ADAPTERS[name](Calibration.of(target, store), folder)
         else:
             written += _write_csv(folder, store)
     return written

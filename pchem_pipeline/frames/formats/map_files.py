@@ -61,12 +61,13 @@ def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) 
     return [path]
 
 
-def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
+def write_tiff(folder: Path, maps: Sequence[MapImage], suffix: str = ".tif") -> list[Path]:
     """Write one TIFF file for each map: float32 for parameters, integers as they are.
 
     Args:
         folder: where to write ``<name>.tif``.
         maps: the maps.
+        suffix: of the files.
 
     Returns:
         The files written.
@@ -78,7 +79,7 @@ def write_tiff(folder: Path, maps: Sequence[MapImage]) -> list[Path]:
 
     written = []
     for image in maps:
-        path = folder / f"{image.name}.tif"
+        path = folder / f"{image.name}{suffix}"
         values = image.values.astype(np.float32) if image.values.dtype.kind == "f" else image.values
         words = {"name": image.name, "unit": image.unit, "long_name": image.long_name}
         with whole_file(path) as part:

@@ -3,15 +3,19 @@
 import csv
 import re
 import shutil
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from helpers import written_fit
 from helpers.pickled_tasks import PickledTasks
 from helpers.stage_runs import completed, stage_context
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.base.variables import PARAMETERS, variables_of
+from pchem_pipeline.commands.adapters import ADAPTERS, Calibration
 from pchem_pipeline.commands.export import export_run
 from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
@@ -23,6 +27,7 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.report.pages.summary import key_numbers, sentence
 from pchem_pipeline.run.fingerprint import status
+from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
 from pchem_pipeline.stages.ensemble.ensemble import on_axis
@@ -411,6 +416,51 @@ def test_export(finished, tmp_path):
     assert rows["bias"]["n_missing"] == "1"
     with (tmp_path / "out" / "fit_status.csv").open() as file:
         assert {row["fit_status"]: row["pixels"] for row in csv.DictReader(file)}["poor_fit"] == "1"
+
+
+def test_export_for_programs_that_localise_single_molecules(finished, tmp_path):
+    from tifffile import imread
+
+    finished.store.write_config(dump_config(finished.config))
+    written = export_run(finished.store.path, tmp_path, tuple(ADAPTERS))
+    assert all(path.exists() for path in written)
+    bias, gain, noise = (
+        finished.store.read(f"maps/{n}") for n in ("bias", "conversion_gain", "read_noise_e")
+    )
+    fitted = np.isfinite(bias)
+    assert 0 < (~fitted).sum() < bias.size / 2
+    # of frames with light only the pixels' own noise is their variance without it
+    variance = imread(next(path for path in written if path.name.startswith("variance_")))
+    np.testing.assert_allclose(variance[fitted], noise[fitted] ** 2, rtol=1e-6)
+    assert (variance[~fitted] == 1e8).all()  # such a pixel does not count
+    np.testing.assert_allclose(
+        imread(tmp_path / "camera_maps/camera_off.tiff")[fitted], bias[fitted], rtol=1e-6
+    )
+    in_dn = imread(tmp_path / "camera_maps/camera_var.tiff")
+    np.testing.assert_allclose(in_dn[fitted], (noise / gain)[fitted] ** 2, rtol=1e-6)
+    camera = yaml.safe_load((tmp_path / "decode_camera.yaml").read_text())["Camera"]
+    assert camera["read_sigma"] == pytest.approx(np.nanmedian(noise))
+    [entry] = yaml.safe_load((tmp_path / "picasso_config.yaml").read_text())["Cameras"].values()
+    assert entry["Sensitivity"] == pytest.approx(np.nanmedian(gain))
+
+
+def test_dark_frames_add_their_dark_current_to_what_other_programs_expect_of_dark_frames(finished, tmp_path):
+    kept = finished.config.model_copy(
+        update={"input": finished.config.input.model_copy(update={"kind": "dark", "integration_time": None})}
+    )
+    target = SimpleNamespace(
+        config=kept, sensor=lambda store: replace(SensorInfo.read(store), integration_time=None)
+    )
+    found = Calibration.of(target, finished.store)
+    bias, gain, noise, exposure = (
+        finished.store.read(f"maps/{n}")
+        for n in ("bias", "conversion_gain", "read_noise_e", "quanta_exposure")
+    )
+    fitted = np.isfinite(bias)
+    np.testing.assert_allclose(found.offset[fitted], (bias + exposure / gain)[fitted], rtol=1e-12)
+    np.testing.assert_allclose(found.variance[fitted], (noise**2 + exposure)[fitted], rtol=1e-12)
+    with pytest.raises(ConfigError, match=r"exposure time.*set input\.integration_time"):
+        ADAPTERS["pyme"](found, tmp_path)
 
 
 def test_export_says_what_is_wrong(finished, tmp_path):
