@@ -20,6 +20,7 @@ from pchem_pipeline.report.pages.emva import COLUMNS as EMVA_COLUMNS
 from pchem_pipeline.report.pages.emva import emva_rows
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.stages.defects import stored_defects
+from pchem_pipeline.stages.report.stored import samples_of
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
 
@@ -118,7 +119,8 @@ def _write_emva(folder: Path, target: Target, store: RunStore) -> Path:
     config = target.config
     maps, status = store.at(group="maps"), store.read("fit/fit_status")
     defects = stored_defects(store, config)
-    found = emva_rows(maps, status, config.input.kind, defects, config.maps.outlier_sigmas)
+    samples = samples_of(target.sensor(store), store.at(group="samples"), config)
+    found = emva_rows(maps, status, config.input.kind, defects, config.maps.outlier_sigmas, samples)
     return _table(folder / "emva1288.csv", [list(EMVA_COLUMNS), *(row.cells() for row in found)])
 
 

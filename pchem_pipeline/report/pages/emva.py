@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import Arrays, FloatArray
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
 from pchem_pipeline.model.maps.defects import Defects
-from pchem_pipeline.report.data import ReportData
+from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.pages.tables import Table
 from pchem_pipeline.report.style.wording import measured, short, unit_text
 
@@ -65,7 +65,9 @@ def emva_tables(data: ReportData) -> list[Table]:
             "definition here": row.definition_here,
             "difference to EMVA 1288": row.where_it_differs,
         }
-        for row in emva_rows(data.maps, data.status, data.kind, defects, data.outlier_sigmas)
+        for row in emva_rows(
+            data.maps, data.status, data.kind, defects, data.outlier_sigmas, samples=data.samples
+        )
     ]
     return [
         Table(
@@ -79,7 +81,12 @@ def emva_tables(data: ReportData) -> list[Table]:
 
 
 def emva_rows(
-    stored: Arrays, status: NDArray[Any], kind: str, defects: Defects, outlier_sigmas: float = 6.0
+    stored: Arrays,
+    status: NDArray[Any],
+    kind: str,
+    defects: Defects,
+    outlier_sigmas: float = 6.0,
+    samples: Samples | None = None,
 ) -> list[EmvaRow]:
     """Return the table of a run; pixels without a value and flagged ones are left out.
 
@@ -89,11 +96,12 @@ def emva_rows(
         kind: what made the charge: dark, light or unknown.
         defects: pixels that are not ordinary.
         outlier_sigmas: robust standard deviations above the median H from which a pixel is hot.
+        samples: several exposures of the pixels.
     """
     kept = (status & int(FAILED | FLAGGED)) == 0
 
     def of(name: str) -> FloatArray:
-        values = stored[name][kept]
+        values = stored[name][kept] if name in stored else np.empty(0)
         return values if values.size else np.full(1, np.nan)
 
     gain, exposure = of("conversion_gain"), stored["quanta_exposure"]
@@ -151,6 +159,59 @@ def emva_rows(
         EmvaRow("saturation capacity", "mu_e.sat", None, None, "e-", "not determined", missing[1]),
         EmvaRow("dynamic range", "DR", None, None, "", "not determined", missing[1]),
     ]
+    ladder = [] if samples is None else _ladder_rows(samples, kept, of)
+    measured_there = {row.symbol for row in ladder}
+    return [row for row in rows if row.symbol.removesuffix(" (similar)") not in measured_there] + ladder
+
+
+def _ladder_rows(samples: Samples, kept: NDArray[Any], of: Callable[[str], FloatArray]) -> list[EmvaRow]:
+    """Return what exposures at several light levels or integration times determine."""
+    lit = [i for i in samples.on_line if samples.samples[i].kind == "exposed"]
+    if not lit or not kept.any():
+        return []
+    exposure, left = (
+        samples.arrays[name][lit][:, kept] for name in ("quanta_exposure", "linearity_residual")
+    )
+    brightest = exposure[np.argmax(np.nanmean(exposure, axis=1))]
+    ratio, floor = (
+        brightest / np.sqrt(brightest + of("read_noise_e") ** 2),
+        _root_mean_square(of("read_noise_e")),
+    )
+    signal = _mean(brightest)
+    rows = [
+        EmvaRow(
+            "signal-to-noise ratio at the largest exposure", "SNR", *_mean(ratio), "",
+            "mean over the pixels of H / sqrt(H + read noise^2)",
+            "EMVA: SNR_max at saturation; here at the largest exposure that was measured",
+        ),
+        EmvaRow(
+            "dynamic range, at least", "DR", signal[0] / floor[0],
+            signal[0] / floor[0] * float(np.hypot(signal[1] / signal[0], floor[1] / floor[0])), "",
+            "mean H of the largest exposure over the temporal dark noise",
+            "EMVA: from the saturation to the absolute sensitivity threshold",
+        ),
+    ]  # fmt: skip
+    if len(lit) > 2:
+        on_line, means = np.nanmean(exposure - left, axis=1), [_mean(row) for row in left]
+        deviation, error = np.array(means).T / on_line
+        rows.append(
+            EmvaRow(
+                "linearity error", "LE", 100.0 * float(np.abs(deviation).mean()),
+                100.0 * float(np.sqrt(np.sum(error**2))) / len(lit), "%",
+                "mean of |deviation| of the mean H of each exposure from the line, relative to the line",
+                "EMVA: of the mean grey value, between 5 and 95 % of saturation",
+            )
+        )  # fmt: skip
+    slope = next((name for name in ("charge_per_level", "charge_rate") if np.isfinite(of(name)).any()), None)
+    if slope is not None:
+        rows.append(
+            EmvaRow(
+                "photo response non-uniformity", "PRNU_1288",
+                *_relative_spread(of(slope), of(f"{slope}_stderr")), "%",
+                "standard deviation of the slope of H between the pixels over its mean, corrected for errors",
+                "EMVA: at half saturation, trends of the illumination filtered out; not done here",
+            )
+        )  # fmt: skip
     return rows
 
 

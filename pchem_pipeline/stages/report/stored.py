@@ -142,7 +142,7 @@ def read_run(
         # several samples need other frames than one: see pchem plan
         plan=None if sensor.samples else plan_section(maps, n_frames),
         discrepancy=None if verdict is None else verdict_data(verdict, groups["discrepancy"]),
-        samples=_samples(sensor, groups["samples"], config),
+        samples=samples_of(sensor, groups["samples"], config),
     )
     return StoredRun(store, sensor, model, data)
 
@@ -194,7 +194,7 @@ def plan_section(maps: Arrays, n_frames: int | None) -> dict[str, Any] | None:
     return {"rows": rows, "reached": reached, "exposure": exposure, "read_noise": noise}
 
 
-def _samples(sensor: SensorInfo, arrays: Arrays, config: RunConfig) -> Samples | None:
+def samples_of(sensor: SensorInfo, arrays: Arrays, config: RunConfig) -> Samples | None:
     """Return the exposures of a run of several; None for a run of one."""
     if not sensor.samples or "quanta_exposure" not in arrays:
         return None

@@ -5,6 +5,7 @@ import pytest
 from helpers.report_material import defects_of
 
 from pchem_pipeline.model.fit.status import FitStatus
+from pchem_pipeline.report.data import Sample, Samples
 from pchem_pipeline.report.pages.emva import COLUMNS, emva_rows
 
 SHAPE = (60, 80)
@@ -68,6 +69,45 @@ def test_spreads_are_those_of_the_sensor_not_of_its_errors(store):
     assert 100 * gain.std() / gain.mean() - 2.0 > 5 * found["non-uniformity of the gain"].standard_error
     assert found["hot pixels"].value == pytest.approx(100 * 24 / (60 * 80 - 80), rel=0.01)
     assert n == 58 * 80
+
+
+def ladder(bend):
+    """Return a table of four light levels: pixels of 3 % PRNU whose signal bends, and their true numbers."""
+    rng, levels, error = np.random.default_rng(8), np.array([1.0, 2.0, 4.0, 8.0]), 0.03
+    rate = 2.0 * (1 + 0.03 * rng.standard_normal(SHAPE))
+    line = levels[:, None, None] * rate
+    left = bend * (line - line.mean(axis=0)) ** 2 + error * rng.standard_normal((4, *SHAPE))
+    read = {"read_noise_e": np.full(SHAPE, 0.3), "charge_per_level": rate + 0.01 * rng.standard_normal(SHAPE)}
+    maps = {
+        name: np.full(SHAPE, 1.0) for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
+    }
+    maps |= read
+    maps |= {f"{name}_stderr": np.full(SHAPE, 0.01) for name in maps}
+    exposures = tuple(Sample(str(x), "exposed", x, 1000) for x in levels.tolist())
+    arrays = {"quanta_exposure": line + left, "linearity_residual": left}
+    status = np.zeros(SHAPE, np.uint16)
+    found = emva_rows(
+        maps, status, "light", defects_of(maps, status), 6.0, Samples(exposures, "light_level", arrays)
+    )
+    rows = {row.symbol: row for row in found}
+    brightest = 8.0 * rate.mean() + left[3].mean()
+    true = {
+        "PRNU_1288": 3.0,
+        "SNR": brightest / np.sqrt(brightest + 0.09),
+        "LE": 100 * np.mean(np.abs(left.mean(axis=(1, 2)) / line.mean(axis=(1, 2)))),
+    }
+    return rows, true, brightest
+
+
+def test_exposures_at_several_light_levels_determine_linearity_and_prnu():
+    rows, true, brightest = ladder(bend=0.002)
+    for symbol, value in true.items():
+        assert abs(rows[symbol].value - value) < 5 * rows[symbol].standard_error + 1e-3 * value, symbol
+    assert rows["LE"].value > 20 * rows["LE"].standard_error  # so that a bend would be missed if it were
+    assert rows["DR"].value == pytest.approx(brightest / 0.3, rel=0.01)
+    assert "PRNU_1288 (similar)" not in rows
+    straight, _, _ = ladder(bend=0.0)
+    assert straight["LE"].value < 5 * straight["LE"].standard_error
 
 
 @pytest.mark.parametrize("kind", ["dark", "light", "unknown"])
