@@ -14,6 +14,8 @@ from pathlib import Path
 EXTRAS = {
     "fits": ("astropy>=6.1",),
     "hdf5": ("h5py>=3.11", "hdf5plugin>=5.0"),
+    "sif": ("sif-parser>=0.3.5",),
+    "nd2": ("nd2>=0.10",),
     "cluster": ("distributed>=2025.1",),
     "s3": ("s3fs>=2025.2",),
     "notebook": ("xarray>=2024.9",),

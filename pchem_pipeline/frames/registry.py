@@ -25,6 +25,9 @@ _OURS = {
     "zarr": ("omezarr", "ZarrReader"),
     "ser": ("ser", "SerReader"),
     "dcimg": ("dcimg", "DcimgReader"),
+    "spe": ("spe", "SpeReader"),
+    "sif": ("sif", "SifReader"),
+    "nd2": ("nd2", "Nd2Reader"),
     "raw": ("raw", "RawReader"),
 }
 #: first bytes of files that hold others -> what made them

@@ -59,7 +59,7 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
             missing.append(path)
     if missing:
         more = f" and {len(missing) - 1} more (last {missing[-1].name})" if len(missing) > 1 else ""
-        raise InputError(f"{missing[0]}{more}: no such file or folder; restore it, or correct input.files")
+        raise InputError(f"{missing[0]}{more}: no such file or folder; restore it, or correct its path")
     for path in found:
         if not (path.is_file() or path.is_dir()):
             raise InputError(f"{path}: not a regular file; write its content to a file first")
@@ -105,7 +105,7 @@ def _glob(pattern: Path, base_dir: Path) -> list[Path]:
     files = [p for p in matches if not p.name.startswith(".") and p.suffix.lower() not in SIDECARS]
     plain = [path for path in files if path.is_file() or is_zarr(path)]
     if not plain:
-        raise InputError(f"{base_dir / pattern}: matches no file; restore the files, or correct input.files")
+        raise InputError(f"{base_dir / pattern}: matches no file; restore the files, or correct the path")
     return plain
 
 

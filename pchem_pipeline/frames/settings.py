@@ -9,6 +9,8 @@ from pydantic import BeforeValidator, Field, model_validator
 from pchem_pipeline.base.settings import Place, Section
 from pchem_pipeline.frames.camera import LONGEST, SHORTEST
 
+PackingName = Literal["Mono10p", "Mono12p", "Mono10Packed", "Mono12Packed"]
+
 
 class SampleSettings(Section):
     """One exposure of several that are fitted together: an ordinary run of the same pixels."""
@@ -71,7 +73,7 @@ class InputSettings(Section):
     format: str = Field(
         default="auto",
         description="auto (from the content, then the suffix), raw, npy, tiff, fits, hdf5, zarr, ser, "
-        "dcimg, histogram (ready-made histograms), or the name of a reader from a plug-in",
+        "dcimg, spe, sif, nd2, histogram (ready-made histograms), or the name of a reader from a plug-in",
     )
     mode: Literal["copy", "reference"] = Field(
         default="copy",
@@ -98,6 +100,11 @@ class InputSettings(Section):
         default=None,
         description="raw and SER: byte order; null: from the file, else little (an error if the samples look "
         "byte-swapped)",
+    )
+    packing: PackingName | None = Field(
+        default=None,
+        description="raw only, instead of dtype: pixel format of packed samples: Mono10p, Mono12p (GenICam), "
+        "Mono10Packed, Mono12Packed (GigE Vision); null: from the sidecar, else they are not packed",
     )
     header_bytes: int | None = Field(
         default=None,
@@ -129,7 +136,7 @@ class InputSettings(Section):
     mask: Place | None = Field(
         default=None,
         description="image file (npy, TIFF, FITS) with the shape of the frames or of roi, relative to this "
-        "YAML file: pixels other than 0 are excluded; so are overscan (FITS: TRIMSEC, DATASEC) and pixels "
+        "YAML file: pixels other than 0 are excluded; so are overscan (FITS, DNG) and pixels "
         "that always have the marker 2^32-1",
     )
     roi: tuple[int, int, int, int] | None = Field(

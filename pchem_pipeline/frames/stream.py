@@ -220,8 +220,7 @@ class HashedFrameStream(FrameStream):
             if len(data) < wanted:
                 raise changed(hasher.path, "the file was truncated")
             for t, start in enumerate((offsets - offsets[0]).tolist(), a - first):
-                frame = np.frombuffer(data, reader.dtype, layout.rows * layout.columns, start)
-                frame = frame.reshape(layout.rows, layout.columns)
+                frame = layout.frame(data, start)
                 for part, (y0, y1) in zip(parts, self.bands, strict=True):
                     part[t] = frame[y0:y1]
         for part, (y0, _) in zip(parts, self.bands, strict=True):

@@ -23,6 +23,7 @@ _INPUT_SETTINGS = (
     "dtype",
     "offset",
     "byte_order",
+    "packing",
     "header_bytes",
     "frame_padding_bytes",
     "dataset",

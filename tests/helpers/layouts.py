@@ -13,6 +13,7 @@ import tifffile
 import zarr
 from astropy.io import fits
 from helpers.dcimg_files import write_dcimg
+from helpers.spe_files import write_spe
 from numpy.typing import NDArray
 
 Stack = NDArray[Any]
@@ -75,6 +76,26 @@ def raw(path: Path, stack: Stack) -> None:
     )
 
 
+def bit_place(packing: str, sample: int, bit: int) -> tuple[int, int]:
+    """Return byte and bit in which the standards have a bit (0 the lowest) of a sample, bit by bit."""
+    bits = int(packing[4:6])
+    if packing.endswith("p"):  # one stream of bits, the lowest first
+        return divmod(bits * sample + bit, 8)
+    group, second = divmod(sample, 2)  # high bits in bytes 0 and 2, low ones in the halves of byte 1
+    low = bits - 8
+    return (3 * group + 1, 4 * second + bit) if bit < low else (3 * group + 2 * second, bit - low)
+
+
+def packed(stack: Stack, packing: str) -> bytes:
+    bits = int(packing[4:6])
+    data = bytearray(stack.size * bits // 8 if packing.endswith("p") else stack.size // 2 * 3)
+    for sample, value in enumerate(stack.ravel().tolist()):
+        for bit in range(bits):
+            byte, place = bit_place(packing, sample, bit)
+            data[byte] |= (value >> bit & 1) << place
+    return bytes(data)
+
+
 #: by the name of a layout: suffix, and what writes it
 LAYOUTS: dict[str, tuple[str, Callable[[Path, Stack], None]]] = {
     "npy": ("npy", npy),
@@ -133,6 +154,8 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path, Stack], None]]] = {
     "dcimg, version 7": ("dcimg", partial(write_dcimg, version=7)),
     "dcimg, streamed": ("dcimg", partial(write_dcimg, version=0x2000000, row=0, footer=512)),
     "dcimg, USB": ("dcimg", partial(write_dcimg, row=None, footer=16)),
+    "spe": ("spe", write_spe),
+    "spe, version 3": ("spe", partial(write_spe, version=3.0)),
 }
 
 

@@ -20,13 +20,16 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
+from pchem_pipeline.frames.formats.kinds import axes_notes, check_samples, stack_shape
+from pchem_pipeline.frames.formats.packing import Packing
 from pchem_pipeline.frames.reader import FrameReader, changed, check_window, sound
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.files import whole_file
 
 _MOST_BYTES = 1 << 30
 _MOST_FRAMES = 1 << 26
+#: of a float of 32 bits that is exact
+_LARGEST_WHOLE = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,7 @@ class Layout:
         columns: columns of a frame.
         stored: numpy type of a stored sample with its byte order.
         offset: what is added to signed samples, DN; sums must not be negative. None: they are unsigned.
+        packing: how samples are packed, in frames of whole groups; None: they are not.
     """
 
     offsets: IntArray
@@ -46,11 +50,20 @@ class Layout:
     columns: int
     stored: np.dtype[Any]
     offset: int | None = None
+    packing: Packing | None = None
 
     @property
     def frame_bytes(self) -> int:
         """Bytes of one frame."""
-        return self.rows * self.columns * self.stored.itemsize
+        pixels = self.rows * self.columns
+        return pixels * self.stored.itemsize if self.packing is None else self.packing.span(0, pixels)[1]
+
+    def frame(self, data: bytes, start: int) -> NDArray[Any]:
+        """Return a frame (y, x) as it is stored, from its bytes, which begin at ``start``."""
+        shape = self.rows, self.columns
+        if self.packing is None:
+            return np.frombuffer(data, unsigned_type(self.stored), shape[0] * shape[1], start).reshape(shape)
+        return self.packing.unpacked(np.frombuffer(data, np.uint8, self.frame_bytes, start)).reshape(shape)
 
     @property
     def end(self) -> int:
@@ -149,7 +162,7 @@ class ContiguousReader(FrameReader):
     #: what a file is called that cannot be opened
     kind: ClassVar[str] = "file"
     _offset: int | None = None
-    _full: tuple[int, ...]
+    _full: tuple[int, ...] = ()
 
     @classmethod
     def open(cls, path: Path, settings: InputSettings) -> Self:
@@ -157,6 +170,7 @@ class ContiguousReader(FrameReader):
         reader = cls()
         with sound(path, cls.kind):
             reader.inspect(path, settings)
+        reader.notes += axes_notes(path, reader._full)
         return reader
 
     def inspect(self, path: Path, settings: InputSettings) -> None:
@@ -224,15 +238,29 @@ class ContiguousReader(FrameReader):
                 raise InputError(f"{path}: cannot be decoded ({error}); copy it again") from error
             unstore(buffer, self.dtype, self._offset, path)
             return
+        if layout.packing is not None:
+            self._read_packed(layout.packing, buffer, layout.offsets[t0:t1], y0 * layout.columns)
+            return
         skip = y0 * layout.columns * layout.stored.itemsize
         target = buffer.data.cast("B")
         band = len(target) // (t1 - t0)
-        with OpenedFile(self.paths[0], self._size) as file:
+        with OpenedFile(path, self._size) as file:
             for first, count in _runs(layout.offsets[t0:t1], band if band == layout.frame_bytes else -1):
                 start = int(layout.offsets[t0 + first]) + skip
                 file.read_into(target[first * band : (first + count) * band], start)
         unstore(buffer, layout.stored, layout.offset, path)
         self.put_right(buffer, t0, y0)
+
+    def _read_packed(
+        self, packing: Packing, buffer: NDArray[Any], offsets: IntArray, first_sample: int
+    ) -> None:
+        """Fill the buffer from frames whose samples are packed, from one of their samples on."""
+        n_samples = buffer[0].size
+        start, end, before = packing.span(first_sample, first_sample + n_samples)
+        with OpenedFile(self.paths[0], self._size) as file:
+            for frame, offset in zip(buffer, offsets.tolist(), strict=True):
+                data = np.frombuffer(file.read_bytes(offset + start, end - start), np.uint8)
+                frame.ravel()[:] = packing.unpacked(data)[before : before + n_samples]
 
     def put_right(self, buffer: NDArray[Any], t0: int, y0: int) -> None:
         """Put samples right that are not where the layout says, in frames from t0 and rows from y0 on."""
@@ -254,15 +282,25 @@ def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, pat
 
     Args:
         buffer: unsigned native type of the size of ``stored``, holding the bytes of the file.
-        stored: type in the file, with its byte order.
+        stored: type in the file, with its byte order; floats hold whole numbers.
         offset: what is added to signed samples, 0 to 2**(bits - 1); None: they are unsigned.
         path: the file, for the message.
 
     Raises:
-        InputError: a sample is negative, with the offset.
+        InputError: a sample is negative, with the offset, or no whole number.
     """
     if not stored.isnative:
         buffer.byteswap(inplace=True)
+    if stored.kind == "f":
+        values = buffer.view(f"f{stored.itemsize}")
+        whole = (values >= 0) & (values <= _LARGEST_WHOLE) & (values == np.floor(values))
+        if not whole.all():
+            raise InputError(
+                f"{path}: samples such as {values[~whole][0]:g}, raw whole numbers are needed; record them "
+                "without a correction, background or averaging"
+            )
+        buffer[...] = values
+        return
     if offset is None or not buffer.size:
         return
     top = 1 << (8 * stored.itemsize - 1)

@@ -1,4 +1,4 @@
-"""FITS cubes, lists of single images, images in extensions, and tile-compressed images.
+"""FITS cubes, lists of single images, a frame in each extension, and tile-compressed images.
 
 FITS stores unsigned integers as signed ones with BZERO = 2**(bits - 1). Uncompressed images are read
 straight from their offset, byte-swapped, and get their sign bit flipped in place; compressed ones go
@@ -37,7 +37,13 @@ from pchem_pipeline.frames.camera import (
 )
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets
 from pchem_pipeline.frames.formats.fits_files import UNSIGNED_ZERO, FitsImage, camera_cards, write_images
-from pchem_pipeline.frames.formats.kinds import check_coded, check_unpacked_size, chosen_pieces, full_window
+from pchem_pipeline.frames.formats.kinds import (
+    check_coded,
+    check_unpacked_size,
+    chosen_pieces,
+    mosaic_note,
+    windows,
+)
 from pchem_pipeline.frames.reader import changed
 from pchem_pipeline.frames.registry import check_unpacked, require
 from pchem_pipeline.frames.settings import InputSettings
@@ -52,6 +58,12 @@ _SERIAL_KEYWORDS = ("SERIALNO", "SERNO", "SERIAL", "CAMSERNO", "DETSERNO")
 _SETUP_KEYWORDS = ("GAIN", "OFFSET", "READMODE", "READOUTM", "XBINNING", "YBINNING", "IMAGETYP")
 #: of these the first counts
 _SECTION_KEYWORDS = ("TRIMSEC", "DATASEC")
+#: alike in images that are frames of one sensor: kind, exposure, setting, camera, place on the detector
+_ALIKE = (
+    *("EXTNAME", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "BZERO", "BSCALE", "TILES"),
+    *(*_TIME_KEYWORDS, *_SETUP_KEYWORDS, *_CAMERA_KEYWORDS, *_SERIAL_KEYWORDS, *_SECTION_KEYWORDS),
+    *("DETSEC", "CCDSEC", "CCDNAME", "CCDCHIP", "CHIPID", "AMPNAME", "AMPSEC"),
+)
 _TEMPERATURE_KEYWORDS = ("CCD-TEMP", "DET-TEMP", "DETTEMP", "CCDTEMP", "SENSTEMP", "SET-TEMP")
 #: of the samples, or of the place of an image in its file
 _SAMPLE_KEYWORDS = (
@@ -63,7 +75,7 @@ _LOCK = threading.Lock()
 
 
 class FitsReader(ContiguousReader):
-    """The first image of a FITS file that has data, 2-D or 3-D."""
+    """The only image of a FITS file, 2-D or 3-D, or a 2-D one in each extension."""
 
     format_name = "fits"
     library: ClassVar[str] = "astropy"
@@ -84,20 +96,22 @@ class FitsReader(ContiguousReader):
         from astropy.io import fits
 
         with fits.open(path, memmap=False, do_not_scale_image_data=True, lazy_load_hdus=True) as hdus:
-            self._number, hdu, primary = _image(path, hdus, settings)
-            header = hdu.header
+            self._numbers = _images(path, hdus, settings)
+            hdu, several = hdus[self._numbers[0]], len(self._numbers) > 1
+            header, primary = hdu.header, hdus[0].header
             sizes = [header[f"NAXIS{axis}"] for axis in range(header["NAXIS"], 0, -1)]
+            sizes = [len(self._numbers), *sizes] if several else sizes
             compressed = isinstance(hdu, fits.CompImageHDU)
             stored, zero = _samples(path, header, compressed)
             self.set_stack(path, sizes, stored, None if zero else settings, "image")
             n, rows, columns = self.shape
-            self.notes = _value_notes(path, header, n)
+            self.notes = _value_notes(path, header, n, several=several)
             if compressed:
                 self.notes += _coding_notes(
-                    path, self._number, stored.itemsize * math.prod(hdu.tile_shape), biased=bool(zero)
+                    path, self._numbers, stored.itemsize * math.prod(hdu.tile_shape), biased=bool(zero)
                 )
                 self.rows_per_read = min(rows, int(hdu.tile_shape[-2]))
-            start = 0 if compressed else int(hdu.fileinfo()["datLoc"])
+            starts = [0 if compressed else int(hdus[each].fileinfo()["datLoc"]) for each in self._numbers]
             end = hdus[-1].fileinfo()["datLoc"] + hdus[-1].fileinfo()["datSpan"]
             self._read_facts(primary, header)
         if compressed:
@@ -106,7 +120,9 @@ class FitsReader(ContiguousReader):
             self._size = size
             check_coded(path, self.shape, hdu.tile_shape, stored.itemsize, size)
             return
-        offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=start)
+        offsets = np.array(starts, np.int64)
+        if not several:
+            offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=starts[0])
         self.set_layout(path, Layout(offsets, rows, columns, stored, zero or self._offset), size)
 
     def _read_facts(self, *headers: Any) -> None:
@@ -133,8 +149,8 @@ class FitsReader(ContiguousReader):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # as above
             with fits.open(self.paths[0], memmap=False, lazy_load_hdus=True) as hdus:
-                header = hdus[self._number].header.copy(strip=True)
-                if self._number:
+                header = hdus[self._numbers[0]].header.copy(strip=True)
+                if self._numbers[0]:
                     header.extend(hdus[0].header, unique=True)
             header = fits.Header.fromstring(header.tostring())  # what breaks the standard is mended
         for name in _SAMPLE_KEYWORDS:
@@ -149,12 +165,16 @@ class FitsReader(ContiguousReader):
         if path.stat().st_size != self._size:
             raise changed(path, "the size of the file changed")
         with _LOCK, fits.open(path, memmap=False) as hdus:
-            values = hdus[self._number].section[full_window(self._full, t0, t1, y0, y1)]
-        buffer[...] = np.asarray(values).reshape(buffer.shape)
+            if len(self._numbers) == 1:
+                for part, window in windows(buffer, self._full, t0, y0):
+                    part[...] = hdus[self._numbers[0]].section[window]
+            else:
+                for frame, number in zip(buffer, self._numbers[t0:t1], strict=True):
+                    frame[...] = hdus[number].section[y0:y1]
 
 
-def _image(path: Path, hdus: Any, settings: InputSettings) -> tuple[int, Any, Any]:
-    """Return number and unit of the only image of the file, and the primary header."""
+def _images(path: Path, hdus: Any, settings: InputSettings) -> list[int]:
+    """Return the number of the only image of the file, or those of extensions with a frame each."""
     from astropy.io import fits
 
     images = []
@@ -169,34 +189,52 @@ def _image(path: Path, hdus: Any, settings: InputSettings) -> tuple[int, Any, An
     if settings.dataset is not None:
         wanted = settings.dataset.strip()
         images = [(n, hdu) for n, hdu in images if wanted in (str(n), hdu.name)]
-    if len(images) != 1:
+    kinds = [_kind(hdu) for _, hdu in images]
+    differing = [name for name in _ALIKE if len({kind[name] for kind in kinds}) > 1]
+    single = all(number and hdu.header["NAXIS"] == 2 for number, hdu in images)
+    if not images or (len(images) > 1 and (differing or not single)):
         names = ", ".join(f"{n} ({hdu.name or 'unnamed'})" for n, hdu in images[:12]) or "none"
         names += f" and {len(images) - 12} more" if len(images) > 12 else ""
+        names += f", which differ in {', '.join(differing[:4])}" if differing else ""
         raise InputError(
             f"{path}: images in the file{' with this name' * (settings.dataset is not None)}: {names}; "
             "choose one by its number in input.dataset (--dataset), or write the frames as one cube"
         )
-    return *images[0], hdus[0].header
+    return [number for number, _ in images]
 
 
-def _value_notes(path: Path, header: Any, frames: int) -> tuple[str, ...]:
+def _kind(hdu: Any) -> dict[str, str]:
+    """Return what frames of one sensor and exposure have alike, of the name of an image all but numbers."""
+    values = {name: hdu.header.get(name) for name in _ALIKE}
+    values |= {"EXTNAME": re.sub(r"[\W\d_]+", "", hdu.name), "TILES": getattr(hdu, "tile_shape", None)}
+    return {name: f"{each:.3g}" if isinstance(each, float) else str(each) for name, each in values.items()}
+
+
+def _value_notes(path: Path, header: Any, frames: int, *, several: bool) -> tuple[str, ...]:
     """Say where pixels may be no samples, or planes no frames."""
     notes = []
     if "BLANK" in header:
         notes.append(f"{path.name}: BLANK = {header['BLANK']} marks pixels without a value; read as stored")
-    if frames == 3:
+    if pattern := text_of(header.get("BAYERPAT")):
+        notes.append(mosaic_note(path, pattern))
+    if several:
+        notes.append(
+            f"{path.name}: its {frames} images are read as frames; if they are parts of a sensor, choose one "
+            "by input.dataset (--dataset)"
+        )
+    elif frames == 3:
         notes.append(
             f"{path.name}: its 3 planes are read as frames; if they are colours, write one file per colour"
         )
     return tuple(notes)
 
 
-def _coding_notes(path: Path, number: int, piece: int, *, biased: bool) -> tuple[str, ...]:
+def _coding_notes(path: Path, numbers: Sequence[int], piece: int, *, biased: bool) -> tuple[str, ...]:
     """Say where compression lost information.
 
     Args:
         path: the file.
-        number: of the image in it.
+        numbers: of the images in it.
         piece: bytes of a tile.
         biased: unsigned by BZERO.
 
@@ -206,24 +244,27 @@ def _coding_notes(path: Path, number: int, piece: int, *, biased: bool) -> tuple
     """
     from astropy.io import fits
 
+    notes = []
     with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
-        header = hdus[number].header
-        coding = str(header.get("ZCMPTYPE", "")).strip()
-        deflated = {"COMPRESSED_DATA"} if coding.startswith("GZIP") else set()
-        for name in {*deflated, "GZIP_COMPRESSED_DATA"} & {*hdus[number].columns.names}:
-            some = chosen_pieces(hdus[number].data[name], len)
-            check_unpacked_size(path, (tile.tobytes() for tile in some), piece, ["gzip"])
-        options = {str(header[f"ZNAME{i}"]).strip(): header.get(f"ZVAL{i}") for i in _numbers(header)}
-    if coding.startswith("PLIO") and biased:
-        raise InputError(
-            f"{path}: unsigned samples compressed by PLIO cannot be decoded reliably; unpack with funpack"
-        )
-    if coding.startswith("HCOMPRESS") and float(options.get("SCALE") or 0) != 0:
-        return (
-            f"{path.name}: lossy compression (HCOMPRESS, scale {options['SCALE']}); noise and histograms are "
-            "altered",
-        )
-    return ()
+        for number in numbers:
+            header = hdus[number].header
+            coding = str(header.get("ZCMPTYPE", "")).strip()
+            deflated = {"COMPRESSED_DATA"} if coding.startswith("GZIP") else set()
+            for name in {*deflated, "GZIP_COMPRESSED_DATA"} & {*hdus[number].columns.names}:
+                some = chosen_pieces(hdus[number].data[name], len)
+                check_unpacked_size(path, (tile.tobytes() for tile in some), piece, ["gzip"])
+            options = {str(header[f"ZNAME{i}"]).strip(): header.get(f"ZVAL{i}") for i in _numbers(header)}
+            if coding.startswith("PLIO") and biased:
+                raise InputError(
+                    f"{path}: unsigned samples compressed by PLIO cannot be decoded reliably; unpack with "
+                    "funpack"
+                )
+            if coding.startswith("HCOMPRESS") and float(options.get("SCALE") or 0) != 0:
+                notes.append(
+                    f"{path.name}: lossy compression (HCOMPRESS, scale {options['SCALE']}); noise and "
+                    "histograms are altered"
+                )
+    return tuple(dict.fromkeys(notes))
 
 
 def _numbers(header: Any) -> Iterator[int]:

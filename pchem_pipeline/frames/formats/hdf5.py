@@ -38,8 +38,8 @@ from pchem_pipeline.frames.formats.kinds import (
     check_unpacked_size,
     choose_dataset,
     chosen_pieces,
-    full_window,
     n_pieces,
+    windows,
 )
 from pchem_pipeline.frames.reader import changed, unwritten_notes
 from pchem_pipeline.frames.registry import require
@@ -134,15 +134,15 @@ class Hdf5Reader(ContiguousReader):
 
     def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """See `ContiguousReader.decode_into`."""
-        window = full_window(self._full, t0, t1, y0, y1)
         with _LOCK, opened(self.paths[0]) as file:
             dataset = file[self._name]
             if tuple(dataset.shape) != self._full:
                 raise changed(self.paths[0], "the shape of the dataset changed")
-            if len(self._full) == buffer.ndim and dataset.dtype == buffer.dtype:
-                dataset.read_direct(buffer, window)
-            else:
-                buffer[...] = dataset[window].reshape(buffer.shape)
+            for part, window in windows(buffer, self._full, t0, y0):
+                if dataset.dtype == part.dtype:
+                    dataset.read_direct(part, window)
+                else:
+                    part[...] = dataset[window]
 
 
 def _chunks_of(dataset: Any) -> list[Any]:

@@ -6,12 +6,13 @@ import bz2
 import lzma
 import math
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.settings import InputSettings
@@ -85,28 +86,41 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
 
 
 def stack_shape(path: Path, shape: Sequence[int], what: str = "array") -> tuple[int, int, int]:
-    """Return (frames, rows, columns) of a 2-D or 3-D array; more axes are taken if they have length 1.
+    """Return (frames, rows, columns) of an array; the axes before rows and columns are counted in turn.
 
     Raises:
-        InputError: too few or too many axes.
+        InputError: too few axes, or colours.
     """
     sizes = list(shape)
     if min(sizes, default=0) < 0 or max(sizes[-2:], default=0) > _MOST_PIXELS:
         raise InputError(f"{path}: damaged header: {what} of shape {tuple(shape)}; copy the file again")
     if len(sizes) < 2:
         raise InputError(f"{path}: {what} of shape {tuple(shape)}; needed: (frames, rows, columns)")
-    leading = [size for size in sizes[:-2] if size != 1]
-    if len(leading) > 1:
-        raise InputError(
-            f"{path}: {what} of shape {tuple(shape)} has {len(leading)} axes before rows and columns "
-            "(colours, "
-            "channels?); write one channel as (frames, rows, columns)"
-        )
-    if leading and sizes[-1] in (3, 4) and len(sizes) > 3:
+    n = math.prod(sizes[:-2])
+    if n != 1 and sizes[-1] in (3, 4) and len(sizes) > 3:
         raise InputError(
             f"{path}: {what} of shape {tuple(shape)} looks like colour images; monochrome frames are needed"
         )
-    return (leading[0] if leading else 1), sizes[-2], sizes[-1]
+    return n, sizes[-2], sizes[-1]
+
+
+def axes_notes(path: Path, shape: Sequence[int]) -> tuple[str, ...]:
+    """Return a remark where several axes of an array are read as frames."""
+    leading = [str(size) for size in shape[:-2] if size != 1]
+    if len(leading) < 2:
+        return ()
+    return (
+        f"{path.name}: array of shape {tuple(shape)} read as {' x '.join(leading)} frames; if one of these "
+        "axes is colours or channels, write one channel as (frames, rows, columns)",
+    )
+
+
+def mosaic_note(path: Path, pattern: str) -> str:
+    """Return the remark on a sensor whose pixels lie behind filters of several colours."""
+    return (
+        f"{path.name}: colour mosaic ({pattern}): read as the monochrome samples of its pixels, each of "
+        "which sees one colour"
+    )
 
 
 def check_coded(
@@ -195,13 +209,30 @@ def _unpacked_size(data: bytes, codec: str, most: int) -> int:
     return found
 
 
-def full_window(full: tuple[int, ...], t0: int, t1: int, y0: int, y1: int) -> tuple[Any, ...]:
-    """Return the index of frames t0..t1 and rows y0..y1 in an array with further axes of length 1."""
-    window: list[Any] = [slice(0, 1) for _ in full[:-2]]
-    for axis, length in enumerate(full[:-2]):
-        if length != 1:
-            window[axis] = slice(t0, t1)
-    return (*window, slice(y0, y1), slice(None))
+def windows(
+    buffer: NDArray[Any], full: tuple[int, ...], t0: int, y0: int
+) -> Iterator[tuple[NDArray[Any], tuple[slice, ...]]]:
+    """Yield the parts of a buffer, shaped like parts of an array, with the indices of these.
+
+    Args:
+        buffer: (frame, y, x), C-contiguous.
+        full: shape of the array, of which the axes before the last two are counted in turn.
+        t0: first frame.
+        y0: first row.
+    """
+    n, rows, columns = buffer.shape
+    axes = full[:-2] or (1,)
+    inner = max((axis for axis, length in enumerate(axes) if length != 1), default=0)
+    image = (slice(y0, y0 + rows), slice(0, columns))
+    start = 0
+    while start < n:
+        place = [slice(int(at), int(at) + 1) for at in np.unravel_index(t0 + start, axes)]
+        first = place[inner].start
+        place[inner] = slice(first, min(axes[inner], first + n - start))
+        end = start + place[inner].stop - first
+        index = (*place[: len(full) - 2], *image)
+        yield buffer[start:end].reshape([part.stop - part.start for part in index]), index
+        start = end
 
 
 def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: str | None) -> str:

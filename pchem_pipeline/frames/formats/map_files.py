@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray
@@ -181,7 +182,7 @@ def read_image(path: Path) -> FloatArray:
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error
     except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read as an image ({error})") from error
+        raise InputError(f"{path}: cannot be read as an image ({error}); write it again") from error
     if values.ndim not in (2, 3):
         raise InputError(f"{path}: an array of {values.ndim} axes; an image needs two, a sequence three")
     return values
@@ -189,7 +190,8 @@ def read_image(path: Path) -> FloatArray:
 
 def _read_any(path: Path) -> Any:
     if path.suffix.lower() == ".npy":
-        return np.load(path, allow_pickle=False)
+        with path.open("rb") as stream:
+            return npy_format.read_array(stream)  # it opens no pickles, and does not offer to
     if path.suffix.lower().startswith(".tif"):
         import tifffile
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, write_plain
-from pchem_pipeline.frames.formats.kinds import check_samples, stack_shape
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 
@@ -39,14 +38,14 @@ class NpyReader(ContiguousReader):
                 f"{path}: an object array (pickles are never opened); save a plain array of uint8, uint16 or "
                 "uint32"
             )
-        offset = check_samples(path, dtype, settings)
-        n, rows, columns = stack_shape(path, shape)
+        self.set_stack(path, shape, dtype, settings, "array")
+        n, rows, columns = self.shape
         if fortran and n * rows > 1 and n * columns > 1 and rows * columns > 1:
             raise InputError(
                 f"{path}: Fortran order; save it with numpy.save(..., numpy.ascontiguousarray(frames))"
             )
         offsets = even_offsets(path, n, rows * columns * dtype.itemsize, size, start=start)
-        self.set_layout(path, Layout(offsets, rows, columns, dtype, offset), size)
+        self.set_layout(path, Layout(offsets, rows, columns, dtype, self._offset), size)
         behind = size - max(start, self._layout.end)
         if behind:
             self.notes = (f"{path.name}: {behind} bytes after the array are ignored",)

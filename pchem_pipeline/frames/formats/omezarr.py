@@ -21,8 +21,8 @@ from pchem_pipeline.frames.formats.kinds import (
     check_unpacked_size,
     choose_dataset,
     chosen_pieces,
-    full_window,
     n_pieces,
+    windows,
 )
 from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.reader import changed, unwritten_notes
@@ -88,9 +88,10 @@ class ZarrReader(ContiguousReader):
         piece = getattr(array, "shards", None) or array.chunks
         check_coded(path, self.shape, piece, self.dtype.itemsize, file_size(path))
         self.take_facts(facts_from_names(attributes))
+        self.notes = _channel_notes(path, _axes(node), self._full)
         missing = _check_chunks(path, path / self._name, array, parts)
         self.unwritten = bool(missing)
-        self.notes = _channel_notes(path, _axes(node), self._full) + missing
+        self.notes += missing
 
     def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """See `ContiguousReader.decode_into`."""
@@ -100,7 +101,8 @@ class ZarrReader(ContiguousReader):
             raise changed(self.paths[0], "the store disappeared")
         node: Any = zarr.open(self.paths[0], mode="r")
         array = node[self._name] if self._name else node
-        buffer[...] = np.asarray(array[full_window(self._full, t0, t1, y0, y1)]).reshape(buffer.shape)
+        for part, window in windows(buffer, self._full, t0, y0):
+            part[...] = np.asarray(array[window])
 
 
 def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -> tuple[str, ...]:
@@ -164,15 +166,20 @@ def _scales(group: Any) -> Any:
 
 
 def _axes(node: Any) -> list[str]:
-    """Return the names of the axes of an OME-Zarr image, as far as it says."""
-    axes = (_scales(node) or [{}])[0].get("axes", [])
+    """Return the names of the axes of an OME-Zarr image (of versions before 0.3 always the same)."""
+    scales = _scales(node)
+    axes = scales[0].get("axes", "tczyx") if scales else []
     return [str(axis.get("name", "") if hasattr(axis, "get") else axis) for axis in axes]
 
 
 def _channel_notes(path: Path, axes: Sequence[str], shape: Sequence[int]) -> tuple[str, ...]:
-    """Say that channels are read as frames."""
+    """Say that channels are read as frames; refuse those that have another axis, too."""
     if "c" not in axes or len(axes) != len(shape) or (channels := shape[axes.index("c")]) < 2:
         return ()
+    if channels < math.prod(shape[:-2]):
+        raise InputError(
+            f"{path}: its metadata describe {channels} channels beside frames; write one array per channel"
+        )
     return (f"{path.name}: its metadata describe the images as {channels} channels; read as frames",)
 
 

@@ -2,14 +2,17 @@
 
 The sidecar lies beside ``frames.raw`` as ``frames.raw.json`` (or ``frames.json``, ``.yaml``, ``.yml``) with
 the keys ``shape`` ([rows, columns] or [frames, rows, columns]), ``dtype``, ``offset``, ``byte_order``,
-``header_bytes``, ``frame_padding_bytes``, ``bit_shift``, ``bit_depth``, ``integration_time`` (s). Other keys
-are left alone, but for those of the camera.
+``packing``, ``header_bytes``, ``frame_padding_bytes``, ``bit_shift``, ``bit_depth``, ``integration_time``
+(s). Other keys are left alone, but for those of the camera. Beside ``movie.dax`` of STORM microscopes HAL
+writes ``movie.inf``, lines ``name = value``.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -21,12 +24,24 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, write_plain
 from pchem_pipeline.frames.formats.kinds import check_samples
-from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.formats.packing import PACKINGS
+from pchem_pipeline.frames.settings import InputSettings, PackingName
 from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 #: suffixes of descriptions beside raw files
-SIDECARS = (".json", ".yaml", ".yml")
+SIDECARS = (".json", ".yaml", ".yml", ".inf")
+_NAMES_IN_INF = {
+    "camera": "camera head",
+    "temperature": "camera temperature (deg. C)",
+    "exposure_time": "Exposure Time",
+    "gain": "EMCCD Gain",
+    "binning": "binning",
+}
+#: what is said of samples that are not packed
+_UNPACKED = ("dtype", "offset", "byte_order")
+#: times as large are the steps of samples of another packing
+_CLEARLY = 4
 
 
 class _Sidecar(BaseModel):
@@ -38,6 +53,7 @@ class _Sidecar(BaseModel):
     dtype: Literal["uint8", "uint16", "uint32", "int16", "int32"] | None = None
     offset: int | None = None
     byte_order: Literal["little", "big"] | None = None
+    packing: PackingName | None = None
     header_bytes: int | None = None
     frame_padding_bytes: int | None = None
     bit_shift: int | None = None
@@ -62,6 +78,8 @@ def _read_sidecar(path: Path) -> _Sidecar:
         text = found.read_text(encoding="utf-8")
         if found.suffix == ".json":
             content = json.loads(text)
+        elif found.suffix == ".inf":
+            content = _from_inf(text)
         else:
             import yaml
 
@@ -82,18 +100,39 @@ def _read_sidecar(path: Path) -> _Sidecar:
         ) from error
 
 
+def _from_inf(text: str) -> dict[str, Any]:
+    """Return what the lines of HAL say, by the names that other sidecars have."""
+    lines = (line.partition("=") for line in text.splitlines())
+    stated = {name.strip(): value.strip() for name, _, value in lines if value.strip() not in ("", "NA")}
+    content: dict[str, Any] = {ours: stated.get(name) for ours, name in _NAMES_IN_INF.items()}
+    size = re.fullmatch(r"(\d+) x (\d+)", stated.get("frame dimensions", ""))  # columns x rows
+    if size:
+        content["shape"] = [int(stated.get("number of frames", 0)), int(size[2]), int(size[1])]
+    if kind := re.match(r"(8|16) bit integers \(binary, (big|little) endian\)", stated.get("data type", "")):
+        content |= {"dtype": f"uint{kind[1]}", "byte_order": kind[2]}
+    return content
+
+
 class RawReader(ContiguousReader):
     """Frames as plain bytes: header, then frames of rows, each followed by padding."""
 
     format_name = "raw"
     kind = "raw file"
-    suffixes: ClassVar[tuple[str, ...]] = (".raw", ".bin", ".dat")
+    suffixes: ClassVar[tuple[str, ...]] = (".raw", ".bin", ".dat", ".dax")
 
     def inspect(self, path: Path, settings: InputSettings) -> None:
         """See `ContiguousReader.inspect`."""
         side = _read_sidecar(path)
         facts = {name: getattr(settings, name, None) for name in _Sidecar.model_fields}
         facts = {name: getattr(side, name) if value is None else value for name, value in facts.items()}
+        if facts["packing"] is not None:
+            if extra := [name for name in _UNPACKED if facts[name] is not None]:
+                raise InputError(
+                    f"{path}: packing {facts['packing']} says what the samples are; remove "
+                    f"{' and '.join(extra)} from the section input or the sidecar"
+                )
+            depth = facts["bit_depth"] or PACKINGS[facts["packing"]].bits
+            facts |= {"dtype": "uint16", "bit_depth": depth}
         if facts["shape"] is None or facts["dtype"] is None:
             missing = " and ".join(f"input.{name}" for name in ("shape", "dtype") if facts[name] is None)
             raise InputError(
@@ -117,7 +156,14 @@ class RawReader(ContiguousReader):
         offset = check_samples(path, stored, InputSettings(offset=facts["offset"]))
         stored = stored.newbyteorder(self.byte_order)
         rows, columns = shape[-2:]
-        frame = rows * columns * stored.itemsize
+        packing, what = PACKINGS.get(facts["packing"]), "packing" if facts["packing"] else "dtype"
+        layout = Layout(np.empty(0, np.int64), rows, columns, stored, offset, packing)
+        if packing is not None and rows * columns % len(packing.places):
+            raise InputError(
+                f"{path}: frames of {rows} x {columns} samples are no whole bytes as {facts['packing']} "
+                f"(groups of {len(packing.places)}); correct input.shape or input.packing"
+            )
+        frame = layout.frame_bytes
         step = frame + padding
         size = path.stat().st_size
         whole, rest = divmod(size - header, step) if size >= header else (0, size)
@@ -126,14 +172,31 @@ class RawReader(ContiguousReader):
         n = shape[0] if len(shape) == 3 else whole
         if len(shape) == 2 and (rest or whole == 0):
             raise InputError(
-                f"{path}: truncated, or not {rows} x {columns} {facts['dtype']}: {size} bytes = header of "
+                f"{path}: truncated, or not {rows} x {columns} {facts[what]}: {size} bytes = header of "
                 f"{header} + {whole} frames of {step} + {rest}; copy the file again, or correct input.shape, "
-                "input.dtype, input.header_bytes or input.frame_padding_bytes"
+                f"input.{what}, input.header_bytes or input.frame_padding_bytes"
             )
         if n < whole:
             self.notes = (f"{path.name} has {whole} frames; the first {n} are used (shape)",)
         offsets = even_offsets(path, n, frame, size, start=header, step=step)
-        self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
+        self.set_layout(path, replace(layout, offsets=offsets), size)
+        if packing is not None:
+            self._check_packing(path, facts["packing"])
+
+    def _check_packing(self, path: Path, name: str) -> None:
+        """Refuse samples that change far less from frame to frame with their bytes read in another order."""
+        layout, steps = self._layout, {}
+        for other, packing in PACKINGS.items():
+            if packing[:2] == PACKINGS[name][:2]:
+                self._layout = replace(layout, packing=packing)
+                some = self.read(0, min(self.shape[0], 8), 0, min(self.shape[1], 64)).astype(np.int64)
+                steps[other] = int(np.abs(np.diff(some, axis=0)).sum())
+                if other == name and not (some & 15).any():
+                    steps[other] = 0  # left-justified: smaller in another order
+        self._layout = layout
+        best = min(steps, key=lambda each: steps[each])
+        if steps[name] > _CLEARLY * steps[best]:
+            raise InputError(f"{path}: the samples look like {best}; correct input.packing")
 
 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import CameraFacts, text_of
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, write_plain
+from pchem_pipeline.frames.formats.kinds import mosaic_note
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 
@@ -24,11 +25,15 @@ _HEADER = struct.Struct("<14s7i40s40s40s2q")
 _MAGIC = b"LUCAM-RECORDER"
 #: ticks of 100 ns from year 1 to 1970
 _EPOCH = 621_355_968_000_000_000
-_COLOUR_NAMES = {8: "Bayer", 9: "Bayer", 10: "Bayer", 11: "Bayer", 16: "CMY", 17: "CMY", 18: "CMY", 19: "CMY"}
+#: ColorID of mosaics
+_MOSAICS = {
+    **{8: "RGGB", 9: "GRBG", 10: "GBRG", 11: "BGGR"},
+    **{16: "CYYM", 17: "YCMY", 18: "YMCY", 19: "MYYC"},
+}
 
 
 class SerReader(ContiguousReader):
-    """Monochrome SER video, 1 to 16 bits."""
+    """Monochrome or Bayer SER video, 1 to 16 bits."""
 
     format_name = "ser"
     kind = "SER file"
@@ -42,10 +47,11 @@ class SerReader(ContiguousReader):
         if len(head) < _HEADER.size or not head.startswith(_MAGIC):
             raise InputError(f"{path}: truncated, or not SER video; copy the file again")
         _, _, colour, flag, columns, rows, depth, n, _, instrument, _, _, ticks = _HEADER.unpack(head)
-        if colour != 0:
-            name = _COLOUR_NAMES.get(colour, "RGB")
+        if colour in _MOSAICS:
+            self.notes = (mosaic_note(path, _MOSAICS[colour]),)
+        elif colour != 0:
             raise InputError(
-                f"{path}: colour video ({name}, ColorID {colour}); monochrome raw frames are needed"
+                f"{path}: colour video (ColorID {colour}); record raw frames (monochrome or Bayer)"
             )
         if not 1 <= depth <= 16 or rows < 1 or columns < 1 or n < 0:
             raise InputError(

@@ -1,4 +1,4 @@
-"""TIFF, BigTIFF, ImageJ and OME-TIFF stacks, and sequences of single-frame files.
+"""TIFF, BigTIFF, ImageJ and OME-TIFF stacks, DNG, and sequences of single-frame files.
 
 Pages are frames whenever all pages share shape and type, whatever the metadata say about series. Uncompressed
 pages are read straight from their offsets; others are decoded strip by strip by tifffile, only
@@ -25,10 +25,13 @@ from pchem_pipeline.frames.formats.contiguous import (
     even_offsets,
     unsigned_type,
 )
-from pchem_pipeline.frames.formats.kinds import check_coded, check_samples
+from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, mosaic_note
 from pchem_pipeline.frames.formats.tiff_facts import (
+    active_area,
     check_chain,
+    has_table,
     images_behind_one_page,
+    mosaic,
     stated_channels,
     stated_facts,
 )
@@ -39,6 +42,7 @@ from pchem_pipeline.store.files import whole_file
 
 _QUIET = logging.NullHandler()
 #: parts of the names of compressions that keep no exact samples, or need not
+_MONOCHROME = ("MINISBLACK", "MINISWHITE", "CFA", "LINEAR_RAW")
 _LOSSY = ("JPEG", "LERC", "WEBP")
 
 
@@ -48,7 +52,7 @@ class TiffReader(ContiguousReader):
     format_name = "tiff"
     library: ClassVar[str] = "tifffile"
     kind = "TIFF file"
-    suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8", ".stk")
+    suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8", ".stk", ".dng")
     magic: ClassVar[tuple[bytes, ...]] = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
     def inspect(self, path: Path, settings: InputSettings) -> None:
@@ -62,8 +66,12 @@ class TiffReader(ContiguousReader):
             self._inspect(path, file, size, settings)
 
     def _inspect(self, path: Path, file: Any, size: int, settings: InputSettings) -> None:
-        pages = [page for page in file.pages if not page.is_reduced]
-        reduced = len(file.pages) - len(pages)
+        every = [*file.pages]
+        pages = [page for page in every if not page.is_reduced]
+        if not pages:  # in DNG the frame may be behind a preview
+            every += [below for page in file.pages for below in page.pages or ()]
+            pages = [page for page in every if not page.is_reduced]
+        reduced = len(every) - len(pages)
         if not pages:
             raise InputError(f"{path}: not a valid TIFF file, or truncated (no pages); copy it again")
         notes = [f"{path.name}: {reduced} reduced pages (previews) are ignored"] if reduced else []
@@ -81,6 +89,7 @@ class TiffReader(ContiguousReader):
         else:
             self._set_coded(path, pages, size, offset)
         self.take_facts(stated_facts(file, first))
+        self.active = active_area(first)
 
     def _set_coded(self, path: Path, pages: Sequence[Any], size: int, offset: int | None) -> None:
         """Remember where the pages are, after a look at where their strips or tiles are."""
@@ -167,6 +176,13 @@ def _value_notes(path: Path, pages: Sequence[Any]) -> list[str]:
         )
     counts = [count for page in pages for count in page.databytecounts]
     notes += unwritten_notes(path, counts.count(0), len(counts), "strips or tiles")
+    if pattern := mosaic(pages[0]):
+        notes.append(mosaic_note(path, pattern))
+    if has_table(pages[0]):
+        notes.append(
+            f"{path.name}: its samples are codes of a table (LinearizationTable), not proportional to light; "
+            "read as stored"
+        )
     if getattr(pages[0].photometric, "name", "") == "MINISWHITE":
         notes.append(
             f"{path.name}: its tags declare 0 as white; samples are read as stored: if more light lowers "
@@ -191,7 +207,7 @@ def _check_pages(path: Path, pages: Sequence[Any]) -> None:
     photometric = first.photometric.name if hasattr(first.photometric, "name") else str(first.photometric)
     planes = first.samplesperpixel
     separate = planes > 1 and int(first.planarconfig) == 2 and photometric.startswith("MINIS")
-    if photometric not in ("MINISBLACK", "MINISWHITE") or (planes > 1 and not separate):
+    if photometric not in _MONOCHROME or (planes > 1 and not separate):
         raise InputError(
             f"{path}: colour or multi-channel images ({photometric}, {planes} samples per pixel); monochrome "
             "raw frames are needed"

@@ -42,6 +42,9 @@ _MOST_PAGES = 100_000
 _EXPOSURE_TAG, _EXIF_TAG = 33434, 34665
 _MICRO_MANAGER_TAG = 51123
 _STK_PLANES_TAG = 33629
+_CFA_PATTERN_TAG, _TABLE_TAG, _ACTIVE_AREA_TAG = 33422, 50712, 50829
+#: colours of a mosaic by their numbers; most pixels of its pattern
+_COLOURS, _LARGEST_MOSAIC = "RGBCMYW", 36
 _MAKE_TAG, _MODEL_TAG, _DATE_TAG = 271, 272, 306
 
 
@@ -132,9 +135,10 @@ def stated_channels(file: Any) -> tuple[int, int]:
 
 
 def stated_facts(file: Any, page: Any) -> StatedFacts:
-    """Return what our own JSON, OME-XML, Micro-Manager, or the tags of a page say beside the frames."""
+    """Return what our own JSON, OME-XML, Micro-Manager or tags say of frames that are like a page."""
+    head = file.pages[0]
     own = facts_from_names(_shaped(file))
-    record = _tag(page, _MICRO_MANAGER_TAG)
+    record = _tag(head, _MICRO_MANAGER_TAG)
     record = record if isinstance(record, dict) else {}
     hot = next((value for name, value in record.items() if name.endswith("Temperature")), None)
     cameras = (
@@ -143,19 +147,40 @@ def stated_facts(file: Any, page: Any) -> StatedFacts:
         CameraFacts(
             text_of(record.get("Camera")), temperature=celsius(hot), taken=seconds_of(record.get("Time"))
         ),
-        CameraFacts(_make_and_model(page), taken=seconds_of(_tag(page, _DATE_TAG))),
+        CameraFacts(_make_and_model(head), taken=seconds_of(_tag(head, _DATE_TAG))),
     )
     times = (
         own.duration,
         _ome_time(_ome(file)),
-        _ratio(_tag(page, _EXPOSURE_TAG)),
-        _ratio(exif.get("ExposureTime")) if isinstance(exif := _tag(page, _EXIF_TAG), dict) else None,
+        _ratio(_tag(head, _EXPOSURE_TAG)),
+        _ratio(exif.get("ExposureTime")) if isinstance(exif := _tag(head, _EXIF_TAG), dict) else None,
         duration_of("Exposure-ms", record.get("Exposure-ms"), "ms"),
     )
     depths = (_ome_depth(_ome(file)), own.bit_depth, _odd_depth(page.bitspersample))
     names = [each.name for each in fields(CameraFacts)]
     camera = CameraFacts(*(first_of(getattr(each, name) for each in cameras) for name in names))
     return StatedFacts(camera, agreed_duration(times), first_of(depths))
+
+
+def mosaic(page: Any) -> str:
+    """Return the colours of a mosaic from left to right and top to bottom; empty where there is none."""
+    if getattr(page.photometric, "name", "") != "CFA":
+        return ""
+    pattern = bytes(_tag(page, _CFA_PATTERN_TAG) or b"")[:_LARGEST_MOSAIC]
+    return "".join(_COLOURS[each] for each in pattern if each < len(_COLOURS)) or "CFA"
+
+
+def has_table(page: Any) -> bool:
+    """Return whether a table says what light the samples of a DNG stand for."""
+    return _TABLE_TAG in page.tags
+
+
+def active_area(page: Any) -> tuple[int, int, int, int] | None:
+    """Return the light-sensitive part of a DNG, see `FrameReader.active`; None where it says none."""
+    rows, columns = page.shape[-2:]
+    top, left, bottom, right = _tag(page, _ACTIVE_AREA_TAG) or (0, 0, 0, 0)
+    inside = 0 <= top < bottom <= rows and 0 <= left < right <= columns
+    return (top, bottom, left, right) if inside else None
 
 
 def _ome_time(text: str) -> Duration | None:

@@ -371,6 +371,10 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path):
     for values, words in (
         (mask[1:], r"mask of shape \(5, 8\)"),
         (np.ones((6, 8)), "every pixel is excluded"),
+        (
+            np.array([{"no": "image"}]),
+            r"mask.npy: cannot be read as an image \(Object arrays.*write it again",
+        ),
     ):
         np.save(tmp_path / "mask.npy", values)
         not_opened(words, tmp_path / "a.npy", mask="mask.npy")

@@ -106,14 +106,14 @@ def test_plug_in_is_not_loaded_without_need(tmp_path, monkeypatch):
     ("points", "words"),
     [
         ([("tiff", "other.package:Tiff")], "'tiff': pchem_pipeline itself and other.package:Tiff"),
-        ([("sif", "one.package:Sif"), ("sif", "two.package:Sif")], "'sif': one.package:Sif and two.package"),
-        ([("sif", "one.package:Sif")] * 2, ""),  # one that is listed twice is no double
+        ([("lab", "one.package:Lab"), ("lab", "two.package:Lab")], "'lab': one.package:Lab and two.package"),
+        ([("lab", "one.package:Lab")] * 2, ""),  # one that is listed twice is no double
     ],
 )
 def test_doubles_are_refused(monkeypatch, points, words):
     plug_in(monkeypatch, *points)
     if not words:
-        assert registry.reader_names()[-1] == "sif"
+        assert registry.reader_names()[-1] == "lab"
         return
     with pytest.raises(ConfigError, match=f"named {words}"):
         registry.reader_names()

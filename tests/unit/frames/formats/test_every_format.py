@@ -142,8 +142,10 @@ def test_signed_samples_are_read_with_an_offset_or_where_none_is_negative(tmp_pa
 
 
 @pytest.mark.parametrize("layout", ["npy", "fits", "hdf5", "zarr, version 2"])
-def test_axes_before_rows_and_columns_are_frames_if_all_but_one_are_of_length_one(tmp_path, layout):
+def test_axes_before_rows_and_columns_are_counted_in_turn(tmp_path, layout):
     stack = drawn(65535, np.uint16)
-    for name, index in (("a", np.s_[:, None]), ("b", np.s_[None])):
-        np.testing.assert_array_equal(read(write(tmp_path, layout, stack[index], name)), stack)
-    refused("2 axes before rows and columns", write(tmp_path, layout, np.stack([stack, stack]), "c"))
+    for name, shape in (("a", (6, 1)), ("b", (1, 6)), ("c", (2, 3))):
+        path = write(tmp_path, layout, stack.reshape(*shape, *SHAPE[1:]), name)
+        reader = opened(path)
+        np.testing.assert_array_equal(reader.read(), stack)
+        assert any("read as 2 x 3 frames" in note for note in reader.report.notes) == (name == "c")

@@ -284,7 +284,29 @@ def test_ome_zarr(tmp_path, version):
     check_windows(path, STACK)
     group.attrs.update({"multiscales": scales, "ome": {"multiscales": [{"datasets": [{"path": "two"}]}]}})
     group.create_array("two", data=np.zeros((4, 2, 1, 8, 9), np.uint16))
-    refused("2 axes before rows and columns", path)
+    refused("2 channels beside frames; write one array per channel", path)
+
+
+@pytest.mark.parametrize("chunks", [None, (1, 7, 19, 22), (2, 3, 8, 22)])
+def test_events_of_several_frames_are_read_in_turn(tmp_path, chunks):
+    """As data brokers write them: (event, frame, y, x)."""
+    events = np.stack([STACK, STACK[::-1], STACK + 7])
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("image", data=events, chunks=chunks)
+        file["time"] = np.arange(3.0)
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file.create_dataset(
+            "image", data=events.astype(">u2")[:, None], chunks=chunks and (1, 1, *chunks[1:])
+        )
+    group = zarr.open_group(tmp_path / "a.zarr", mode="w")
+    group.create_array("image", data=events, chunks=chunks or events.shape)
+    frames = events.reshape(-1, *STACK.shape[1:])
+    for name in ("a.h5", "b.h5", "a.zarr"):
+        reader = opened(tmp_path / name)
+        np.testing.assert_array_equal(reader.read(), frames)
+        for t0, t1, y0, y1 in (*WINDOWS, (5, 16, 2, 9), (13, 15, 0, 1), (20, 21, 0, 19)):
+            np.testing.assert_array_equal(reader.read(t0, t1, y0, y1), frames[t0:t1, y0:y1])
+        assert "read as 3 x 7 frames" in reader.report.notes[0]
 
 
 @pytest.mark.parametrize("axes", [["c", "y", "x"], [{"name": "c"}, {"name": "y"}, {"name": "x"}]])

@@ -1,5 +1,7 @@
 """FITS: facts of its headers, what must be chosen, what is reported and what is refused."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -36,6 +38,14 @@ def test_values_that_may_be_no_samples_are_reported(tmp_path):
         ]
 
 
+def test_a_mosaic_is_read_as_its_samples(tmp_path):
+    path = write_fits(tmp_path / "a.fits", STACK, BAYERPAT="RGGB")
+    assert (
+        "colour mosaic (RGGB): read as the monochrome samples"
+        in FitsReader.open(path, InputSettings()).notes[0]
+    )
+
+
 def test_compression_that_loses_is_reported(tmp_path):
     path = tmp_path / "a.fits"
     for scale, notes in ((0, 0), (4, 1)):
@@ -66,6 +76,41 @@ def test_several_images_must_be_chosen_from(tmp_path):
     np.testing.assert_array_equal(read(path, dataset="DARK"), STACK)
     np.testing.assert_array_equal(read(path, dataset="2"), STACK + 1)
     refused("with this name: none", path, dataset="BIAS")
+
+
+@pytest.mark.parametrize("coding", [None, "RICE_1", "GZIP_2"])
+def test_extensions_of_a_frame_each_are_a_stack(tmp_path, coding):
+    path = tmp_path / "a.fits"
+
+    def write(cards=None, primary=None, last=STACK[-1], names=("", "", "", "", "")):
+        units = [fits.PrimaryHDU(primary)]
+        for frame, name in zip([*STACK[:-1], last], names, strict=True):
+            kind = fits.ImageHDU if coding is None else partial(fits.CompImageHDU, compression_type=coding)
+            units.append(kind(frame, name=name, header=fits.Header([("EXPTIME", 0.25), ("GAIN", 2)])))
+        units[-1].header.update(cards or {})
+        fits.HDUList(units).writeto(path, overwrite=True)
+
+    for names in ([""] * 5, [f"FRAME_{i}" for i in range(5)]):
+        write({"EXPTIME": 0.25001}, names=names)
+        with open_frames(InputSettings(files=("a.fits",)), tmp_path) as reader:
+            np.testing.assert_array_equal(reader.read(), STACK)
+            np.testing.assert_array_equal(reader.read(1, 4, 3, 9), STACK[1:4, 3:9])
+            assert reader.integration_time == 0.25
+            assert "its 5 images are read as frames" in reader.report.notes[0]
+    for differing in ("EXPTIME", "GAIN", "DETSEC"):
+        write({differing: 3})
+        refused(rf"4 \(\w+\), 5 \(\w+\), which differ in {differing}; choose one", path)
+    write(names=("SCI", "SCI", "SCI", "SCI", "DQ"))
+    refused("which differ in EXTNAME", path)
+    np.testing.assert_array_equal(read(path, dataset="SCI"), STACK[:4])
+    if coding is None:
+        write()
+        path.write_bytes(path.read_bytes()[:-2400])
+        refused("truncated", path)
+    write(last=STACK[-1, 1:])
+    refused("which differ in NAXIS2", path)
+    write(primary=STACK[0])
+    refused(r"0 \(PRIMARY\), 1 \(", path)
 
 
 def test_scaled_values_and_no_image_are_refused(tmp_path):

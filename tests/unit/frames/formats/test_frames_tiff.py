@@ -165,6 +165,47 @@ def test_exposure_in_the_exif_directory(tmp_path):
     assert TiffReader.open(tmp_path / "a.tif", InputSettings()).integration_time == pytest.approx(4.87)
 
 
+CFA = [(33421, "H", 2, (2, 2), True), (33422, "B", 4, b"\0\1\1\2", True)]
+DNG = [(50706, "B", 4, b"\1\4\0\0", True)]
+
+
+def write_mosaic(path, tags=(), **options):
+    with tifffile.TiffWriter(path) as file:
+        for frame in STACK:
+            file.write(frame, photometric="cfa", extratags=[*CFA, *tags], metadata=None, **options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"compression": "zlib"}, {"compression": "jpeg", "compressionargs": {"lossless": True}}],
+    ids=["plain", "zlib", "lossless JPEG"],
+)
+def test_a_mosaic_is_read_as_its_samples(tmp_path, options):
+    write_mosaic(tmp_path / "a.tif", **options)
+    reader = opened(tmp_path / "a.tif")
+    np.testing.assert_array_equal(reader.read(), STACK)
+    assert any("a.tif: colour mosaic (RGGB): read as the mono" in note for note in reader.report.notes)
+
+
+def test_dng_with_its_preview_edges_and_table(tmp_path):
+    area = (50829, "I", 4, (2, 3, 21, 30), True)
+    for i, frame in enumerate(STACK):
+        with tifffile.TiffWriter(tmp_path / f"f{i}.dng") as file:
+            exposure = (33434, "2I", 1, (1, 50), True)
+            preview = {"photometric": "rgb", "subfiletype": 1, "subifds": 1, "extratags": [*DNG, exposure]}
+            file.write(np.zeros((7, 11, 3), np.uint8), **preview)
+            file.write(frame, photometric="cfa", extratags=[*CFA, area])
+    with opened(tmp_path / "*.dng") as reader:
+        excluded = np.ones(STACK.shape[1:], bool)
+        excluded[2:21, 3:30] = False
+        np.testing.assert_array_equal(reader.excluded, excluded)
+        np.testing.assert_array_equal(reader.read()[:, ~excluded], STACK[:, ~excluded])
+        assert reader.integration_time == 0.02
+    write_mosaic(tmp_path / "table.dng", [*DNG, (50712, "H", 3, (0, 4, 9), True)])
+    notes = TiffReader.open(tmp_path / "table.dng", InputSettings()).notes
+    assert any("codes of a table" in note for note in notes)
+
+
 def test_channels_beside_frames_are_refused(tmp_path):
     """Frames of two channels in turn are no samples of one law; frames called channels are frames."""
     imagej, ome = tmp_path / "imagej.tif", tmp_path / "a.ome.tif"

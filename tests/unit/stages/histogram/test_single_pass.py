@@ -39,9 +39,15 @@ def _raw(folder, frames):
         (folder / f"{name}.json").write_text(json.dumps(facts))
 
 
+def _packed(folder, frames):
+    (folder / "a.raw").write_bytes(layouts.packed(frames, "Mono12p"))
+    (folder / "a.raw.json").write_text(json.dumps({"shape": [NY, NX], "packing": "Mono12p"}))
+
+
 WRITERS = {
     "npy": lambda folder, frames: layouts.npy(folder / "a.npy", frames),
     "raw": _raw,
+    "raw, packed": _packed,
     "tiff": lambda folder, frames: [
         layouts.tiff(folder / f"f{i}.tif", part) for i, part in enumerate(np.array_split(frames, 5))
     ],
