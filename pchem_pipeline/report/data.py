@@ -21,6 +21,7 @@ from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus, flags_of
 from pchem_pipeline.model.maps.defects import Defects
@@ -208,6 +209,7 @@ class ReportData:
         methods: content of ``methods.json``, or None where nobody compared.
         plan: frames that precisions need, or None where no pixel has a value.
         samples: the exposures of a run whose input is several samples, or None.
+        regions: parts of the sensor that have a name.
     """
 
     title: str
@@ -245,6 +247,7 @@ class ReportData:
     methods: Mapping[str, Any] | None = None
     plan: Mapping[str, Any] | None = None
     samples: Samples | None = None
+    regions: Mapping[str, Region] = field(default_factory=dict)
     _summaries: dict[tuple[str, bool], MapSummary] = field(default_factory=dict, init=False, repr=False)
     _errors: dict[tuple[str, bool], float | None] = field(default_factory=dict, init=False, repr=False)
     _ordered: dict[str, Ordered] = field(default_factory=dict, init=False, repr=False)
@@ -335,6 +338,15 @@ class ReportData:
         names = () if self.few_channels else ("conversion_gain", "read_noise_e", "quanta_exposure", "bias")
         known = (name for name in names if self.has_values(name))
         return {name: map_parts(np.where(self.flagged_in(name), np.nan, self.maps[name])) for name in known}
+
+    def in_region(self, region: str) -> dict[str, MapSummary]:
+        """Describe each map with values in a part of the sensor; flagged pixels are left out."""
+        inside = self.regions[region].mask(self.shape)
+        known = (name for name in self.maps if not name.endswith("_stderr") and self.has_values(name))
+        return {
+            name: self._summarised(Ordered.of(self.maps[name][inside], self.flagged_in(name)[inside]))
+            for name in known
+        }
 
     def ordered(self, name: str) -> Ordered:
         """Return the values of a map in their order; the last one is kept, which many ask for in turn."""

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from pchem_pipeline.base.settings import Section
+from pchem_pipeline.effects.framework.region import Region
 
 PixelPosition = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 
@@ -58,3 +59,8 @@ class ReportSettings(Section):
         "read noise and low and high quanta exposure",
     )
     criteria: Criteria = Field(default_factory=Criteria, description="limits of the sensor; null: no limit")
+    regions: dict[str, Region] = Field(
+        default_factory=dict,
+        description="parts of the sensor by name, such as {left: columns=0:256, right: columns=256:512}; the "
+        "report has the medians of each",
+    )

@@ -10,6 +10,7 @@ import numpy as np
 
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.model.maps.maps import MapSummary
 from pchem_pipeline.report.data import ReportData, reasons_in, truth_errors
 from pchem_pipeline.report.figures.samples import middle
 from pchem_pipeline.report.pages.summary import (
@@ -51,6 +52,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
                 "camera": data.camera or None,
             },
             "summary": _summary(data),
+            "regions": _regions(data),
             "fit_status": _fit_status(data),
             "goodness_of_fit": _goodness(data),
             "ensemble": {"rmse": rmse, **facts},
@@ -77,24 +79,36 @@ def report_json(data: ReportData) -> str:
 def _summary(data: ReportData) -> dict[str, Any]:
     found = {}
     for name in (name for name in data.maps if not name.endswith("_stderr")):
-        summary = data.summary(name)
         found[name] = {
-            "unit": stored_unit(name),
-            "median": summary.median,
-            "median_stderr": summary.median_stderr,
-            "robust_sd": summary.robust_sd,
+            **_numbers_of(name, data.summary(name), data),
             "pixel_stderr": data.pixel_error(name),
-            "percentiles": {f"{p:g}": summary.percentiles[p] for p in data.percentiles},
-            "minimum": summary.minimum,
-            "maximum": summary.maximum,
-            "n_pixels": summary.n_valid,
-            "n_without_value": summary.n_missing,
-            "n_flagged": summary.n_left_out,
-            "n_outliers_low": summary.n_low,
-            "n_outliers_high": summary.n_high,
             "parts": [asdict(parts) for parts in data.parts.get(name, ())],
         }
     return found
+
+
+def _numbers_of(name: str, summary: MapSummary, data: ReportData) -> dict[str, Any]:
+    return {
+        "unit": stored_unit(name),
+        "median": summary.median,
+        "median_stderr": summary.median_stderr,
+        "robust_sd": summary.robust_sd,
+        "percentiles": {f"{p:g}": summary.percentiles[p] for p in data.percentiles},
+        "minimum": summary.minimum,
+        "maximum": summary.maximum,
+        "n_pixels": summary.n_valid,
+        "n_without_value": summary.n_missing,
+        "n_flagged": summary.n_left_out,
+        "n_outliers_low": summary.n_low,
+        "n_outliers_high": summary.n_high,
+    }
+
+
+def _regions(data: ReportData) -> dict[str, Any]:
+    return {
+        region: {name: _numbers_of(name, summary, data) for name, summary in data.in_region(region).items()}
+        for region in data.regions
+    }
 
 
 def _fit_status(data: ReportData) -> dict[str, Any]:

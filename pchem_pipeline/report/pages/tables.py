@@ -59,8 +59,8 @@ class Table:
 def result_tables(data: ReportData) -> list[Table]:
     """Return the tables of results that the data allow."""
     makers = (
-        _channels, _parameters, _flagged, _against_truth, _moments, _misfits, _intervals, _samples, _plan,
-        _quick_look,
+        _channels, _parameters, _regions, _flagged, _against_truth, _moments, _misfits, _intervals, _samples,
+        _plan, _quick_look,
     )  # fmt: skip
     return [table for make in makers if (table := make(data)) is not None and table.rows]
 
@@ -106,6 +106,27 @@ def _parameters(data: ReportData) -> Table:
         f"{data.noun}s (1.4826 MAD), median 1 sigma error per {data.noun}, percentiles, and outliers beyond "
         f"{data.outlier_sigmas:g} robust standard deviations.{_left_out(data)}",
         [_parameter_row(data, name) for name in _known(data)],
+    )
+
+
+def _regions(data: ReportData) -> Table:
+    rows = []
+    for name, region in data.regions.items():
+        found = data.in_region(name)
+        medians = {heading(m): measured(found[m].median, found[m].median_stderr) for m in MAPS if m in found}
+        rows.append(
+            {
+                "region": name,
+                "where": region.describe(),
+                **medians,
+                "pixels": f"{region.mask(data.shape).sum():,}",
+            }
+        )
+    return Table(
+        "regions",
+        "Regions",
+        "Median of each parameter with its standard error, in the parts of the sensor of report.regions.",
+        rows,
     )
 
 

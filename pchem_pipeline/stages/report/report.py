@@ -48,7 +48,7 @@ def run(context: StageContext) -> None:
     """Write the report.
 
     Raises:
-        ConfigError: a pixel of ``report.pixels`` is outside the sensor.
+        ConfigError: a pixel of ``report.pixels`` or a region is outside the sensor.
         StoreError: an array is missing or the store cannot be written.
     """
     ny, nx = context.sensor.shape
@@ -58,6 +58,11 @@ def run(context: StageContext) -> None:
                 f"report.pixels: pixel y = {y}, x = {x} is outside the sensor of {ny} x {nx} pixels; choose "
                 f"y below {ny} and x below {nx}"
             )
+    for name, region in context.config.report.regions.items():
+        try:
+            region.mask((ny, nx))
+        except ConfigError as error:
+            raise ConfigError(f"report.regions.{name}: {error}") from error
     task = functools.partial(
         _write,
         config=context.config,

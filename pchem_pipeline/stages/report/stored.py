@@ -143,6 +143,7 @@ def read_run(
         plan=None if sensor.samples else plan_section(maps, n_frames),
         discrepancy=None if verdict is None else verdict_data(verdict, groups["discrepancy"]),
         samples=samples_of(sensor, groups["samples"], config),
+        regions=config.report.regions,
     )
     return StoredRun(store, sensor, model, data)
 

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from helpers.report_material import report_data
 
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.report_json import report_json
+from pchem_pipeline.report.pages.tables import result_tables
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +58,20 @@ def test_every_map_is_summarised_with_its_unit(numbers: dict, data: ReportData) 
     assert noise["pixel_stderr"] == pytest.approx(
         np.nanmedian(np.where(data.flagged_in("read_noise_e"), np.nan, data.maps["read_noise_e_stderr"]))
     )
+
+
+def test_parts_of_the_sensor_with_a_name_have_their_own_numbers(data: ReportData) -> None:
+    taps = {"left": Region(columns=((0, 10),)), "right": Region(columns=((10, 20),))}
+    shown = replace(data, regions=taps, maps=data.maps | {"bias": data.maps["bias"] + np.arange(20)})
+    numbers = json.loads(report_json(shown))["regions"]
+    for name, columns in (("left", slice(0, 10)), ("right", slice(10, 20))):
+        inside = np.where(shown.flagged_in("bias"), np.nan, shown.maps["bias"])[:, columns]
+        assert numbers[name]["bias"]["median"] == pytest.approx(np.nanmedian(inside))
+        assert numbers[name]["bias"]["n_pixels"] == np.isfinite(inside).sum()
+    [table] = [table for table in result_tables(shown) if table.id == "regions"]
+    assert [row["where"] for row in table.rows] == ["columns 0 to 9", "columns 10 to 19"]
+    assert {row["pixels"] for row in table.rows} == {"160"}
+    assert not [table for table in result_tables(data) if table.id == "regions"]
 
 
 def test_fit_status_counts_pixels_by_reason(numbers: dict, data: ReportData) -> None:
