@@ -113,7 +113,7 @@ _ALL = (
     ),
     Stage(
         "report",
-        version=6,
+        version=7,
         upstream=("histogram", "fit", "maps", "ensemble"),
         settings=("report", "maps", "run.title", "run.allowed_failed_pixels", "input.kind"),
         writes=(),
