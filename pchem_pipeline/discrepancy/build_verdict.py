@@ -35,6 +35,7 @@ _MOST_LONGER = 30.0  # largest factor on the number of samples that is recommend
 # nats per sample from which on a plain fit may be far off: six of seven hidden effects that left so much had
 # moved the gain of 19 to 100 % of the pixels by a fifth or more
 _BEYOND_A_FIT = 0.1
+_UNFINISHED = "; the search used its budget before it finished: go on with a larger --effort."
 #: Reason of a rejection.
 LEAVES_TOO_MUCH = "it leaves too much of the discrepancy"
 
@@ -274,7 +275,7 @@ def build_verdict(
         verdict=schema.Verdict(
             verdict=found.state,
             sentence=_sentence(found, sizes).removesuffix(".")
-            + (f"; {found.limit}." if found.limit else "."),
+            + (_UNFINISHED if found.limit else "."),
             doubt=found.doubt,
             limit=found.limit,
             effects=tuple(dict.fromkeys(effect.tag for effect in found.named)),

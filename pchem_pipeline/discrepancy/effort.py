@@ -117,10 +117,9 @@ class Effort:
             raise EffortSpentError(doing)
 
     def limit_words(self, spent: EffortSpentError, candidates: Iterable[str]) -> str:
-        """State where the search ended, which candidates (tags) were not tried, and how to continue."""
+        """State where the search ended, and which candidates (tags) were not tried."""
         untried = ", ".join(tag for tag in dict.fromkeys(candidates) if tag not in self.tried)
-        rest = f"; not tried: {untried}" if untried else ""
-        return f"the search used its budget before {spent}{rest}; go on with a larger --effort"
+        return f"the search used its budget before {spent}" + (f"; not tried: {untried}" if untried else "")
 
     @property
     def _hard(self) -> float:

@@ -573,6 +573,8 @@ def _remarks(data: DiscrepancyData) -> Iterator[Flag]:
         yield Flag("caution", f"Largest remaining disagreement: {words} ({sigma_text(most.z)}).")
     for name, why in found.defects.items():
         yield Flag("serious", f"Defect: candidate {name} failed and was not compared: {why}.")
+    if found.limit:
+        yield Flag("note", f"{found.limit[:1].upper()}{found.limit[1:]}.")
     if found.untestable:
         titles = ", ".join(map(data.title, found.untestable))
         yield Flag("note", f"Not testable with these data: {titles}.")

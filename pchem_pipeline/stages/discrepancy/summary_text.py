@@ -55,6 +55,7 @@ def verdict_text(found: Verdict) -> str:
     lines += _places("unexplained", found.unexplained, _MOST_LEFT)
     for tag, why in found.defects.items():
         lines += _wrapped(f"DEFECT: candidate {tag} failed and was not compared: {why}")
+    lines += _wrapped(found.limit) if found.limit else []
     if found.untestable:
         lines += _wrapped(f"not testable with such frames: {', '.join(found.untestable)}")
     return "\n".join(lines)
