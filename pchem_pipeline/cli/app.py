@@ -279,26 +279,37 @@ def compare(
             "number is the axis [default: dates of the files]"
         ),
     ] = None,
-    fdr: Annotated[
-        float, typer.Option(help="false-discovery rate for pixels that changed since the first run")
-    ] = 0.01,
+    fdr: Annotated[float, typer.Option(help="false-discovery rate for pixels that changed")] = 0.01,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="exit code 3 only for a median that changed by significantly more: bias=0.5 (in the map's "
+            "unit), read_noise_e=5%; or for more changed pixels: pixels=10, pixels=1% (repeatable) [default: "
+            "section compare of the reference; none there: any significant change]",
+        ),
+    ] = None,
     progress: Progress = "auto",
+    quiet: Quiet = False,
 ) -> None:
     """Compare runs and write their history.
 
-    Runs on the same frames are compared value by value, others in standard errors. Exit code 3: changed.
+    Prints what changed since the first run, and in the last since the one before it in the history. Runs on
+    the same frames are compared value by value, others in standard errors. Exit code 3: changed.
     """
     from pchem_pipeline.commands.compare.compare import compare_runs
 
-    for path in compare_runs(
+    compare_runs(
         runs,
         output,
         tolerance=tolerance,
         labels=label or (),
         rate=fdr,
+        limits=limit or (),
         progress=progress,
-    ):
-        typer.echo(path)
+        quiet=quiet,
+        write=say,
+    )
 
 
 _command("Look at results")(methods)

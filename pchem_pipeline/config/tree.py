@@ -12,6 +12,7 @@ from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.methods.settings import MethodsSettings
+from pchem_pipeline.model.checks.settings import CompareSettings
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings, MapsSettings
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.histogram.settings import HistogramSettings
@@ -63,6 +64,11 @@ class RunConfig(Section):
     )
     methods: MethodsSettings = Field(
         default_factory=MethodsSettings, description="comparison with other methods (pchem methods)"
+    )
+    compare: CompareSettings = Field(
+        default_factory=CompareSettings,
+        description="limits of pchem compare with this run as reference; null: not judged, none at all: any "
+        "significant change counts",
     )
     report: ReportSettings = Field(default_factory=ReportSettings, description="report.html")
     compute: ComputeSettings = Field(default_factory=ComputeSettings, description="backend, workers, memory")

@@ -23,11 +23,11 @@ class RunFacts:
         shape: rows and columns.
         n_frames: of each pixel, or None.
         digest: of the content of its input files.
-        sentence: what its maps say, in words.
         summary: map to median, its standard error and the robust scatter of the pixels, in the map's unit.
         ensemble: arrays of the ensemble that are drawn.
         rmse: RMSE of the predictions of the ensemble.
         pixels: number of pixels with a good fit, with caution, and without a value.
+        identity: of its frames and how they were characterised.
     """
 
     label: str
@@ -39,6 +39,7 @@ class RunFacts:
     ensemble: Arrays = field(default_factory=dict)
     rmse: Mapping[str, float] = field(default_factory=dict)
     pixels: tuple[int, int, int] = (0, 0, 0)
+    identity: str = ""
 
     @property
     def title(self) -> str:
@@ -101,10 +102,11 @@ class DefectChange:
 
 @dataclass(frozen=True)
 class Pair:
-    """A run compared with the first one.
+    """A run compared with the first one, or with the one before it in the history.
 
     Attributes:
         one, other: the runs.
+        since: what the first of them is to the second.
         same_data: both come from the same frames.
         arrays: every array of the results; empty where the frames differ.
         maps: map to its difference; empty where the shapes differ.
@@ -115,10 +117,14 @@ class Pair:
         changed: whether anything changed.
         changes: what changed, one sentence each.
         defects: pixels with other defects in the other run.
+        n_changed: pixels with other defects, or of which a value changed beyond its limit.
+        n_compared: these, and those with a good fit in both.
+        limits: beyond which something counts as changed; empty: beyond its errors.
     """
 
     one: RunFacts
     other: RunFacts
+    since: Literal["reference", "last run"]
     same_data: bool
     arrays: Sequence[ArrayRow] = ()
     maps: Mapping[str, MapDifference] = field(default_factory=dict)
@@ -129,39 +135,18 @@ class Pair:
     changed: bool = False
     changes: Sequence[str] = ()
     defects: Sequence[DefectChange] = ()
+    n_changed: int = 0
+    n_compared: int = 0
+    limits: Mapping[str, float | str] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """Labels of both, for names within a page."""
+        return f"{self.other.label}-{self.one.label}"
 
 
-@dataclass(frozen=True)
-class HistoryRow:
-    """One run among others of the same camera.
-
-    Attributes:
-        label: as given, else the date.
-        date: when its frames were taken, else written, UTC, ISO 8601; empty where that is not known.
-        temperature: of the sensor as its frames say, degrees Celsius; None where they do not.
-        place: number that the label begins with, or days of the date; NaN where there is none.
-        run: what its maps say.
-        defects: number of pixels of each kind of defect.
-        defects_changed: pixels with other defects than in the first run.
-        flags: number of pixels that bear each word of ``fit_status``.
-        effects: tags of its model.
-        moved: map to number of pixels that moved since the first run; empty for that one itself.
-        any_moved: pixels that moved in any map.
-        compared: pixels with a good fit in both.
-    """
-
-    label: str
-    date: str
-    temperature: float | None
-    place: float
-    run: RunFacts
-    defects: Mapping[str, int] = field(default_factory=dict)
-    defects_changed: Sequence[DefectChange] = ()
-    flags: Mapping[str, int] = field(default_factory=dict)
-    effects: tuple[str, ...] = ()
-    moved: Mapping[str, int] = field(default_factory=dict)
-    any_moved: int = 0
-    compared: int = 0
+#: A line of ``history.csv``: heading to text.
+HistoryRow = Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -169,11 +154,10 @@ class Comparison:
     """Runs against the first of them.
 
     Attributes:
-        runs: in the order given.
-        pairs: the first with each of the others.
+        runs: the first, the others in the order given, and the one before the last in the history.
+        pairs: the first with each of the others, and the one before the last with the last.
         tolerance: relative difference that counts as rounding.
-        history: a row for each run.
-        labelled: whether the history is drawn against labels, not against dates.
+        history: of all runs that were ever compared with the first, a row for each.
         rate: false-discovery rate at which pixels count as moved.
     """
 
@@ -181,7 +165,6 @@ class Comparison:
     pairs: Sequence[Pair]
     tolerance: float
     history: Sequence[HistoryRow] = ()
-    labelled: bool = False
     rate: float = 0.01
 
     @property

@@ -1,5 +1,6 @@
 """Runs compared: a rerun is proven to be the same, and what changed is found and shown."""
 
+import contextlib
 import csv
 import hashlib
 import json
@@ -15,11 +16,12 @@ from helpers.report_material import report_data
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.compare.compare import compare_runs, comparison_of
-from pchem_pipeline.commands.compare.history import history_csv
+from pchem_pipeline.commands.compare.history import HISTORY
 from pchem_pipeline.commands.notebook import open_run
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.figures.compare import history_figures
+from pchem_pipeline.report.pages.compare import sentence_of
 from pchem_pipeline.report.pages.summary import criteria
 from pchem_pipeline.report.style.wording import percent
 from pchem_pipeline.run.progress import Reporter
@@ -36,12 +38,22 @@ def copies(shell, finished):
 
 
 def here(shell, *names):
-    """Compare in this process: the message where something changed, else nothing."""
-    try:
-        compare_runs([shell.folder / name for name in names], shell.folder / "compare", progress="off")
-    except ChangedError as change:
-        return str(change)
-    return ""
+    """Compare in this process: the lines that are printed."""
+    lines = []
+    with contextlib.suppress(ChangedError):
+        compare_runs(
+            [shell.folder / name for name in names],
+            shell.folder / "compare",
+            progress="off",
+            write=lines.append,
+        )
+    return "\n".join(lines)
+
+
+def compared(shell, *names, **options):
+    """Return the comparison of runs; nothing is written."""
+    paths = [shell.folder / name for name in names]
+    return comparison_of(paths, shell.folder / "nowhere", Reporter("off"), **options)[0]
 
 
 def put(store, name, values):
@@ -55,11 +67,12 @@ def numbers(shell, folder="compare"):
 
 def test_nothing_changed_is_proven_by_digests(shell, copies):
     result = shell.ok("compare", "a.zarr", "b.zarr")
-    assert result.stdout.split() == [
-        f"compare/{name}" for name in ("compare.html", "compare.json", "history.csv")
-    ]
-    assert result.last.startswith("Nothing changed: ")
-    assert result.last.endswith(" are bit-identical.")
+    assert (result.stdout, result.stderr) == ("no change\n", "")
+    result = shell.ok("compare", "a.zarr", "b.zarr", "--quiet")
+    assert (result.stdout, result.stderr) == ("", "")
+    sentence = numbers(shell)["sentence"]
+    assert sentence.startswith("Nothing changed: ")
+    assert sentence.endswith(" are bit-identical.")
     [pair] = numbers(shell)["comparisons"]
     assert (pair["same_data"], pair["changed"], pair["what"]) == (True, False, [])
     rows = {row["name"]: row for row in pair["arrays"]}
@@ -84,16 +97,19 @@ def test_one_value_that_moved_is_found(shell, copies):
     y, x = np.argwhere(np.isfinite(bias))[5]
     bias[y, x] *= 1 + 1e-9
     put(copies, "maps/bias", bias)
-    result = shell("compare", "a.zarr", "b.zarr", "-o", "out")
+    result = shell("compare", "a.zarr", "b.zarr", "-o", "out", "--quiet")
     assert result.code == 3
-    assert result.stdout == ""
-    assert "maps/bias: 1 value of 560 changed" in result.last
-    assert "out/compare.html" in result.last
+    head, what = result.stdout.splitlines()
+    assert head == "b.zarr since the reference a.zarr:"
+    assert what.startswith("  maps/bias: 1 value of 560 changed")
+    assert result.last == f"pchem: changed; see {shell.folder}/out/compare.html"
     [pair] = numbers(shell, "out")["comparisons"]
     states = {row["name"]: row["state"] for row in pair["arrays"]}
     assert [name for name, state in states.items() if state != "identical"] == ["maps/bias"]
-    pair = comparison_of([shell.folder / "a.zarr", shell.folder / "b.zarr"], 1e-6, Reporter("off")).pairs[0]
-    assert not pair.changed
+    for rule in ({"tolerance": 1e-6}, {"limits": ["bias=0.1"]}):
+        [pair] = compared(shell, "a.zarr", "b.zarr", **rule).pairs
+        assert not pair.changed
+    [pair] = compared(shell, "a.zarr", "b.zarr", tolerance=1e-6).pairs
     assert "equal" in {row.state for row in pair.arrays}
 
 
@@ -112,13 +128,13 @@ def test_lost_and_new_arrays_settings_and_versions(shell, copies):
     assert pair["versions"] == []
 
 
-def other_capture(store, *, exposure=1.0, seed=1):
+def other_capture(store, *, exposure=1.0, seed=1, noise=2**0.5):
     """Make of a run what another capture would have given: noise of its standard errors, other frames."""
     rng = np.random.default_rng(seed)
     for name in (*PARAMETERS, "read_noise_e", "charge_rate"):
         values, error = store.read(f"maps/{name}"), store.read(f"maps/{name}_stderr")
         factor = exposure if name in ("quanta_exposure", "charge_rate") else 1.0
-        values = factor * values + np.sqrt(2) * error * rng.standard_normal(values.shape)
+        values = factor * values + noise * error * rng.standard_normal(values.shape)
         put(store, f"maps/{name}", values)
     store.delete("maps/analog_read_noise_e")
     sensor = store.attributes("frames")["sensor"]
@@ -131,10 +147,16 @@ def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished):
     shutil.copytree(finished, shell.folder / "warm <b>.zarr")
     warm = RunStore.open(shell.folder / "warm <b>.zarr", writable=True)
     other_capture(warm, exposure=1.2, seed=2)
-    sentence = here(shell, "a.zarr", "b.zarr", "warm <b>.zarr")
-    assert sentence.startswith("Differs from A (a.zarr): C (Quanta exposure: median changed by ")
-    assert sentence.partition(" See ")[0].endswith("; no difference in B.")
-    same, moved = numbers(shell)["comparisons"]
+    lines = here(shell, "a.zarr", "b.zarr", "warm <b>.zarr").splitlines()
+    assert lines[:2] == [
+        "b.zarr since the reference a.zarr: no change",
+        "warm <b>.zarr since the reference a.zarr:",
+    ]
+    assert lines[2].startswith("  Quanta exposure: median changed by ")
+    assert "warm <b>.zarr since the last run b.zarr:" in lines
+    assert numbers(shell)["sentence"] == "Changed: C since A, C since B. No change: B since A."
+    same, moved, since_last = numbers(shell)["comparisons"]
+    assert [pair["since"] for pair in (same, moved, since_last)] == ["reference", "reference", "last run"]
     assert not same["changed"]
     assert moved["maps"]["charge_rate"]["reasons"]["shifted"]
     assert not any(moved["maps"]["bias"]["reasons"].values())
@@ -175,7 +197,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
     with (shell.folder / "history" / "history.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["label"] for row in rows] == labels
-    assert [row["run"] for row in rows] == ["a.zarr", "b.zarr", "c.zarr"]
+    assert [row["run"] for row in rows] == ["../a.zarr", "../b.zarr", "../c.zarr"]
     assert rows[0]["bias_moved"] == ""
     n = int(rows[1]["compared_pixels"])
     # without a change each of 6 maps calls a pixel moved with a probability of 5 %, not each of its pixels
@@ -183,7 +205,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
     found = int(rows[2]["bias_moved"])
     assert 38 <= found <= 40 + 12  # 40 moved; at most one in twenty of those found by chance, and its scatter
     assert found < 0.2 * n
-    sentence = f"Bias: {found} pixels changed, p < 0.001 over all pixels and maps."
+    sentence = f"Bias: {found} pixels changed, p < 0.001."
     assert sentence in numbers(shell, "history")["comparisons"][1]["what"]  # one count in both
     assert int(rows[2]["pixels_good"]) == int((third.read("maps/quality") == 0).sum())
     summary = third.attributes("maps")["summary"]["conversion_gain"]
@@ -209,7 +231,7 @@ def test_the_history_of_a_camera(shell, copies, finished):
     assert "-20 C" in page
     for each in ({"labels": ["one"]}, {"rate": 0.0}):
         with pytest.raises(ConfigError, match="--"):
-            comparison_of(paths[:2], 1e-12, Reporter("off"), **each)
+            compared(shell, "a.zarr", "b.zarr", **each)
 
 
 def test_the_history_has_date_and_temperature_of_the_files(shell, copies, finished):
@@ -219,15 +241,101 @@ def test_the_history_has_date_and_temperature_of_the_files(shell, copies, finish
         store = RunStore.open(shell.folder / f"{name}.zarr", writable=True)
         sensor = SensorInfo.read(store)
         replace(sensor, camera=CameraFacts("Camera <X>", "7", temperature, taken)).write(store)
-    paths = [shell.folder / "a.zarr", shell.folder / "b.zarr"]
-    found = comparison_of(paths, 1e-12, Reporter("off"), ["-20 °C", "-5.5 °C"])
-    assert [row.place for row in found.history] == [-20.0, -5.5]
-    assert found.history[0].date.startswith("2025-06-15T")
-    text = history_csv(found.history).splitlines()
-    assert text[0].startswith("label,date,temperature,run,")
-    assert text[2].split(",")[2] == "-5.5"
-    (figure,) = history_figures(found.history, found.labelled)
+    rows = compared(shell, "a.zarr", "b.zarr", labels=["-20 °C", "-5.5 °C"]).history
+    assert rows[0]["date"].startswith("2025-06-15T")
+    assert list(rows[0])[:4] == ["label", "date", "temperature", "run"]
+    assert rows[1]["temperature"] == "-5.5"
+    (figure,) = history_figures(rows)
     assert figure.tables[0]["label"].tolist() == [-20.0, -5.5]
+
+
+def test_ten_nights_of_one_camera(shell, finished, monkeypatch):
+    """Nothing is said where nothing changed; a jump is told once since the last run, then since the first."""
+
+    pages = []  # what they would be made of: drawing takes most of the time
+    render = "pchem_pipeline.commands.compare.compare.render_comparison"
+    monkeypatch.setattr(render, lambda found, draw: pages.append(found) or ("", ""))
+    monkeypatch.setattr("pchem_pipeline.commands.compare.compare.warn_if_old", lambda *_: None)
+
+    def tonight(n):
+        shutil.copytree(finished, shell.folder / f"night{n}.zarr")
+        store = RunStore.open(shell.folder / f"night{n}.zarr", writable=True)
+        other_capture(store, seed=100 + n, noise=1.0)
+        return store
+
+    def lines(n, *limits):
+        written = []
+        paths = [shell.folder / f"night{each}.zarr" for each in (0, n)]
+        with contextlib.suppress(ChangedError):
+            compare_runs(
+                paths,
+                shell.folder / "compare",
+                limits=limits,
+                quiet=True,
+                progress="off",
+                write=written.append,
+            )
+        return written
+
+    tonight(0)
+    history = shell.folder / "compare" / HISTORY
+    for n in range(1, 11):
+        tonight(n)
+        assert lines(n) == []
+        before = history.read_text()
+        assert len(before.splitlines()) == n + 2
+        assert lines(n) == []
+        assert history.read_text() == before
+    limits = ("bias=0.5", "read_noise_e=5%", "pixels=1%")
+    for n in (11, 12):
+        store = tonight(n)
+        put(store, "maps/bias", store.read("maps/bias") + 2.0)
+    said = lines(11, *limits)
+    assert [line.partition(":")[0] for line in said] == [
+        "night11.zarr since the reference night0.zarr",
+        "  Bias",
+        "  Pixels",
+        "night11.zarr since the last run night10.zarr",
+        "  Bias",
+        "  Pixels",
+    ]
+    change, error = re.search(r"median changed by ([\d.]+) ± ([\d.]+) DN, limit 0.5 DN\.", said[1]).groups()
+    assert abs(float(change) - 2.0) < 5 * float(error) < 0.5
+    said = lines(12, *limits)
+    assert said[0] == "night12.zarr since the reference night0.zarr:"
+    assert said[-1] == "night12.zarr since the last run night11.zarr: no change beyond the limits"
+    assert lines(12, "bias=2.5", "pixels=100%") == []
+    # the limits of the reference's YAML are those of the command line
+    shutil.rmtree(shell.folder / "night11.zarr")
+    reference = RunStore.open(shell.folder / "night0.zarr", writable=True)
+    text = stored_config(reference.path)
+    reference.write_config(text.replace("  bias: null\n", "  bias: 3\n", 1))
+    assert lines(12) == []
+    [pair] = pages[-1].pairs  # the last run is gone
+    assert sentence_of(pages[-1]).endswith("all that has a limit is within it: bias.")
+    assert pair.limits == {"bias": 3.0}
+    assert [row["run"] for row in pages[-1].history] == [f"../night{n}.zarr" for n in range(13)]
+    assert len(history.read_text().splitlines()) == 1 + 13
+
+
+@pytest.mark.parametrize(
+    ("limit", "said"),
+    [
+        ("bais=3", "compare.bais: unknown key; did you mean bias?"),
+        ("bias", "write name=value, such as bias=0.5"),
+        ("bias=-1", "compare.bias: give a number from 0 on, or per cent"),
+        ("dark_current=5%", "compare.dark_current: .* has no such map; omit this limit"),
+    ],
+)
+def test_a_wrong_limit_is_refused(shell, copies, limit, said):
+    with pytest.raises(ConfigError, match=said):
+        compared(shell, "a.zarr", "b.zarr", limits=[limit])
+
+
+def test_nothing_to_compare_is_a_change(shell, copies):
+    other_capture(copies)
+    put(copies, "maps/quality", np.full_like(copies.read("maps/quality"), 2))
+    assert "No pixel has a good fit in both runs." in here(shell, "a.zarr", "b.zarr")
 
 
 def test_bad_input_gets_one_line(shell, finished):

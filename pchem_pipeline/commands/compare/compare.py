@@ -2,47 +2,67 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import math
 import string
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.base.errors import ChangedError, ConfigError
-from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS, VARIABLES
-from pchem_pipeline.commands.compare.history import PixelStates, history_csv, history_rows
+from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
+from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.commands.compare.history import (
+    HISTORY,
+    PixelStates,
+    append_history,
+    history_row,
+    identity_of,
+    read_history,
+)
 from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
 from pchem_pipeline.commands.figures import warn_if_old
 from pchem_pipeline.model.checks.run_differences import (
+    MAPS,
     BlockDifference,
     CommonFit,
+    MapDifference,
+    Reasons,
     common_fit_p,
     compare_blocks,
     compare_maps,
     reasons_of_change,
 )
+from pchem_pipeline.model.checks.settings import allowed
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
-from pchem_pipeline.report.comparison import ArrayRow, Comparison, Pair, RunFacts, by_change
+from pchem_pipeline.report.comparison import (
+    ArrayRow,
+    Comparison,
+    HistoryRow,
+    Pair,
+    RunFacts,
+    by_change,
+)
 from pchem_pipeline.report.pages.compare import (
     COMPARE_JSON,
     COMPARE_PAGE,
+    lines_of,
     render_comparison,
-    sentence_of,
 )
-from pchem_pipeline.report.style.wording import count, measured, p_value_text, short, signed, symbol
+from pchem_pipeline.report.style.wording import count, measured, p_value_text, short, symbol
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.stages.report.report import draw_and_say
 from pchem_pipeline.store.files import write_atomic
+from pchem_pipeline.store.remote_path import place_of
 from pchem_pipeline.store.run_store import RunStore
-
-#: The maps that are compared.
-MAPS = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)
 
 _ENSEMBLE = (
     "dn",
@@ -63,9 +83,14 @@ def compare_runs(
     tolerance: float = 1e-12,
     labels: Sequence[str] = (),
     rate: float = 0.01,
+    limits: Sequence[str] = (),
     progress: ProgressMode = "auto",
-) -> list[Path]:
-    """Compare runs with the first of them and write ``compare.html``, ``compare.json`` and ``history.csv``.
+    quiet: bool = False,
+    write: Callable[[str], None] = print,
+) -> None:
+    """Compare runs with the first of them, and the last with the one before it in the history.
+
+    Writes ``compare.html`` and ``compare.json``, and adds a line to ``history.csv`` for each new run.
 
     Args:
         paths: stores, or the YAML files that made them; two or more.
@@ -73,63 +98,128 @@ def compare_runs(
         tolerance: relative difference that counts as rounding, where the frames are the same.
         labels: of the runs, in their order, such as setpoints, which the history draws them against by the
             numbers that these begin with; none: the dates.
-        rate: false-discovery rate at which a pixel counts as moved since the first run.
+        rate: false-discovery rate at which a pixel counts as changed.
+        limits: ``name=value`` of the section ``compare``; they replace those of the first run.
         progress: auto | on | off.
-
-    Returns:
-        The files written, where nothing changed.
+        quiet: write nothing where nothing changed.
+        write: takes each line of what changed.
 
     Raises:
         ChangedError: something changed; the files are written all the same.
-        ConfigError: fewer than two runs.
+        ConfigError: fewer than two runs, or an option is wrong.
         StoreError: a run has no maps, or the folder cannot be written.
     """
-    reporter = Reporter(progress)
-    found = comparison_of(paths, tolerance, reporter, labels, rate)
+    reporter = Reporter(progress, quiet=quiet)
+    found, new = comparison_of(paths, folder, reporter, tolerance, labels, rate, limits)
     page, numbers = render_comparison(found, draw_and_say(reporter, "figures"))
-    files = {COMPARE_PAGE: page, COMPARE_JSON: numbers, "history.csv": history_csv(found.history)}
-    for name, text in files.items():
+    for name, text in ((COMPARE_PAGE, page), (COMPARE_JSON, numbers)):
         write_atomic(folder / name, text.encode())
+    if new:
+        append_history(folder / HISTORY, new)
+    if found.changed or not quiet:
+        for line in lines_of(found):
+            write(line)
     if found.changed:
-        raise ChangedError(f"{sentence_of(found)} See {folder / COMPARE_PAGE}")
-    reporter.info(sentence_of(found))
-    return [folder / name for name in files]
+        raise ChangedError(f"changed; see {(folder / COMPARE_PAGE).resolve()}")
 
 
 def comparison_of(
     paths: Sequence[Path],
-    tolerance: float,
+    folder: Path,
     reporter: Reporter,
+    tolerance: float = 1e-12,
     labels: Sequence[str] = (),
     rate: float = 0.01,
-) -> Comparison:
-    """Return how the runs differ from the first of them; see :func:`compare_runs`."""
+    limits: Sequence[str] = (),
+) -> tuple[Comparison, list[HistoryRow]]:
+    """Return how the runs differ, and lines that the history does not have yet; see :func:`compare_runs`."""
     if len(paths) < 2:
         raise ConfigError("compare: give two runs or more")
     if not 0 <= tolerance < 1:
         raise ConfigError(f"--tolerance {tolerance:g}: give a relative difference from 0 to below 1")
     if not 0.0 < rate < 1.0:
         raise ConfigError(f"--fdr {rate:g}: give a rate between 0 and 1, such as 0.01")
-    targets = [find_run(path) for path in paths]
-    stores = [with_maps(target.stored()) for target in targets]
-    for target, store in zip(targets, stores, strict=True):
-        warn_if_old(target, ("fit", "maps", "ensemble"), f"{store.path} is compared in its present state")
-    names = _told_apart([store.path for store in stores])
-    states = [PixelStates.of(store, target.config) for store, target in zip(stores, targets, strict=True)]
-    runs = list(map(_facts, _letters(len(names)), names, stores, states))
-    sides = list(zip(runs, targets, stores, states, strict=True))
-    pairs = [_pair(sides[0], side, tolerance, rate, reporter) for side in sides[1:]]
-    rows = history_rows(runs, stores, pairs, labels, states)
-    return Comparison(runs, pairs, tolerance, rows, bool(labels), rate)
+    if labels and len(labels) != len(paths):
+        raise ConfigError(
+            f"--label: {len(labels)} labels for {len(paths)} runs; give one per run, in the same order"
+        )
+    given = list(map(_side, paths))
+    first, last = given[0], given[-1]
+    between = partial(
+        _pair, tolerance=tolerance, rate=rate, limits=_limits(first.target, limits), reporter=reporter
+    )
+    kept = read_history(folder / HISTORY)
+    rows = {row["id"]: row for row in kept if row["reference"] == first.facts.identity}
+    before = _before(given, rows, folder, reporter)
+    sides = [*given[:-1], *([] if before is None or before in given else [before]), last]
+    names = _told_apart([side.store.path for side in sides])
+    for side, letter, name in zip(sides, _letters(len(sides)), names, strict=True):
+        side.facts = replace(side.facts, label=letter, name=name)
+    pairs = [between(first, side, "reference") for side in given[1:]]
+    new: dict[str, HistoryRow] = {}
+    for side, label, pair in zip(given, labels or [""] * len(given), [None, *pairs], strict=True):
+        row = history_row(side.facts, side.store, side.states, label, folder, pair)
+        there = rows.get(row["id"]) or new.setdefault(row["id"], row)
+        if label and there["label"] != row["label"]:
+            raise ConfigError(
+                f"--label {label}: this run is {there['label']} in {folder / HISTORY}; choose another "
+                "--output"
+            )
+    if before is not None:
+        pairs.append(between(before, last, "last run"))
+    history = [*rows.values(), *new.values()]
+    facts = [side.facts for side in sides]
+    return Comparison(facts, pairs, tolerance, history, rate), list(new.values())
+
+
+@dataclass(eq=False)
+class _Side:
+    """A run that is compared."""
+
+    target: Target
+    store: RunStore
+    states: PixelStates
+    facts: RunFacts
+
+
+def _limits(reference: Target, given: Sequence[str]) -> dict[str, float | str]:
+    """Return the limits of the section ``compare`` of the reference, and those that are given instead."""
+    values = {}
+    for text in given:
+        name, sign, value = (part.strip() for part in text.partition("="))
+        if not sign:
+            raise ConfigError(f"--limit {text}: write name=value, such as bias=0.5 or read_noise_e=5%")
+        values[name] = value
+    section = (reference.changed("compare", **values) if values else reference).config.compare
+    return section.model_dump(exclude_none=True)
+
+
+def _before(
+    given: Sequence[_Side], rows: Mapping[str, HistoryRow], folder: Path, reporter: Reporter
+) -> _Side | None:
+    """Return the run before the last one in the history; None where it is the reference, or gone."""
+    order = list(dict.fromkeys([*rows, *(side.facts.identity for side in given)]))
+    wanted = order[max(order.index(given[-1].facts.identity) - 1, 0)]
+    if wanted == order[0]:
+        return None
+    for side in given:
+        if side.facts.identity == wanted:
+            return side
+    place = rows[wanted]["run"]
+    with contextlib.suppress(ConfigError, StoreError):
+        side = _side(place_of(place, folder).resolve())
+        if side.facts.identity == wanted:
+            return side
+    reporter.info(
+        f"the last run in {folder / HISTORY}, {place}, is gone or another one: not compared with it"
+    )
+    return None
 
 
 def _letters(n: int) -> list[str]:
     """Return n labels: A to Z, then AA to AZ and so on."""
     singles = string.ascii_uppercase
     return [(singles[i // 26 - 1] if i >= 26 else "") + singles[i % 26] for i in range(n)]
-
-
-_Side = tuple[RunFacts, Target, RunStore, PixelStates]
 
 
 def _told_apart(paths: Sequence[Path]) -> list[str]:
@@ -142,20 +232,27 @@ def _told_apart(paths: Sequence[Path]) -> list[str]:
     return [path.name for path in paths]
 
 
-def _facts(label: str, name: str, store: RunStore, states: PixelStates) -> RunFacts:
+def _side(path: Path) -> _Side:
+    target = find_run(path)
+    store = with_maps(target.stored())
+    warn_if_old(target, ("fit", "maps", "ensemble"), f"{store.path} is compared in its present state")
+    states = PixelStates.of(store, target.config)
     sensor = SensorInfo.read(store)
     good, caution, none = (int((states.quality == grade).sum()) for grade in (GOOD, CAUTION, NO_VALUE))
-    return RunFacts(
-        label,
-        name,
+    digest = _data_digest(store, sensor)
+    facts = RunFacts(
+        "",
+        "",
         sensor.shape,
         sensor.n_frames if sensor.kind == "frames" else None,
-        _data_digest(store, sensor),
+        digest,
         {each: _median(content) for each, content in store.attributes("maps").get("summary", {}).items()},
         {each: store.read(f"ensemble/{each}") for each in _ENSEMBLE if store.has(f"ensemble/{each}")},
         dict(store.attributes("ensemble").get("rmse", {})),
         (good, caution, none),
+        identity_of(store, digest),
     )
+    return _Side(target, store, states, facts)
 
 
 def _median(content: dict[str, Any]) -> tuple[float, float, float]:
@@ -175,38 +272,59 @@ def _data_digest(store: RunStore, sensor: SensorInfo) -> str:
     return f"{sensor.identity.get('digest', '')} {taken} {sensor.n_frames} {sensor.shape}"
 
 
-def _pair(first: _Side, second: _Side, tolerance: float, rate: float, reporter: Reporter) -> Pair:
-    (one, one_target, one_store, before), (other, other_target, other_store, now) = first, second
+def _pair(
+    first: _Side,
+    second: _Side,
+    since: Literal["reference", "last run"],
+    *,
+    tolerance: float,
+    rate: float,
+    limits: Mapping[str, float | str],
+    reporter: Reporter,
+) -> Pair:
+    one, other, before, now = first.facts, second.facts, first.states, second.states
     same_data = one.digest == other.digest
-    confirm = None if same_data else _common_fit((one_target, one_store), (other_target, other_store))
-    maps: dict[str, Any] = {}
+    confirm = None if same_data else _common_fit(first, second)
+    maps: dict[str, MapDifference] = {}
     transitions: list[list[int]] = []
+    changed = compared = np.zeros(one.shape, np.bool_)
+    defects = now.changes_since(before, confirm)
     if one.shape == other.shape:
         grades = before.quality.ravel(), now.quality.ravel()
         transitions = np.histogram2d(*grades, bins=np.arange(4) - 0.5)[0].astype(int).tolist()
-        good = (before.quality == GOOD) & (now.quality == GOOD)
-        in_both = (name for name in MAPS if one_store.has(f"maps/{name}") and other_store.has(f"maps/{name}"))
-        read = ((name, _value(one_store, name), _value(other_store, name)) for name in in_both)
-        maps = compare_maps(read, good, same_data=same_data, rate=rate, confirm=confirm)
-    arrays = _compared_arrays(one_store, other_store, tolerance, reporter) if same_data else []
-    reasons = {} if same_data else {name: reasons_of_change(found) for name, found in maps.items()}
-    words = _words(one, other, arrays, maps, reasons)
-    defects = now.changes_since(before, confirm)
-    if defects:
-        counts = (f"{len(each):,} {change}" for change, each in by_change(defects).items() if each)
-        words.append(f"Defects: {', '.join(counts)}.")
-    return Pair(
-        one, other, same_data, arrays, maps, reasons, transitions,
-        settings_that_differ(one_target.config, other_target.config),
-        versions_that_differ(one_store, other_store),
-        bool(words), words, defects,
+        compared = (before.quality == GOOD) & (now.quality == GOOD)
+        stores = first.store, second.store
+        in_both = [name for name in MAPS if all(store.has(f"maps/{name}") for store in stores)]
+        if lacking := limits.keys() - {*in_both, "pixels"}:
+            raise ConfigError(
+                f"compare.{min(lacking)}: {one.name} or {other.name} has no such map; omit this limit"
+            )
+        read = ((name, _value(stores[0], name), _value(stores[1], name)) for name in in_both)
+        maps = compare_maps(read, compared, same_data=same_data, rate=rate, confirm=confirm, limits=limits)
+        judged = [name for name in maps if name in limits] or maps
+        changed = np.logical_or.reduce([maps[name].changed for name in judged])
+        changed[[each.y for each in defects], [each.x for each in defects]] = True
+        compared |= changed
+    arrays = _compared_arrays(first.store, second.store, tolerance, reporter) if same_data else []
+    reasons = {name: reasons_of_change(found) for name, found in maps.items() if limits or not same_data}
+    if limits:
+        reasons = {
+            name: replace(reasons[name], spread=False, pixels=False) for name in limits if name in reasons
+        }
+    pair = Pair(
+        one, other, since, same_data, arrays, maps, reasons, transitions,
+        settings_that_differ(first.target.config, second.target.config),
+        versions_that_differ(first.store, second.store),
+        defects=defects, n_changed=int(changed.sum()), n_compared=int(compared.sum()), limits=limits,
     )  # fmt: skip
+    words = _words(pair)
+    return replace(pair, changed=bool(words), changes=words)
 
 
-def _common_fit(*runs: tuple[Target, RunStore]) -> CommonFit | None:
+def _common_fit(*sides: _Side) -> CommonFit | None:
     """Return the test whether pixels of two runs are the same; None for fits of several exposures."""
-    stores = [store for _, store in runs]
-    sensors = [target.sensor(store) for target, store in runs]
+    stores = [side.store for side in sides]
+    sensors = [side.target.sensor(side.store) for side in sides]
     if any(sensor.samples or sensor.adc_limits != sensors[0].adc_limits for sensor in sensors):
         return None
     names = ("histogram/counts", "histogram/origin")
@@ -220,33 +338,45 @@ def _value(store: RunStore, name: str) -> tuple[FloatArray, FloatArray]:
     return store.read(f"maps/{name}"), store.read(f"maps/{name}_stderr")
 
 
-def _words(
-    one: RunFacts, other: RunFacts, arrays: Sequence[ArrayRow], maps: dict[str, Any], reasons: dict[str, Any]
-) -> list[str]:
+def _words(pair: Pair) -> list[str]:
     """Say what changed, one sentence each; nothing where nothing did."""
-    found = []
-    if one.shape != other.shape:
-        sizes = " and ".join(f"{ny} x {nx}" for ny, nx in (one.shape, other.shape))
+    found, limits = [], pair.limits
+    if pair.one.shape != pair.other.shape:
+        sizes = " and ".join(f"{ny} x {nx}" for ny, nx in (pair.one.shape, pair.other.shape))
         found.append(f"Different sensors: {sizes} pixels.")
-    counted = [row for row in arrays if row.counts and row.state in ("changed", "lost")]
-    found += [f"{row.name}: {_array_words(row)}." for row in counted]
-    for name, why in reasons.items():
-        text = []
-        if why.shifted:
-            each = maps[name]
-            median = measured(each.median, each.median_stderr, symbol(name)[2])
-            text.append(f"median changed by {median} ({signed(each.median_z)} sigma of one pixel)")
-        if why.spread:
-            text.append(f"scatter {short(maps[name].spread_z, 2)} sigma")
-        if why.pixels:
-            text.append(
-                f"{count(maps[name].n_changed, 'pixel')} changed, {p_value_text(maps[name].p_value)} "
-                "over all pixels and maps"
-            )
-        if text:
+    elif not any(each.n_counted for each in pair.maps.values()):
+        found.append("No pixel has a good fit in both runs.")
+    if not limits:
+        counted = [row for row in pair.arrays if row.counts and row.state in ("changed", "lost")]
+        found += [f"{row.name}: {_array_words(row)}." for row in counted]
+    for name, why in pair.reasons.items():
+        if why:
             sign = f"{symbol(name)[1]}{' (DN)' if name == 'read_noise_dn' else ''}"
-            found.append(f"{sign[0].upper()}{sign[1:]}: {', '.join(text)}.")
+            text = _map_words(pair.maps[name], why, limits.get(name), symbol(name)[2])
+            found.append(f"{sign[0].upper()}{sign[1:]}: {text}.")
+    changes = {change: len(each) for change, each in by_change(pair.defects).items() if each}
+    defects = ", ".join(f"{n:,} {change}" for change, n in changes.items())
+    if limits and pair.n_changed > allowed(most := limits.get("pixels", math.inf), pair.n_compared):
+        beside = f" (defects: {defects})" if defects else ""
+        pixels = f"{pair.n_changed:,} of {pair.n_compared:,} changed{beside}"
+        found.append(f"Pixels: {pixels}, limit {_limit_words(most, '')}.")
+    elif defects and not limits:
+        found.append(f"Defects: {defects}.")
     return found
+
+
+def _limit_words(limit: float | str, unit: str) -> str:
+    return limit if isinstance(limit, str) else f"{limit:g} {unit}".strip()
+
+
+def _map_words(each: MapDifference, why: Reasons, limit: float | str | None, unit: str) -> str:
+    if why.shifted:
+        words = f"median changed by {measured(each.median, each.median_stderr, unit)}"
+        return words if limit is None else f"{words}, limit {_limit_words(limit, unit)}"
+    text = [f"scatter {short(each.spread_z, 2)} sigma"] if why.spread else []
+    if why.pixels:
+        text.append(f"{count(each.n_changed, 'pixel')} changed, {p_value_text(each.p_value)}")
+    return ", ".join(text)
 
 
 def _array_words(row: ArrayRow) -> str:

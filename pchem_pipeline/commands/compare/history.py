@@ -1,13 +1,17 @@
-"""Runs of one camera over time: what each found, and which pixels moved since the first."""
+"""Runs of one camera over time: a line for each, with what it found and which pixels changed."""
 
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
+import os
 import re
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,71 +19,124 @@ from numpy.typing import NDArray
 from scipy.special import erfc
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.base.variables import VARIABLES
 from pchem_pipeline.frames.camera import CameraFacts
-from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
+from pchem_pipeline.model.checks.run_differences import LIMIT, MAPS, CommonFit
 from pchem_pipeline.model.fit.status import FitStatus, words_of
 from pchem_pipeline.model.maps.defects import FAULTS, Defect
-from pchem_pipeline.model.maps.maps import GOOD
 from pchem_pipeline.report.comparison import DefectChange, HistoryRow, Pair, RunFacts, by_change
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.defects import stored_defects
-from pchem_pipeline.store.files import read_json
+from pchem_pipeline.store.files import read_json, write_atomic
+from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
 
+HISTORY = "history.csv"
 
-def history_rows(
-    runs: Sequence[RunFacts],
-    stores: Sequence[RunStore],
-    pairs: Sequence[Pair],
-    labels: Sequence[str],
-    states: Sequence[PixelStates],
-) -> list[HistoryRow]:
-    """Return a row for each run, in the order given.
+_NAMES = [name.removeprefix("maps/") for name in VARIABLES if name.startswith("maps/")]
+#: Maps whose medians are kept: those with a standard error.
+_MEDIANS = tuple(name for name in _NAMES if f"{name}_stderr" in _NAMES)
+
+
+def identity_of(store: RunStore, digest: str) -> str:
+    """Return what tells one run from another: its frames, and how they were characterised."""
+    record = store.records.read("maps")
+    return hashlib.sha256(f"{digest} {record and record.fingerprint}".encode()).hexdigest()[:12]
+
+
+def history_row(
+    run: RunFacts, store: RunStore, states: PixelStates, label: str, folder: Path, pair: Pair | None
+) -> HistoryRow:
+    """Return the line of a run in the history.
 
     Args:
-        runs: the runs.
-        stores: of them.
-        pairs: the first with each of the others.
-        labels: of the runs; none: their dates.
-        states: of the pixels of each run.
+        run: the run.
+        store: of it.
+        states: of its pixels.
+        label: of the run; empty: its date.
+        folder: of the history.
+        pair: how it differs from the reference; None: it is the reference.
+    """
+    camera = SensorInfo.read(store).camera
+    date = _date(store, camera)
+    version = model_of(store, "fit")
+    path = str(store.path)
+    if not isinstance(store.path, RemotePath):
+        path = os.path.relpath(store.path.resolve(), folder.resolve())
+    row: dict[str, object] = {
+        "label": _cell(label or date),
+        "date": date,
+        "temperature": "" if camera.temperature is None else f"{camera.temperature:.6g}",
+        "run": _cell(path),
+        "frames": run.n_frames or "",
+    }
+    row |= dict(zip(("pixels_good", "pixels_caution", "pixels_no_value"), run.pixels, strict=True))
+    row |= {f"{kind}_pixels": n for kind, n in states.defects().items()}
+    for kind, changes in by_change(() if pair is None else pair.defects).items():
+        row[f"defects_{kind.replace(' ', '_')}"] = " ".join(f"{each.y}/{each.x}" for each in changes)
+    for name in _MEDIANS:
+        values = run.summary.get(name, (float("nan"),) * 3)
+        for part, value in zip(("median", "median_stderr", "scatter"), values, strict=True):
+            row[f"{name}_{part}"] = "" if value != value else f"{value:.9g}"
+    moved = {} if pair is None else {name: each.n_changed for name, each in pair.maps.items()}
+    row |= {f"{name}_moved": moved.get(name, "") for name in MAPS}
+    row |= {
+        "moved_pixels": "" if pair is None else pair.n_changed,
+        "compared_pixels": "" if pair is None else pair.n_compared,
+        "effects": "" if version is None else " ".join(effect.tag for effect in version.effects),
+    }
+    row |= {f"flag_{name}": n for name, n in states.flags().items()}
+    row |= {"id": run.identity, "reference": run.identity if pair is None else pair.one.identity}
+    return {name: str(value) for name, value in row.items()}
+
+
+def read_history(path: Path) -> list[HistoryRow]:
+    """Return the lines of a history, none where there is no file.
 
     Raises:
-        ConfigError: there are labels, but not one for each run.
+        StoreError: it is no history, or a line is damaged.
     """
-    if labels and len(labels) != len(runs):
-        raise ConfigError(
-            f"--label: {len(labels)} labels for {len(runs)} runs; give one per run, in the same order"
-        )
-    rows = []
-    for i, (run, store) in enumerate(zip(runs, stores, strict=True)):
-        moved, any_moved, compared = _moved(pairs[i - 1], states[0], states[i]) if i else ({}, 0, 0)
-        camera = SensorInfo.read(store).camera
-        date = _date(store, camera)
-        label = labels[i] if labels else date
-        days = datetime.fromisoformat(date).timestamp() / 86400.0 if date else float("nan")
-        version = model_of(store, "fit")
-        rows.append(
-            HistoryRow(
-                label,
-                date,
-                camera.temperature,
-                _number(label) if labels else days,
-                run,
-                states[i].defects(),
-                pairs[i - 1].defects if i else (),
-                states[i].flags(),
-                () if version is None else tuple(effect.tag for effect in version.effects),
-                moved,
-                any_moved,
-                compared,
-            )
-        )
+    try:
+        lines = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""), restval="")
+        # a column that an earlier version did not have is empty
+        rows: list[HistoryRow] = [defaultdict(str, row) for row in lines]
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise StoreError(f"{path}: cannot be read ({error}); move it away") from error
+    if not {"id", "reference", "run", "date", "label"} <= set(lines.fieldnames or ()):
+        raise StoreError(f"{path} is no history of this version; move it away or choose another --output")
+    for number, row in enumerate(rows, 2):
+        try:
+            datetime.fromisoformat(row["date"] or "2000-01-01")
+            for name, text in row.items():
+                if name.startswith(_MEDIANS) or name.endswith("_pixels") or name.startswith("pixels_"):
+                    float(text or 0)
+        except (ValueError, AttributeError, TypeError) as error:
+            raise StoreError(f"{path}, row {number}: damaged ({error}); correct or delete it") from error
     return rows
+
+
+def append_history(path: Path, rows: Sequence[HistoryRow]) -> None:
+    """Add lines to a history; those that are there stay as they are.
+
+    Raises:
+        StoreError: the file cannot be written.
+    """
+    old = path.read_bytes() if path.exists() else b""
+    columns = list((read_history(path) or rows)[0])
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
+    if not old:
+        writer.writeheader()
+    writer.writerows(rows)
+    end = b"\n" if old and not old.endswith(b"\n") else b""
+    write_atomic(path, old + end + text.getvalue().encode())
 
 
 def _date(store: RunStore, camera: CameraFacts) -> str:
@@ -93,12 +150,6 @@ def _date(store: RunStore, camera: CameraFacts) -> str:
         return datetime.fromtimestamp(min(known) / 1e9, UTC).isoformat(timespec="seconds")
     record = store.records.read("ingest")
     return "" if record is None else record.started
-
-
-def _number(label: str) -> float:
-    """Return the number that a label begins with; NaN where it begins with none."""
-    match = re.match(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)", label)
-    return float(match[1]) if match else float("nan")
 
 
 @dataclass(frozen=True)
@@ -161,52 +212,6 @@ def _near(one: tuple[FloatArray, FloatArray], other: tuple[FloatArray, FloatArra
     """Return which values agree within their errors, as far as these are known."""
     error = np.hypot(np.nan_to_num(one[1]), np.nan_to_num(other[1]))
     return np.asarray(np.abs(one[0] - other[0]) <= LIMIT * error)
-
-
-def _moved(pair: Pair, one: PixelStates, other: PixelStates) -> tuple[dict[str, int], int, int]:
-    """Return the pixels whose parameters moved: of each map, of any, and how many were compared."""
-    if pair.same_data or not pair.maps:
-        return {}, 0, 0
-    good = (one.quality == GOOD) & (other.quality == GOOD)
-    any_moved = np.logical_or.reduce([each.changed for each in pair.maps.values()])
-    return {name: each.n_changed for name, each in pair.maps.items()}, int(any_moved.sum()), int(good.sum())
-
-
-def history_csv(rows: Sequence[HistoryRow]) -> str:
-    """Return the history as CSV: a line of headings, and a line for each run."""
-    maps = list(dict.fromkeys(name for row in rows for name in row.run.summary))
-    moved = list(dict.fromkeys(name for row in rows for name in row.moved))
-    text = io.StringIO()
-    lines = [_csv_line(row, maps, moved) for row in rows]
-    writer = csv.DictWriter(text, list(lines[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    return text.getvalue()
-
-
-def _csv_line(row: HistoryRow, maps: Sequence[str], moved: Sequence[str]) -> dict[str, object]:
-    found: dict[str, object] = {
-        "label": _cell(row.label),
-        "date": row.date,
-        "temperature": "" if row.temperature is None else f"{row.temperature:.6g}",
-        "run": _cell(row.run.name),
-        "frames": row.run.n_frames or "",
-    }
-    found |= dict(zip(("pixels_good", "pixels_caution", "pixels_no_value"), row.run.pixels, strict=True))
-    found |= {f"{kind}_pixels": n for kind, n in row.defects.items()}
-    for kind, changes in by_change(row.defects_changed).items():
-        found[f"defects_{kind.replace(' ', '_')}"] = " ".join(f"{each.y}/{each.x}" for each in changes)
-    for name in maps:
-        values = row.run.summary.get(name, (float("nan"),) * 3)
-        for part, value in zip(("median", "median_stderr", "scatter"), values, strict=True):
-            found[f"{name}_{part}"] = "" if value != value else f"{value:.9g}"
-    found |= {f"{name}_moved": row.moved.get(name, "") for name in moved}
-    found |= {
-        "moved_pixels": row.any_moved,
-        "compared_pixels": row.compared,
-        "effects": " ".join(row.effects),
-    }
-    return found | {f"flag_{name}": n for name, n in row.flags.items()}
 
 
 def _cell(text: str) -> str:

@@ -8,7 +8,7 @@ the likelihood is not quadratic, a few estimates in 10,000 are many of their own
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, erfc
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.model.checks.multiple_testing import false_discovery
+from pchem_pipeline.model.checks.settings import allowed
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.maps.maps import summarise
 
+#: The maps that are compared.
+MAPS = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)
 #: Standard errors beyond which a single pixel, or a statistic of all pixels, counts as changed.
 LIMIT = 5.0
 #: By how much the standard errors of the fits themselves may be wrong.
@@ -90,9 +94,12 @@ class MapDifference:
     Attributes:
         difference: other minus one, in the unit of the map, shape (ny, nx); NaN where either has no value.
         z: the same in standard errors.
-        median: median of the difference.
+        median: median of the difference over the pixels that count.
         median_stderr: its standard error.
-        median_z: median of ``z`` over the pixels that count.
+        median_z: median of ``z`` over them.
+        limit: change that is allowed, in the unit of the map; 0: none.
+        margin: the same in standard errors, (ny, nx).
+        beyond_z: median of ``z`` less the margin, towards where the values moved.
         spread_z: robust standard deviation of ``z`` over them; 1 where chance alone acts.
         n_counted: pixels that count: good fits in both.
         largest_z: largest absolute value of ``z`` among them.
@@ -107,6 +114,9 @@ class MapDifference:
     median: float
     median_stderr: float
     median_z: float
+    limit: float
+    margin: FloatArray
+    beyond_z: float
     spread_z: float
     n_counted: int
     largest_z: float
@@ -128,12 +138,14 @@ def compare_maps(
     same_data: bool,
     rate: float = 0.01,
     confirm: CommonFit | None = None,
+    limits: Mapping[str, float | str | None] | None = None,
 ) -> dict[str, MapDifference]:
     """Compare the maps of two runs.
 
-    A pixel changed where its ``z`` is significant at a false-discovery rate (Benjamini and Hochberg 1995)
-    among all pixels of all maps together. Where nothing changed, a pixel is found with at most that
-    probability: standard errors a tenth too small, and the tails of fits, are allowed for.
+    A pixel changed where its ``z`` is significantly beyond the limit, at a false-discovery rate (Benjamini
+    and Hochberg 1995) among the pixels of its map, with Bonferroni's factor for the number of maps. Where
+    nothing changed, a pixel is found with at most that probability: standard errors a tenth too small, and
+    the tails of fits, are allowed for.
 
     Args:
         maps: name of each, and its values and standard errors in either run, (ny, nx); NaN: no value.
@@ -143,12 +155,17 @@ def compare_maps(
         rate: share of the changed pixels that may be due to chance.
         confirm: p-values of pixels for a common fit of both runs, which those that stand out must pass, too;
             None: not known.
+        limits: change of a map that is allowed, absolute or in per cent of the median of one.
     """
-    found = {name: _difference(one, other, good, same_data=same_data) for name, one, other in maps}
+    found = {
+        name: _difference(one, other, good, (limits or {}).get(name), same_data=same_data)
+        for name, one, other in maps
+    }
     tested = sum(each.n_counted for each in found.values())
     places, likely = [], []
     for each in found.values():
-        probability = np.where(good, erfc(np.abs(each.z) / ((1.0 + _TRUST) * np.sqrt(2.0))), np.nan)
+        beyond = np.maximum(np.abs(each.z) - each.margin, 0.0)
+        probability = np.where(good, erfc(beyond / ((1.0 + _TRUST) * np.sqrt(2.0))), np.nan)
         places.append(np.nonzero(probability <= rate))  # the others are not significant in any company
         likely.append(probability[places[-1]])
     q = _q_values(likely, tested)
@@ -166,10 +183,11 @@ def compare_maps(
 
 
 def _q_values(likely: Sequence[FloatArray], tested: int) -> list[FloatArray]:
-    """Return the q-values of the smallest p-values of some maps, out of all that were tested."""
-    few = np.concatenate([*likely, np.empty(0)])
-    q = false_discovery(few * (tested / max(few.size, 1)))
-    return np.split(q, np.cumsum([each.size for each in likely]))[: len(likely)]
+    """Return the q-values of the smallest p-values of each map, out of all that were tested.
+
+    Map by map: where one has changed throughout, no pixel of another is let through in its company.
+    """
+    return [false_discovery(few * (tested / max(few.size, 1))) for few in likely]
 
 
 def _with_changed(found: MapDifference, place: Any, q: FloatArray, rate: float) -> MapDifference:
@@ -211,20 +229,32 @@ def common_fit_p(
 
 
 def _difference(
-    one: ValuesAndErrors, other: ValuesAndErrors, good: BoolArray, *, same_data: bool
+    one: ValuesAndErrors,
+    other: ValuesAndErrors,
+    good: BoolArray,
+    limit: float | str | None,
+    *,
+    same_data: bool,
 ) -> MapDifference:
     difference = other[0] - one[0]
     with np.errstate(invalid="ignore", divide="ignore"):
         unit = np.sqrt((one[1] ** 2 + other[1] ** 2) / (2.0 if same_data else 1.0))
         z = np.where(unit > 0, difference / unit, np.nan)
-    counted = z[good & np.isfinite(z)]
-    whole, core = summarise(difference), summarise(counted)
+        counts = good & np.isfinite(z)
+        most = allowed(limit, summarise(one[0][counts]).median)
+        margin = np.where(unit > 0, most / unit, np.nan)
+    counted, core = z[counts], summarise(z[counts])
+    whole = summarise(difference[counts])
+    beyond = summarise(np.sign(core.median) * counted - margin[counts]).median
     return MapDifference(
         difference=difference,
         z=z,
         median=whole.median,
         median_stderr=whole.median_stderr,
         median_z=core.median,
+        limit=most,
+        margin=margin,
+        beyond_z=beyond,
         spread_z=core.robust_sd,
         n_counted=counted.size,
         largest_z=float(np.max(np.abs(counted), initial=0.0)),
@@ -236,7 +266,7 @@ class Reasons:
     """Why two measurements of a map differ by more than chance; all False where they do not.
 
     Attributes:
-        shifted: the median of ``z`` is not 0.
+        shifted: the median is beyond the limit.
         spread: ``z`` scatters more than its standard errors allow.
         pixels: single pixels changed.
     """
@@ -253,9 +283,9 @@ class Reasons:
 def reasons_of_change(found: MapDifference) -> Reasons:
     """Judge two independent measurements of a map.
 
-    Under the null ``z`` is N(0, 1): its median has standard error ``sqrt(pi / 2 n)``, its robust standard
-    deviation ``1.166 / sqrt(n)`` (Maronna et al., *Robust Statistics*, 2019, Sec. 2.5), to which a tenth is
-    added since the standard errors are estimates.
+    Where all values moved by just the limit, ``z`` less the limit is N(0, 1): its median has standard error
+    ``sqrt(pi / 2 n)``, its robust standard deviation ``1.166 / sqrt(n)`` (Maronna et al., *Robust
+    Statistics*, 2019, Sec. 2.5), to which a tenth is added since the standard errors are estimates.
 
     Args:
         found: of two runs on different frames.
@@ -264,7 +294,7 @@ def reasons_of_change(found: MapDifference) -> Reasons:
     if n < 2:
         return Reasons(False, False, False)
     return Reasons(
-        shifted=bool(abs(found.median_z) > LIMIT * np.sqrt(np.pi / (2.0 * n))),
+        shifted=bool(found.beyond_z > LIMIT * np.sqrt(np.pi / (2.0 * n))),
         spread=bool(found.spread_z > 1.0 + _TRUST + LIMIT * 1.166 / np.sqrt(n)),
         pixels=found.n_changed > 0,
     )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -71,7 +73,7 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
     )
     title = f"{label}: {pair.other.label} − {pair.one.label}"
     return Figure(
-        f"difference_{name}_{pair.other.label}",
+        f"difference_{name}_{pair.key}",
         "",
         f"{label[0].upper()}{label[1:]}",
         f"{pair.other.label} − {pair.one.label}, in standard errors of each pixel. {caption}",
@@ -214,12 +216,14 @@ _LETTERS, _MOST_TICKS = 48, 12
 _SHORTEST = 0.04
 
 
-def history_figures(rows: Sequence[HistoryRow], labelled: bool) -> Iterator[Figure]:
+def history_figures(rows: Sequence[HistoryRow]) -> Iterator[Figure]:
     """Return the medians of the maps of each run, by labels or dates; none for fewer than two runs."""
-    shown = [name for name in _SHOWN if all(name in row.run.summary for row in rows)]
+    parts = {"median": "median", "standard error": "median_stderr", "scatter": "scatter"}
+    shown = [name for name in _SHOWN if any(row[f"{name}_median"] for row in rows)]
     if len(rows) < 2 or not shown:
         return
-    places = np.array([row.place for row in rows])
+    labelled = all(row["label"] != row["date"] for row in rows)
+    places = np.array([_place(row, labelled) for row in rows])
     ordered = bool(np.isfinite(places).all() and np.unique(places).size > 1)
     by_date = ordered and not labelled
     if by_date and np.ptp(places) < _SHORTEST:  # runs within an hour are drawn in their order
@@ -228,40 +232,46 @@ def history_figures(rows: Sequence[HistoryRow], labelled: bool) -> Iterator[Figu
     axis = "days since the first" if by_date else "label" if ordered else "run"
     heads = ("run", "label") if by_date else ("name", "text")
     columns: dict[str, Any] = {
-        heads[0]: [row.run.name for row in rows],
-        heads[1]: [row.label for row in rows],
+        heads[0]: [row["run"] for row in rows],
+        heads[1]: [row["label"] for row in rows],
     }
     columns[axis] = at
     units = {}
     for name in shown:
-        for part, key in enumerate(("median", "standard error", "scatter")):
-            heading = f"{name} {key}"
-            columns[heading] = [row.run.summary[name][part] for row in rows]
-            units[heading] = symbol(name)[2].replace("e⁻", "e-")
+        for words, part in parts.items():
+            columns[f"{name} {words}"] = [float(row[f"{name}_{part}"] or "nan") for row in rows]
+            units[f"{name} {words}"] = symbol(name)[2].replace("e⁻", "e-")
     table = DataTable(columns, units)
-    first, last = rows[0], rows[-1]
     words = "; ".join(
-        f"{symbol(name)[1]} from {short(first.run.summary[name][0])} to {short(last.run.summary[name][0])} "
-        f"{symbol(name)[2]}"
+        f"{symbol(name)[1]} from {short(medians[0])} to {short(medians[-1])} {symbol(name)[2]}"
         for name in shown
+        for medians in [columns[f"{name} median"]]
     )
     yield Figure(
         "history",
         "",
         "The camera over time",
         "Medians of the maps with their standard errors; band: scatter of the pixels.",
-        f"From {first.label} to {last.label}: {words}.",
+        f"From {rows[0]['label']} to {rows[-1]['label']}: {words}.",
         (table,),
         _history_chart(table, tuple(shown), axis, () if ordered else _labels(rows)),
         PAGE_MM,
     )
 
 
+def _place(row: HistoryRow, labelled: bool) -> float:
+    """Return the number that the label of a run begins with, or its days since 1970; NaN for neither."""
+    if labelled:
+        match = re.match(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)", row["label"])
+        return float(match[1]) if match else float("nan")
+    return datetime.fromisoformat(row["date"]).timestamp() / 86400.0 if row["date"] else float("nan")
+
+
 def _labels(rows: Sequence[HistoryRow]) -> tuple[tuple[float, str], ...]:
-    """Return a tick for each run in its order, by its label where there is room, else by its letter."""
-    texts = [row.label for row in rows]
+    """Return a tick for each run in its order, by its label where there is room, else by its number."""
+    texts = [row["label"] for row in rows]
     if sum(map(len, texts)) > _LETTERS:
-        texts = [row.run.label for row in rows]
+        texts = [str(i + 1) for i in range(len(rows))]
     every = -(-len(rows) // _MOST_TICKS)
     return tuple((float(i), texts[i]) for i in range(0, len(rows), every))
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pchem_pipeline.base.plain import plain
+from pchem_pipeline.model.checks.run_differences import MAPS
+from pchem_pipeline.model.fit.status import words_of
+from pchem_pipeline.model.maps.defects import FAULTS
 from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting, by_change
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
@@ -38,48 +41,54 @@ _MOST_PLACES, _MOST_PIXELS = 8, 100
 _MOST_DRAWN = 8
 
 
+def lines_of(found: Comparison) -> list[str]:
+    """Return what changed, a line each below a heading for each pair; ``no change`` where nothing did."""
+    same = "no change beyond the limits" if found.pairs[0].limits else "no change"
+    if not found.changed:
+        return [same]
+    lines = []
+    for pair in found.pairs:
+        head = f"{pair.other.name} since the {pair.since} {pair.one.name}:"
+        lines += [head, *(f"  {each}" for each in _shown(pair))] if pair.changed else [f"{head} {same}"]
+    return lines
+
+
 def sentence_of(found: Comparison) -> str:
-    """Return what came out, in one sentence or one for each pair."""
+    """Return what came out, in one sentence."""
     if len(found.pairs) == 1:
         return _pair_sentence(found.pairs[0], found.tolerance)
-    changed = [f"{pair.other.label} ({_first_change(pair)})" for pair in found.pairs if pair.changed]
+    changed, same = (
+        ", ".join(f"{pair.other.label} since {pair.one.label}" for pair in found.pairs if pair.changed is how)
+        for how in (True, False)
+    )
     if not changed:
-        return f"None of the {len(found.pairs)} runs differs from {found.runs[0].title}."
-    same = [pair.other.label for pair in found.pairs if not pair.changed]
-    rest = f"; no difference in {', '.join(same)}" if same else ""
-    return f"Differs from {found.runs[0].title}: {', '.join(changed)}{rest}."
+        return f"No change: {same}."
+    return f"Changed: {changed}." + (f" No change: {same}." if same else "")
 
 
-def _first_change(pair: Pair) -> str:
-    more = "" if len(pair.changes) == 1 else f", and {len(pair.changes) - 1} more"
-    return f"{pair.changes[0].rstrip('.')}{more}"
+def _shown(pair: Pair) -> list[str]:
+    """Return what changed, as many sentences as are shown."""
+    more = len(pair.changes) - _MOST_WORDS
+    rest = [f"And {more} more; see {COMPARE_JSON}."] if more > 0 else []
+    return [*pair.changes[:_MOST_WORDS], *rest]
 
 
 def _pair_sentence(pair: Pair, tolerance: float) -> str:
     if pair.changed:
-        first = f"{pair.other.title} differs from {pair.one.title}: {_first_change(pair)}."
-        return f"{first}{_largest_text(pair)}"
+        return f"{pair.other.title} differs from {pair.one.title}."
+    both = f"{pair.other.title} and {pair.one.title}"
+    if pair.limits:
+        return f"Of {both}, all that has a limit is within it: {', '.join(pair.limits)}."
     if not pair.same_data:
-        n = max((each.n_counted for each in pair.maps.values()), default=0)
-        both = f"{pair.other.title} and {pair.one.title} (different frames)"
-        if n == 0:
-            return f"Nothing can be compared: no pixel has a good fit in both {both}."
-        pixels = count(n, "pixel")
-        return f"Nothing changed: all maps of {both} agree within their standard errors in {pixels}."
+        pixels = count(pair.n_compared, "pixel")
+        return (
+            f"Nothing changed: in {pixels} all maps of {both} (different frames) agree within their errors."
+        )
     rows = [row for row in pair.arrays if row.counts and row.state in ("identical", "equal")]
     values = sum(row.n_values for row in rows)
     inexact = sum(row.state == "equal" for row in rows)
     what = "are bit-identical" if not inexact else f"are equal ({inexact} arrays within {tolerance:g})"
     return f"Nothing changed: {count(len(rows), 'array')} with {values:,} values {what}."
-
-
-def _largest_text(pair: Pair) -> str:
-    """Return the largest change of a good pixel between maps of the same frames, in sigma."""
-    counted = {name: each for name, each in pair.maps.items() if each.n_counted}
-    if not pair.same_data or not counted:
-        return ""
-    name, most = max(counted.items(), key=lambda item: item[1].largest_z)
-    return f" Largest change of a good pixel: {short(most.largest_z, 2)} sigma ({symbol(name)[1]})."
 
 
 def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[str, str]:
@@ -90,16 +99,16 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
         draw: draws all figures at once; None: one after the other, here.
     """
     many = len(found.pairs) > _MOST_DRAWN
-    maps = {pair.other.label: [] if many else difference_figures(pair) for pair in found.pairs}
+    maps = {pair.key: [] if many else difference_figures(pair) for pair in found.pairs}
     whole = list(ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]]))
-    times = list(history_figures(found.history, found.labelled))
+    times = list(history_figures(found.history))
     every = [*whole, *times, *(each for figures in maps.values() for each in figures)]
     drawn = (draw or draw_here)(every)
 
     sections = [
         Section(id="verdict", title="Result", verdict=_finding(found.changed, sentence_of(found))),
         Section(id="history", title="History", figures=times, tables=[history_table(found)]),
-        *(_pair_section(pair, found, maps[pair.other.label]) for pair in found.pairs),
+        *(_pair_section(pair, found, maps[pair.key]) for pair in found.pairs),
         *([Section(id="ensemble", title="Ensembles", figures=whole)] if whole else []),
         Section(id="all-runs", title="Runs", tables=[run_table(found)]),
     ]
@@ -110,20 +119,18 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
 def _finding(changed: bool, sentence: str, changes: Sequence[str] = ()) -> Finding:
     level: Level = "caution" if changed else "good"
     remarks = [Flag(level, text) for text in changes]
-    name = "Changed" if changed else "Nothing changed"
+    name = "Changed" if changed else "No change"
     return Finding(level, name, sentence.replace(" -", " −"), remarks=remarks)
 
 
 def _pair_section(pair: Pair, found: Comparison, figures: Sequence[Figure]) -> Section:
-    more = len(pair.changes) - _MOST_WORDS
-    words = (*pair.changes[:_MOST_WORDS], *((f"And {more} more; see compare.json.",) if more > 0 else ()))
     # of a single pair it is said above
     sentence = _pair_sentence(pair, found.tolerance) if len(found.pairs) > 1 else ""
     tables = pair_tables(pair)
     return Section(
-        id=f"pair-{pair.other.label}",
-        title=f"{pair.other.title} against {pair.one.title}",
-        verdict=_finding(pair.changed, sentence, words),
+        id=f"pair-{pair.key}",
+        title=f"{pair.other.title} since the {pair.since} {pair.one.title}",
+        verdict=_finding(pair.changed, sentence, _shown(pair)),
         first=tables[:1],
         figures=figures,
         tables=tables[1:],
@@ -160,10 +167,12 @@ _MEDIAN = ("median", "median_stderr", "robust_sd")
 
 
 def _pair_numbers(pair: Pair) -> dict[str, Any]:
-    skipped = ("difference", "z", "changed")
+    skipped = ("difference", "z", "margin", "changed")
     return {
         "reference": pair.one.label,
         "run": pair.other.label,
+        "since": pair.since,
+        "limits": pair.limits,
         "same_data": pair.same_data,
         "changed": pair.changed,
         "what": list(pair.changes),
@@ -172,6 +181,7 @@ def _pair_numbers(pair: Pair) -> dict[str, Any]:
             | ({"reasons": vars(pair.reasons[name])} if name in pair.reasons else {})
             for name, each in pair.maps.items()
         },
+        "pixels": {"changed": pair.n_changed, "compared": pair.n_compared},
         "quality_transitions": pair.transitions,
         "defects": {
             **{change.replace(" ", "_"): len(each) for change, each in by_change(pair.defects).items()},
@@ -190,40 +200,45 @@ def history_table(found: Comparison) -> Table:
     """Return a row for each run: pixels, flags, effects, and what moved since the first."""
     rows = []
     for row in found.history:
-        flagged = {name.replace("_", " "): n for name, n in row.flags.items() if n}
-        moved = {symbol(name)[1]: n for name, n in row.moved.items() if n}
+        flags = {name[5:].replace("_", " "): n for name, n in row.items() if name.startswith("flag_")}
+        moved = {symbol(name)[1]: row[f"{name}_moved"] for name in MAPS}
         rows.append(
             {
-                "label": row.run.label if row.label == row.date else row.label,
-                "date": row.date[:16].replace("T", " "),
-                "°C": "" if row.temperature is None else f"{row.temperature:.4g}",
-                "run": row.run.title,
-                "good pixels": f"{row.run.pixels[0]:,}",
+                "label": "" if row["label"] == row["date"] else row["label"],
+                "date": row["date"][:16].replace("T", " "),
+                "°C": row["temperature"],
+                "run": row["run"],
+                "good pixels": row["pixels_good"],
                 "defects": _defect_words(row),
-                "flags": ", ".join(f"{name}: {n:,}" for name, n in flagged.items()) or "none",
-                "effects": ", ".join(row.effects) or "none",
-                "changed": f"{row.any_moved:,} of {row.compared:,}" if row.compared else "",
-                "in": ", ".join(f"{name} {n:,}" for name, n in moved.items()),
+                "flags": _numbers_that_are_not_0(flags) or "none",
+                "effects": row["effects"].replace(" ", ", ") or "none",
+                "changed": row["moved_pixels"] and f"{row['moved_pixels']} of {row['compared_pixels']}",
+                "in": _numbers_that_are_not_0(moved),
             }
         )
     return Table(
         "history-runs",
         "Run by run",
-        "Changed: pixels with a good fit in both runs whose value differs significantly from the first run "
-        f"(false-discovery rate {found.rate:g} over all pixels and maps). All medians: history.csv, one line "
-        "per run.",
+        "Changed: pixels with other defects, or with a good fit in both runs and a value that differs from "
+        f"the first run significantly (false-discovery rate {found.rate:g}) and by more than its limit. All "
+        "medians: history.csv, one line per run.",
         rows,
     )
 
 
+def _numbers_that_are_not_0(numbers: Mapping[str, str]) -> str:
+    return ", ".join(f"{name}: {n}" for name, n in numbers.items() if n not in ("", "0"))
+
+
 def _defect_words(row: HistoryRow) -> str:
     """Return the number of defects by kind, and where they differ from those of the first run."""
-    parts = [", ".join(f"{n:,} {kind}" for kind, n in row.defects.items() if n) or "none"]
-    for kind, changes in by_change(row.defects_changed).items():
-        if changes:
-            shown = ", ".join(f"({each.y}, {each.x})" for each in changes[:_MOST_PLACES])
-            more = " …" if len(changes) > _MOST_PLACES else ""  # all are in history.csv
-            parts.append(f"{len(changes):,} {kind}: {shown}{more}")
+    kinds = {kind: row[f"{kind}_pixels"] for kind in map(words_of, FAULTS)}
+    parts = [_numbers_that_are_not_0(kinds) or "none"]
+    for change in by_change(()):
+        if places := row[f"defects_{change.replace(' ', '_')}"].split():
+            shown = ", ".join(places[:_MOST_PLACES])
+            more = " …" if len(places) > _MOST_PLACES else ""  # all are in history.csv
+            parts.append(f"{len(places):,} {change}: {shown}{more}")
     return "; ".join(parts)
 
 
@@ -260,7 +275,8 @@ def _map_table(pair: Pair) -> Table:
     rows = []
     for name, each in pair.maps.items():
         reason = pair.reasons.get(name)
-        verdict = "" if reason is None else "changed" if reason else "within sampling noise"
+        same = "within the limit" if pair.limits else "within sampling noise"
+        verdict = "" if reason is None else "changed" if reason else same
         rows.append(
             {
                 "map": heading(name),
@@ -279,7 +295,7 @@ def _map_table(pair: Pair) -> Table:
         "median 0, scatter 1."
     )
     return Table(
-        f"maps-{pair.other.label}",
+        f"maps-{pair.key}",
         "Differences of the maps",
         f"{pair.other.label} − {pair.one.label}, pixels with a good fit in both runs. {unit_words}",
         rows,
@@ -290,7 +306,7 @@ def _defects(pair: Pair) -> Table:
     shown = pair.defects[:_MOST_PIXELS]
     rest = f" The first {len(shown)} of {len(pair.defects):,}." if len(shown) < len(pair.defects) else ""
     return Table(
-        f"defects-{pair.other.label}",
+        f"defects-{pair.key}",
         "Defects that changed",
         f"Kinds as in pchem export --format defects; all pixels: compare.json.{rest}",
         [
@@ -307,7 +323,7 @@ def _transitions(pair: Pair) -> Table:
         {"": f"{grade} in {pair.one.label}"} | dict(zip(heads, (f"{int(n):,}" for n in row), strict=True))
         for grade, row in zip(_GRADES, pair.transitions, strict=False)
     ]
-    return Table(f"quality-{pair.other.label}", "Pixels by quality", "", rows)
+    return Table(f"quality-{pair.key}", "Pixels by quality", "", rows)
 
 
 def _settings(pair: Pair) -> Table:
@@ -315,12 +331,12 @@ def _settings(pair: Pair) -> Table:
         _both("setting", pair, each) | {"read by": ", ".join(each.stages) or "no stage"}
         for each in pair.settings
     ]
-    return Table(f"settings-{pair.other.label}", "Settings that differ", "", rows)
+    return Table(f"settings-{pair.key}", "Settings that differ", "", rows)
 
 
 def _versions(pair: Pair) -> Table:
     rows = [_both("program or algorithm", pair, each) for each in pair.versions]
-    return Table(f"versions-{pair.other.label}", "Versions that differ", "", rows)
+    return Table(f"versions-{pair.key}", "Versions that differ", "", rows)
 
 
 def _both(what: str, pair: Pair, each: Setting) -> dict[str, str]:

@@ -52,9 +52,9 @@ def test_blocks_add_up():
     assert 0 < whole.n_beyond == int((a != b).sum())
 
 
-def compared(one, other, good, *, same_data):
+def compared(one, other, good, *, same_data, limit=None):
     """The difference of one map."""
-    return compare_maps([("bias", one, other)], good, same_data=same_data)["bias"]
+    return compare_maps([("bias", one, other)], good, same_data=same_data, limits={"bias": limit})["bias"]
 
 
 def two_captures(seed, *, shift=0.0, scatter=1.0):
@@ -114,6 +114,65 @@ def test_ten_pixels_of_five_errors_are_a_change():
     assert reasons_of_change(found["b"]).pixels
     assert 7 <= found["b"].n_changed <= 11
     assert not any(reasons_of_change(found[name]) for name in "acdef")
+
+
+def test_a_map_that_changed_throughout_lets_no_pixel_of_another_through():
+    """In one company with 6,000 certain pixels, one in a hundred of the others could be chance: some 60."""
+    rng = np.random.default_rng(8)
+    error, good = np.ones(SHAPE), GOOD
+    maps = [(name, *((rng.standard_normal(SHAPE), error) for _ in range(2))) for name in "abcdef"]
+    maps[0][2][0][:] += 9.0 * np.sqrt(2.0)
+    found = compare_maps(maps, good, same_data=False)
+    assert found["a"].n_changed > 0.99 * N
+    assert not any(reasons_of_change(found[name]) for name in "bcdef")
+
+
+@pytest.mark.parametrize("limit", [2.0, "2%"])
+def test_a_median_counts_where_it_is_significantly_beyond_its_limit(limit):
+    """Values of 100, errors of the difference of sqrt(2): that of the median of 10,000 is 0.018."""
+    rng = np.random.default_rng(9)
+    error = np.ones(SHAPE)
+
+    def moved_by(change, seed):
+        rng = np.random.default_rng(seed)
+        one = 100.0 + rng.standard_normal(SHAPE)
+        other = 100.0 + change + rng.standard_normal(SHAPE)
+        return compared((one, error), (other, error), GOOD, same_data=False, limit=limit)
+
+    standard_error = np.sqrt(2.0 * np.pi / (2 * N))
+    for side in (-1.0, 1.0):
+        assert not any(reasons_of_change(moved_by(side * 2.0, seed)).shifted for seed in range(5))
+        assert reasons_of_change(moved_by(side * (2.0 + 8.0 * standard_error), 3)).shifted
+    # at the limit the statistic is a standard normal number; half of them are above 0
+    z = np.array([moved_by(2.0, seed).beyond_z for seed in range(100, 120)]) / np.sqrt(np.pi / (2 * N))
+    assert abs(z.mean()) < 5 / np.sqrt(z.size) + 0.02
+    assert 0.4 < z.std() < 1.6
+    # a pixel counts beyond its limit, too
+    found = moved_by(1.5, 4)
+    assert found.n_changed == 0
+    jumped = 100.0 + rng.standard_normal(SHAPE)
+    jumped[0, :10] += 2.0 + 8.0 * np.sqrt(2.0)
+    found = compared((np.full(SHAPE, 100.0), error), (jumped, error), GOOD, same_data=False, limit=limit)
+    assert 9 <= found.n_changed <= 11
+    assert found.limit == pytest.approx(2.0)
+
+
+def test_unchanged_nights_alarm_at_the_stated_rate():
+    """Ten nights against the first and against the one before, in sets of six maps: 15 histories."""
+    rng = np.random.default_rng(10)
+    shape, rate = (20, 20), 0.05
+    error, good = np.ones(shape), np.ones(shape, bool)
+    alarms, n = 0, 0
+    for _ in range(15):
+        nights = [{name: (rng.standard_normal(shape), error) for name in "abcdef"} for _ in range(11)]
+        for tonight in range(1, 11):
+            for earlier in {0, tonight - 1}:
+                maps = [(name, nights[earlier][name], nights[tonight][name]) for name in "abcdef"]
+                found = compare_maps(maps, good, same_data=False, rate=rate)
+                alarms += any(reasons_of_change(each) for each in found.values())
+                n += 1
+    assert n == 15 * 19
+    assert alarms <= n * rate
 
 
 def test_missing_values_do_not_count_and_the_unit_follows_the_data():

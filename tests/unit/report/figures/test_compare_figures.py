@@ -5,9 +5,9 @@ import pytest
 
 from pchem_pipeline.commands.compare.settings import settings_that_differ
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.model.checks.run_differences import MapDifference, compare_maps
+from pchem_pipeline.model.checks.run_differences import MAPS, MapDifference, compare_maps
 from pchem_pipeline.report.charts.on_paper import Drawing, Look, draw_chart
-from pchem_pipeline.report.comparison import HistoryRow, RunFacts
+from pchem_pipeline.report.comparison import RunFacts
 from pchem_pipeline.report.figures.compare import (
     difference_chart,
     ensemble_tables,
@@ -98,18 +98,17 @@ def test_settings_that_differ_name_their_readers() -> None:
     ("labels", "ticks"),
     [
         (["before", "after"], [(0.0, "before"), (1.0, "after")]),
-        (["2026-01-31T12:00:00+00:00"] * 2, [(0.0, "A"), (1.0, "B")]),
+        (["2026-01-31T12:00:00+00:00"] * 2, [(0.0, "1"), (1.0, "2")]),
     ],
 )
-def test_runs_in_their_order_are_told_by_label_or_letter(
+def test_runs_in_their_order_are_told_by_label_or_number(
     labels: list[str], ticks: list[tuple[float, str]]
 ) -> None:
-    summary = {"bias": (100.0, 0.1, 2.0)}
-    rows = [
-        HistoryRow(label, "", None, np.nan, RunFacts(letter, "r.zarr", (8, 8), 9, "", summary=summary))
-        for letter, label in zip("AB", labels, strict=True)
-    ]
-    (figure,) = history_figures(rows, labelled=True)
+    parts = ("median", "median_stderr", "scatter")
+    bias = {f"bias_{part}": "1" for part in parts}
+    others = {f"{name}_{part}": "" for name in MAPS if name != "bias" for part in parts}
+    rows = [{"label": label, "date": "", "run": "r.zarr", **bias, **others} for label in labels]
+    (figure,) = history_figures(rows)
     assert figure.tables[0]["name"].tolist() == ["r.zarr", "r.zarr"]
     axis = figure.draw(Look()).axes[-1].xaxis
     assert list(zip(axis.get_ticklocs(), [t.get_text() for t in axis.get_ticklabels()], strict=True)) == ticks
