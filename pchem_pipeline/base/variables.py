@@ -151,6 +151,7 @@ summary/open_covariances | lag y x | float64 | DN2 | sums of covariances, for ap
 summary/frame_mean | frame | float64 | DN | mean of a frame
 summary/frame_variance | frame | float64 | DN2 | variance over the pixels of a frame
 """),
+    *_both("overscan", ("bias", "read_noise_dn")),
     *_both("fit", PARAMETERS),
     *_table("""
 fit/correlation | y x parameter_pair | float64 | 1 | correlations of the estimates: (H, g), (H, mu), (H,

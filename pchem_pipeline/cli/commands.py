@@ -48,13 +48,13 @@ def apply(
     max_age: Annotated[
         float | None, typer.Option(min=0, help="folder of runs: days between run and frames at most")
     ] = None,
-    keep_modes: Annotated[
-        bool,
+    reference: Annotated[
+        Literal["pixels", "overscan", "none"],
         typer.Option(
-            "--keep-modes",
-            help="do not subtract row, column and frame noise, drift and pickup of the model",
+            help="what tells the offsets of rows, columns and frames that are subtracted: pixels (all, the "
+            "offsets in the model of the run), overscan (these, else those of rows and frames), none"
         ),
-    ] = False,
+    ] = "pixels",
     force: Annotated[bool, typer.Option("--force", help="replace existing calibrated frames")] = False,
     *,
     command: Command,
@@ -72,7 +72,7 @@ def apply(
     target, why = run_for(target, frames, max_age)
     if why:
         typer.echo(f"apply: calibrated with {target}, {why}", err=True)
-    wanted = ApplySettings(kinds_of(what), prior, not keep_modes, format, dataset)
+    wanted = ApplySettings(kinds_of(what), prior, reference, format, dataset)
     for path in apply_to_frames(find_run(target), frames, output, wanted, replace(command, force=force)):
         typer.echo(path)
 

@@ -81,9 +81,10 @@ def _reader_words(reader: FrameReader) -> str:
     seconds = reader.integration_time
     time = "no exposure time" if seconds is None else f"exposure {seconds:g} s ({reader.time_words})"
     size = f"{n} frames of {rows} x {columns}"
-    if reader.active is not None:
-        y0, y1, x0, x1 = reader.active
-        size += f" (light-sensitive: rows {y0} to {y1 - 1}, columns {x0} to {x1 - 1})"
+    for words, area in (("light-sensitive", reader.active), ("overscan", reader.overscan)):
+        if area is not None:
+            y0, y1, x0, x1 = area
+            size += f" ({words}: rows {y0} to {y1 - 1}, columns {x0} to {x1 - 1})"
     stamped = {"frame stamps": reader.frame_stamps, "time stamps": reader.timestamps}
     names = [name for name, stamps in stamped.items() if stamps is not None]
     return ", ".join([described(type(reader)), size, str(reader.dtype), depth, time, *names])

@@ -41,7 +41,7 @@ from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.report.pixels import bin_masses, pixel_fits, pixel_index
-from pchem_pipeline.stages.report.stored import read_histograms
+from pchem_pipeline.stages.report.stored import read_histograms, read_run
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import read_json
 from pchem_pipeline.store.run_store import RunStore
@@ -252,6 +252,14 @@ class Run:
     def summary(self) -> xr.Dataset:
         """Sums in time and space."""
         return self.group("summary")
+
+    @property
+    def overscan(self) -> dict[str, Any]:
+        """Row and frame noise, and medians of bias and read noise there and beside; empty without overscan.
+
+        The maps are in ``run.group("overscan")``.
+        """
+        return read_run(with_maps(self._store), self.config).data.overscan_medians
 
     @property
     def ensemble(self) -> xr.Dataset:

@@ -274,8 +274,7 @@ def build_verdict(
     return schema.Discrepancy(
         verdict=schema.Verdict(
             verdict=found.state,
-            sentence=_sentence(found, sizes).removesuffix(".")
-            + (_UNFINISHED if found.limit else "."),
+            sentence=_sentence(found, sizes).removesuffix(".") + (_UNFINISHED if found.limit else "."),
             doubt=found.doubt,
             limit=found.limit,
             effects=tuple(dict.fromkeys(effect.tag for effect in found.named)),

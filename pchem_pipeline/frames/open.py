@@ -55,7 +55,9 @@ def joined(
 ) -> FrameSequence:
     """Join the readers of a survey to one stack; ``check``: look at some samples, see `open_frames`."""
     frames = FrameSequence(readers, settings, report, least)
-    frames.exclude(_excluded(frames, settings, base_dir))
+    bad = _bad_pixels(frames, settings, base_dir)
+    frames.overscan_pixels &= ~bad
+    frames.exclude(frames.insensitive | bad)
     if check:
         report.notes += first_look(frames, settings)
     return frames
@@ -65,20 +67,16 @@ def joined(
 _MARKER = (1 << 32) - 1
 
 
-def _excluded(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> BoolArray:
-    """Return the pixels (y, x) that ``input.mask`` excludes, overscan, and those with a marker or a stamp.
+def _bad_pixels(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> BoolArray:
+    """Return the pixels (y, x) that ``input.mask`` excludes, and those with a marker or a stamp.
 
     The marker is in the first and the last frame.
 
     Raises:
         InputError: the mask is no image of the shape of the frames.
     """
-    n, rows, columns = frames.shape
-    excluded = np.zeros((rows, columns), np.bool_)
-    if frames.active is not None:
-        y0, y1, x0, x1 = frames.active
-        excluded[:] = True
-        excluded[y0:y1, x0:x1] = False
+    n, rows, _ = frames.shape
+    excluded = np.zeros(frames.shape[1:], np.bool_)
     stamped = stamped_pixels(frames)
     if stamped is not None and frames.within_region(stamped).any():
         excluded |= frames.within_region(stamped)

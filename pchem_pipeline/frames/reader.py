@@ -21,7 +21,7 @@ from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
 from pchem_pipeline.frames.identity import content_identity, quick_identity
-from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.settings import Area, InputSettings
 
 
 class FrameReader(ABC):
@@ -44,7 +44,9 @@ class FrameReader(ABC):
         time_words: what the file states of it, and in what unit.
         camera: its name, serial number, temperature and time, as far as the file says.
         active: first row, end of the rows, first column and end of the columns of the light-sensitive area,
-            where the file says so; the pixels around it are overscan.
+            where the file says so.
+        overscan: likewise of pixels without electrons, where the file says so; None: all outside of
+            ``active``.
         timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
         frame_stamps: number that the camera gave to each frame, (frames,), where the file says so.
         notes: remarks for the user on what was left out or assumed.
@@ -68,7 +70,8 @@ class FrameReader(ABC):
     integration_time: float | None = None
     time_words: str = ""
     camera: CameraFacts = CameraFacts()
-    active: tuple[int, int, int, int] | None = None
+    active: Area | None = None
+    overscan: Area | None = None
     timestamps: FloatArray | None = None
     frame_stamps: IntArray | None = None
     notes: tuple[str, ...] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from pchem_pipeline.frames.camera import shared_facts
 from pchem_pipeline.frames.identity import SCRATCH_BYTES
 from pchem_pipeline.frames.inspect import InputReport
 from pchem_pipeline.frames.reader import FrameReader, check_window, described, shared_notes
-from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.settings import Area, InputSettings
 
 
 class FrameSequence(FrameReader):
@@ -25,6 +26,8 @@ class FrameSequence(FrameReader):
     Attributes:
         report: what was found in the files and what was done about it.
         excluded: pixels (y, x) whose samples are replaced by one that is the same in all frames; None: none.
+        insensitive: pixels (y, x) outside of the light-sensitive area.
+        overscan_pixels: those of them that tell the bias, (y, x).
         stated_integration_time: s, as the files say, whatever the settings say; None if they do not agree.
     """
 
@@ -66,26 +69,33 @@ class FrameSequence(FrameReader):
         self.rows_per_read = max(reader.rows_per_read for reader in readers)
         self.byte_order = readers[0].byte_order
         self.seen_limits: tuple[int | None, int | None] = (None, None)
-        self.active = self._own_active(readers)
+        self._set_areas(settings)
         self.unwritten = any(reader.unwritten for reader in readers)
         self._set_facts(readers, settings, end)
 
-    def _own_active(self, readers: Sequence[FrameReader]) -> tuple[int, int, int, int] | None:
-        """Return the light-sensitive part of the region of interest; None: all, or all of it is overscan."""
-        active = {reader.active for reader in readers}
-        if len(active) > 1:
+    def _set_areas(self, settings: InputSettings) -> None:
+        """Set overscan and other insensitive pixels of the region; none where no other pixel is in it."""
+        stated = {(reader.active, reader.overscan) for reader in self._readers}
+        if len(stated) > 1:
             raise InputError(
-                f"{_where(self.paths)}: the files have different light-sensitive areas (TRIMSEC or DATASEC: "
-                f"{len(active)} of them); make one run of each"
+                f"{_where(self.paths)}: the files have different light-sensitive areas or overscan (TRIMSEC, "
+                f"DATASEC, BIASSEC: {len(stated)} of them); make one run of each"
             )
-        (area,) = active
-        if area is None:
-            return None
-        rows, columns = self.shape[1:]
-        y0, y1 = (min(max(y - self._y0, 0), rows) for y in area[:2])
-        x0, x1 = (min(max(x - self._x0, 0), columns) for x in area[2:])
-        whole = (y0, y1, x0, x1) == (0, rows, 0, columns)
-        return None if whole or y0 == y1 or x0 == x1 else (y0, y1, x0, x1)
+        ((active, overscan),) = stated
+        rows, columns = self.whole_shape
+        outside = ~_image_of([active or (0, rows, 0, columns)], self.whole_shape)
+        areas = [overscan] if settings.overscan is None and overscan else settings.overscan
+        for area in areas or ():
+            if area[1] > rows or area[3] > columns:
+                raise InputError(
+                    f"input.overscan {list(area)} exceeds the frames of {rows} rows and {columns} columns; "
+                    "correct it"
+                )
+        dark = outside if areas is None else _image_of(areas, self.whole_shape)
+        self.insensitive, dark = (self.within_region(each) for each in (outside | dark, dark))
+        if self.insensitive.all():  # overscan alone is what is wanted
+            self.insensitive, dark = np.zeros((2, *self.shape[1:]), np.bool_)
+        self.overscan_pixels = dark
 
     def _set_facts(self, readers: Sequence[FrameReader], settings: InputSettings, end: int) -> None:
         """Take bit shift, bit depth, integration time and times from the settings, else from the files."""
@@ -145,6 +155,14 @@ class FrameSequence(FrameReader):
             self.excluded, self._places = pixels, np.nonzero(pixels)
             others = self.stored(0, 1, 0, self.shape[1])[0][~pixels]
             self._filler = np.quantile(others, 0.5, method="lower")
+
+    def with_overscan(self) -> Self:
+        """Return these frames with the samples of the overscan as they are."""
+        found = copy.copy(self)
+        if self.excluded is not None:
+            found.excluded = self.excluded & ~self.overscan_pixels
+            found._places = np.nonzero(found.excluded)
+        return found
 
     def stored(self, t0: int, t1: int, y0: int, y1: int) -> NDArray[Any]:
         """Return frames t0..t1 and rows y0..y1 (frame, y, x) as they are in the files."""
@@ -257,6 +275,14 @@ class FrameSequence(FrameReader):
         """Close all readers."""
         for reader in self._readers:
             reader.close()
+
+
+def _image_of(areas: Sequence[Area], shape: tuple[int, int]) -> BoolArray:
+    """Return the pixels of areas, (y, x)."""
+    found = np.zeros(shape, np.bool_)
+    for y0, y1, x0, x1 in areas:
+        found[y0:y1, x0:x1] = True
+    return found
 
 
 def _time_words(first: FrameReader, taken: float | None) -> str:

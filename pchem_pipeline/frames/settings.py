@@ -10,6 +10,8 @@ from pchem_pipeline.base.settings import Place, Section
 from pchem_pipeline.frames.camera import LONGEST, SHORTEST
 
 PackingName = Literal["Mono10p", "Mono12p", "Mono10Packed", "Mono12Packed"]
+#: First row, end of the rows, first column, end of the columns.
+Area = tuple[int, int, int, int]
 
 
 class SampleSettings(Section):
@@ -136,10 +138,16 @@ class InputSettings(Section):
     mask: Place | None = Field(
         default=None,
         description="image file (npy, TIFF, FITS) with the shape of the frames or of roi, relative to this "
-        "YAML file: pixels other than 0 are excluded; so are overscan (FITS, DNG) and pixels "
-        "that always have the marker 2^32-1",
+        "YAML file: pixels other than 0 are excluded; so are overscan and pixels that always have the marker "
+        "2^32-1",
     )
-    roi: tuple[int, int, int, int] | None = Field(
+    overscan: tuple[Area, ...] | None = Field(
+        default=None,
+        description="pixels without electrons (overscan, dark reference rows or columns), regions of the "
+        "files as in roi: [[y0, y1, x0, x1], ...]; they tell bias and row noise, and are excluded from all "
+        "else; null: from the file (FITS: BIASSEC, else all outside of TRIMSEC or DATASEC)",
+    )
+    roi: Area | None = Field(
         default=None, description="region of interest [y0, y1, x0, x1] in pixels, ends excluded; null: all"
     )
     frame_range: tuple[int, int | None] | None = Field(
@@ -179,10 +187,10 @@ class InputSettings(Section):
             raise ValueError(f"integration_time must be at least {SHORTEST:g} s")
         if self.shape is not None and (len(self.shape) not in (2, 3) or min(self.shape) < 1):
             raise ValueError("shape must be [rows, columns] or [frames, rows, columns], each at least 1")
-        if self.roi is not None:
-            y0, y1, x0, x1 = self.roi
-            if not (0 <= y0 < y1 and 0 <= x0 < x1):
-                raise ValueError("roi must be [y0, y1, x0, x1] with 0 <= y0 < y1 and 0 <= x0 < x1")
+        for name, areas in (("roi", (self.roi,)), ("each region of overscan", self.overscan or ())):
+            for y0, y1, x0, x1 in filter(None, areas):
+                if not (0 <= y0 < y1 and 0 <= x0 < x1):
+                    raise ValueError(f"{name} must be [y0, y1, x0, x1] with 0 <= y0 < y1 and 0 <= x0 < x1")
         if self.frame_range is not None:
             first, end = self.frame_range
             if first < 0 or (end is not None and end <= first):

@@ -186,6 +186,8 @@ class ReportData:
         moments: rows ``{name, quantity, unit, predicted, observed, stderr}`` of Appendix A; the last two are
             None for terms that data do not show.
         truth: true maps of simulated data.
+        overscan: ``bias`` and ``read_noise_dn`` of the pixels without electrons, (y, x), NaN elsewhere.
+        overscan_facts: ``frame_variance`` and ``row_variance`` there, DN^2.
         channel_names: names of the channels of ready-made histograms.
         percentiles: percentiles of the summaries, %.
         outlier_sigmas: robust standard deviations beyond which a pixel is an outlier.
@@ -227,6 +229,8 @@ class ReportData:
     component_cases: Sequence[str] = ()
     moments: Sequence[Mapping[str, Any]] = ()
     truth: Mapping[str, FloatArray] = field(default_factory=dict)
+    overscan: Mapping[str, FloatArray] = field(default_factory=dict)
+    overscan_facts: Mapping[str, float] = field(default_factory=dict)
     channel_names: Sequence[str] = ()
     percentiles: tuple[float, ...] = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
     outlier_sigmas: float = 6.0
@@ -368,6 +372,23 @@ class ReportData:
                 known = Ordered.of(self.maps[name], self.flagged_in(name))
                 self._summaries[name, False] = self._summarised(known)
         return self._summaries[name, with_flagged]
+
+    @property
+    def overscan_medians(self) -> dict[str, Any]:
+        """Row and frame noise of the overscan (DN), and medians with errors there and of the other pixels."""
+        found: dict[str, Any] = {
+            f"{name}_noise_dn": self.overscan_facts[f"{name}_variance"] ** 0.5
+            for name in ("row", "frame")
+            if self.overscan
+        }
+        for name, values in self.overscan.items():
+            both = {"overscan": summarise(values)}
+            both |= {"active": self.summary(name)} if name in self.maps else {}
+            found[name] = {
+                where: {"median": each.median, "median_stderr": each.median_stderr, "n_pixels": each.n_valid}
+                for where, each in both.items()
+            }
+        return found
 
     def _summarised(self, known: Ordered) -> MapSummary:
         percentiles = tuple(dict.fromkeys((*self.percentiles, 5.0, 95.0)))

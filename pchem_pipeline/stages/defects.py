@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import Arrays, IntArray
 from pchem_pipeline.model.maps.defects import MAPS, Defects, Moments, find_defects, needs_moments
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.overscan import read_overscan
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
@@ -41,7 +43,7 @@ def stored_defects(store: RunStore, config: RunConfig, maps: Arrays | None = Non
     parts = zip(np.split(y, ends), np.split(x, ends), strict=True)
     moments = [_moments(store, *part, None if limits is None else limits[1]) for part in parts]
     levels = "fit/satellite_amplitude_e"
-    return find_defects(
+    found = find_defects(
         maps,
         status,
         Moments(y * status.shape[1] + x, *map(np.concatenate, zip(*moments, strict=True))),
@@ -49,6 +51,10 @@ def stored_defects(store: RunStore, config: RunConfig, maps: Arrays | None = Non
         light=kind == "light",
         sigmas=config.maps.outlier_sigmas,
     )
+    if (overscan := read_overscan(store)) is None:
+        return found
+    listed = np.isnan(overscan.bias[found.table["y"], found.table["x"]])  # overscan is no defect
+    return replace(found, table={name: values[listed] for name, values in found.table.items()})
 
 
 def _moments(store: RunStore, y: IntArray, x: IntArray, top: int | None) -> list[NDArray[Any]]:

@@ -19,6 +19,7 @@ from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.input import keep_ingested, listed_identity
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, Named, StageContext, Task
+from pchem_pipeline.stages.overscan import write_overscan
 from pchem_pipeline.stages.samples import check_samples, sample_sensor
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ def run(context: StageContext) -> None:
         context.note(
             f"{number} of {reader.excluded.size} pixels excluded (mask, overscan, marker 2^32-1 or stamp)"
         )
+    write_overscan(context.store, reader)
     keep_ingested(context)
     if settings.mode == "reference":
         _run_whole(context)

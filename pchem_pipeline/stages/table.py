@@ -30,6 +30,7 @@ _INPUT_SETTINGS = (
     "bit_shift",
     "bit_depth",
     "mask",
+    "overscan",
     "roi",
     "frame_range",
     "on_bad_file",
@@ -56,7 +57,7 @@ _ALL = (
         upstream=(),
         # not files: their content counts; not integration_time: it changes no frame
         settings=tuple(f"input.{name}" for name in _INPUT_SETTINGS),
-        writes=("frames",),
+        writes=("frames", "overscan"),
         run=f"{_HERE}.ingest:run",
         identity=f"{_HERE}.identities:input_content",
         follows=("simulate",),

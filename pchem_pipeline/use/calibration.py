@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.model.law.parameters import PixelParameters, usable_pixels
@@ -59,6 +60,26 @@ class Calibration(PixelParameters):
             np.nan_to_num(self.quanta_exposure), self.conversion_gain, self.bias, self.read_noise_dn
         )
         return np.asarray(known & ((self.fit_status & np.uint16(int(FAILED))) == 0))
+
+    def without_noise(self, variance: float) -> Calibration:
+        """Return that of samples without a noise, of this variance (DN^2), that the read noise includes."""
+        if variance == 0.0:
+            return self
+
+        def less(sigma: FloatArray) -> FloatArray:
+            return np.sqrt(np.maximum(sigma**2 - variance, QUANTISATION_VARIANCE))
+
+        scale = np.ones((*self.shape, 3))
+        scale[..., 2] = self.read_noise_dn / less(self.read_noise_dn)
+        rivals = None if self.rivals is None else self.rivals.copy()
+        if rivals is not None:
+            rivals[..., 3] = less(rivals[..., 3])
+        return replace(
+            self,
+            read_noise_dn=less(self.read_noise_dn),
+            covariance=self.covariance * scale[..., None] * scale[..., None, :],
+            rivals=rivals,
+        )
 
     @property
     def columns(self) -> FloatArray:

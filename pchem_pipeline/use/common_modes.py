@@ -5,7 +5,7 @@ Which a model names, and what they were in some frames.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.use.calibration import Calibration
+from pchem_pipeline.use.overscan import Overscan
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect, SharedOffset
@@ -32,6 +33,7 @@ class CommonModes:
         parts: pixels of each part, shape (part, y, x); parts may overlap.
         variances: of offsets of the frames, rows and columns of each part, DN^2, shape (part, 3); 0: none.
         left: tags of effects on many pixels alike that are not the same in other frames.
+        in_noise: variance of these offsets that the read noise of the run includes, DN^2.
         waves: periodic patterns ``c cos(2 pi (f_y y + f_x x)) + s sin(...)`` with their own c and s in each
             frame: f_y, f_x, the variance of c and of s (DN^2), and the number of the part, shape (wave, 4).
     """
@@ -41,6 +43,7 @@ class CommonModes:
     variances: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     left: tuple[str, ...] = ()
     waves: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
+    in_noise: float = 0.0
 
     @classmethod
     def of_model(cls, effects: Sequence[Effect], shape: tuple[int, int]) -> CommonModes:
@@ -75,6 +78,13 @@ class CommonModes:
             tuple(left),
             np.array(waves).reshape(-1, 4),
         )
+
+    @classmethod
+    def of_overscan(cls, overscan: Overscan, frames: Iterable[FloatArray]) -> CommonModes:
+        """Return those of whole frames and rows, as large as in frames; see `Overscan.variances_in`."""
+        variances = np.array([[*overscan.variances_in(frames), 0.0]])
+        parts = np.ones((1, *overscan.bias.shape), np.bool_)
+        return cls(("frame_noise", "row_noise"), parts, variances, in_noise=overscan.shared_variance)
 
     def turns(self, shape: tuple[int, int]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Return ``exp(2 pi i f y)`` of rows and columns, whose product is a wave: (wave, y), (wave, x)."""
@@ -116,6 +126,35 @@ class Offsets:
         waves = self.waves if len(self.waves) else np.zeros((n, 0, 2))
         frames = [design.offsets(self.rows[t], self.columns[t], waves[t], rows) for t in range(n)]
         return np.array(frames, np.float32).reshape(n, *modes.parts[0, rows].shape)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Pixels that tell offsets, shape (y, x) each; NaN where nothing is known.
+
+    Attributes:
+        scene: exposure to expect, e-; 0 without electrons.
+        step: DN of an electron.
+        bias: mu, DN.
+        sigma: standard deviation of samples of one electron number, without the offsets, DN.
+    """
+
+    scene: FloatArray
+    step: FloatArray
+    bias: FloatArray
+    sigma: FloatArray
+
+    @classmethod
+    def of_pixels(cls, calibration: Calibration, scene: FloatArray) -> Reference:
+        """Return calibrated pixels; the law of the calibration is without these offsets."""
+        sigma = np.sqrt(calibration.noise_variance_dn2)
+        return cls(scene, 1.0 / calibration.conversion_gain, calibration.bias, sigma)
+
+    @classmethod
+    def of_overscan(cls, overscan: Overscan) -> Reference:
+        """Return the overscan."""
+        nothing = np.zeros(overscan.bias.shape)
+        return cls(nothing, nothing + 1.0, overscan.bias, np.sqrt(overscan.own_variance))
 
 
 def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
@@ -208,23 +247,28 @@ class _Design:
         return np.asarray(cg(curvature, self.sums(form[0]), x0=near, rtol=1e-6)[0])
 
     def left(self, weight: FloatArray) -> FloatArray:
-        """Return the variance of a sample's offset that stays unknown, DN^2, shape (part,)."""
+        """Return the variance of a sample's offset that stays unknown, on the median line, DN^2, (part,)."""
         parts, waves = self.modes.parts, self.parts_of_waves
-        known = np.einsum("pyx,yx->p", parts, weight)
-        lines = [np.ones(len(parts)), *(parts.any(axis=axis).sum(axis=1) for axis in (2, 1))]
+        of_frame, of_row, of_column = self.modes.variances.T
+        known = parts * weight
+        # what a row says of itself, and then of its frame
+        rows = 1.0 / (1.0 + of_row[:, None] * known.sum(axis=2))
         with np.errstate(divide="ignore"):
-            each = 1.0 / (
-                known[:, None] / np.maximum(np.stack(lines, axis=1), 1) + 1.0 / self.modes.variances
-            )
+            frame = 1.0 / ((known.sum(axis=2) * rows).sum(axis=1) + 1.0 / of_frame)
+            columns = 1.0 / (known.sum(axis=1) + 1.0 / of_column[:, None])
             # each coefficient is known by half of the samples' information, and cos^2 + sin^2 = 1
-            of_waves = 1.0 / (0.5 * known[waves] + 1.0 / self.modes.waves[:, 2])
-        return np.asarray(each.sum(axis=1) + np.bincount(waves, of_waves, len(parts)))
+            of_waves = 1.0 / (0.5 * known.sum(axis=(1, 2))[waves] + 1.0 / self.modes.waves[:, 2])
+        lines = (frame[:, None] * rows**2 + of_row[:, None] * rows, columns)
+        each = [
+            np.nanmedian(np.where(parts.any(axis=axis), values, np.nan), axis=1)
+            for axis, values in zip((2, 1), lines, strict=True)
+        ]
+        return np.asarray(sum(each) + np.bincount(waves, of_waves, len(parts)))
 
 
 def estimate_offsets(
     frames: NDArray[np.unsignedinteger[Any]],
-    scene: FloatArray,
-    calibration: Calibration,
+    reference: Reference,
     modes: CommonModes,
 ) -> Offsets:
     """Return the most probable offsets of the frames, rows, columns and waves.
@@ -234,26 +278,23 @@ def estimate_offsets(
 
     Args:
         frames: DN, whole frames, shape (frame, y, x).
-        scene: exposure to expect, see `scene_of`.
-        calibration: of the pixels, under a law without these offsets.
+        reference: the pixels that tell the offsets.
         modes: which offsets there are.
     """
     from pchem_pipeline.model.law.pcd import pcd_posterior  # loads compiled loops
 
-    design, sigma = _Design.of(modes), np.sqrt(calibration.noise_variance_dn2)
-    known = np.ascontiguousarray(np.where(np.isfinite(sigma), scene, np.nan))
-    step = 1.0 / calibration.conversion_gain
+    design, step, bias, sigma = _Design.of(modes), reference.step, reference.bias, reference.sigma
+    known = np.ascontiguousarray(np.where(np.isfinite(sigma), reference.scene, np.nan))
+    expansions = 4 if (known > 0.0).any() else 0  # without electrons the means tell all
     found = []
     for frame in frames:
         # means tell offsets beyond half an electron apart, electron numbers the rest
         weight = np.nan_to_num(1.0 / (known * step**2 + sigma**2))
-        form = np.stack([weight * np.nan_to_num(frame - calibration.bias - known * step), weight])
+        form = np.stack([weight * np.nan_to_num(frame - bias - known * step), weight])
         z = design.top(form, np.zeros_like(design.sums(weight)))
-        for _ in range(4):  # expansions in the offsets
+        for _ in range(expansions):  # in the offsets
             offset = design.offsets(*design.unpacked(z))
-            given = pcd_posterior(
-                frame - calibration.bias - offset, known, calibration.conversion_gain, 0.0, sigma
-            )
+            given = pcd_posterior(frame - bias - offset, known, 1.0 / step, 0.0, sigma)
             # what is left open of the electron number takes from what a sample tells of its offset
             # but for a twentieth of what one tells whose electron number is known
             open_part = (given.ee - given.e**2) / sigma**2

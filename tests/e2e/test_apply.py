@@ -478,7 +478,7 @@ def test_row_noise_of_the_model_is_taken_from_the_frames(striped, shell):
     given = ["apply", striped / "run.zarr", striped / "night.tif", "--output"]
     said = shell.ok(*given, "out.zarr").stderr
     assert "subtracted row_noise" in said
-    shell.ok(*given, "kept.zarr", "--keep-modes")
+    shell.ok(*given, "kept.zarr", "--reference", "none")
     found, kept = (opened(shell.folder / name).load() for name in ("out.zarr", "kept.zarr"))
     electrons = np.load(striped / "electrons.npy")
     good = found.quality.values == 0
@@ -499,6 +499,140 @@ def test_row_noise_of_the_model_is_taken_from_the_frames(striped, shell):
     assert (found.noise_after < found.noise_before).values[good].mean() > 0.9
     assert "row_offset" in found
     assert "row_offset" not in kept
+
+
+OVERSCAN = 8  # columns, of 40; between it and the others is one of neither
+LIGHT = np.s_[..., : 39 - OVERSCAN]
+
+
+def the_telescope():
+    rng = np.random.default_rng(62)
+    return rng, KnownCamera.drawn(rng, (24, 40), read_noise=(0.2, 0.25))
+
+
+@pytest.fixture(scope="module")
+def astronomer(make_once):
+    """A run of a FITS file that states its overscan, and frames of a scene; its model has no row noise."""
+
+    def make(folder):
+        from astropy.io import fits
+
+        folder = folder / "nuit é"
+        folder.mkdir()
+        rng, camera = the_telescope()
+        for name, n, exposure, noise in (
+            ("dark", 1500, 2.0, ROW_NOISE),
+            ("night", 300, 0.7, ROW_NOISE),
+            ("quiet", 300, 0.7, 0.0),
+            ("cold", 50, 0.7, ROW_NOISE),
+        ):
+            light = np.full((24, 40), exposure) * (np.arange(40) < 40 - OVERSCAN)
+            offset = noise * rng.standard_normal((n, 24, 1)) - 40.0 * (name == "cold")
+            electrons, dn = camera.frames(rng, light, n, offset)
+            image = fits.PrimaryHDU(dn)
+            image.header.update(TRIMSEC=f"[1:{39 - OVERSCAN},1:24]", BIASSEC=f"[{41 - OVERSCAN}:40,1:24]")
+            image.writeto(folder / f"{name}.fits")
+            np.save(folder / f"{name}.npy", electrons[LIGHT])
+        Shell(folder).ok("run", "dark.fits", "--store", "run.zarr", "--bit-depth", "14")
+
+    return make_once("astronomer", make) / "nuit é"
+
+
+def test_overscan_takes_row_noise_from_frames_as_far_as_theory_allows(astronomer, shell):
+    """The read noise of the run includes the row noise, that of the calibrated frames what stays of it."""
+    _, camera = the_telescope()
+    given = ["apply", astronomer / "run.zarr", astronomer / "night.fits", "--output"]
+    said = shell.ok(*given, "out.zarr", "--reference", "overscan").stderr
+    assert "subtracted frame_noise, row_noise" in said
+    own = 1 / (camera.sigma[:, -OVERSCAN:] ** -2.0).sum(axis=1).mean()  # variance of the mean of a row
+    left = ROW_NOISE**2 * own / (ROW_NOISE**2 + own)
+    # what is said is measured in the light-sensitive pixels
+    numbers = re.findall(r"(\d\.\d+) ± (\d\.\d+) DN", said)
+    for (value, error), truth in zip(numbers, (ROW_NOISE, left**0.5), strict=True):
+        assert abs(float(value) - truth) < 5 * float(error) + 0.02 * truth
+        assert float(error) < 0.1 * truth
+    found = opened(shell.folder / "out.zarr").load()
+    good, true = found.quality.values[LIGHT] == 0, np.load(astronomer / "night.npy")
+    assert good.mean() > 0.9
+    off = (found.electrons.values[LIGHT] - true)[:, good]
+    theory = (camera.gain**2 * (camera.sigma**2 + left))[LIGHT][good].mean()
+    # pixels of a row share some of it
+    assert abs(off.var(axis=0).mean() / theory - 1) < 5 * np.sqrt(2 / (300 * 24))
+    stated = (found.electrons_stderr_read.values[LIGHT][good] ** 2).mean()
+    assert abs(stated / theory - 1) < 5 * np.sqrt(2 / (256 * 24))
+    wrong = (found.electron_number.values[LIGHT] != true)[:, good].mean()
+    claimed = 1 - found.number_probability.values[LIGHT][:, good].mean()
+    assert abs(wrong / claimed - 1) < 0.2
+    assert np.isnan(found.electrons.values[..., 39 - OVERSCAN :]).all()
+
+
+def test_overscan_without_row_noise_costs_nothing(astronomer, shell):
+    given = ["apply", astronomer / "run.zarr", astronomer / "quiet.fits", "--what", "electrons", "--output"]
+    true, variances = np.load(astronomer / "quiet.npy"), []
+    for name, *options in (("out.zarr", "--reference", "overscan"), ("kept.zarr",)):
+        shell.ok(*given, name, *options)
+        off = opened(shell.folder / name).electrons.values[LIGHT] - true
+        variances.append(np.nanmean(off.var(axis=0)))
+    assert variances[0] < 1.002 * variances[1]
+
+
+def test_overscan_tells_a_bias_that_moved(astronomer, shell):
+    given = ["apply", astronomer / "run.zarr", astronomer / "cold.fits", "--what", "electrons", "--output"]
+    assert "DN below the bias of the run" in shell.refused(4, *given, "kept.zarr")
+    shell.ok(*given, "out.zarr", "--reference", "overscan")
+    found = opened(shell.folder / "out.zarr").load()
+    off = found.electrons.values[LIGHT] - np.load(astronomer / "cold.npy")
+    assert (found.quality.values[LIGHT] == 0).mean() > 0.9
+    assert abs(np.nanmean(found.mean_signal.values[LIGHT]) - 0.7) < 0.1
+    _, camera = the_telescope()
+    error = ROW_NOISE * camera.gain.mean() / np.sqrt(50 * 24)  # at most: of the rows of all frames
+    assert abs(np.nanmedian(off)) < 5 * error + 0.02
+
+
+def test_overscan_is_in_the_report_and_in_nothing_else(astronomer, shell):
+    from pchem_pipeline import open_run
+
+    (_, camera), run = the_telescope(), open_run(astronomer / "run.zarr")
+    report = json.loads((astronomer / "run.zarr/report.json").read_text())
+    medians, dark = run.overscan, np.s_[:, -OVERSCAN:]
+    assert report["overscan"] == medians
+    noise = np.hypot(camera.sigma, ROW_NOISE)
+    for name, truth in (("bias", camera.bias), ("read_noise_dn", noise)):
+        for where, some in (("overscan", dark), ("active", LIGHT)):
+            cell = medians[name][where]
+            assert abs(cell["median"] - np.median(truth[some])) < 5 * cell["median_stderr"]
+        assert medians[name]["overscan"]["n_pixels"] == 24 * OVERSCAN
+        group = run.group("overscan")
+        z = ((group[name] - truth) / group[f"{name}_stderr"]).values[dark]
+        # the pixels of a row share most of the error
+        assert abs((z**2).mean() - 1) < 5 * np.sqrt(2 / 24)
+    assert abs(medians["row_noise_dn"] / ROW_NOISE - 1) < 5 / np.sqrt(2 * 1024 * 23)
+    assert "Overscan" in (astronomer / "run.zarr/report.html").read_text()
+    summary, n = report["summary"]["bias"], 24 * (39 - OVERSCAN)
+    assert report["fit_status"]["n_pixels"] == summary["n_pixels"] + summary["n_flagged"] == n
+    # nor does its constant dilute what rows share in the sums of the quick look
+    [row] = [check for check in report["quick_look"]["checks"] if check["name"] == "row_noise"]
+    assert abs(row["size"] / ROW_NOISE - 1) < 5 / np.sqrt(2 * 1500 * 23) + 0.02
+    # one column is of neither
+    assert set(run.defects().query("kind == 'excluded'").x) <= {39 - OVERSCAN}
+    shell.ok("export", astronomer / "run.zarr", "--format", "defects", "--output", "out")
+    assert len((shell.folder / "out/defects.csv").read_text().splitlines()) < 24 * OVERSCAN
+    shell.ok("compare", astronomer / "run.zarr", astronomer / "run.zarr", "--output", "same")
+    run = json.loads((shell.folder / "same/compare.json").read_text())["runs"][0]
+    assert sum(run["pixels"].values()) == n
+
+
+def test_frames_or_runs_without_overscan_are_refused(astronomer, lab):
+    from astropy.io import fits
+
+    asked = ["--reference", "overscan", "--output", "out.zarr"]
+    assert "run.zarr: no overscan is known; set input.overscan" in lab.refused(
+        4, "apply", "run.zarr", "night.tif", *asked
+    )
+    fits.writeto(lab.folder / "bare.fits", fits.getdata(astronomer / "night.fits"))
+    assert "bare.fits: no overscan is known" in lab.refused(
+        4, "apply", astronomer / "run.zarr", "bare.fits", *asked
+    )
 
 
 def test_a_sample_at_the_limit_less_its_offset_is_censored(striped, shell):

@@ -24,7 +24,14 @@ from pchem_pipeline.commands.apply.characterisation import (
 from pchem_pipeline.commands.apply.files import check_names, write_files
 from pchem_pipeline.commands.apply.finish import finish_maps
 from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
-from pchem_pipeline.commands.apply.source import check_camera, check_level, limits_of, open_like_run, some_of
+from pchem_pipeline.commands.apply.source import (
+    check_camera,
+    check_level,
+    limits_of,
+    open_like_run,
+    overscan_of,
+    some_of,
+)
 from pchem_pipeline.commands.apply.tasks import (
     N_SUMS,
     convert_piece,
@@ -39,6 +46,7 @@ from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Command, StageContext, Task
 from pchem_pipeline.runner.session import at_work, with_overrides
+from pchem_pipeline.stages.overscan import overscan_samples
 from pchem_pipeline.store.files import fingerprint_of
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import local_path, place_of
@@ -58,6 +66,8 @@ _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
 _BLOCK_SAMPLES = 1 << 26
+#: Frames that tell the scene, or the variances of the offsets in the overscan.
+_SCENE_FRAMES = 256
 #: Share of the samples at a limit of the ADC beyond which offsets are not known: with 6 % of them the stated
 #: probabilities of electron numbers are as right as without, with 32 % they are 0.1 too high.
 _MOST_CUT = 0.2
@@ -125,22 +135,28 @@ def _make_job(
     limits = limits_of(frames, sensor)
     version = model_of(run, "fit")
     modes = CommonModes()
-    if version is not None and wanted.remove:
+    overscan = overscan_of(target, frames) if wanted.reference == "overscan" else None
+    if version is not None and wanted.reference != "none":
         modes = CommonModes.of_model(version.effects, sensor.shape)
-    some, cut = some_of(frames), 0.0
+    if overscan is not None and not modes.removed:
+        samples = overscan_samples(frames, np.isfinite(overscan.bias), _SCENE_FRAMES)
+        modes = CommonModes.of_overscan(overscan, samples)
+    some, cut = some_of(frames if overscan is None else frames.with_overscan()), 0.0
     if limits is not None:
         cut = float(np.mean((some <= limits[0]) | (some >= limits[1])))
-    kept = ", ".join(modes.removed) if cut > _MOST_CUT else ""
+    kept = ", ".join(modes.removed) if cut > _MOST_CUT and overscan is None else ""
     if kept:
         modes = CommonModes()
     calibration = read_calibration(run, limits=limits or (None, None), removed=modes.removed)
-    remarks = check_camera(frames, sensor) + check_level(some, calibration, frames.paths[0])
+    # a bias that moved is told by the overscan
+    drift = 0.0 if overscan is None else float(np.nanmean(some.mean(axis=0) - overscan.bias))
+    remarks = check_camera(frames, sensor) + check_level(some - drift, calibration, frames.paths[0])
     if kept:
         remarks.append(
             f"{kept} not subtracted: {100 * cut:.0f} % of the samples are at a limit of the ADC, which hides "
             "their offset; the read noise includes it, and errors and probabilities allow for it"
         )
-    if modes.left and wanted.remove:
+    if modes.left:
         remarks.append(
             f"{', '.join(modes.left)}: only at certain times of the characterisation, so not subtracted"
         )
@@ -163,6 +179,7 @@ def _make_job(
         wanted.prior,
         limits=limits,
         modes=modes,
+        overscan=overscan,
         depth=depth,
         expected=numbers and overlap > 0,
     )
@@ -285,6 +302,7 @@ def _do(context: StageContext, job: Job, calibration: Calibration) -> None:
         context.reporter.info(f"apply: {context.store.path} is up to date")
         return
     job, calibration = _with_moments(context, job, calibration)
+    calibration = calibration.without_noise(job.modes.in_noise)
     if job.removed:
         job = _with_offsets(context, job, calibration)
     if job.counts:
@@ -342,10 +360,10 @@ def _with_moments(context: StageContext, job: Job, calibration: Calibration) -> 
 def _with_offsets(context: StageContext, job: Job, calibration: Calibration) -> Job:
     """Find the offsets of frames, rows and columns; return the job that takes them away."""
     n, ny, nx = job.source.shape
-    # some frames suffice for the scene
-    chosen = np.unique(np.linspace(0, n - 1, 256).astype(int)).tolist()
-    mean = sum(job.source.read(t, t + 1)[0].astype(np.float64) for t in chosen) / len(chosen)
-    job = replace(job, scene=scene_of(np.asarray(mean), calibration))
+    if job.overscan is None:
+        chosen = np.unique(np.linspace(0, n - 1, _SCENE_FRAMES).astype(int)).tolist()
+        mean = sum(job.source.read(t, t + 1)[0].astype(np.float64) for t in chosen) / len(chosen)
+        job = replace(job, scene=scene_of(np.asarray(mean), calibration))
     parts = job.modes.parts
     waves = job.modes.waves
     lengths, whole = {"part": len(parts), "wave": len(waves), "coefficient": 2}, {"y": ny}
@@ -371,7 +389,8 @@ def _with_offsets(context: StageContext, job: Job, calibration: Calibration) -> 
     # codes are cut to quarters of a DN: their own rounding is part of what is not known
     variance = np.tensordot(left, parts, 1) + QUANTISATION_VARIANCE / 4**2
     reached = (any(each["reached"][0] for each in found), any(each["reached"][1] for each in found))
-    return replace(job, parts=4, lift=lift, offset_variance=variance, reached=reached)
+    rows = np.sum([each["rows"] for each in found], axis=0)
+    return replace(job, parts=4, lift=lift, offset_variance=variance, reached=reached, row_sums=rows)
 
 
 def _counted(context: StageContext, job: Job, calibration: Calibration) -> Job:

@@ -43,6 +43,7 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
     calibration = replace(calibration, law=_law(calibration, job))
     if sums is not None and job.removed:
         _write_noise(output, calibration, sums, n, job, reporter)
+        sums[0] = sums[2]  # the offsets may have a mean: a bias that moved
     raised = {"peaks_overlap": calibration.conversion_gain * calibration.read_noise_dn > PEAKS_OVERLAP_E}
     if "electrons" in job.kinds:
         assert sums is not None
@@ -100,16 +101,47 @@ def _write_noise(
 ) -> None:
     """Write what the pixels scatter by with the offsets and without, and say what that gains."""
     gain = np.where(calibration.usable, calibration.conversion_gain, np.nan)
-    variances = [gain**2 * (sums[i + 1] / n - (sums[i] / n) ** 2) * n / max(n - 1, 1) for i in (0, 2)]
+    variances = [gain**2 * _variance(sums[i : i + 2], n) for i in (0, 2)]
     for name, variance in zip(("noise_before", "noise_after"), variances, strict=True):
         output.write_array(f"applied/{name}", np.sqrt(np.maximum(variance, 0.0)))
     # what is not of the electrons' own number, whose variance is its mean
-    signal = gain * (sums[0] / n - calibration.bias)
+    signal = gain * (sums[2] / n - calibration.bias)
     expected = np.maximum(signal, 0.0) + (gain * calibration.read_noise_dn) ** 2
     before, after = (_noise_words(each - signal, expected) for each in variances)
     reporter.info(
         f"apply: subtracted {', '.join(job.removed)}: noise without shot noise {before} before, {after} after"
     )
+    before, after = (
+        _row_words(_variance(rows, n), _variance(sums[i : i + 2], n), calibration.usable)
+        for i, rows in zip((0, 2), job.row_sums, strict=True)
+    )
+    reporter.info(f"apply: row noise, that of frames included, {before} before, {after} after")
+
+
+def _variance(sums: FloatArray, n: int) -> FloatArray:
+    """Return the variance of n values from their sum and the sum of their squares, shape (2, ...)."""
+    mean, square = sums / n
+    return np.asarray((square - mean**2) * n / max(n - 1, 1))
+
+
+def _row_words(means: FloatArray, pixels: FloatArray, usable: BoolArray) -> str:
+    """Return the standard deviation that rows share beyond the noise of their pixels, with its error, DN.
+
+    Args:
+        means: variances of the means of the rows, DN^2, shape (y,).
+        pixels: variances of the samples, DN^2, shape (y, x).
+        usable: pixels that the means are of, shape (y, x).
+    """
+    number = usable.sum(axis=1)
+    several = number > 1
+    own = np.where(usable, pixels, 0.0).sum(axis=1)[several] / number[several] ** 2
+    # the pixels' noise has the shared part, too
+    shared = (means[several] - own) / (1.0 - 1.0 / number[several])
+    if not shared.size:
+        return "not known"
+    error = float(shared.std() / np.sqrt(shared.size))
+    root = float(np.sqrt(max(shared.mean(), 0.0)))
+    return f"{root:.3f} ± {error / (2.0 * max(root, error**0.5, 1e-9)):.3f} DN"
 
 
 def _noise_words(excess: FloatArray, expected: FloatArray) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.use.common_modes import CommonModes
+from pchem_pipeline.use.overscan import Overscan
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
@@ -29,14 +30,15 @@ class ApplySettings:
         kinds: any of `KINDS`.
         prior: exposure that the electron numbers are expected to have: ``frames`` (estimated from these
             frames), ``flat`` (none) or ``run`` (of the characterisation).
-        remove: take the common modes that the model of the run names from the frames.
+        reference: pixels that tell the offsets of frames, rows and columns, which are subtracted: ``pixels``
+            (all, of the offsets in the model of the run), ``overscan`` or ``none``.
         format: one of `FORMATS`.
         dataset: which frames inside an HDF5, zarr or FITS file; None: as the run has it.
     """
 
     kinds: tuple[str, ...] = KINDS
     prior: str = "frames"
-    remove: bool = True
+    reference: str = "pixels"
     format: str = "zarr"
     dataset: str | None = None
 
@@ -88,8 +90,11 @@ class Job:
         pool: what the exposures of these frames have in common, where they are the prior.
         limits: first and last code of the ADC, DN; None: not known.
         modes: offsets that are taken from the frames; none: the frames as they come.
-        scene: exposure to expect while the offsets are found (y, x), e-.
+        overscan: that tells the offsets; None: all pixels do.
+        scene: exposure to expect while these tell them (y, x), e-.
         offset_variance: variance of the offsets' estimates, DN^2, (y, x); None without offsets.
+        row_sums: of the mean of each row less its bias over the frames, and of its square, DN and DN^2, with
+            the offsets and without: shape (2, 2, y).
         moments: whether the errors of the calibration are in the output, by `write_moments`.
         parts: codes in a DN.
         lift: DN by which codes are raised so that none is negative; no offset is larger.
@@ -108,8 +113,10 @@ class Job:
     pool: ExposurePool | None = None
     limits: tuple[int, int] | None = None
     modes: CommonModes = field(default_factory=CommonModes)
+    overscan: Overscan | None = None
     scene: Any = None
     offset_variance: Any = None
+    row_sums: Any = None
     moments: bool = False
     parts: int = 1
     lift: int = 0

@@ -15,8 +15,11 @@ from pchem_pipeline.frames.camera import IMAGE_TYPES, CameraFacts
 from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.stages.overscan import read_overscan
 from pchem_pipeline.stages.samples import sample_targets
+from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
+from pchem_pipeline.use.overscan import Overscan
 
 if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
@@ -86,7 +89,7 @@ def _with_region(settings: InputSettings, region: list[int], sensor: SensorInfo,
     Raises:
         InputError: the frames are of another size than both.
     """
-    whole = settings.model_copy(update={"roi": None})
+    whole = settings.model_copy(update={"roi": None, "overscan": None})
     with open_frames(whole, Path.cwd(), check_duplicates=False, least=1) as frames:
         shape, name = frames.whole_shape, frames.paths[0]
     if shape == sensor.shape:
@@ -101,6 +104,24 @@ def _with_region(settings: InputSettings, region: list[int], sensor: SensorInfo,
 
 def _by(shape: tuple[int, ...]) -> str:
     return " x ".join(str(each) for each in shape)
+
+
+def overscan_of(target: Target, frames: FrameSequence) -> Overscan:
+    """Return what a run, of several exposures the first, says of the overscan that the frames have.
+
+    Raises:
+        InputError: the run has none, or the frames have none.
+    """
+    samples = sample_targets(target.config, target.base_dir)
+    run = (samples[0] if samples else target).store
+    found = read_overscan(RunStore.open(run))
+    bias = None if found is None else np.where(frames.overscan_pixels, found.bias, np.nan)
+    if found is None or bias is None or np.isnan(bias).all():
+        raise InputError(
+            f"{run if found is None else frames.paths[0]}: no overscan is known; set input.overscan in the "
+            "YAML of the run (FITS: BIASSEC) and run it again, or choose another --reference"
+        )
+    return replace(found, bias=bias)
 
 
 def limits_of(frames: FrameSequence, sensor: SensorInfo) -> tuple[int, int] | None:

@@ -18,7 +18,7 @@ from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
-from pchem_pipeline.use.common_modes import Offsets, estimate_offsets
+from pchem_pipeline.use.common_modes import Offsets, Reference, estimate_offsets
 from pchem_pipeline.use.electrons import add_up, electrons, read_stderr, whole_parts, with_its_errors
 
 if TYPE_CHECKING:
@@ -47,7 +47,8 @@ def _calibration(
     run = RunStore.open(job.run)
     extra = None if job.offset_variance is None else job.offset_variance[rows]
     found = read_calibration(run, rows, removed=job.removed, extra_variance=extra, limits=limits)
-    return with_moments(found, output, rows) if job.moments else found
+    found = with_moments(found, output, rows) if job.moments else found
+    return found.without_noise(job.modes.in_noise)
 
 
 def _codes(frames: NDArray[Any], job: Job, offsets: Float32Array) -> NDArray[Any]:
@@ -68,13 +69,18 @@ def moments_piece(piece: Piece, output: RunStore, *, job: Job, settings: FitSett
 
 def offsets_piece(piece: Piece, output: RunStore, *, job: Job) -> dict[str, Any]:
     """Find and write the offsets of some frames; the summary has their errors."""
-    calibration = _calibration(output, job, _WHOLE, job.cut)
+    calibration, source = _calibration(output, job, _WHOLE, job.cut), job.source
+    if job.overscan is None:
+        reference = Reference.of_pixels(calibration, job.scene)
+    else:
+        reference, source = Reference.of_overscan(job.overscan), source.with_overscan()
     left, largest = np.zeros(len(job.modes.parts)), 0.0
     ends, known = [0, np.iinfo(np.int64).max] if job.limits is None else list(job.limits), calibration.usable
-    reached = [False, False]
-    with FrameStream(job.source, [(piece.y0, piece.y1)], job.depth, frames=(piece.t0, piece.t1)) as stream:
+    reached, rows = [False, False], np.zeros((2, 2, job.source.shape[1]))
+    bias, number = calibration.bias, np.maximum(known.sum(axis=1), 1)
+    with FrameStream(source, [(piece.y0, piece.y1)], job.depth, frames=(piece.t0, piece.t1)) as stream:
         for start, (frames,) in stream:
-            found = estimate_offsets(frames, job.scene, calibration, job.modes)
+            found = estimate_offsets(frames, reference, job.modes)
             region = (slice(start, start + len(frames)), _WHOLE, _WHOLE)
             output.write("applied/row_offset", region, found.rows.astype(np.float32))
             output.write("applied/column_offset", region, found.columns.astype(np.float32))
@@ -83,8 +89,13 @@ def offsets_piece(piece: Piece, output: RunStore, *, job: Job) -> dict[str, Any]
             reached[0] |= bool((frames.min(axis=0) <= ends[0])[known].any())
             reached[1] |= bool((frames.max(axis=0) >= ends[1])[known].any())
             left += found.left.sum(axis=0)
-            largest = max(largest, float(abs(found.of_samples(job.modes)).max()))
-    return {"left": left.tolist(), "largest": largest, "reached": reached}
+            offsets = found.of_samples(job.modes)
+            largest = max(largest, float(abs(offsets).max()))
+            means, less = (
+                np.where(known, each, 0.0).sum(axis=2) / number for each in (frames - bias, offsets)
+            )
+            rows += [(each.sum(axis=0), (each**2).sum(axis=0)) for each in (means, means - less)]
+    return {"left": left.tolist(), "largest": largest, "reached": reached, "rows": rows.tolist()}
 
 
 # -- histograms and exposure -----------------------------------------------------------------------

@@ -40,6 +40,7 @@ from pchem_pipeline.model.checks.run_differences import (
     reasons_of_change,
 )
 from pchem_pipeline.model.checks.settings import allowed
+from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
 from pchem_pipeline.report.comparison import (
     ArrayRow,
@@ -238,7 +239,8 @@ def _side(path: Path) -> _Side:
     warn_if_old(target, ("fit", "maps", "ensemble"), f"{store.path} is compared in its present state")
     states = PixelStates.of(store, target.config)
     sensor = SensorInfo.read(store)
-    good, caution, none = (int((states.quality == grade).sum()) for grade in (GOOD, CAUTION, NO_VALUE))
+    wanted = states.quality[(states.status & int(FitStatus.EXCLUDED)) == 0]
+    good, caution, none = (int((wanted == grade).sum()) for grade in (GOOD, CAUTION, NO_VALUE))
     digest = _data_digest(store, sensor)
     facts = RunFacts(
         "",

@@ -275,7 +275,7 @@ def _frame_means(sums: StackSums) -> FloatArray:
     quiet = _quiet(sums)
     if not sums.whole or not quiet.any():
         return sums.frame_mean if quiet.any() else np.zeros(0)
-    return np.asarray(sums.row_sum[:, quiet].sum(axis=1) / (quiet.sum() * sums.shape[1]))
+    return np.asarray(sums.row_sum[:, quiet].sum(axis=1) / sums.n_varying(quiet))
 
 
 # -- successive samples and neighbours -----------------------------------------------------------
@@ -301,7 +301,8 @@ class _Common:
     def frame(self) -> _Estimate:
         """Of pixels in different rows and columns."""
         sums, quiet = self.sums, _quiet(self.sums)
-        m, nx = int(quiet.sum()), sums.shape[1]
+        m = int(quiet.sum())
+        nx = sums.n_varying(quiet) / max(m, 1)
         if m < _FEWEST_LINES or nx < _FEWEST_LINES:
             return _NOTHING
         rows, variance = sums.rows.centred()[:, quiet], sums.rows.variance[quiet]
@@ -314,7 +315,7 @@ class _Common:
         freedom = sums.freedom
         value = float(products.sum()) / freedom
         chance = math.sqrt(2.0 / freedom * (scale**2 - float((variance**2).sum())))
-        pairs, along = float(nx * m * (m - 1)), 2.0 * nx * (m - 1)
+        pairs, along = nx * m * (m - 1), 2.0 * nx * (m - 1)
         down = sums.next_y[quiet]
         neighbours = along * float(np.mean(down[np.isfinite(down)])) if np.isfinite(down).any() else 0.0
         others = pairs * nx - pairs
@@ -371,7 +372,7 @@ def _lag_check(common: _Common) -> list[Check]:
         # a centred series is anticorrelated with itself
         shared = float(total[at] @ total[at - 1]) + float(np.mean(total**2)) * sums.lengths.size
         shared = shared / sums.freedom - float(np.nansum(sums.lag[quiet]))
-        shared /= float(quiet.sum() * sums.shape[1]) ** 2
+        shared /= float(sums.n_varying(quiet)) ** 2
         error = math.sqrt(2.0 / sums.freedom) * abs(common.frame.value)
     return _resemblance("lag", sums.lag, sums.variance, common, (shared, error))
 

@@ -39,7 +39,7 @@ class Lines:
         pairs: sum over ordered pairs of pixels of the line, neighbours left out, of the product of their
             variances, (line,), DN^4.
         neighbours: sum of the covariances of pixels next to each other along the line, (line,), DN^2.
-        length: pixels of each line.
+        length: pixels of each line that vary: excluded ones do not.
     """
 
     sums: NDArray[np.signedinteger]
@@ -198,6 +198,10 @@ class StackSums:
         """Variance of each pixel within blocks, (y, x), DN^2."""
         return self._variance(slice(None))
 
+    def n_varying(self, rows: BoolArray) -> int:
+        """Return the number of pixels of some rows that vary."""
+        return int(np.count_nonzero(self.variance[rows] > 0.0))
+
     @cached_property
     def rows(self) -> Lines:
         """Sums over the rows of all frames."""
@@ -227,7 +231,6 @@ def _lines(
     product[groups[1:] - 1] = 0.0  # no product crosses the border of a group
     along = np.add.reduceat(product, groups, axis=0)
     del product  # as large as a map
-    heights = np.diff(np.append(groups, len(variance)))
     return Lines(
         sums,
         np.asarray(np.cumsum(lengths) - lengths),
@@ -235,7 +238,7 @@ def _lines(
         total.ravel(),
         (total**2 - square - 2.0 * along).ravel(),
         np.add.reduceat(np.nan_to_num(covariance), groups, axis=0).ravel(),
-        np.repeat(heights, variance.shape[1]),
+        np.add.reduceat(variance > 0.0, groups, axis=0, dtype=np.int64).ravel(),
     )
 
 

@@ -46,7 +46,7 @@ from pchem_pipeline.frames.formats.kinds import (
 )
 from pchem_pipeline.frames.reader import changed
 from pchem_pipeline.frames.registry import check_unpacked, require
-from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.settings import Area, InputSettings
 from pchem_pipeline.frames.writing import StackFacts
 
 _TIME_KEYWORDS = ("EXPTIME", "EXPOSURE", "INTTIME", "ITIME")
@@ -56,12 +56,14 @@ _DEPTH_KEYWORDS = ("BITDEPTH", "ADCBITS")
 _CAMERA_KEYWORDS = ("CAMERA", "DETNAM", "DETECTOR", "INSTRUME")
 _SERIAL_KEYWORDS = ("SERIALNO", "SERNO", "SERIAL", "CAMSERNO", "DETSERNO")
 _SETUP_KEYWORDS = ("GAIN", "OFFSET", "READMODE", "READOUTM", "XBINNING", "YBINNING", "IMAGETYP")
-#: of these the first counts
-_SECTION_KEYWORDS = ("TRIMSEC", "DATASEC")
+#: of the light-sensitive area the first counts
+_ACTIVE_KEYWORDS, _OVERSCAN_KEYWORDS = ("TRIMSEC", "DATASEC"), ("BIASSEC",)
 #: alike in images that are frames of one sensor: kind, exposure, setting, camera, place on the detector
 _ALIKE = (
     *("EXTNAME", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "BZERO", "BSCALE", "TILES"),
-    *(*_TIME_KEYWORDS, *_SETUP_KEYWORDS, *_CAMERA_KEYWORDS, *_SERIAL_KEYWORDS, *_SECTION_KEYWORDS),
+    *(*_TIME_KEYWORDS, *_SETUP_KEYWORDS, *_CAMERA_KEYWORDS, *_SERIAL_KEYWORDS),
+    *_ACTIVE_KEYWORDS,
+    *_OVERSCAN_KEYWORDS,
     *("DETSEC", "CCDSEC", "CCDNAME", "CCDCHIP", "CHIPID", "AMPNAME", "AMPSEC"),
 )
 _TEMPERATURE_KEYWORDS = ("CCD-TEMP", "DET-TEMP", "DETTEMP", "CCDTEMP", "SENSTEMP", "SET-TEMP")
@@ -137,8 +139,13 @@ class FitsReader(ContiguousReader):
         duration = agreed_duration(map(time_of, _TIME_KEYWORDS)) or first_of(
             map(time_of, _TOTAL_TIME_KEYWORDS)
         )
-        sections = (header[name] for name in _SECTION_KEYWORDS for header in last if name in header)
-        self.active = first_of(_active(section, *self.shape[1:]) for section in sections)
+
+        def area_of(names: Sequence[str]) -> Area | None:
+            sections = (header[name] for name in names for header in last if name in header)
+            found: Area | None = first_of(_area(section, *self.shape[1:]) for section in sections)
+            return found
+
+        self.active, self.overscan = area_of(_ACTIVE_KEYWORDS), area_of(_OVERSCAN_KEYWORDS)
         depths = (bits_of(header.get(name)) for header in last for name in _DEPTH_KEYWORDS)
         self.take_facts(StatedFacts(_camera(last), duration, first_of(depths)))
 
@@ -289,7 +296,7 @@ def _camera(headers: Sequence[Any]) -> CameraFacts:
     )
 
 
-def _active(section: Any, rows: int, columns: int) -> tuple[int, int, int, int] | None:
+def _area(section: Any, rows: int, columns: int) -> Area | None:
     """Return rows and columns of ``[x1:x2,y1:y2]``, counted from 1, both ends included; None if unusable."""
     match = re.fullmatch(r"\s*\[(\d+):(\d+),(\d+):(\d+)\]\s*", str(section))
     if match is None:

@@ -60,6 +60,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
             "electron_numbers": _electron_numbers(data),
             "truth": _truth(data),
             "samples": _samples(data),
+            "overscan": data.overscan_medians or None,
             "missing": dict(data.missing),
             "discrepancy": _discrepancy(data),
             "quick_look": None if data.quick_look is None else data.quick_look.to_dict(),

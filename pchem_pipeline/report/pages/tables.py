@@ -59,8 +59,8 @@ class Table:
 def result_tables(data: ReportData) -> list[Table]:
     """Return the tables of results that the data allow."""
     makers = (
-        _channels, _parameters, _regions, _flagged, _against_truth, _moments, _misfits, _intervals, _samples,
-        _plan, _quick_look,
+        _channels, _parameters, _regions, _overscan, _flagged, _against_truth, _moments, _misfits, _intervals,
+        _samples, _plan, _quick_look,
     )  # fmt: skip
     return [table for make in makers if (table := make(data)) is not None and table.rows]
 
@@ -126,6 +126,24 @@ def _regions(data: ReportData) -> Table:
         "regions",
         "Regions",
         "Median of each parameter with its standard error, in the parts of the sensor of report.regions.",
+        rows,
+    )
+
+
+def _overscan(data: ReportData) -> Table:
+    found, rows = data.overscan_medians, []
+    for name in data.overscan:
+        row = {"parameter": heading(name)}
+        for head, where in (("overscan", "overscan"), ("other pixels", "active")):
+            cell = found[name].get(where)
+            row[head] = measured(cell["median"], cell["median_stderr"]) if cell else "not known"
+        rows.append(row)
+    noises = [f"{key} noise {short(found[f'{key}_noise_dn'])} DN" for key in ("row", "frame") if rows]
+    return Table(
+        "overscan",
+        "Overscan",
+        "Medians with their standard errors. Of pixels without electrons: mean and standard deviation of "
+        f"their codes, {' and '.join(noises)} included. They are in no other table.",
         rows,
     )
 

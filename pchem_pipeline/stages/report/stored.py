@@ -52,6 +52,7 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
     **{group: tuple(v.name for v in variables_of(group)) for group in ("ensemble", "discrepancy")},
     "fit": ("fit_status", "goodness_p", "goodness_chi2", "goodness_dof", "outlier_share"),
     "truth": (*PARAMETERS, "read_noise_e"),
+    "overscan": ("bias", "read_noise_dn"),
     "samples": ("quanta_exposure", "mean", "variance", "linearity_residual", "linearity_p"),
 }
 
@@ -124,6 +125,8 @@ def read_run(
         component_cases=[case_name(case) for case in cases],
         moments=moments,
         truth=groups["truth"],
+        overscan=groups["overscan"],
+        overscan_facts=store.attributes("overscan"),
         channel_names=[short_name(name) for name in sensor.names],
         percentiles=config.maps.percentiles,
         outlier_sigmas=config.maps.outlier_sigmas,

@@ -317,29 +317,52 @@ def test_unreadable_file(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("cards", "roi", "used"),
+    ("cards", "settings", "active", "overscan"),
     [
-        ({"DATASEC": "[3:8,1:5]"}, None, (0, 5, 2, 8)),
-        ({"DATASEC": "[1:8,1:6]", "TRIMSEC": "[3:8,2:6]"}, None, (1, 6, 2, 8)),
-        ({"DATASEC": "[3:8,1:5]"}, (1, 6, 1, 8), (0, 4, 1, 7)),
-        ({"DATASEC": "[1:8,1:6]"}, None, None),  # all
-        ({"DATASEC": "[3:8,1:6]"}, (0, 6, 0, 2), None),  # overscan alone is what is wanted
-        ({"DATASEC": "[3:9,1:6]"}, None, None),  # not of this image
-        ({"DATASEC": "whole"}, None, None),
+        ({"DATASEC": "[3:8,1:5]"}, {}, (0, 5, 2, 8), None),
+        ({"DATASEC": "[1:8,1:6]", "TRIMSEC": "[3:8,2:6]"}, {}, (1, 6, 2, 8), None),
+        ({"DATASEC": "[3:8,1:5]"}, {"roi": (1, 6, 1, 8)}, (0, 4, 1, 7), None),
+        ({"DATASEC": "[1:8,1:6]"}, {}, None, None),  # all
+        ({"DATASEC": "[3:8,1:6]"}, {"roi": (0, 6, 0, 2)}, None, None),  # overscan alone is what is wanted
+        ({"DATASEC": "[3:9,1:6]"}, {}, None, None),  # not of this image
+        ({"DATASEC": "whole"}, {}, None, None),
+        # between both a column of neither
+        ({"TRIMSEC": "[1:5,1:6]", "BIASSEC": "[7:8,1:6]"}, {}, (0, 6, 0, 5), np.s_[:, 6:]),
+        ({"BIASSEC": "[7:8,1:6]"}, {}, (0, 6, 0, 6), np.s_[:, 6:]),
+        (
+            {"BIASSEC": "[7:8,1:6]"},
+            {"overscan": [(0, 2, 0, 8)], "roi": (1, 6, 0, 8)},
+            (1, 5, 0, 8),
+            np.s_[:1],
+        ),
+        ({"TRIMSEC": "[1:5,1:6]"}, {"overscan": []}, (0, 6, 0, 5), np.s_[:0]),
     ],
 )
-def test_overscan_is_excluded(tmp_path, cards, roi, used):
+def test_overscan_is_excluded(tmp_path, cards, settings, active, overscan):
+    """``overscan``: None is all outside of the light-sensitive area."""
     stack = np.arange(4 * 6 * 8, dtype=np.uint16).reshape(4, 6, 8)
     write_fits(tmp_path / "a.fits", stack, **cards)
-    with opened(tmp_path / "a.fits", roi=roi) as frames:
-        assert frames.active == used
-        if used is None:
+    with opened(tmp_path / "a.fits", **settings) as frames:
+        if active is None:
             assert frames.excluded is None
+            assert not frames.overscan_pixels.any()
             return
-        y0, y1, x0, x1 = used
-        inside = np.zeros(frames.shape[1:], bool)
+        y0, y1, x0, x1 = active
+        inside, dark = np.zeros((2, *frames.shape[1:]), bool)
         inside[y0:y1, x0:x1] = True
+        dark[np.s_[:] if overscan is None else overscan] = True
         np.testing.assert_array_equal(frames.excluded, ~inside)
+        np.testing.assert_array_equal(frames.overscan_pixels, dark & ~inside)
+        top, _, left, _ = settings.get("roi", (0, 0, 0, 0))
+        whole = stack[:, top : top + frames.shape[1], left : left + frames.shape[2]]
+        shown = inside | frames.overscan_pixels
+        np.testing.assert_array_equal(frames.with_overscan().read()[:, shown], whole[:, shown])
+        assert (np.ptp(frames.read()[:, ~inside], axis=0) == 0).all()
+
+
+def test_overscan_outside_of_the_frames_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", STACK)
+    not_opened(r"input\.overscan \[0, 5, 0, 900\] exceeds", tmp_path / "a.npy", overscan=[(0, 5, 0, 900)])
 
 
 def test_files_with_two_light_sensitive_areas_are_no_stack(tmp_path):

@@ -11,12 +11,17 @@ from pchem_pipeline.effects.framework.effect import SharedOffset
 from pchem_pipeline.effects.operators.drifts import BiasDrift
 from pchem_pipeline.effects.operators.noise import NoiseSkew
 from pchem_pipeline.effects.operators.offsets import ColumnNoise, FrameNoise, PeriodicPickup, RowNoise
-from pchem_pipeline.use.common_modes import CommonModes, estimate_offsets, scene_of
+from pchem_pipeline.use.common_modes import CommonModes, Reference, estimate_offsets, scene_of
 from pchem_pipeline.use.electrons import electrons
 
 SHAPE, N_FRAMES = (24, 40), 60
 EVERYWHERE = np.ones((1, *SHAPE), bool)
 SPREAD = {"frame": 1.0, "row": 1.5, "column": 1.2}
+
+
+def seen(frames, calibration):
+    """All pixels, at the mean of the frames."""
+    return Reference.of_pixels(calibration, scene_of(frames.mean(axis=0), calibration))
 
 
 def taken(seed, read_noise, spread, exposure=1.0):
@@ -30,8 +35,7 @@ def taken(seed, read_noise, spread, exposure=1.0):
     variances = np.array([[spread[name] ** 2 for name in ("frame", "row", "column")]])
     modes = CommonModes(("row_noise",), np.ones((1, *SHAPE), bool), variances)
     calibration = camera.calibration()
-    scene = scene_of(frames.mean(axis=0), calibration)
-    return camera, true, frames, offset, modes, estimate_offsets(frames, scene, calibration, modes)
+    return camera, true, frames, offset, modes, estimate_offsets(frames, seen(frames, calibration), modes)
 
 
 @pytest.mark.parametrize(("read_noise", "share"), [((0.15, 0.25), 0.1), ((0.3, 0.45), 0.5)])
@@ -79,7 +83,7 @@ def test_pixels_without_calibration_tell_nothing():
     calibration = camera.calibration()
     calibration.bias[0] = np.nan
     modes = CommonModes(("row_noise",), EVERYWHERE, np.array([[0.0, 1.0, 0.0]]))
-    found = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, modes)
+    found = estimate_offsets(frames, seen(frames, calibration), modes)
     assert (found.rows[:, 0, 0] == 0).all()
     assert np.isfinite(found.rows).all()
 
@@ -98,7 +102,7 @@ def test_offsets_of_a_tap_are_found_there_and_beside_those_of_all():
     offset = rows + rng.standard_normal((N_FRAMES, 1, 1))
     _, frames = camera.frames(rng, 1.0, N_FRAMES, offset)
     calibration = camera.calibration()
-    found = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, modes)
+    found = estimate_offsets(frames, seen(frames, calibration), modes)
     error = (found.of_samples(modes) - offset) ** 2
     # a frame's offset is known from 960 samples, a row's from 16
     inside, outside = error[..., 24:].mean(), error[..., :24].mean()
@@ -107,7 +111,7 @@ def test_offsets_of_a_tap_are_found_there_and_beside_those_of_all():
     assert 0.6 < inside / found.left.sum(axis=1).mean() < 1.6
     # taken for all of the row, the tap's noise would be smeared over the pixels beside it
     smeared = CommonModes.of_model([RowNoise(row_noise_dn=1.5), whole], SHAPE)
-    wrong = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, smeared)
+    wrong = estimate_offsets(frames, seen(frames, calibration), smeared)
     assert ((wrong.of_samples(smeared) - offset) ** 2)[..., :24].mean() > 10 * outside
 
 
@@ -139,7 +143,7 @@ def test_pickup_of_any_orientation_is_taken_from_each_frame(per_row, per_column,
     modes = CommonModes.of_model([pickup], SHAPE)
     assert modes.removed == ("periodic_pickup",)
     calibration = camera.calibration()
-    found = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, modes)
+    found = estimate_offsets(frames, seen(frames, calibration), modes)
     total = found.of_samples(modes)
     np.testing.assert_allclose(found.of_samples(modes, slice(5, 9)), total[:, 5:9])
     error = ((total - offset) ** 2)[np.broadcast_to(inside, offset.shape)]
@@ -165,7 +169,7 @@ def test_a_wave_and_noise_of_rows_are_told_apart():
     modes = CommonModes.of_model([RowNoise(row_noise_dn=1.5), slanted], SHAPE)
     assert len(modes.parts) == 1
     calibration = camera.calibration()
-    found = estimate_offsets(frames, scene_of(frames.mean(axis=0), calibration), calibration, modes)
+    found = estimate_offsets(frames, seen(frames, calibration), modes)
     error = ((found.of_samples(modes) - offset) ** 2).mean()
     assert 0.6 < error / found.left.mean() < 1.6
     assert error < 0.1 * (offset**2).mean()
