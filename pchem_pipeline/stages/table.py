@@ -135,7 +135,7 @@ _ALL = (
     ),
     Stage(
         "discrepancy",
-        version=16,
+        version=17,
         upstream=("ingest",),
         settings=("discrepancy",),
         writes=("discrepancy",),
