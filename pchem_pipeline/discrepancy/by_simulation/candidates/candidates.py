@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -242,17 +242,21 @@ class ReplicateSimulator:
         return [better.get(int(i), hypotheses[i]) for i in order]
 
     def _visible(self, hypotheses: Sequence[Hypothesis], told: Sequence[Effect]) -> list[Hypothesis]:
-        """Return hypotheses, four times as strong where chance hides all that they do, unless they are told.
+        """Return hypotheses, four times as strong where chance hides all that they do.
 
-        A fingerprint that is lost in chance cannot be scaled to the data.
+        A fingerprint that is lost in chance cannot be scaled to the data. Effects whose numbers are told stay
+        as they are: they do a quarter of it.
         """
-        faint = {
-            id(h): h.rescaled(_STRONGER)
-            for h in hypotheses
-            if np.abs(h.fingerprint).max() < CERTAIN and not any(h.effect is effect for effect in told)
-        }
+        faint = {id(h): h.rescaled(_STRONGER) for h in hypotheses if np.abs(h.fingerprint).max() < CERTAIN}
         seen = {id(h.effect): h for h in self.fingerprints(list(faint.values()))}
-        return [seen.get(id(faint.get(id(h))), h) for h in hypotheses]
+
+        def shown(h: Hypothesis) -> Hypothesis:
+            stronger = seen.get(id(faint.get(id(h))), h)
+            if stronger is not h and any(h.effect is effect for effect in told):
+                return replace(h, fingerprint=stronger.fingerprint / _STRONGER)
+            return stronger
+
+        return [shown(h) for h in hypotheses]
 
     def _tuned(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
         """Tune the strength of each by simulation; a step that predicts worse is halved.

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from helpers.discrepancy_material import evidence
 
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screening
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.region import When
+from pchem_pipeline.effects.framework.registry import effect_class
 
 PART = Part(None, When(range=((300, 420),)))
 NAMES = ("tail.low.count", f"tail.low.count@{PART.text}", "shape.He4.mean")
@@ -38,3 +40,23 @@ def test_a_part_shows_what_it_does_beside_the_model_of_all_frames_or_of_itself(
     assert found.z["tail.low.count"] == pytest.approx(seen, rel=0.05)
     # what is known of all frames only says nothing about the part
     assert found.z["shape.He4.mean"] == 1.0
+
+
+def test_what_chance_hides_of_an_effect_is_seen_at_a_larger_strength() -> None:
+    acquisition: Any = SimpleNamespace(numbers=np.arange(100))
+
+    def simulated(replicates: Any) -> Any:
+        return [{"shape.He4.mean": 1000.0 * sum(e.share for e in one.effects)} for one in replicates]
+
+    simulator = ReplicateSimulator(evidence().maps, (), acquisition, NAMES, simulated, 1)
+    kind = effect_class("heavy_tailed_noise")
+    weak, other, strong = (kind.model_validate({"share": share}) for share in (0.002, 0.0021, 0.02))
+    hypotheses = simulator.fingerprints([weak, other, strong])
+    assert [h.fingerprint[2] for h in hypotheses] == [0.0, 0.0, pytest.approx(20.0)]
+    told, guessed, clear = simulator._visible(hypotheses, [weak])
+    # numbers that are told stay, and so does what they do
+    assert told.effect is weak
+    assert told.fingerprint[2] == pytest.approx(2.0)
+    assert guessed.effect.share == pytest.approx(4 * 0.0021)
+    assert guessed.fingerprint[2] == pytest.approx(8.4)
+    assert clear is hypotheses[2]
