@@ -136,7 +136,9 @@ def joint(
         list[Path],
         typer.Argument(help="a joint.yaml, or the runs (YAML or store) in increasing order of exposure"),
     ],
-    bias: Annotated[list[Path] | None, typer.Option(help="run of bias frames (repeatable)")] = None,
+    bias: Annotated[
+        list[Path] | None, typer.Option(help="run of bias frames, without any charge (repeatable)")
+    ] = None,
     store: Annotated[Path | None, typer.Option(help="store of the fit [default: joint.zarr]")] = None,
     against: Annotated[
         Literal["integration_time", "light_level", "none"] | None,

@@ -36,7 +36,7 @@ def millimetres(text: str) -> float:
         raise ConfigError(f"--width {text!r}: write a length such as 88mm, 8.8cm or 3.5in")
     length = float(match[1]) * _UNITS[match[2] or ""]
     if not _WIDTHS[0] <= length <= _WIDTHS[1]:
-        raise ConfigError(f"--width {text}: give {_WIDTHS[0]:g} to {_WIDTHS[1]:g} mm")
+        raise ConfigError(f"--width {text}: give {_WIDTHS[0]:g} to {_WIDTHS[1]:g} mm, such as 88mm or 18cm")
     return length
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,7 @@ def about_program() -> list[str]:
 
 
 def about_files(places: Sequence[Path]) -> Iterator[str]:
-    """Yield a line for each camera file: reader, frames, what its metadata say, or why it cannot be read.
+    """Yield a line for each camera file, or successive ones that are alike: what it is, or why it is unread.
 
     Raises:
         InputError: files are missing, or a folder has none.
@@ -51,8 +52,11 @@ def about_files(places: Sequence[Path]) -> Iterator[str]:
         return
     readers, report = survey(settings, here)
     by_path = {reader.paths[0]: reader for reader in readers}
-    for entry in report.files:
-        yield f"{entry.path}: {entry.problem or _reader_words(by_path[entry.path])}"
+    words = {entry.path: entry.problem or _reader_words(by_path[entry.path]) for entry in report.files}
+    for said, alike in groupby(words, key=words.__getitem__):
+        first, *others = alike
+        more = f" to {others[-1].name} ({1 + len(others)} files, each)" if others else ""
+        yield f"{first}{more}: {said}"
     if not report.good:
         yield from report.notes
         return
@@ -80,7 +84,7 @@ def _reader_words(reader: FrameReader) -> str:
     depth = "bit depth not stated" if reader.bit_depth is None else f"{reader.bit_depth} bits"
     seconds = reader.integration_time
     time = "no exposure time" if seconds is None else f"exposure {seconds:g} s ({reader.time_words})"
-    size = f"{n} frames of {rows} x {columns}"
+    size = f"{n} frame{'s' * (n != 1)} of {rows} x {columns}"
     for words, area in (("light-sensitive", reader.active), ("overscan", reader.overscan)):
         if area is not None:
             y0, y1, x0, x1 = area

@@ -262,8 +262,10 @@ def _complaint(item: Any, root: type[BaseModel]) -> str:
     where = ".".join(_shown(str(part)) for part in item["loc"])
     message = item["msg"].removeprefix("Value error, ").replace("valid tuple", "list")  # as YAML calls it
     if item["type"] == "extra_forbidden":
-        close = difflib.get_close_matches(_shown(str(item["loc"][-1])), _keys_at(item["loc"][:-1], root), 1)
-        return f"{where}: unknown key" + (f"; did you mean {close[0]}?" if close else "")
+        keys = _keys_at(item["loc"][:-1], root)
+        close = difflib.get_close_matches(_shown(str(item["loc"][-1])), keys, 1)
+        cure = f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(keys)}"
+        return f"{where}: unknown key; {cure}" if keys else f"{where}: unknown key"
     hidden = item["type"] == SECRET or isinstance(item["input"], dict | BaseModel)
     given = "" if hidden else f" (given: {_shown(repr(item['input']))})"
     return f"{where}: {message}{given}" if where else message

@@ -598,8 +598,10 @@ def micronats(gap: float) -> str:
 
 
 def share_text(share: float) -> str:
-    """Format a share in per cent; 100 % only if it is all."""
+    """Format a share in per cent; 100 % only if it is all, 0 % only if it is nothing."""
     percent = 100.0 * share
+    if 0.0 < percent < 1.0:
+        return f"{max(percent, 0.01):.2g} %"
     return f"{percent:.0f} %" if percent < 99.0 or share >= 1.0 else f"{min(percent, 99.99):.4g} %"
 
 

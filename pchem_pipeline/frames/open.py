@@ -56,8 +56,9 @@ def joined(
     """Join the readers of a survey to one stack; ``check``: look at some samples, see `open_frames`."""
     frames = FrameSequence(readers, settings, report, least)
     bad = _bad_pixels(frames, settings, base_dir)
-    frames.overscan_pixels &= ~bad
-    frames.exclude(frames.insensitive | bad)
+    for pixels in bad.values():
+        frames.overscan_pixels &= ~pixels
+    frames.exclude({"overscan": frames.insensitive} | bad)
     if check:
         report.notes += first_look(frames, settings)
     return frames
@@ -67,36 +68,36 @@ def joined(
 _MARKER = (1 << 32) - 1
 
 
-def _bad_pixels(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> BoolArray:
-    """Return the pixels (y, x) that ``input.mask`` excludes, and those with a marker or a stamp.
+def _bad_pixels(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> dict[str, BoolArray]:
+    """Return by cause the pixels (y, x) of ``input.mask``, and those with a marker or a stamp.
 
     The marker is in the first and the last frame.
 
     Raises:
         InputError: the mask is no image of the shape of the frames.
     """
-    n, rows, _ = frames.shape
-    excluded = np.zeros(frames.shape[1:], np.bool_)
+    n, rows, columns = frames.shape
+    causes: dict[str, BoolArray] = {}
     stamped = stamped_pixels(frames)
     if stamped is not None and frames.within_region(stamped).any():
-        excluded |= frames.within_region(stamped)
+        causes["stamp"] = frames.within_region(stamped)
         frames.report.notes.append(
             f"{frames.paths[0].name}: {np.count_nonzero(stamped)} pixels from the first one on hold a stamp "
             "that counts the frames, and no samples; excluded"
         )
     if frames.dtype.itemsize == 4:
         first, last = (frames.stored(t, t + 1, 0, rows)[0] for t in (0, n - 1))
-        excluded |= (first == _MARKER) & (last == _MARKER)
+        causes["marker 2^32-1"] = (first == _MARKER) & (last == _MARKER)
     path = mask_path(settings, base_dir)
     if path is None:
-        return excluded
+        return causes
     mask: BoolArray = read_image(path) != 0
-    if settings.roi is not None and mask.shape != excluded.shape and mask.ndim == 2:
+    if settings.roi is not None and mask.shape != (rows, columns) and mask.ndim == 2:
         y0, y1, x0, x1 = settings.roi
         mask = mask[y0:y1, x0:x1]
-    if mask.shape != excluded.shape:
+    if mask.shape != (rows, columns):
         raise InputError(
-            f"{path}: mask of shape {mask.shape}, but frames of {excluded.shape}; correct input.mask (--mask)"
+            f"{path}: mask of shape {mask.shape}, frames of {(rows, columns)}; correct input.mask (--mask)"
         )
-    excluded |= mask
-    return excluded
+    causes["mask"] = mask
+    return causes

@@ -28,11 +28,13 @@ class FrameSequence(FrameReader):
         excluded: pixels (y, x) whose samples are replaced by one that is the same in all frames; None: none.
         insensitive: pixels (y, x) outside of the light-sensitive area.
         overscan_pixels: those of them that tell the bias, (y, x).
+        exclusions: why pixels are excluded.
         stated_integration_time: s, as the files say, whatever the settings say; None if they do not agree.
     """
 
     format_name = "sequence"
     excluded: BoolArray | None = None
+    exclusions: tuple[str, ...] = ()
 
     @property
     def order_by_habit(self) -> bool:  # type: ignore[override]
@@ -143,18 +145,21 @@ class FrameSequence(FrameReader):
         for reader, part in self._parts(buffer, t0, t1, (y0, y1)):
             self.check_bits(reader, part, y0)
 
-    def exclude(self, pixels: BoolArray) -> None:
-        """Exclude pixels (y, x): their samples become the median of the others in the first frame.
+    def exclude(self, causes: Mapping[str, BoolArray]) -> None:
+        """Exclude pixels (y, x) by cause: their samples become the median of the others in the first frame.
 
         Raises:
             InputError: no pixel is left.
         """
+        self.exclusions = tuple(cause for cause, pixels in causes.items() if pixels.any())
+        if not self.exclusions:
+            return
+        pixels = np.logical_or.reduce([causes[cause] for cause in self.exclusions])
         if pixels.all():
             raise InputError(f"{_where(self.paths)}: every pixel is excluded; correct input.mask (--mask)")
-        if pixels.any():
-            self.excluded, self._places = pixels, np.nonzero(pixels)
-            others = self.stored(0, 1, 0, self.shape[1])[0][~pixels]
-            self._filler = np.quantile(others, 0.5, method="lower")
+        self.excluded, self._places = pixels, np.nonzero(pixels)
+        others = self.stored(0, 1, 0, self.shape[1])[0][~pixels]
+        self._filler = np.quantile(others, 0.5, method="lower")
 
     def with_overscan(self) -> Self:
         """Return these frames with the samples of the overscan as they are."""
@@ -313,12 +318,14 @@ def _check_same_camera(readers: Sequence[FrameReader]) -> None:
         }
         if len(set(values.values())) > 1:
             shown = _first_of_each(values, f"{name} = ")
-            raise InputError(f"the files were taken with different settings: {shown}; make one run of each")
+            raise InputError(
+                f"the files were taken with different settings: {shown}; give those of one setting at a time"
+            )
     serials = {reader.paths[0].name: reader.camera.serial for reader in readers if reader.camera.serial}
     distinct = set(serials.values())
     if len(distinct) > 1 and not 2 < len(readers) == len(distinct):
         shown = _first_of_each(serials, "serial number ")
-        raise InputError(f"the files are from different cameras: {shown}; make one run of each")
+        raise InputError(f"the files are from different cameras: {shown}; give those of one at a time")
 
 
 def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
@@ -334,11 +341,14 @@ def _agreed(readers: Sequence[FrameReader], name: str) -> Any:
 
 
 def _first_of_each(values: Mapping[str, Any], what: str = "") -> str:
-    """Return the first values that differ, each with the first file that has it."""
-    seen: dict[Any, str] = {}
+    """Return the first values that differ, each with its first file and the number of the others."""
+    seen: dict[Any, list[str]] = {}
     for file, value in values.items():
-        seen.setdefault(value, file)
-    return ", ".join(f"{what}{value} in {file}" for value, file in [*seen.items()][:4])
+        seen.setdefault(value, []).append(file)
+    return ", ".join(
+        f"{what}{value} in {files[0]}" + (f" and {len(files) - 1} more" if len(files) > 1 else "")
+        for value, files in [*seen.items()][:4]
+    )
 
 
 def _frame_range(settings: InputSettings, total: int, least: int) -> tuple[int, int]:

@@ -68,8 +68,8 @@ def stamp_notes(readers: Sequence[FrameReader], frame_range: tuple[int, int | No
     edges = sorted({first, end, *(t + 1 for t in after + back), *repeated})
     a, b = max(pairwise(edges), key=lambda part: part[1] - part[0])
     return [
-        f"by the camera's count of frames {' and '.join(found)}; values of single pixels hold; for what "
-        f"changes in time a part without gaps is input.frame_range: [{a}, {b}] (--frames {a}:{b})"
+        f"the camera's count of frames: {' and '.join(found)}; values of pixels are right, what is found in "
+        f"time can be off; the longest part without gaps: input.frame_range: [{a}, {b}] (--frames {a}:{b})"
     ]
 
 

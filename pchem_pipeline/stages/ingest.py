@@ -69,9 +69,7 @@ def run(context: StageContext) -> None:
     if reader.excluded is not None:
         context.store.write_array("frames/excluded", reader.excluded)
         number = np.count_nonzero(reader.excluded)
-        context.note(
-            f"{number} of {reader.excluded.size} pixels excluded (mask, overscan, marker 2^32-1 or stamp)"
-        )
+        context.note(f"{number} of {reader.excluded.size} pixels excluded: {', '.join(reader.exclusions)}")
     write_overscan(context.store, reader)
     keep_ingested(context)
     if settings.mode == "reference":

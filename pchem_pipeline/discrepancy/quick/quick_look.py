@@ -412,7 +412,8 @@ def _wandering(sums: StackSums, maps: PixelMaps) -> list[Check]:
     p = special.chdtrc(lengths.size - 1.0, chi2)
     out = np.flatnonzero(p < SIGNIFICANCE / p.size)
     places = np.argwhere(some)[out[np.argsort(-chi2[out])][:3]]
-    shown = ", ".join(f"({y}, {x})" for y, x in places)
-    where = f"{out.size:,} pixels, mainly (y, x) {shown}" if out.size else ""
+    shown = "; ".join(f"{y}, {x}" for y, x in places)
+    more = f" and {out.size - len(places):,} more" if out.size > len(places) else ""
+    where = f"y, x = {shown}{more}" if out.size else ""
     p_any, share = look_elsewhere(float(p.min()), p.size), out.size / p.size
     return [check_of("wandering_pixels", p_any, share, limit=2.0 / p.size, where=where)]

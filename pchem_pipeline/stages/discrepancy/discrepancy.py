@@ -205,7 +205,7 @@ def _surveyed(
         seen = _survey(context, source, settings)
         if seen.left_out:
             context.note(
-                f"excluded, empty, repeated, outlying or moved: {frame_words(np.array(seen.left_out))}"
+                f"left out (empty, repeated, outlying or moved): {frame_words(np.array(seen.left_out))}"
             )
         most, few = settings, fewer_samples(source, settings, roi, seen, model)
         if few != settings:

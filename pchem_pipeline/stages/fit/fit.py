@@ -71,7 +71,8 @@ def run(context: StageContext) -> None:
     if poor > 0.2 * pixels:
         context.note(
             f"{100 * poor / pixels:.0f} % of the pixels disagree with common g, mu and sigma for all "
-            "samples: check that all have the same sensor, gain, offset and temperature"
+            "samples: check that all have the same sensor, gain, offset and temperature, and that bias "
+            "frames (--bias) have no charge"
         )
     if biased:
         share = f"{100 * biased / pixels:.1f} %" if biased >= 0.001 * pixels else "fewer than 0.1 %"

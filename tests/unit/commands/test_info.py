@@ -24,6 +24,7 @@ def test_formats_effects_and_the_cache_are_listed(monkeypatch):
 
 def test_files_are_described_and_what_cannot_be_read_says_why(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", FRAMES, photometric="minisblack")
+    (tmp_path / "night").mkdir()
     (tmp_path / "b.tif").write_bytes(b"hello")
     stamps = np.r_[5:45][np.r_[:30, 33:40]]
     write_dcimg(tmp_path / "c.dcimg", FRAMES[:37], stamps=stamps)
@@ -38,6 +39,13 @@ def test_files_are_described_and_what_cannot_be_read_says_why(tmp_path):
     assert bad.startswith(f"{tmp_path / 'b.tif'}: ")
     codes = np.unique(FRAMES[[0, 20, 39]])
     assert together == f"together 40 frames of 8 x 9, DN {codes[0]} to {codes[-1]} ({codes.size} codes)"
+    for i in (1, 2, 3):
+        tifffile.imwrite(tmp_path / "night" / f"{i}.tif", FRAMES[i], photometric="minisblack")
+    alike, together = info.about_files([tmp_path / "night"])
+    assert alike.startswith(
+        f"{tmp_path / 'night' / '1.tif'} to 3.tif (3 files, each): tiff (tifffile), 1 frame of 8"
+    )
+    assert together.startswith("together 3 frames of 8 x 9")
     with pytest.raises(InputError, match="no such file"):
         list(info.about_files([tmp_path / "none.tif"]))
     tifffile.imwrite(tmp_path / "c.tif", FRAMES[:, :, 1:], photometric="minisblack")

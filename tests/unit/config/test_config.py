@@ -59,6 +59,10 @@ def test_files_may_be_one_place():
     [
         ("input: {files: 3}", "input.files: Input should be a list"),
         ("input: {files: [a]}\nfit: {algoritm: em}", "fit.algoritm: unknown key; did you mean algorithm?"),
+        (
+            "input: {files: [a]}\nrun: {bias: 1}",
+            "run.bias: unknown key; the keys here are store, title, tile, allowed_failed_pixels",
+        ),
         ("input: {files: [a], integration_time: .nan}", "input.integration_time"),
         ("input: {files: [a], integration_time: 0}", "input.integration_time: .*greater than 0"),
         ("input: {files: [a], integration_time: -1}", "input.integration_time"),

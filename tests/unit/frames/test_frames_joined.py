@@ -155,7 +155,8 @@ def test_left_justified_values_above_the_bit_depth_say_their_shift(tmp_path, shi
 def test_files_that_contradict_each_other(tmp_path):
     for i, time in enumerate((1.5, 1.5, 2.0)):
         write_fits(tmp_path / f"f{i}.fits", STACK[i], EXPTIME=time)
-    not_opened(r"different integration_time: 1\.5 in f0\.fits, 2\.0 in f2\.fits", tmp_path / "*.fits")
+    words = r"different integration_time: 1\.5 in f0\.fits and 1 more, 2\.0 in f2\.fits"
+    not_opened(words, tmp_path / "*.fits")
     assert opened(tmp_path / "*.fits", integration_time=3.0).integration_time == 3.0
     fits.PrimaryHDU(STACK[2]).writeto(tmp_path / "f2.fits", overwrite=True)
     assert opened(tmp_path / "*.fits").integration_time is None
@@ -352,6 +353,7 @@ def test_overscan_is_excluded(tmp_path, cards, settings, active, overscan):
         inside[y0:y1, x0:x1] = True
         dark[np.s_[:] if overscan is None else overscan] = True
         np.testing.assert_array_equal(frames.excluded, ~inside)
+        assert frames.exclusions == ("overscan",)
         np.testing.assert_array_equal(frames.overscan_pixels, dark & ~inside)
         top, _, left, _ = settings.get("roi", (0, 0, 0, 0))
         whole = stack[:, top : top + frames.shape[1], left : left + frames.shape[2]]
@@ -385,6 +387,7 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path):
         excluded = ((stack[0] == 2**32 - 1) | (mask_too * (mask != 0)))[y0:y1, x0:x1]
         with opened(tmp_path / "a.npy", mask=name, roi=roi) as frames:
             np.testing.assert_array_equal(frames.excluded, excluded)
+            assert frames.exclusions == ("marker 2^32-1", "mask")[: 1 + mask_too]
             wanted = stack[:, y0:y1, x0:x1]
             middle = np.quantile(wanted[0][~excluded], 0.5, method="lower")
             np.testing.assert_array_equal(frames.read(), np.where(excluded, middle, wanted))

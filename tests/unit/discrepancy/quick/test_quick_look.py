@@ -474,7 +474,9 @@ def test_a_region_that_is_moved_in_the_middle_of_the_run_is_found(n: int) -> Non
     frames[n // 2 :] = np.roll(frames[n // 2 :], 1, axis=2)
     block = HistogramSettings().block_length(n)
     look = quick_look(sums_of(frames, block), maps_of((16, 16)))
-    assert "wandering_pixels" in {check.name for check in look.found}
+    check = by_name(look)["wandering_pixels"]
+    assert check.found
+    assert re.fullmatch(r"y, x = \d+, \d+; \d+, \d+; \d+, \d+ and \d+ more", check.where)
     assert "pixels along the run" not in look.missing
     short = quick_look(sums_of(frames[:90], HistogramSettings().block_length(90)), maps_of((16, 16)))
     assert "pixels along the run" in short.missing
