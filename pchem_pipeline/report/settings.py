@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pchem_pipeline.base.settings import Section
+from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.effects.framework.region import Region
 
 PixelPosition = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
@@ -45,6 +46,21 @@ class Criteria(Section):
         description="spread of the conversion gain between pixels over its median: robust standard "
         "deviation, corrected for the errors of the pixels",
     )
+    medians: dict[str, tuple[float, float]] = Field(
+        default_factory=dict,
+        description="range of the median of a map, in its unit, such as {bias: [90, 110]}",
+    )
+
+    @field_validator("medians")
+    @classmethod
+    def _of_maps(cls, ranges: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        known = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)
+        for name, (low, high) in ranges.items():
+            if name not in known:
+                raise ValueError(f"{name} is no map; choose from {', '.join(known)}")
+            if not low < high:
+                raise ValueError(f"{name}: {low:g} to {high:g} is no range; give the smaller number first")
+        return ranges
 
 
 class ReportSettings(Section):

@@ -63,6 +63,13 @@ def criteria(data: ReportData) -> list[Criterion]:
             met, shown = number <= limit, show(number)
             shown = shown if met or shown != show(limit) else f"> {shown}"  # rounded to the limit
             found.append(Criterion(setting, words, shown, f"≤ {show(limit)}", met))
+    for name, (low, high) in data.criteria.medians.items():
+        if data.has_values(name):
+            median, (_, words, unit) = data.summary(name).median, symbol(name)
+            shown, within = f"{short(median, 4)} {unit}", f"{low:g} to {high:g} {unit}"
+            found.append(
+                Criterion(f"medians.{name}", f"median {words}", shown, within, low <= median <= high)
+            )
     return found
 
 
@@ -595,7 +602,9 @@ def _sensor(data: ReportData) -> Answer:
         text = f"Most {data.noun}s are flagged: the data do not fix their gain and read noise."
         return Answer(question, "serious", "Unknown", text, kept)
     missed = [each for each in judged if not each.met]
-    limits = "; ".join(f"{each.words} {each.found} (limit {each.limit[2:]})" for each in missed)
+    limits = "; ".join(
+        f"{each.words} {each.found} (limit {each.limit.removeprefix('≤ ')})" for each in missed
+    )
     met = f"all {len(judged)} criteria pass" if judged else "no limits are set (report.criteria)"
     text = f"{_value_share(data)}; {limits or met}."
     if pixels.failed > data.allowed_failed * pixels.total:

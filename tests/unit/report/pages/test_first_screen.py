@@ -125,7 +125,7 @@ def test_flagged_pixels_leave_medians_maxima_and_the_truth_table(bit: FitStatus,
 
 def test_criteria_stand_with_their_numbers_and_limits() -> None:
     found = {each.setting: each for each in criteria(flagged(0.2))}
-    assert set(found) == set(Criteria.model_fields)
+    assert set(found) == set(Criteria.model_fields) - {"medians"}
     assert (found["flagged_pixels"].found, found["flagged_pixels"].limit) == ("20 %", "≤ 10 %")
     assert not found["flagged_pixels"].met
     assert found["read_noise_e"].met
@@ -138,7 +138,9 @@ def test_criteria_stand_with_their_numbers_and_limits() -> None:
         (Criteria(), "Yes"),
         (Criteria(read_noise_e=0.2), "Too noisy"),
         (Criteria(gain_nonuniformity=0.01), "Mostly"),
-        (Criteria(**dict.fromkeys(Criteria.model_fields)), "Yes"),
+        (Criteria(**dict.fromkeys(set(Criteria.model_fields) - {"medians"})), "Yes"),
+        (Criteria(medians={"bias": (0.0, 1e4)}), "Yes"),
+        (Criteria(medians={"bias": (0.0, 1.0)}), "Mostly"),
     ],
 )
 def test_limits_decide(limits: Criteria, word: str) -> None:
@@ -146,6 +148,18 @@ def test_limits_decide(limits: Criteria, word: str) -> None:
     sensor = answers(data)[0]
     assert sensor.word == word
     assert all(f"{each.found} (limit" in sensor.text for each in sensor.criteria if not each.met)
+
+
+def test_the_range_of_a_median_is_told_with_what_was_found() -> None:
+    data = replace(flagged(0.0), criteria=Criteria(medians={"bias": (1.0, 2.0)}))
+    [bias] = [each for each in criteria(data) if each.setting == "medians.bias"]
+    assert (bias.limit, bias.met) == ("1 to 2 DN", False)
+    assert float(bias.found.removesuffix(" DN")) == pytest.approx(data.summary("bias").median, rel=1e-3)
+    assert "median bias" in answers(data)[0].text
+    with pytest.raises(ValueError, match="voltage is no map; choose from quanta_exposure"):
+        Criteria(medians={"voltage": (1.0, 2.0)})
+    with pytest.raises(ValueError, match="2 to 1 is no range"):
+        Criteria(medians={"bias": (2.0, 1.0)})
 
 
 def test_a_third_failed_and_noise_that_hides_the_electrons_are_not_all_right() -> None:
