@@ -40,7 +40,6 @@ from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, Floa
 _GRID = 16  # cells along either side of the map of what grows
 _STRAIGHT = 50.0  # runs: a time constant so long is a straight line
 _LEAST_GROWTH = 20.0  # chi2 that the best of some 1,000 spots must explain
-_SPOT = ("radius", "centre_y", "centre_x")  # parameters of a spot beside its brightness
 
 
 class Glow(Effect, tag="glow"):
@@ -106,10 +105,6 @@ class Glow(Effect, tag="glow"):
     def localised(self) -> bool:
         """It is where its spot is."""
         return True
-
-    def details(self) -> tuple[str, ...]:
-        """Return place and size of the spot, and how often it bursts."""
-        return tuple(name for name in ("burst_share", *_SPOT) if getattr(self, name))
 
     def pattern(self, rows: IntArray, shape: tuple[int, ...]) -> FloatArray:
         """Return the spot in some rows relative to its brightest pixel, shape (rows, columns)."""
@@ -258,11 +253,6 @@ class Persistence(Effect, tag="persistence"):
     def localised(self) -> bool:
         """A spot is where it is; an image on a coarse grid has no sharp ends."""
         return not self.image
-
-    def details(self) -> tuple[str, ...]:
-        """Return time constants, and place and size of a spot."""
-        names = ("decay_frames", "slow_decay_frames", *(() if self.image else _SPOT))
-        return tuple(name for name in names if getattr(self, name))
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its spot or image counted from these rows and columns."""
