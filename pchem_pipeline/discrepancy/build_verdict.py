@@ -419,9 +419,11 @@ def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, sc
 
 def _factor_words(factors: Mapping[str, tuple[str, ...]]) -> str:
     """State which factors of an effect are certain, and what the others may be."""
-    certain = ", ".join(values[0] for values in factors.values() if len(values) == 1)
-    left = [f"{schema.FACTORS[key]} ({' or '.join(v)})" for key, v in factors.items() if len(v) > 1]
-    return (f"; certain: {certain}" if certain else "") + (f"; open: {_and(left)}" if left else "")
+    words = ""
+    for state, many in (("certain", False), ("open", True)):
+        told = [f"{schema.FACTORS[k]} ({' or '.join(v)})" for k, v in factors.items() if (len(v) > 1) is many]
+        words += f"; {state}: {_and(told)}" if told else ""
+    return words
 
 
 def _sized(effect: Effect, sizes: Mapping[Effect, schema.Size | None]) -> str:

@@ -421,7 +421,10 @@ def test_what_the_likeliest_effects_have_in_common_is_certain() -> None:
     found = Findings("frames", z, null, null, gap, [], False, Added((addition,), gap))
     assert found.state == "ambiguous"
     words = _sentence(found, {})
-    assert "do not decide which; certain: offset; open: what shares it (pixels of a row or a wave" in words
+    assert (
+        "do not decide which; certain: what changes (offset); open: what shares it (pixels of a row or"
+        in words
+    )
     named = replace(addition, alone=True, candidates=candidates[:1])
     assert named.step(None).factors["shared_by"] == ("pixels of a row",)
     assert replace(addition, against="it does not fit").step(None).factors == {}
