@@ -355,7 +355,7 @@ def _nearly(found: Findings) -> str:
     if p < FALSE_ALARM:
         least = int(np.argmin(found.first.p_values(found.z.both, 2)))
         says = STATISTICS[found.first.names[least]].says(float(found.first.pulls(found.z.both, 2)[least]))
-        words.append(f"{says} (p = {p:.1g})")
+        words.append(f"{says} (p = {p:.1g}, corrected for the number of statistics)")
     if not found.before.at_floor:
         words.append("all statistics together exceed the 95 % limit of sampling noise")
     return f"; borderline: {'; '.join(words)}; take more frames to decide" if words else ""
@@ -396,7 +396,7 @@ def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> st
 
 def _none(found: Findings) -> str:
     """Return the subject of "explains it" where nothing does."""
-    return "no effect tried" if found.limit else "no known effect"
+    return "no effect tried" if found.limit else "no effect in the library"
 
 
 def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, schema.Size | None]) -> str:
@@ -463,7 +463,9 @@ def _nearest(found: Findings) -> str:
     words = ""
     for why in dict.fromkeys(doubtful.values()):
         alike = [_title(tag) for tag, against in doubtful.items() if against == why]
-        words += f"; {_and(alike)} {'comes' if len(alike) == 1 else 'come'} closest, but {why}"
+        several = len(alike) > 1
+        why = why.replace("it ", "each of them ", 1) if several else why
+        words += f"; {_and(alike)} {'come' if several else 'comes'} closest, but {why}"
     return words + (f"; closest known: {_and(nearest)}" if nearest else "")
 
 

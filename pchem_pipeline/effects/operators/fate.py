@@ -87,8 +87,8 @@ class ChargeLag(Effect, tag="charge_lag"):
     strength = "fraction"
     reach_frames = 1
     untestable = (
-        "randomly delayed Poisson electrons remain independent and Poisson; a bright frame followed by dark "
-        "ones would show it"
+        "in steady light, delayed charge leaves Poisson statistics unchanged; a bright frame followed by "
+        "dark ones would show it"
     )
     #: at a fifth
     typical_values = ({"fraction": 0.2},)

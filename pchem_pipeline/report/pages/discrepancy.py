@@ -86,7 +86,7 @@ def place_text(place: Place) -> str:
     words = [place.spot()] if place.spot() else []
     if place.pixels:
         shown = ", ".join(f"({y}, {x})" for y, x in place.pixels[:4])
-        more = f" … {count(len(place.pixels), 'pixel')}" if len(place.pixels) > 4 else ""
+        more = f" … {count(len(place.pixels), 'pixel')} listed" if len(place.pixels) > 4 else ""
         words.append(f"pixels (y, x) {shown}{more}")
     if place.dn is not None:
         low, high = place.dn
@@ -165,7 +165,8 @@ def _rivals(data: DiscrepancyData) -> Table:
     return Table(
         "discrepancy-rivals",
         "Rejected effects",
-        "The next best effects, each fitted instead of the named one.",
+        "The next best effects, each fitted instead of the named one; log-likelihood of all statistics of "
+        "training and test frames.",
         [
             {
                 "effect": rival.effect,
@@ -187,7 +188,7 @@ def _factors(steps: Sequence[Step]) -> Table:
     return Table(
         "discrepancy-factors",
         "What is certain of an effect that has no name",
-        "Factors in which the candidates agree are certain.",
+        "Certain is what all candidates that remain have in common.",
         [
             {
                 "factor": FACTORS[name],
@@ -216,7 +217,7 @@ def _how(step: Step, found: Verdict) -> str:
     if step.effect:
         return ""
     if step.verdict != "described":
-        return " (the likeliest)"
+        return " (rejected)" if step.verdict == "unexplained" else " (the likeliest)"
     return " (empirical)" if found.part_of_model(step) else " (empirical, not in the model)"
 
 
@@ -225,7 +226,7 @@ def _parameters(data: DiscrepancyData) -> Table:
     return Table(
         "discrepancy-parameters",
         "Parameters of the effects",
-        "The strength with its standard error, and fixed parameters without one; names are keys of "
+        "Each with its standard error, where one was computed; names are keys of "
         "model.effects in the run's YAML.",
         [
             {
@@ -250,13 +251,16 @@ def _values(step: Step) -> dict[str, str]:
 
 def _moved(found: Verdict) -> Table:
     rows = []
-    for step in found.steps:
-        for name, each in step.moved.items():
+    kept = [step for step in found.steps if found.part_of_model(step)]
+    for step in kept:
+        # effects that were fitted together have moved the maps together
+        together = [other for other in kept if other.moved == step.moved]
+        for name, each in step.moved.items() if together[0] is step else ():
             unit = unit_text(each.unit)
             rows.append(
                 {
                     "parameter": f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
-                    "effect added": f"{step.likeliest}{_how(step, found)}",
+                    "effect added": " + ".join(f"{one.likeliest}{_how(one, found)}" for one in together),
                     "change": short(each.median, 2) if abs(each.in_stderr) >= _NOT_MOVED else "0",
                     "in standard errors": signed(each.in_stderr),
                 }
@@ -286,7 +290,7 @@ def _unexplained(places: Sequence[Place]) -> Table:
     return Table(
         "discrepancy-unexplained",
         "Unexplained",
-        "Remaining disagreements with all named effects in the model.",
+        "Remaining disagreements with the effects above in the model.",
         [
             {
                 "disagreement": place.sentence or place.statistic,
@@ -327,7 +331,6 @@ def _examined(data: DiscrepancyData) -> Table:
     for place in examined.places:
         words = Region.model_validate(place.region).describe()
         rows.append((_surveyed(place.map, data), f"{words} (p {probability_text(place.p)})"))
-    rows += [(f"version: {name}", str(version)) for name, version in data.found.versions.items()]
     cells = [{"item": item, "value": value} for item, value in rows]
     return Table("discrepancy-examined", "Survey of the whole sensor", "", cells)
 
@@ -405,7 +408,7 @@ def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
     first = _signature(data.found)
     words = {"where": {} if data.found.where else {"title": "Data and model side by side"}}
     if any(step.verdict == "described" for step in data.found.steps):
-        words["evidence"] = {"empty": "No known effect explains the disagreement."}
+        words["evidence"] = {"empty": "No effect in the library explains the disagreement."}
     elif data.found.steps:
         words["evidence"] = {"empty": "There is only one candidate."}
     parts = []
@@ -480,7 +483,7 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
     if not extended or gap.within_chance:
         return [KeyFact("gap between data and model", nats, (unit, chance))]
     more = (f"{nats} {unit}", chance + _interval(gap))
-    nearest = " by the closest effect, not named" if found.verdict == "unexplained" else ""
+    nearest = " by the closest effect, which is rejected" if found.verdict == "unexplained" else ""
     return [KeyFact(f"of the gap closed{nearest}", percent(gap.closed_fraction, 1.0), more)]
 
 
@@ -520,7 +523,7 @@ def _size_texts(step: Step, values: Sequence[str]) -> tuple[str, tuple[str, ...]
 
 
 def _moved_fact(found: Verdict) -> list[KeyFact]:
-    steps = [step for step in found.steps if not found.proposed or step.effect]
+    steps = filter(found.part_of_model, found.steps)
     moved = [(name, m) for step in steps for name, m in step.moved.items() if math.isfinite(m.in_stderr)]
     name, largest = max(moved, key=lambda pair: abs(pair[1].in_stderr), default=("", None))
     if largest is None or abs(largest.in_stderr) < _NOT_MOVED:
@@ -531,7 +534,7 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
         KeyFact(
             f"largest change: {parameter_name(name)}",
             f"{_signed(largest.median, 2)} {unit}".strip(),
-            (f"{_signed(largest.in_stderr, 2)} standard errors per pixel{small}",),
+            (f"{_signed(largest.in_stderr, 2)} times the standard error of a pixel{small}",),
         )
     ]
 
@@ -543,7 +546,8 @@ def _signed(value: float, digits: int = 3) -> str:
 def _chance_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(found.p_global.before):
         return []
-    more = [f"of the largest disagreement, {found.replicates} replicates"] if found.replicates else []
+    more = [f"of the largest disagreement of all statistics, {found.replicates} replicates"]
+    more = more if found.replicates else []
     before, after = probability_text(found.p_global.before), probability_text(found.p_global.after)
     value = f"{before} → {after}" if after and found.effects else before
     return [KeyFact("p-value", value, tuple(more))]
@@ -609,8 +613,10 @@ def _compared(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
         rival, why = short_title(runner_up.effect), f"is rejected, since {runner_up.why}"
         # reductions of sampling noise mean nothing
         if not step.within_chance:
-            share = percent(step.closed_by(runner_up), 1.0)
-            words = f"Instead of {name}, {rival} (next best effect) closes {share} of the gap"
-            yield Flag("note", f"{words}{f' and {why}' if runner_up.why else ''}.")
+            closed = step.closed_by(runner_up)
+            words = f"{rival} (next best effect) closes {percent(closed, 1.0)} of the gap"
+            words = words if closed > 0.0 else f"no other effect reduces the gap; the next best, {rival},"
+            words += f"{' and' if closed > 0.0 else ''} {why}" if runner_up.why else ""
+            yield Flag("note", f"Instead of {name}, {words.removesuffix(',')}.")
         elif runner_up.why:
             yield Flag("note", f"The next best effect, {rival}, {why}.")

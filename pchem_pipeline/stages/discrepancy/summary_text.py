@@ -82,7 +82,7 @@ def _spots(place: Place) -> str:
     # the sentence of a statistic of a part ends with that part
     words = [place.spot()] if place.spot() and "@" not in place.statistic else []
     if place.pixels:
-        words.append(f"{len(place.pixels)} pixels, first (y, x) = {place.pixels[0]}")
+        words.append(f"{len(place.pixels)} pixels listed, first (y, x) = {place.pixels[0]}")
     if place.dn is not None:
         words.append(f"{place.dn[0]:g} to {place.dn[1]:g} DN")
     if place.frames:
