@@ -101,4 +101,4 @@ def test_a_place_is_told_once():
     few = Place.of("shape.goodness.cnt", z=7.3, region=pixels, pixels=((2, 9), (8, 0), (1, 5)))
     text = " ".join(verdict_text(verdict_of("named", where=[part.model_dump(), few.model_dump()])).split())
     assert "along x, in columns 10 to 13 (6.6 sigma)" in text
-    assert "(7.3 sigma; 3 pixels, first (y, x) = (2, 9))" in text
+    assert "(7.3 sigma; 3 pixels listed, first (y, x) = (2, 9))" in text
