@@ -14,6 +14,8 @@ PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 
 #: Names of the quanta exposure over the integration time: in the dark, and where something else made charge.
 CHARGE_RATES = ("dark_current", "charge_rate")
+#: Maps of what the fit determines, each with a standard error.
+MEASURED_MAPS = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)
 
 #: Arrays of the group ``fit`` that exist only where the model holds effects.
 FREE_SATELLITES = ("satellite_amplitude_e", "satellite_weight")
@@ -171,7 +173,7 @@ fit/outlier_share | y x | float64 | 1 | share of the frames excluded by the tail
 fit/satellite_amplitude_e | y x | float64 | e- | distance of the pixel's levels; NaN: one level
 fit/satellite_weight | y x | float64 | 1 | probability of the other level; 0: one level
 """),
-    *_both("maps", (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)),
+    *_both("maps", MEASURED_MAPS),
     *_ends("maps", (*INTERVALS, *CHARGE_RATES)),
     *_table("""
 maps/goodness_q | y x | float64 | 1 | false-discovery rate at which the pixel is a misfit

@@ -6,6 +6,7 @@ PYME and navigate take maps (Lin et al. 2017, Optics Express 25, 11701), DECODE 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,7 @@ class Calibration:
 
     Attributes:
         name: of the camera.
-        serial: its serial number; "camera" where it is not known.
+        serial: its serial number, as a file name; "camera" where it is not known.
         integration_time: s; None: not known.
         offset: mean of a pixel, DN; the median where a pixel has no fit.
         gain: conversion gain, e-/DN; the median where a pixel has no fit.
@@ -57,7 +58,7 @@ class Calibration:
         offset, variance = bias + electrons / gain, noise**2 + electrons
         return cls(
             sensor.camera.name or "camera",
-            Path(sensor.camera.serial or "camera").name,
+            re.sub(r"\W+", "_", sensor.camera.serial or "").strip("_") or "camera",
             sensor.integration_time,
             np.where(np.isfinite(offset), offset, np.nanmedian(offset)),
             np.where(np.isfinite(gain), gain, np.nanmedian(gain)),

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field, field_validator
 
 from pchem_pipeline.base.settings import Section
-from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
+from pchem_pipeline.base.variables import MEASURED_MAPS
 from pchem_pipeline.effects.framework.region import Region
 
 PixelPosition = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
@@ -54,10 +54,9 @@ class Criteria(Section):
     @field_validator("medians")
     @classmethod
     def _of_maps(cls, ranges: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-        known = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)
         for name, (low, high) in ranges.items():
-            if name not in known:
-                raise ValueError(f"{name} is no map; choose from {', '.join(known)}")
+            if name not in MEASURED_MAPS:
+                raise ValueError(f"{name} is no map; choose from {', '.join(MEASURED_MAPS)}")
             if not low < high:
                 raise ValueError(f"{name}: {low:g} to {high:g} is no range; give the smaller number first")
         return ranges

@@ -55,8 +55,11 @@ from pchem_pipeline.store.tiles import equal_rows
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
 from pchem_pipeline.use.common_modes import CommonModes, scene_of
 from pchem_pipeline.use.electrons import read_stderr
+from pchem_pipeline.use.overscan import Overscan
 
 if TYPE_CHECKING:
+    from pchem_pipeline.effects.framework.effect import Effect
+    from pchem_pipeline.frames.sequence import FrameSequence
     from pchem_pipeline.run.target import Target
 
 #: Name of the work in the records of the output.
@@ -125,6 +128,20 @@ def apply_to_frames(
     return written
 
 
+def _offsets_to_remove(
+    effects: Sequence[Effect], target: Target, frames: FrameSequence, reference: str
+) -> tuple[CommonModes, Overscan | None]:
+    """Return the offsets that are subtracted, and the overscan where that tells them."""
+    modes = CommonModes() if reference == "none" else CommonModes.of_model(effects, frames.shape[1:])
+    if reference != "overscan":
+        return modes, None
+    overscan = overscan_of(target, frames)
+    if not modes.removed:
+        samples = overscan_samples(frames, np.isfinite(overscan.bias), _SCENE_FRAMES)
+        modes = CommonModes.of_overscan(overscan, samples)
+    return modes, overscan
+
+
 def _make_job(
     run: RunStore, target: Target, files: Sequence[str | Path], wanted: ApplySettings
 ) -> tuple[Job, Calibration, dict[str, Any], list[str]]:
@@ -134,13 +151,8 @@ def _make_job(
     frames = open_like_run(target, sensor, files, wanted.dataset)
     limits = limits_of(frames, sensor)
     version = model_of(run, "fit")
-    modes = CommonModes()
-    overscan = overscan_of(target, frames) if wanted.reference == "overscan" else None
-    if version is not None and wanted.reference != "none":
-        modes = CommonModes.of_model(version.effects, sensor.shape)
-    if overscan is not None and not modes.removed:
-        samples = overscan_samples(frames, np.isfinite(overscan.bias), _SCENE_FRAMES)
-        modes = CommonModes.of_overscan(overscan, samples)
+    effects = () if version is None else version.effects
+    modes, overscan = _offsets_to_remove(effects, target, frames, wanted.reference)
     some, cut = some_of(frames if overscan is None else frames.with_overscan()), 0.0
     if limits is not None:
         cut = float(np.mean((some <= limits[0]) | (some >= limits[1])))
@@ -191,7 +203,7 @@ def _make_job(
         "program": __version__,
         "run": target.store.name,
         "run_digest": digest,
-        "model": "PCD" if version is None else model_words(version.effects),
+        "model": model_words(effects),
         "frames": frames.quick_identity()["files"],
         "settings": {**settings, "kinds": list(wanted.kinds)},
     }

@@ -77,7 +77,8 @@ def offsets_piece(piece: Piece, output: RunStore, *, job: Job) -> dict[str, Any]
     left, largest = np.zeros(len(job.modes.parts)), 0.0
     ends, known = [0, np.iinfo(np.int64).max] if job.limits is None else list(job.limits), calibration.usable
     reached, rows = [False, False], np.zeros((2, 2, job.source.shape[1]))
-    bias, number = calibration.bias, np.maximum(known.sum(axis=1), 1)
+    share = known / np.maximum(known.sum(axis=1, keepdims=True), 1)  # of a pixel in the mean of its row
+    bias = np.where(known, calibration.bias * share, 0.0).sum(axis=1)
     with FrameStream(source, [(piece.y0, piece.y1)], job.depth, frames=(piece.t0, piece.t1)) as stream:
         for start, (frames,) in stream:
             found = estimate_offsets(frames, reference, job.modes)
@@ -91,10 +92,10 @@ def offsets_piece(piece: Piece, output: RunStore, *, job: Job) -> dict[str, Any]
             left += found.left.sum(axis=0)
             offsets = found.of_samples(job.modes)
             largest = max(largest, float(abs(offsets).max()))
-            means, less = (
-                np.where(known, each, 0.0).sum(axis=2) / number for each in (frames - bias, offsets)
-            )
-            rows += [(each.sum(axis=0), (each**2).sum(axis=0)) for each in (means, means - less)]
+            means, less = (np.einsum("tyx,yx->ty", each, share) for each in (frames, offsets))
+            rows += [
+                (each.sum(axis=0), (each**2).sum(axis=0)) for each in (means - bias, means - bias - less)
+            ]
     return {"left": left.tolist(), "largest": largest, "reached": reached, "rows": rows.tolist()}
 
 

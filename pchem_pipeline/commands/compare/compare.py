@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
-from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.base.variables import MEASURED_MAPS, VARIABLES
 from pchem_pipeline.commands.compare.history import (
     HISTORY,
     PixelStates,
@@ -29,7 +29,6 @@ from pchem_pipeline.commands.compare.history import (
 from pchem_pipeline.commands.compare.settings import settings_that_differ, versions_that_differ
 from pchem_pipeline.commands.figures import warn_if_old
 from pchem_pipeline.model.checks.run_differences import (
-    MAPS,
     BlockDifference,
     CommonFit,
     MapDifference,
@@ -296,7 +295,7 @@ def _pair(
         transitions = np.histogram2d(*grades, bins=np.arange(4) - 0.5)[0].astype(int).tolist()
         compared = (before.quality == GOOD) & (now.quality == GOOD)
         stores = first.store, second.store
-        in_both = [name for name in MAPS if all(store.has(f"maps/{name}") for store in stores)]
+        in_both = [name for name in MEASURED_MAPS if all(store.has(f"maps/{name}") for store in stores)]
         if lacking := limits.keys() - {*in_both, "pixels"}:
             raise ConfigError(
                 f"compare.{min(lacking)}: {one.name} or {other.name} has no such map; omit this limit"

@@ -20,9 +20,9 @@ from scipy.special import erfc
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import StoreError
-from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.base.variables import MEASURED_MAPS, VARIABLES
 from pchem_pipeline.frames.camera import CameraFacts
-from pchem_pipeline.model.checks.run_differences import LIMIT, MAPS, CommonFit
+from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
 from pchem_pipeline.model.fit.status import FitStatus, words_of
 from pchem_pipeline.model.maps.defects import FAULTS, Defect
 from pchem_pipeline.report.comparison import DefectChange, HistoryRow, Pair, RunFacts, by_change
@@ -84,7 +84,7 @@ def history_row(
         for part, value in zip(("median", "median_stderr", "scatter"), values, strict=True):
             row[f"{name}_{part}"] = "" if value != value else f"{value:.9g}"
     moved = {} if pair is None else {name: each.n_changed for name, each in pair.maps.items()}
-    row |= {f"{name}_moved": moved.get(name, "") for name in MAPS}
+    row |= {f"{name}_moved": moved.get(name, "") for name in MEASURED_MAPS}
     row |= {
         "moved_pixels": "" if pair is None else pair.n_changed,
         "compared_pixels": "" if pair is None else pair.n_compared,

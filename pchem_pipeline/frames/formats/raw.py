@@ -40,7 +40,7 @@ _NAMES_IN_INF = {
 }
 #: what is said of samples that are not packed
 _UNPACKED = ("dtype", "offset", "byte_order")
-#: times as large are the steps of samples of another packing
+#: factor between the steps of samples from frame to frame by which another packing is told
 _CLEARLY = 4
 
 

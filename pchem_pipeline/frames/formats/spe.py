@@ -118,7 +118,10 @@ def _footer(path: Path, start: int, size: int) -> Any:
         raise InputError(f"{path}: truncated before its footer, or a damaged header; copy the file again")
     with path.open("rb") as stream:
         stream.seek(start)
-        return ElementTree.fromstring(stream.read())
+        text = stream.read()
+    if b"<!DOCTYPE" in text:  # entities can unfold without an end
+        raise InputError(f"{path}: its footer declares entities, which SPE files do not have; copy it again")
+    return ElementTree.fromstring(text)
 
 
 def _name(element: Any) -> str:

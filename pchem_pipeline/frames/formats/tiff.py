@@ -41,8 +41,9 @@ from pchem_pipeline.frames.writing import StackFacts
 from pchem_pipeline.store.files import whole_file
 
 _QUIET = logging.NullHandler()
-#: parts of the names of compressions that keep no exact samples, or need not
+#: photometric interpretations with one sample per pixel
 _MONOCHROME = ("MINISBLACK", "MINISWHITE", "CFA", "LINEAR_RAW")
+#: parts of the names of compressions that keep no exact samples, or need not
 _LOSSY = ("JPEG", "LERC", "WEBP")
 
 

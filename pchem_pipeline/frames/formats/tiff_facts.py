@@ -24,6 +24,7 @@ from pchem_pipeline.frames.camera import (
     seconds_of,
     text_of,
 )
+from pchem_pipeline.frames.settings import Area
 
 
 class _Kind(NamedTuple):
@@ -175,7 +176,7 @@ def has_table(page: Any) -> bool:
     return _TABLE_TAG in page.tags
 
 
-def active_area(page: Any) -> tuple[int, int, int, int] | None:
+def active_area(page: Any) -> Area | None:
     """Return the light-sensitive part of a DNG, see `FrameReader.active`; None where it says none."""
     rows, columns = page.shape[-2:]
     top, left, bottom, right = _tag(page, _ACTIVE_AREA_TAG) or (0, 0, 0, 0)

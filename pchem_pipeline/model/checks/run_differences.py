@@ -17,15 +17,12 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, erfc
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
-from pchem_pipeline.base.variables import CHARGE_RATES, PARAMETERS
 from pchem_pipeline.model.checks.multiple_testing import false_discovery
 from pchem_pipeline.model.checks.settings import allowed
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.maps.maps import summarise
 
-#: The maps that are compared.
-MAPS = (*PARAMETERS, "read_noise_e", "analog_read_noise_e", *CHARGE_RATES)
 #: Standard errors beyond which a single pixel, or a statistic of all pixels, counts as changed.
 LIMIT = 5.0
 #: By how much the standard errors of the fits themselves may be wrong.

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pchem_pipeline.base.plain import plain
-from pchem_pipeline.model.checks.run_differences import MAPS
+from pchem_pipeline.base.variables import MEASURED_MAPS
 from pchem_pipeline.model.fit.status import words_of
 from pchem_pipeline.model.maps.defects import FAULTS
 from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting, by_change
@@ -201,7 +201,7 @@ def history_table(found: Comparison) -> Table:
     rows = []
     for row in found.history:
         flags = {name[5:].replace("_", " "): n for name, n in row.items() if name.startswith("flag_")}
-        moved = {symbol(name)[1]: row[f"{name}_moved"] for name in MAPS}
+        moved = {symbol(name)[1]: row[f"{name}_moved"] for name in MEASURED_MAPS}
         rows.append(
             {
                 "label": "" if row["label"] == row["date"] else row["label"],
@@ -210,10 +210,10 @@ def history_table(found: Comparison) -> Table:
                 "run": row["run"],
                 "good pixels": row["pixels_good"],
                 "defects": _defect_words(row),
-                "flags": _numbers_that_are_not_0(flags) or "none",
+                "flags": _nonzero_counts(flags) or "none",
                 "effects": row["effects"].replace(" ", ", ") or "none",
                 "changed": row["moved_pixels"] and f"{row['moved_pixels']} of {row['compared_pixels']}",
-                "in": _numbers_that_are_not_0(moved),
+                "in": _nonzero_counts(moved),
             }
         )
     return Table(
@@ -226,14 +226,14 @@ def history_table(found: Comparison) -> Table:
     )
 
 
-def _numbers_that_are_not_0(numbers: Mapping[str, str]) -> str:
+def _nonzero_counts(numbers: Mapping[str, str]) -> str:
     return ", ".join(f"{name}: {n}" for name, n in numbers.items() if n not in ("", "0"))
 
 
 def _defect_words(row: HistoryRow) -> str:
     """Return the number of defects by kind, and where they differ from those of the first run."""
     kinds = {kind: row[f"{kind}_pixels"] for kind in map(words_of, FAULTS)}
-    parts = [_numbers_that_are_not_0(kinds) or "none"]
+    parts = [_nonzero_counts(kinds) or "none"]
     for change in by_change(()):
         if places := row[f"defects_{change.replace(' ', '_')}"].split():
             shown = ", ".join(places[:_MOST_PLACES])

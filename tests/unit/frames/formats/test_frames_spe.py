@@ -64,6 +64,7 @@ def test_refusals(tmp_path):
         (spe_bytes(STACK, regions=3, version=3.0, numbers=NUMBERS), "3 regions of interest"),
         (good[:108] + b"\5\0" + good[110:], "samples of type 5; record whole numbers"),
         (good.replace(b'"Frame"', b'"Other"'), "not a valid SPE file"),
+        (good.replace(b"<SpeFormat", b"<!DOCTYPE a><SpeFormat"), "its footer declares entities"),
     ):
         path.write_bytes(data)
         refused(words, path)

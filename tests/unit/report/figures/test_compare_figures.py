@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from pchem_pipeline.base.variables import MEASURED_MAPS
 from pchem_pipeline.commands.compare.settings import settings_that_differ
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.model.checks.run_differences import MAPS, MapDifference, compare_maps
+from pchem_pipeline.model.checks.run_differences import MapDifference, compare_maps
 from pchem_pipeline.report.charts.on_paper import Drawing, Look, draw_chart
 from pchem_pipeline.report.comparison import RunFacts
 from pchem_pipeline.report.figures.compare import (
@@ -106,7 +107,7 @@ def test_runs_in_their_order_are_told_by_label_or_number(
 ) -> None:
     parts = ("median", "median_stderr", "scatter")
     bias = {f"bias_{part}": "1" for part in parts}
-    others = {f"{name}_{part}": "" for name in MAPS if name != "bias" for part in parts}
+    others = {f"{name}_{part}": "" for name in MEASURED_MAPS if name != "bias" for part in parts}
     rows = [{"label": label, "date": "", "run": "r.zarr", **bias, **others} for label in labels]
     (figure,) = history_figures(rows)
     assert figure.tables[0]["name"].tolist() == ["r.zarr", "r.zarr"]

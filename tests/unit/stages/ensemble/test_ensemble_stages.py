@@ -463,6 +463,17 @@ def test_dark_frames_add_their_dark_current_to_what_other_programs_expect_of_dar
         ADAPTERS["pyme"](found, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("serial", "folder"), [("../../etc", "etc"), ("..", "camera"), ("SN 7/2", "SN_7_2"), (None, "camera")]
+)
+def test_a_serial_number_never_leads_out_of_the_folder(finished, tmp_path, serial, folder):
+    sensor = SensorInfo.read(finished.store)
+    sensor = replace(sensor, camera=replace(sensor.camera, serial=serial), integration_time=1.0)
+    target = SimpleNamespace(config=finished.config, sensor=lambda _: sensor)
+    written = ADAPTERS["pyme"](Calibration.of(target, finished.store), tmp_path)
+    assert {path.parent for path in written} == {tmp_path / "pyme" / folder}
+
+
 def test_export_says_what_is_wrong(finished, tmp_path):
     run = finished.store.path
     finished.store.write_config(dump_config(finished.config))
