@@ -441,7 +441,7 @@ def _root(
 
 
 def _fail(message: str, code: int) -> NoReturn:
-    from pchem_pipeline.base.units import typeset
+    from pchem_pipeline.base.wording import typeset
 
     typer.echo(f"pchem: {typeset(' '.join(message.split()))}", err=True)
     begun = any(each.name.startswith("tile") for each in threading.enumerate())

@@ -193,6 +193,6 @@ def region_of(text: str | None) -> tuple[int, int, int, int] | None:
 
 def say(text: str) -> None:
     """Print sentences with the signs of a page: ``e⁻``, ``→``."""
-    from pchem_pipeline.base.units import typeset
+    from pchem_pipeline.base.wording import typeset
 
     typer.echo(typeset(text))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.base.wording import measured, symbol
 from pchem_pipeline.commands.model import adopt_verdict
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE, read_verdict
 from pchem_pipeline.report.pages.summary import KEY_MAPS
-from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Command

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError, install_hint, quoted
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.base.wording import measured, symbol
 from pchem_pipeline.commands.figures import gather_run, millimetres
 from pchem_pipeline.commands.in_memory import paths_of, stack_of, write_stack
 from pchem_pipeline.model.fit.result import html_table
@@ -33,7 +34,6 @@ from pchem_pipeline.report.charts.on_paper import Look, draw_chart, draw_panels
 from pchem_pipeline.report.data import PixelFit
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.pixels import has_fit, pixels_chart
-from pchem_pipeline.report.style.wording import measured, symbol
 from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_versions
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run, with_maps

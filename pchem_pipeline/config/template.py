@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined, to_jsonable_python
 
-from pchem_pipeline.base.units import typeset
+from pchem_pipeline.base.wording import typeset
 from pchem_pipeline.config.tree import RunConfig
 
 _HEAD = """\

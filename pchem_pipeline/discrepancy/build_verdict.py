@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.wording import fitted_or_chosen, percent
 from pchem_pipeline.discrepancy import verdict as schema
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS, VERSION
 from pchem_pipeline.discrepancy.size import size_of
-from pchem_pipeline.effects.framework.compose import AddedExposure, place_words, title_words
+from pchem_pipeline.effects.framework.compose import AddedExposure, in_place, place_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
@@ -97,6 +98,7 @@ class Addition:
         return schema.Step(
             effect=self.effect.tag if self.named else None,
             verdict=self.verdict,
+            why=self.against,
             # an unconfirmed effect without a competitor is listed alone
             candidates=self.candidates[:1] if self.alone and not self.confirmed else self.candidates,
             parameters=schema.parameters_of(self.effect, self.stderr),
@@ -149,7 +151,6 @@ class Added:
         additions: the effects, the largest first.
         after: gap on the final samples with all of them.
         unfinished: whether the remaining gap is too large for a complete model.
-        nearest: tags of the closest effects if none explains the data.
         stand_ins: tags of effects that explain some codes, but not all.
         residuals: codes that the final model does not explain.
         set_aside: intervals of (x - bias) * gain, e-, whose codes the fit leaves out.
@@ -158,7 +159,6 @@ class Added:
     additions: tuple[Addition, ...]
     after: Gap
     unfinished: bool = False
-    nearest: tuple[str, ...] = ()
     stand_ins: tuple[str, ...] = ()
     residuals: tuple[schema.Place, ...] = ()
     set_aside: tuple[tuple[float | None, float | None], ...] = ()
@@ -364,7 +364,7 @@ def _nearly(found: Findings) -> str:
 def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Return the verdict in one sentence: the effect, its size, and the remaining discrepancy."""
     state, data, added = found.state, found.samples, found.added
-    titles = [_sized(effect, sizes) for effect in found.named]
+    titles = [_told(each, sizes) for each in added.additions if each.named]
     if state == "consistent":
         seen = " (histograms of single pixels only; frames, rows, columns and neighbours were not tested)"
         seen = seen if data == "histograms" else ""
@@ -377,19 +377,19 @@ def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> st
     if state == "unexplained":
         first = found.places[0] if found.places else None
         lead = f": {first.sentence or first.statistic}" if first is not None else ""
-        words = f"{lead}; {_none(found)} explains it{_nearest(found)}{_left(added)}{_broken(found)}"
+        words = f"{lead}; {_none(found)} explains it{_left(added)}{_broken(found)}"
         return f"Data and model disagree{words}."
     if state == "described":
         return _described(found, titles, sizes)
     if state == "ambiguous":
         return _ambiguous(found, titles, sizes)
     if found.before.at_floor:
-        return f"The model was missing {_and(titles)}, too small to show in the final {data} alone."
+        return f"The data show {_and(titles)}; the final {data} alone are too few to show it."
     if state == "named_in_part":
-        words = f"{_rest(found)}{_shown(found)}{_nearest(found)}{_left(added)}"
-        return f"The model was missing {_and(titles)}{words}{_broken(found)}."
+        words = f"{_rest(found)}{_shown(found)}{_left(added)}"
+        return f"The data show {_and(titles)}{words}{_broken(found)}."
     return (
-        f"The model was missing {_and(titles)}; with {'them' if len(titles) > 1 else 'it'}, data and model "
+        f"The data show {_and(titles)}; with {'them' if len(titles) > 1 else 'it'}, data and model "
         f"agree within sampling noise{_left(added)}."
     )
 
@@ -406,10 +406,10 @@ def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, sc
     unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in open_ones]
     factors = "".join(_factor_words(each.factors) for each in open_ones)
     doubtful = [each for each in additions if each.alone and each.fits and not each.confirmed]
-    weak = _and([_sized(each.effect, sizes) for each in doubtful])
+    weak = _and([_told(each, sizes) for each in doubtful])
     certain = all(each.certain for each in doubtful)
     why = f"not confirmed by the final {data}" if certain else f"too weak in these {data} to be certain"
-    also = f"The model was missing {_and(titles)}; it also" if titles else "The model"
+    also = f"The data show {_and(titles)}; the model also" if titles else "The model"
     rest = f"{_rest(found)}{_left(found.added)}"
     if not unknown:
         return f"{also} may lack {weak}: {why}; take more samples{rest}."
@@ -426,26 +426,26 @@ def _factor_words(factors: Mapping[str, tuple[str, ...]]) -> str:
     return words
 
 
-def _sized(effect: Effect, sizes: Mapping[Effect, schema.Size | None]) -> str:
-    """Describe an effect by name, size and region."""
-    size = sizes.get(effect)
-    if size is None:
-        return title_words(effect)
-    place = "" if effect.everywhere else f", in {place_words(effect)}"
-    return f"{_title(effect.tag)} of {size.words()}{place}"
+def _told(each: Addition, sizes: Mapping[Effect, schema.Size | None]) -> str:
+    """Describe an effect by its name, its place, its leading parameter and its size."""
+    effect, size = each.effect, sizes.get(each.effect)
+    numbers = list(schema.parameters_of(effect, each.stderr).items())[:1]
+    words = [f"{effect.meaning(name)} {fitted_or_chosen(n.value, n.stderr, n.unit)}" for name, n in numbers]
+    words += [] if size is None else [size.words()]
+    return f"{effect.short_title()}{in_place(effect)}" + (f" ({'; '.join(words)})" if words else "")
 
 
 def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Describe the data empirically where no known effect explains them."""
     known = [(effect.describe(), sizes.get(effect)) for effect in found.described]
-    words = "; and ".join(text if size is None else f"{text}, size {size.words()}" for text, size in known)
-    lead = f"The model was missing {_and(titles)}; {_none(found)} explains the rest"
+    words = "; and ".join(text if size is None else f"{text}; {size.words()}" for text, size in known)
+    lead = f"The data show {_and(titles)}; {_none(found)} explains the rest"
     if not titles:
         lead = f"{_none(found).capitalize()} explains the discrepancy"
     before, after = found.before, found.added.after
     closed = f"does not reduce the discrepancy in unseen {found.samples}"
     if not before.at_floor and after.value < before.value:
-        share = schema.share_text(schema.closed_share(before.value, after.value))
+        share = percent(schema.closed_share(before.value, after.value))
         closed = f"explains {share} of the discrepancy in unseen {found.samples}"
     rest = "; single statistics still disagree" if found.still else ""
     if found.proposed:
@@ -454,25 +454,10 @@ def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, sc
     return f"{lead}{rest}{_broken(found)}."
 
 
-def _nearest(found: Findings) -> str:
-    """Name the effects that come closest to an unexplained discrepancy."""
-    named = {effect.tag for effect in found.named}
-    doubtful = {e.candidates[0].effect: e.against for e in found.added.additions if not e.fits}
-    doubtful = {tag: against for tag, against in doubtful.items() if tag not in named}
-    nearest = [] if doubtful else [_title(tag) for tag in found.added.nearest if tag not in named]
-    words = ""
-    for why in dict.fromkeys(doubtful.values()):
-        alike = [_title(tag) for tag, against in doubtful.items() if against == why]
-        several = len(alike) > 1
-        why = why.replace("it ", "each of them ", 1) if several else why
-        words += f"; {_and(alike)} {'come' if several else 'comes'} closest, but {why}"
-    return words + (f"; closest known: {_and(nearest)}" if nearest else "")
-
-
 def _title(tag: str) -> str:
-    """Return the title of an effect."""
+    """Return the name of an effect."""
     effect = effect_classes().get(tag)
-    return tag if effect is None else effect.title or tag
+    return tag if effect is None else effect.short_title()
 
 
 def _rest(found: Findings) -> str:
@@ -483,7 +468,7 @@ def _rest(found: Findings) -> str:
     if after.value <= after.floor:
         return f"; a significant discrepancy remains in {schema.families_words(after.standing_out)}"
     left = 1.0 - schema.closed_share(found.before.value, after.value)
-    return f"; {schema.share_text(left)} of the discrepancy remains"
+    return f"; {percent(left)} of the discrepancy remains"
 
 
 def _broken(found: Findings) -> str:

@@ -19,7 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, Va
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import StoreError
-from pchem_pipeline.base.units import per_cent
+from pchem_pipeline.base.wording import percent, short
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
@@ -43,11 +43,6 @@ State = Literal[
 ]
 
 _NAN = float("nan")
-
-
-def _two_digits(value: float) -> str:
-    """Format a number to two significant digits without an exponent: 0.035, 21, 2,000."""
-    return f"{value:.2g}" if abs(value) < 99.5 else f"{float(f'{value:.2g}'):,.0f}"
 
 
 Number = Annotated[
@@ -119,14 +114,14 @@ class Size(_Part):
     samples: Number = 1.0
 
     def words(self) -> str:
-        """Describe the size: ``0.5 DN rms (1.1 e-, 22 % of the read noise)``."""
-        size = f"{_two_digits(self.dn)} DN rms ({_two_digits(self.electrons)} e-, {self.beside_noise()})"
-        return size if self.samples >= RARE else f"{size} in {per_cent(self.samples)} of the samples"
+        """Describe the size: ``samples change by 0.5 DN rms, 22 % of the read noise``."""
+        which = "samples" if self.samples >= RARE else f"{percent(self.samples)} of these samples"
+        return f"{which} change by {short(self.dn, 2)} DN rms, {self.beside_noise()}"
 
     def beside_noise(self) -> str:
         """Describe the size relative to the read noise, in per cent or as a multiple."""
         share = self.of_read_noise
-        times = f"{per_cent(share)} of" if share < _TIMES else f"{_two_digits(share)} times"
+        times = f"{percent(share)} of" if share < _TIMES else f"{short(share, 2)} times"
         return f"{times} the read noise"
 
 
@@ -368,6 +363,7 @@ class Step(_Part):
     Attributes:
         effect: tag of the named effect; None if ambiguous or rejected.
         verdict: verdict of this step alone.
+        why: reason of its rejection, starting with "it"; empty if it is not rejected.
         candidates: effects compared, the likeliest first.
         parameters: parameters of the named or the likeliest effect.
         form: its text fields that differ from their default.
@@ -388,6 +384,7 @@ class Step(_Part):
 
     effect: str | None
     verdict: State
+    why: str = ""
     candidates: tuple[Candidate, ...]
     parameters: dict[str, Measured]
     form: dict[str, str] = {}
@@ -597,14 +594,6 @@ def micronats(gap: float) -> str:
     return "not known" if not math.isfinite(gap) else f"{value:,.0f}" if value >= 100.0 else f"{value:.2g}"
 
 
-def share_text(share: float) -> str:
-    """Format a share in per cent; 100 % only if it is all, 0 % only if it is nothing."""
-    percent = 100.0 * share
-    if 0.0 < percent < 1.0:
-        return f"{max(percent, 0.01):.2g} %"
-    return f"{percent:.0f} %" if percent < 99.0 or share >= 1.0 else f"{min(percent, 99.99):.4g} %"
-
-
 def sigma_text(z: float) -> str:
     """Format the size of a deviation in standard deviations; its direction is in the sentence beside it."""
     return f"{abs(z):.{1 if abs(z) < 9.95 else 0}f} sigma" if math.isfinite(z) else "sigma not known"
@@ -627,7 +616,7 @@ def read_verdict(folder: Path) -> Verdict | None:
 
 
 def parameters_of(effect: Effect, errors: Mapping[str, float]) -> dict[str, Measured]:
-    """Return the fitted or chosen parameters of an effect, with the standard errors of those that have one.
+    """Return the fitted or chosen parameters of an effect, its strength first, with their standard errors.
 
     Those at their default say nothing, or have no meaning in this form of the effect.
 
@@ -636,11 +625,12 @@ def parameters_of(effect: Effect, errors: Mapping[str, float]) -> dict[str, Meas
         errors: standard errors by parameter.
     """
     fields = type(effect).model_fields
+    numbers = effect.model_dump(exclude={"tag"})
     return {
         name: Measured(
             value=value, stderr=errors.get(name, _NAN), unit=effect.unit(name).removeprefix("none")
         )
-        for name, value in effect.model_dump(exclude={"tag"}).items()
+        for name, value in sorted(numbers.items(), key=lambda item: item[0] != effect.strength)
         if isinstance(value, int | float) and not isinstance(value, bool)
         if name in (*errors, effect.strength) or value != fields[name].default
     }

@@ -23,12 +23,12 @@ from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.wording import unit_text
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.style.palette import shades
 from pchem_pipeline.report.style.ranges import DECADES
-from pchem_pipeline.report.style.wording import unit_text
 
 #: Codes with a meaning of their own, and the last one of the regular range.
 _NONE, _BELOW, _FIRST, _LAST, _ABOVE = 0, 1, 2, 65534, 65535

@@ -21,7 +21,7 @@ from typing import Any, Literal, Protocol, TextIO, TypeVar
 
 from pchem_pipeline.base.errors import ConfigError, StoreError, one_line
 from pchem_pipeline.base.kernel_cache import cache_folder, is_writable, listening
-from pchem_pipeline.base.units import typeset
+from pchem_pipeline.base.wording import typeset
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.lock import is_locked
 

@@ -15,6 +15,7 @@ from helpers.report_material import report_data
 
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.base.wording import percent
 from pchem_pipeline.commands.compare.compare import compare_runs, comparison_of
 from pchem_pipeline.commands.compare.history import HISTORY
 from pchem_pipeline.commands.notebook import open_run
@@ -23,7 +24,6 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.figures.compare import history_figures
 from pchem_pipeline.report.pages.compare import sentence_of
 from pchem_pipeline.report.pages.summary import criteria
-from pchem_pipeline.report.style.wording import percent
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.defects import stored_defects

@@ -160,5 +160,5 @@ def test_a_notebook_has_the_search_and_its_verdict(searched, tmp_path):
     run = open_run(shell.folder / "run.yaml")
     found = run.discrepancy()  # up to date
     assert found.effects == run.verdict.effects == ("row_noise",)
-    assert repr(found).startswith("<Verdict named: The model was missing row noise")
+    assert repr(found).startswith("<Verdict named: The data show row noise")
     assert "<li>row means of the readout residuals" in found._repr_html_()

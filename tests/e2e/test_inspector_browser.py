@@ -12,11 +12,11 @@ from helpers.inspector_material import make_run
 from helpers.packed_maps import unpack_map
 
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.base.wording import measured, short, symbol
 from pchem_pipeline.model.fit.status import MEANINGS
 from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import display_edges
 from pchem_pipeline.model.maps.ordered import Ordered
-from pchem_pipeline.report.style.wording import measured, short, symbol
 from pchem_pipeline.stages.report.inspector import packed_map
 
 NY, NX = 70, 90

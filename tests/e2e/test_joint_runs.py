@@ -300,7 +300,7 @@ def test_a_search_looks_at_all_samples_and_the_fit_takes_what_it_names(tmp_path)
     path.write_text(path.read_text() + f"discrepancy: {search}\n")
     fit(path)
     said = shell.ok("discrepancy", path.name, "--quiet").stdout
-    assert said.startswith("NAMED: The model was missing spurious")
+    assert said.startswith("NAMED: The data show spurious")
     found = read_verdict(tmp_path / "together.zarr")
     assert found.effects == ("spurious_charge",)
     fitted = found.steps[0].parameters["mean_e"]

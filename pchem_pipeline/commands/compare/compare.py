@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ChangedError, ConfigError, StoreError
 from pchem_pipeline.base.variables import MEASURED_MAPS, VARIABLES
+from pchem_pipeline.base.wording import count, measured, p_value_text, short, symbol
 from pchem_pipeline.commands.compare.history import (
     HISTORY,
     PixelStates,
@@ -55,7 +56,6 @@ from pchem_pipeline.report.pages.compare import (
     lines_of,
     render_comparison,
 )
-from pchem_pipeline.report.style.wording import count, measured, p_value_text, short, symbol
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run, with_maps

@@ -80,7 +80,6 @@ class AddedSets:
         added = Added(
             additions=tuple(replace(each, against=left or each.against) for each in additions),
             after=gap,
-            nearest=self.found.nearest,
             stand_ins=self.found.stand_ins,
             residuals=self.residuals(fitted) if still or not gap.at_floor else (),
             set_aside=self.found.set_aside,

@@ -51,7 +51,6 @@ class Explanation:
         best: the named effects, fitted to the codes that the gap compares.
         named: its effects, the weightiest first, compared on perhaps fewer codes, perhaps beside others.
         stand_ins: tags of effects that fit in one view and not in another, for something unknown.
-        nearest: tags of the best single effects on all codes.
         rest: share of the gap that is left among the codes on which effects were compared.
         rise: by how much the set of them predicts these better than none, nats, and the standard error.
     """
@@ -61,7 +60,6 @@ class Explanation:
     best: FittedSet
     named: tuple[Named, ...]
     stand_ins: tuple[str, ...]
-    nearest: tuple[str, ...]
     rest: float
     rise: tuple[float, float]
 
@@ -83,14 +81,13 @@ def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
         # what misfits all the same may be anything, such as a peak of no electron that is cut
         if moved.gap(again).at_floor:
             sets, best = moved, again
-    nearest = tuple(one.members[0].tag for one in sets.extended(sets.plain, candidates))
     rest, rise = _rest(sets, best), sets.difference(best, sets.plain)
     if best.members and (rest <= LARGEST_REST or sets.gap(best).at_floor):
         named = tuple(_named(sets, best, candidates))
-        return Explanation(sets.kept, (), best, named, (), nearest, rest, rise)
+        return Explanation(sets.kept, (), best, named, (), rest, rise)
     fixed_in_dn = combs_coincide(sets.plain.fit.parameters)
     pool = [c for c in candidates if not (c.tabulated or (fixed_in_dn and c.law.edge_shift.size))]
-    return _narrowed(sets, pool, nearest)
+    return _narrowed(sets, pool)
 
 
 def _rest(sets: SetComparison, best: FittedSet) -> float:
@@ -108,7 +105,7 @@ def combs_coincide(parameters: FloatArray) -> bool:
     return bool(np.ptp(np.quantile(bias, [0.1, 0.9])) * gain < _COINCIDE)
 
 
-def _narrowed(sets: SetComparison, candidates: Sequence[Member], nearest: tuple[str, ...]) -> Explanation:
+def _narrowed(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
     """Select on the codes that are understood, and keep what is selected on more of them, too."""
     parameters = sets.plain.fit.parameters
     electrons = electrons_of(sets.origin, sets.train.shape[1], parameters[:, 1], parameters[:, 2])
@@ -133,7 +130,7 @@ def _narrowed(sets: SetComparison, candidates: Sequence[Member], nearest: tuple[
     )
     stand_ins = tuple(m.tag for m in judged.members if best.member(m.tag) is None)
     rest, rise = _rest(view, judged), view.difference(judged, view.plain)
-    return Explanation(wide.kept, peak, best, named, stand_ins, nearest, rest, rise)
+    return Explanation(wide.kept, peak, best, named, stand_ins, rest, rise)
 
 
 def _cut_peak(

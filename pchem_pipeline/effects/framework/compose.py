@@ -263,11 +263,6 @@ def effect_words(effect: Effect) -> str:
     return f"{effect.tag}{in_place(effect)}"
 
 
-def title_words(effect: Effect) -> str:
-    """Describe an effect by its title."""
-    return f"{type(effect).title or effect.tag}{in_place(effect)}"
-
-
 def model_words(effects: Sequence[Effect]) -> str:
     """Describe a model, for example ``PCD + row_noise + rts_noise``."""
     return " + ".join(["PCD", *map(effect_words, effects)])

@@ -33,6 +33,7 @@ frames (:meth:`~Effect.added_exposure`). What many pixels share is taken from ca
 from __future__ import annotations
 
 import math
+import re
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from enum import Enum
@@ -396,6 +397,16 @@ class Effect(Section):
             value = max(value, low) if low is not None else value
             value = min(value, high) if high is not None else value
         return value
+
+    @classmethod
+    def short_title(cls) -> str:
+        """Return the title without synonyms and abbreviations in brackets."""
+        return re.sub(r" \(.*?\)", "", cls.title) or str(cls.model_fields["tag"].default)
+
+    @classmethod
+    def meaning(cls, name: str) -> str:
+        """Return what a parameter is: the first words of its description, without unit and further cases."""
+        return re.split(r"[,;]| \(", cls.model_fields[name].description or name, maxsplit=1)[0]
 
     def stuck_words(self) -> str:
         """State which parameters are at a limit; empty if none."""

@@ -154,7 +154,7 @@ class AdcInl(Effect, tag="adc_inl"):
         for period, phase in itertools.product((60.0, 150.0), (0.0, 1.57))
     )
     inl_lsb: Lsb = Field(
-        ge=0, le=1e4, description="amplitude of the sine, or scale of `curve` (its largest value is 1), LSB"
+        ge=0, le=1e4, description="largest deviation of the sine, or of `curve` where it is 1, LSB"
     )
     form: Literal["sine", "curve"] = Field(
         default="sine", description="sine: of one period; curve: smooth through the values of `curve`"
@@ -307,7 +307,7 @@ class AdcDnl(Effect, tag="adc_dnl"):
     dnl_lsb: Lsb = Field(
         ge=-1,
         le=1,
-        description="random: rms deviation of the code widths, LSB; edges: scale of `edges`, LSB; bit: error "
+        description="error of the code widths, LSB; random: its rms; edges: scale of `edges`; bit: error "
         "of the bit's weight, sign included, LSB",
     )
     pattern: Literal["random", "bit", "edges"] = Field(
@@ -547,8 +547,8 @@ class Clipping(Effect, tag="clipping"):
         "adc_dnl": "a shifted bias: a limit is fixed in DN, with no samples beyond",
         "adc_inl": "a shifted bias or more light: clipping affects one code, INL all",
     }
-    low: Code | None = Field(default=None, ge=0, description="smallest DN; null: limit of the ADC")
-    high: Code | None = Field(default=None, ge=0, description="largest DN; null: limit of the ADC")
+    low: Code | None = Field(default=None, ge=0, description="smallest value, DN; null: limit of the ADC")
+    high: Code | None = Field(default=None, ge=0, description="largest value, DN; null: limit of the ADC")
 
     @model_validator(mode="after")
     def _limits_in_order(self) -> Self:

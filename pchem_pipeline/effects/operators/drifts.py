@@ -163,7 +163,7 @@ class BiasDrift(Drift, OffsetEffect, tag="bias_drift"):
     drift_dn: Dn = Field(
         ge=-1e6,
         le=1e6,
-        description="linear, settling: bias at the end less that at the start, DN; path: its scale, DN; "
+        description="change of the bias from start to end, DN; path: its scale; "
         "walk: standard deviation of the end less the start, DN",
     )
 
@@ -237,7 +237,7 @@ class GainDrift(Drift, tag="gain_drift"):
     drift: Ratio = Field(
         ge=-0.5,
         le=0.5,
-        description="linear: relative change of the gain (DN/e-) from the first frame to the last, no unit; "
+        description="relative change of the gain (DN/e-) from the first frame to the last, no unit; "
         "path: its scale",
     )
 
@@ -298,7 +298,9 @@ class ExposureDrift(Drift, tag="exposure_drift"):
         {"drift": -0.016, "settling_fraction": 0.2},
     )
     drift: Ratio = Field(
-        ge=-2, le=2, description="(H_last - H_first) / H_mean (range of the time profile for a path), no unit"
+        ge=-2,
+        le=2,
+        description="relative change of the exposure, (H_last - H_first) / H_mean; path: its range",
     )
 
     @model_validator(mode="before")

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
-from pchem_pipeline.base.units import per_cent
+from pchem_pipeline.base.wording import percent
 from pchem_pipeline.effects.framework.compose import in_place
 from pchem_pipeline.effects.framework.context import DIMS, Dim
 from pchem_pipeline.effects.framework.effect import MOST_TOLD, Dn, Effect, Plane
@@ -135,7 +135,7 @@ class NoiseMode(Section):
         what = "" if rms is None else self._size_words(rms)
         if self.wave is not None:
             shared = self._wave_words(self.wave)
-        burst = "" if self.burst is None else f"only in {per_cent(self.burst)} of the {self.of}s"
+        burst = "" if self.burst is None else f"only in {percent(self.burst)} of the {self.of}s"
         return ", ".join(part for part in (what, whole, burst, shared) if part)
 
     def _size_words(self, rms: float) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pchem_pipeline.base.settings import Section
-from pchem_pipeline.base.units import per_cent
+from pchem_pipeline.base.wording import percent
 from pchem_pipeline.effects.framework.compose import in_place
 from pchem_pipeline.effects.framework.draws import OF_PIXEL, binomial_upper, regrouped, sent_to_neighbours
 from pchem_pipeline.effects.framework.effect import DEPTH, Effect, Electrons, Factors, Plane, Ratio
@@ -587,7 +587,7 @@ class ElectronMode(Section):
     def describe(self, chance: float) -> str:
         """Return in words how the numbers vary together, with a chance (or a mean number)."""
         if self.fate == "emptied":
-            return f"{per_cent(chance)} of the samples have no electrons"
+            return f"{percent(chance)} of the samples have no electrons"
         where = neighbour_words(self.place) if any(self.place) else "the same sample"
         if self.fate == "followed":
             return f"{chance:+.2g} electrons in {where} per electron"

@@ -482,7 +482,7 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
     }
     #: at 0.5 DN, of one tap and of several
     typical_values = tuple({"noise_dn": 0.5, "taps": taps} for taps in (1, 4, 2, 8))
-    noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation, DN")
+    noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the noise, DN")
     taps: Count = Field(
         default=1, ge=1, le=4096, description="column blocks read in parallel, with independent noise"
     )

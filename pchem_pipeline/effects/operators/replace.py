@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from pchem_pipeline.base.settings import Section
-from pchem_pipeline.base.units import per_cent
+from pchem_pipeline.base.wording import percent
 from pchem_pipeline.effects.estimators.common_modes import Multiple, multiple_of
 from pchem_pipeline.effects.framework.compose import in_place
 from pchem_pipeline.effects.framework.context import DIMS, Dim
@@ -763,14 +763,14 @@ class Empirical(Effect, tag="empirical"):
         if self.squares:
             rows, columns = (("even", "odd")[parity] for parity in self.squares)
             return (
-                f"{per_cent(self.share)} of the squares of 2 x 2 pixels{in_place(self)}, from {rows} rows "
+                f"{percent(self.share)} of the squares of 2 x 2 pixels{in_place(self)}, from {rows} rows "
                 f"and {columns} columns on, equal the mean of their samples"
             )
         shares = self.shares()
         order = np.argsort(-shares)[:MOST_TOLD]
-        told = [f"{per_cent(shares[i])} {self.moves[i].describe()}" for i in order]
+        told = [f"{percent(shares[i])} {self.moves[i].describe()}" for i in order]
         how = f" {self.moves[0].describe()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
-        return f"{per_cent(self.share)} of the {what}{in_place(self)} are shifted{how}"
+        return f"{percent(self.share)} of the {what}{in_place(self)} are shifted{how}"
 
 
 def _averaged(values: IntArray, chosen: BoolArray) -> IntArray:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from scipy import ndimage, special
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.wording import short
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 
 KINDS = ("empty", "copied", "far", "moved_x", "moved_y")
@@ -174,12 +174,8 @@ def odd_words(odd: dict[str, IntArray], mean: FloatArray, variance: FloatArray) 
         (odd.get("moved_y", nothing), ("looks", "look"), None, "moved by one row"),
     ):
         if frames.size:
-            size = "" if values is None else f"{_two_digits(np.median(np.abs(values[frames])))} "
+            size = "" if values is None else f"{short(float(np.median(np.abs(values[frames]))), 2)} "
             runs = _runs(frames)
             listed = f": {', '.join(runs[:4])}, ..." if len(runs) > 4 else ""
             words.append(f"{frame_words(frames)} {verbs[frames.size > 1]} {size}{says}{listed}")
     return "; ".join(words)
-
-
-def _two_digits(value: np.floating[Any]) -> str:
-    return f"{float(f'{value:.2g}'):,g}"

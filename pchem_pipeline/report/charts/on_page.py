@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.base.wording import without_formulas
 from pchem_pipeline.report.charts.chart import (
     Axis,
     Chart,
@@ -26,7 +27,6 @@ from pchem_pipeline.report.charts.chart import (
     y_window,
 )
 from pchem_pipeline.report.style.palette import DARK, LIGHT, Palette
-from pchem_pipeline.report.style.wording import without_formulas
 
 #: Columns of a curve that the page keeps, with two values each, and steps of a histogram.
 _COLUMNS, _STEPS = 2000, 4000

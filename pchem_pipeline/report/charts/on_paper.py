@@ -28,6 +28,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, NullLocator, ScalarFormatter
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.wording import power_of_ten
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
     SHADES,
@@ -51,7 +52,6 @@ from pchem_pipeline.report.charts.chart import (
     tick_rows,
 )
 from pchem_pipeline.report.style.palette import LIGHT, MAP_COLOURS
-from pchem_pipeline.report.style.wording import power_of_ten
 
 _STYLE: Any = {
     "axes.axisbelow": True,

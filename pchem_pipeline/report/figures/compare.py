@@ -10,6 +10,16 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.wording import (
+    count,
+    measured,
+    plain,
+    power_of_ten,
+    short,
+    signed,
+    symbol,
+    unit_text,
+)
 from pchem_pipeline.model.checks.run_differences import LIMIT, MapDifference
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
@@ -29,16 +39,6 @@ from pchem_pipeline.report.figures.ensemble import HALVES
 from pchem_pipeline.report.figures.figure import DataTable, Figure, pull_stack, sensor_stack
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import (
-    count,
-    measured,
-    plain,
-    power_of_ten,
-    short,
-    signed,
-    symbol,
-    unit_text,
-)
 
 #: Hues and styles of the ensembles of runs.
 _HUES = ("ink", "blue", "vermilion", "green", "orange", "purple", "sky")

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pchem_pipeline.base.wording import short
 from pchem_pipeline.discrepancy.verdict import MOST_PULLS, Pull, Verdict, micronats
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
@@ -28,7 +29,6 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.figure import DataTable, Figure, pull_axis, row_stack
-from pchem_pipeline.report.style.wording import short
 
 #: The gap is shown in millionths of a nat per sample.
 MICRO = 1e6

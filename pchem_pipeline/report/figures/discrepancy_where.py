@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray
+from pchem_pipeline.base.wording import count, short
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.discrepancy.where import PAIRS, map_of
 from pchem_pipeline.effects.framework.evidence import SCORES
@@ -46,7 +47,6 @@ from pchem_pipeline.report.figures.figure import (
 )
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import count, short
 
 #: Colours end at least, and at most, at so many standard deviations.
 _LEAST, _MOST = 4.0, 12.0

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, FloatArray
+from pchem_pipeline.base.wording import measured, percent, power_of_ten, scientific, short
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
     Axis,
@@ -27,7 +28,6 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.figures.pixels import shown_bins
-from pchem_pipeline.report.style.wording import measured, percent, power_of_ten, scientific, short
 
 #: Suffix of a prediction to (name in the legend, hue, line style).
 PREDICTIONS: dict[str, tuple[str, str, Dash]] = {
@@ -95,7 +95,7 @@ def electron_figures(data: ReportData) -> Iterator[Figure]:
         rate, error = 100.0 * float(facts["error_rate"]), 100.0 * float(facts.get("error_rate_stderr") or 0.0)
         words += f" Wrong estimates (truth known): {measured(rate, error, '%')}."
     if facts.get("expected_error_rate") is not None:
-        words += f" Expected from the fit: {percent(float(facts['expected_error_rate']), 1.0)} wrong."
+        words += f" Expected from the fit: {percent(float(facts['expected_error_rate']))} wrong."
     first = ", ".join(f"k = {k}: {mass[k]:.4f} against {pmf[k]:.4f}" for k in range(min(5, mass.size)))
     names = ("k", "electron_counts", "electron_mass", "electron_pmf", "electron_pmf_map")
     table = DataTable({name: arrays[name] for name in names if name in arrays}, {"k": "e-"})

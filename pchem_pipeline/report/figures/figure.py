@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.wording import plain
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
     LONGEST,
@@ -33,7 +34,6 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.style.palette import DIVERGING
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import plain
 
 if TYPE_CHECKING:
     from pchem_pipeline.report.charts.on_paper import Drawing, Look

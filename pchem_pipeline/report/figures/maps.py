@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.wording import count, measured, percent, plain, short, stored_unit, symbol
 from pchem_pipeline.model.checks.multiple_testing import misfit
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.ordered import Ordered
@@ -45,7 +46,6 @@ from pchem_pipeline.report.style.ranges import (
     map_colours,
     robust_range,
 )
-from pchem_pipeline.report.style.wording import count, measured, percent, plain, short, stored_unit, symbol
 
 #: Bins of the histogram of a map at most; of a line of channels half as many.
 _MOST_BINS = 128

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.base.wording import short
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
     Axis,
@@ -26,7 +27,6 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure, row_stack
-from pchem_pipeline.report.style.wording import short
 
 #: Method to the hue, or colour, of its line, and its marker.
 _MARKS: dict[str, tuple[str, Shape]] = {

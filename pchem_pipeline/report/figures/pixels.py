@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.base.wording import cut, measured, plain, short, stored_unit, symbol
 from pchem_pipeline.model.law.pcd import pcd, thresholds
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
@@ -30,7 +31,6 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.wording import cut, measured, plain, short, stored_unit, symbol
 
 #: Letters of a line of the status.
 _STATUS_LETTERS = 52

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.base.wording import measured, short, symbol
 from pchem_pipeline.model.maps.maps import summarise
 from pchem_pipeline.report.charts.chart import Axis, Chart, Level, Line, Mark, Panel, Points, Stack
 from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import measured, short, symbol
 
 #: Label and unit of what the exposures are drawn against, the maps that their slope may be, and the offset.
 AXES = {

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.wording import count, short
 from pchem_pipeline.discrepancy.observe.laws import FAR
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums
 from pchem_pipeline.model.histogram.spectrum import FEWEST_LINES
 from pchem_pipeline.report.charts.chart import Axis, Band, Chart, Level, Line, Panel, Stack
 from pchem_pipeline.report.figures.figure import DataTable, Figure
-from pchem_pipeline.report.style.wording import count, short
 
 #: Points of a curve at most; longer runs are averaged over frames, spectra over frequencies.
 _MOST_POINTS, _MOST_FREQUENCIES = 1200, 160

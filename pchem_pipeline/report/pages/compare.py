@@ -9,15 +9,7 @@ from typing import Any
 
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import MEASURED_MAPS
-from pchem_pipeline.model.fit.status import words_of
-from pchem_pipeline.model.maps.defects import FAULTS
-from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting, by_change
-from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
-from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, draw_here, render_page
-from pchem_pipeline.report.pages.summary import Flag, Level
-from pchem_pipeline.report.pages.tables import RMSES, Table
-from pchem_pipeline.report.style.wording import (
+from pchem_pipeline.base.wording import (
     count,
     cut,
     heading,
@@ -27,6 +19,14 @@ from pchem_pipeline.report.style.wording import (
     short,
     symbol,
 )
+from pchem_pipeline.model.fit.status import words_of
+from pchem_pipeline.model.maps.defects import FAULTS
+from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting, by_change
+from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
+from pchem_pipeline.report.figures.figure import Figure
+from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, draw_here, render_page
+from pchem_pipeline.report.pages.summary import Flag, Level
+from pchem_pipeline.report.pages.tables import RMSES, Table
 
 #: Names of the files.
 COMPARE_PAGE, COMPARE_JSON = "compare.html", "compare.json"

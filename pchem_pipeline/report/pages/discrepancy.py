@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from pchem_pipeline.base.units import typeset
+from pchem_pipeline.base.wording import (
+    count,
+    fitted_or_chosen,
+    measured,
+    percent,
+    short,
+    signed,
+    symbol,
+    typeset,
+    unit_text,
+)
 from pchem_pipeline.discrepancy.verdict import (
     FACTORS,
-    RARE,
     GapChange,
     Place,
     Step,
@@ -26,16 +34,6 @@ from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import Finding, KeyFact, Section
 from pchem_pipeline.report.pages.summary import VERDICT_LEVELS, Flag, Level, gravest_first
 from pchem_pipeline.report.pages.tables import Table
-from pchem_pipeline.report.style.wording import (
-    count,
-    fitted_or_chosen,
-    measured,
-    percent,
-    short,
-    signed,
-    symbol,
-    unit_text,
-)
 
 #: Longer lists are in ``discrepancy.json`` only.
 _MOST_PLACES, _MOST_CANDIDATES = 12, 8
@@ -151,7 +149,7 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     elif data.found.verdict == "ambiguous":
         outcome = "these data do not decide"
     else:
-        outcome = "none explains the data"
+        outcome = f"none explains the data{f'; of the first: {step.why}' if step.why else ''}"
     title = f"Candidates, step {index + 1}" if len(data.found.steps) > 1 else "Candidates"
     return Table(
         f"discrepancy-candidates-{index + 1}",
@@ -232,6 +230,7 @@ def _parameters(data: DiscrepancyData) -> Table:
             {
                 "parameter": f"{tag}: {name}",
                 "value": value,
+                "meaning": meaning(tag, name),
                 "effect": f"{data.title(tag)}{place}{_how(step, data.found)}" if i == 0 else "",
                 "source": effects[tag].source if i == 0 and tag in effects else "",
             }
@@ -241,6 +240,12 @@ def _parameters(data: DiscrepancyData) -> Table:
             for i, (name, value) in enumerate(_values(step).items())
         ],
     )
+
+
+def meaning(tag: str, name: str) -> str:
+    """Return what a parameter of an effect is, in a few words."""
+    known = effect_classes().get(tag)
+    return name if known is None or name not in known.model_fields else typeset(known.meaning(name))
 
 
 def _values(step: Step) -> dict[str, str]:
@@ -326,8 +331,8 @@ def _surveyed(name: str, data: DiscrepancyData) -> str:
 def _examined(data: DiscrepancyData) -> Table:
     examined, rows = data.found.examined, []
     if math.isfinite(examined.share):
-        rows.append(("share of the samples", percent(examined.surveyed, 1.0)))
-        rows += [(f"share: {kind}", percent(share, 1.0)) for kind, share in examined.surveyed_by.items()]
+        rows.append(("share of the samples", percent(examined.surveyed)))
+        rows += [(f"share: {kind}", percent(share)) for kind, share in examined.surveyed_by.items()]
     for place in examined.places:
         words = Region.model_validate(place.region).describe()
         rows.append((_surveyed(place.map, data), f"{words} (p {probability_text(place.p)})"))
@@ -346,7 +351,7 @@ PARTS = (
         "signature",
         "Largest disagreement, before and after",
         "The statistic that the added effect changes most (else the largest disagreement), and all "
-        "statistics before and after, in sigma.",
+        "statistics before and after, in standard deviations of the statistic under the model (sigma).",
         "",
     ),
     Section(
@@ -447,7 +452,7 @@ def frames_text(found: Verdict) -> str:
     dealt = f"{seen.train:,} for training, {seen.test:,} for testing, {seen.final:,} for the gap"
     if seen.histograms is not None:
         return f"{count(seen.histograms, 'histogram')}, samples split at random: {dealt}."
-    share = f" ({percent(seen.share, 1.0)} of the run's samples)" if math.isfinite(seen.share) else ""
+    share = f" ({percent(seen.share)} of the run's samples)" if math.isfinite(seen.share) else ""
     place = f"rows {seen.rows[0]} to {seen.rows[1] - 1}, columns {seen.columns[0]} to {seen.columns[1] - 1}"
     rest = seen.frames - seen.train - seen.test - seen.final
     over = f"; {rest} left over" if rest > 0 else ""
@@ -479,12 +484,13 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
         return []
     extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
     nats = f"{micronats(gap.before)} → {micronats(gap.after)}" if extended else micronats(gap.before)
-    unit, chance = "micronats per sample", f"sampling noise: up to {micronats(gap.floor)}"
-    if not extended or gap.within_chance:
-        return [KeyFact("gap between data and model", nats, (unit, chance))]
+    unit, chance = "micronats per sample", f"sampling noise up to {micronats(gap.floor)}"
+    if not extended or gap.after <= gap.floor:
+        now = ", reached" if extended and not gap.within_chance else ""
+        return [KeyFact("gap between data and model", nats, (unit, chance + now))]
     more = (f"{nats} {unit}", chance + _interval(gap))
     nearest = " by the closest effect, which is rejected" if found.verdict == "unexplained" else ""
-    return [KeyFact(f"of the gap closed{nearest}", percent(gap.closed_fraction, 1.0), more)]
+    return [KeyFact(f"of the gap closed{nearest}", percent(gap.closed_fraction), more)]
 
 
 def _interval(gap: GapChange) -> str:
@@ -498,28 +504,13 @@ def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
     facts = []
     for step in data.found.steps:
         if (step.effect or step.verdict == "described") and step.parameters:
-            values = [
-                f"{name} {fitted_or_chosen(p.value, p.stderr, unit_text(p.unit))}"
-                for name, p in step.parameters.items()
-            ]
-            values += [f"{name} {word}" for name, word in step.form.items()]
-            value, more = _size_texts(step, values)
-            place = (f"in {step.place}",) if step.place else ()
-            only = () if data.found.part_of_model(step) else ("proposed, not in the model",)
-            facts.append(KeyFact(data.title(step.likeliest), value, (*more, *place, *only)))
+            (first, value), *others = _values(step).items()
+            more = [meaning(step.likeliest, first), *(f"{name} {text}" for name, text in others[:2])]
+            more += [] if step.size is None else [step.size.words()]
+            more += [f"in {step.place}"] if step.place else []
+            more += [] if data.found.part_of_model(step) else ["proposed, not in the model"]
+            facts.append(KeyFact(data.title(step.likeliest), value, tuple(more)))
     return facts[:4]
-
-
-def _size_texts(step: Step, values: Sequence[str]) -> tuple[str, tuple[str, ...]]:
-    """Format the size of an effect, and the lines below it; its parameters if the size is unknown."""
-    size = step.size
-    if size is None:
-        # name and value do not fit in one line
-        name, _, value = values[0].partition(" ")
-        return value, (name, *values[1:3])
-    part = "" if size.samples >= RARE else f", in {percent(size.samples, 1.0)} of the samples"
-    share = f"{size.beside_noise()}, {short(size.electrons, 2)} e⁻ rms{part}"
-    return f"{short(size.dn, 2)} DN", (share, values[0])
 
 
 def _moved_fact(found: Verdict) -> list[KeyFact]:
@@ -546,8 +537,8 @@ def _signed(value: float, digits: int = 3) -> str:
 def _chance_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(found.p_global.before):
         return []
-    more = [f"of the largest disagreement of all statistics, {found.replicates} replicates"]
-    more = more if found.replicates else []
+    more = ["of the largest disagreement of all statistics"]
+    more += [f"t-distribution, scatter from {found.replicates} replicates"] if found.replicates else []
     before, after = probability_text(found.p_global.before), probability_text(found.p_global.after)
     value = f"{before} → {after}" if after and found.effects else before
     return [KeyFact("p-value", value, tuple(more))]
@@ -595,28 +586,23 @@ def _closing(found: Verdict) -> Iterator[Flag]:
         families = families_words(gap.standing_out)
         yield Flag("caution", f"A significant discrepancy remains in {families}.")
     elif gap.after > gap.floor:
-        left = percent(1.0 - gap.closed_fraction, 1.0)
+        left = percent(1.0 - gap.closed_fraction)
         words = f"{micronats(gap.after)} micronats per sample, sampling noise up to {micronats(gap.floor)}"
         level: Level = "caution" if found.verdict == "named_in_part" else "note"
         yield Flag(level, f"{left} of the gap remains: {words}.")
 
 
 def _compared(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
-    """State the share of the gap that the next best effect closes instead."""
-
-    def short_title(tag: str) -> str:
-        return re.sub(r" \(.*?\)", "", data.title(tag))  # without synonyms
-
-    own, name = step.closed, short_title(step.effect or "")
-    runner_up = step.runner_up
-    if runner_up is not None and (step.within_chance or own > 0.0):
-        rival, why = short_title(runner_up.effect), f"is rejected, since {runner_up.why}"
-        # reductions of sampling noise mean nothing
-        if not step.within_chance:
-            closed = step.closed_by(runner_up)
-            words = f"{rival} (next best effect) closes {percent(closed, 1.0)} of the gap"
-            words = words if closed > 0.0 else f"no other effect reduces the gap; the next best, {rival},"
-            words += f"{' and' if closed > 0.0 else ''} {why}" if runner_up.why else ""
-            yield Flag("note", f"Instead of {name}, {words.removesuffix(',')}.")
-        elif runner_up.why:
-            yield Flag("note", f"The next best effect, {rival}, {why}.")
+    """State what the next best effect leaves of the gap."""
+    rival = step.runner_up
+    if rival is None:
+        return
+    why = f" is rejected, since {rival.why}" if rival.why else ""
+    # changes of sampling noise mean nothing
+    if not step.within_chance:
+        own, other = micronats(step.gap_after), micronats(rival.gap_after)
+        why = f"{why}{'; it' if why else ''} leaves a gap of {other} micronats per sample instead of {own}"
+    if why:
+        yield Flag(
+            "note", f"The next best effect instead of {step.effect}, {data.title(rival.effect)},{why}."
+        )

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, FloatArray
+from pchem_pipeline.base.wording import measured, short, unit_text
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED
 from pchem_pipeline.model.maps.defects import Defects
 from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.pages.tables import Table
-from pchem_pipeline.report.style.wording import measured, short, unit_text
 
 COLUMNS = ("quantity", "symbol", "value", "standard_error", "unit", "definition_here", "where_it_differs")
 

@@ -15,11 +15,11 @@ from urllib.parse import quote
 import jinja2
 from markupsafe import Markup, escape
 
+from pchem_pipeline.base.wording import short_name, visible
 from pchem_pipeline.report.charts.on_page import page_charts
 from pchem_pipeline.report.figures.figure import Figure, csv_text
 from pchem_pipeline.report.inspector import content_policy, json_for_html, text_of
 from pchem_pipeline.report.style.palette import dark_rules
-from pchem_pipeline.report.style.wording import short_name, visible
 
 if TYPE_CHECKING:
     from pchem_pipeline.report.pages.summary import Flag

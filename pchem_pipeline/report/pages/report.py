@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from typing import Any
 
+from pchem_pipeline.base.wording import symbol
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
 from pchem_pipeline.report.figures.figure import Figure
@@ -30,7 +31,6 @@ from pchem_pipeline.report.pages.summary import (
     sentence,
 )
 from pchem_pipeline.report.pages.tables import Table, method_tables, provenance_tables, result_tables
-from pchem_pipeline.report.style.wording import symbol
 
 #: The sections from top to bottom.
 PAGE = (

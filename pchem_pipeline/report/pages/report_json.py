@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pchem_pipeline.base.plain import plain
+from pchem_pipeline.base.wording import stored_unit
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.model.maps.maps import MapSummary
 from pchem_pipeline.report.data import ReportData, reasons_in, truth_errors
@@ -22,7 +23,6 @@ from pchem_pipeline.report.pages.summary import (
     sentence,
 )
 from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import stored_unit
 
 #: Version of the layout of ``report.json``.
 REPORT_VERSION = 1

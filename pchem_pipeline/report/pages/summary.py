@@ -9,16 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from pchem_pipeline.base.units import typeset
 from pchem_pipeline.base.variables import CHARGE_RATES
-from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
-from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
-from pchem_pipeline.model.checks.map_parts import Parts
-from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of, words_of
-from pchem_pipeline.model.maps.defects import FAULTS, FEWEST, Defect
-from pchem_pipeline.report.data import ReportData, reasons_in
-from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import (
+from pchem_pipeline.base.wording import (
     count,
     measured,
     p_value_text,
@@ -26,7 +18,15 @@ from pchem_pipeline.report.style.wording import (
     scientific,
     short,
     symbol,
+    typeset,
 )
+from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
+from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
+from pchem_pipeline.model.checks.map_parts import Parts
+from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of, words_of
+from pchem_pipeline.model.maps.defects import FAULTS, FEWEST, Defect
+from pchem_pipeline.report.data import ReportData, reasons_in
+from pchem_pipeline.report.style.ranges import finite
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def _gain_spread(data: ReportData) -> _Found:
 
 
 def _share(value: float) -> str:
-    return percent(value, 1.0)
+    return percent(value)
 
 
 def _electrons(value: float) -> str:
@@ -164,7 +164,7 @@ def size_text(check: Check) -> str:
         return f"{short(check.size, 2)} DN apart"
     if check.unit == "DN":
         electrons = f"{short(check.size_e, 2)} e⁻" if math.isfinite(check.size_e) else ""
-        share = f"{percent(check.share, 1.0)} of the read noise" if math.isfinite(check.share) else ""
+        share = f"{percent(check.share)} of the read noise" if math.isfinite(check.share) else ""
         others = ", ".join(filter(None, (electrons, share)))
         return f"{short(check.size, 2)} DN{f' ({others})' if others else ''}"
     if check.unit == "LSB":
@@ -178,7 +178,7 @@ def size_text(check: Check) -> str:
         if check.name.endswith("pixels")
         else "samples"
     )
-    return f"{percent(check.size, 1.0)} of the {noun}"
+    return f"{percent(check.size)} of the {noun}"
 
 
 def nothing_found(look: QuickLook) -> str:
@@ -346,7 +346,7 @@ def _failed_pixels(data: ReportData) -> Iterator[Flag]:
     share = pixels.failed / max(pixels.total, 1)
     text = f"{count(pixels.failed, data.noun)} ({percent(pixels.failed, pixels.total)}) without a value"
     if share > data.allowed_failed:
-        allowed = percent(data.allowed_failed, 1.0)
+        allowed = percent(data.allowed_failed)
         yield Flag("serious", f"{text}; {allowed} allowed{_reasons(data)}.", "sensor")
     elif pixels.failed:
         yield Flag("caution" if share > _CAUTION_SHARE else "note", f"{text}{_reasons(data)}.", "sensor")

@@ -11,17 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
-from pchem_pipeline.model.fit.status import describe
-from pchem_pipeline.model.maps.maps import summarise
-from pchem_pipeline.report.data import ReportData, Samples, truth_errors
-from pchem_pipeline.report.figures.ensemble import HALVES, PREDICTIONS
-from pchem_pipeline.report.figures.methods import crossing_text, percent_text
-from pchem_pipeline.report.figures.samples import AXES, middle
-from pchem_pipeline.report.pages.summary import check_title
-from pchem_pipeline.report.pages.summary import size_text as check_size
-from pchem_pipeline.report.style.ranges import finite
-from pchem_pipeline.report.style.wording import (
+from pchem_pipeline.base.wording import (
     MAPS,
     count,
     heading,
@@ -32,6 +22,16 @@ from pchem_pipeline.report.style.wording import (
     signed,
     unit_text,
 )
+from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
+from pchem_pipeline.model.fit.status import describe
+from pchem_pipeline.model.maps.maps import summarise
+from pchem_pipeline.report.data import ReportData, Samples, truth_errors
+from pchem_pipeline.report.figures.ensemble import HALVES, PREDICTIONS
+from pchem_pipeline.report.figures.methods import crossing_text, percent_text
+from pchem_pipeline.report.figures.samples import AXES, middle
+from pchem_pipeline.report.pages.summary import check_title
+from pchem_pipeline.report.pages.summary import size_text as check_size
+from pchem_pipeline.report.style.ranges import finite
 
 #: A row of a table: cells by the heading of their column.
 Row = Mapping[str, str]
@@ -302,7 +302,7 @@ def _misfits(data: ReportData) -> Table | None:
         f"{int(facts['misfits']):,} of {int(facts['tested']):,} tested {data.noun}s disagree with the model "
         f"at a false-discovery rate of {facts['false_discovery_rate']:g} (Benjamini and Hochberg 1995). "
         f"{count(int(facts['pixels_with_outliers']), data.noun)} with excluded samples, at most "
-        f"{percent(float(facts['largest_outlier_share']), 1.0)} of their frames.",
+        f"{percent(float(facts['largest_outlier_share']))} of their frames.",
         [
             {
                 data.noun: f"channel {row['x']}" if data.shape[0] == 1 else f"y = {row['y']}, x = {row['x']}",
@@ -341,7 +341,7 @@ def _interval_rows(data: ReportData) -> Iterator[Row]:
             continue
         # both robust: the median squared error over (1.4826 MAD)^2
         known = summary.n_valid >= 8 and summary.robust_sd > 0
-        noise = percent(min(error**2 / summary.robust_sd**2, 1.0), 1.0) if known else "not known"
+        noise = percent(min(error**2 / summary.robust_sd**2, 1.0)) if known else "not known"
         row = {
             "quantity": heading(name),
             f"error per {data.noun}": short(error, 3),

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.wording import short
 from pchem_pipeline.model.maps.maps import display_edges
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import SHADES
-from pchem_pipeline.report.style.wording import short
 
 #: A positive range that spans more than this factor is drawn on a logarithmic axis.
 DECADES = 30.0

@@ -9,18 +9,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pchem_pipeline.base.units import typeset
+from pchem_pipeline.base.wording import fitted_or_chosen, percent, typeset
 from pchem_pipeline.discrepancy.verdict import (
     Place,
     Rival,
     Step,
     Verdict,
     micronats,
-    share_text,
     sigma_text,
 )
 from pchem_pipeline.model.histogram.odd_frames import frame_words
-from pchem_pipeline.report.style.wording import fitted_or_chosen
 
 _WIDTH = 100
 #: Longer lists end with a count.
@@ -139,9 +137,9 @@ def _gap(found: Verdict) -> list[str]:
     if found.steps and math.isfinite(gap.after):
         words += f" → {micronats(gap.after)}"
     words += f" micronats per sample (sampling noise: up to {micronats(gap.floor)})"
-    if found.steps and not gap.within_chance and math.isfinite(gap.closed_fraction):
+    if found.steps and gap.after > gap.floor and math.isfinite(gap.closed_fraction):
         nearest = " by the closest effect" if found.verdict == "unexplained" else ""
-        words += f", {share_text(gap.closed_fraction)} closed{nearest}"
+        words += f", {percent(gap.closed_fraction)} closed{nearest}"
     for step in found.steps:
         # reductions of sampling noise mean nothing
         if step.effect and not step.within_chance and (other := step.runner_up) is not None:

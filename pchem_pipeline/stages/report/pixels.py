@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.base.wording import symbol
 from pchem_pipeline.model.fit.status import MEANINGS, describe
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.data import MAP_NAMES, PixelFit
 from pchem_pipeline.report.inspector import Notable, some_of
-from pchem_pipeline.report.style.wording import symbol
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.report.stored import PixelHistograms
 from pchem_pipeline.store.tiles import MAX_BINS

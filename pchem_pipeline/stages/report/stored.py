@@ -21,6 +21,7 @@ from pchem_pipeline.base.variables import (
     interval_names,
     variables_of,
 )
+from pchem_pipeline.base.wording import short_name
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
@@ -34,7 +35,6 @@ from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import parse_target
 from pchem_pipeline.report.data import DiscrepancyData, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.ensemble import case_name
-from pchem_pipeline.report.style.wording import short_name
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.maps import NO_TIME

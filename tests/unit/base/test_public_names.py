@@ -11,7 +11,6 @@ import pytest
 
 import pchem_pipeline
 from pchem_pipeline.base.plain import plain
-from pchem_pipeline.base.units import per_cent
 
 
 def test_the_public_names_are_these():
@@ -54,14 +53,6 @@ def test_every_module_says_what_it_is_for_and_fits_in_the_head():
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= 800, path
         assert text.lstrip().startswith('"""'), path
-
-
-@pytest.mark.parametrize(
-    ("share", "words"),
-    [(0.0123, "1.2 %"), (0.68, "68 %"), (0.9949, "99 %"), (0.997, "100 %"), (3.4, "340 %")],
-)
-def test_a_share_is_never_told_as_a_power_of_ten(share, words):
-    assert per_cent(share) == words
 
 
 @pytest.mark.parametrize(

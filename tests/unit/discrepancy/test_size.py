@@ -70,17 +70,17 @@ def test_without_usable_pixels_there_is_no_size() -> None:
     [
         (
             Size(electrons=0.039, dn=0.61, of_read_noise=0.11),
-            "0.61 DN rms (0.039 e-, 11 % of the read noise)",
+            "samples change by 0.61 DN rms, 11 % of the read noise",
         ),
         (
             Size(electrons=213.0, dn=2028.0, of_read_noise=831.06, samples=0.0081),
-            "2,000 DN rms (210 e-, 830 times the read noise) in 0.81 % of the samples",
+            "0.81 % of these samples change by 2028 DN rms, 831 times the read noise",
         ),
         (
             Size(electrons=1.1, dn=12.0, of_read_noise=3.41),
-            "12 DN rms (1.1 e-, 3.4 times the read noise)",
+            "samples change by 12 DN rms, 3.4 times the read noise",
         ),
     ],
 )
-def test_a_size_is_told_to_two_digits_in_full(size: Size, words: str) -> None:
+def test_a_size_is_told_with_the_samples_that_change(size: Size, words: str) -> None:
     assert size.words() == words

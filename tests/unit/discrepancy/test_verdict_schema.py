@@ -16,7 +16,6 @@ from pchem_pipeline.discrepancy.verdict import (
     form_of,
     parameters_of,
     read_verdict,
-    share_text,
 )
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 
@@ -157,11 +156,3 @@ def test_a_parameter_has_the_standard_error_that_is_known() -> None:
     assert found["row_noise_dn"].model_dump() == {"value": 0.35, "stderr": 0.004, "unit": "DN"}
     others = [measured for name, measured in found.items() if name != "row_noise_dn"]
     assert all(math.isnan(measured.stderr) for measured in others)
-
-
-@pytest.mark.parametrize(
-    ("share", "words"),
-    [(0.0, "0 %"), (1e-6, "0.01 %"), (0.00152, "0.15 %"), (0.42, "42 %"), (0.9985, "99.85 %"), (1, "100 %")],
-)
-def test_only_nothing_is_0_per_cent_and_only_all_is_100(share: float, words: str) -> None:
-    assert share_text(share) == words

@@ -13,6 +13,7 @@ from helpers.discrepancy_material import discrepancy_data
 from helpers.quick_stacks import stack, sums_of
 from helpers.report_material import report_data
 
+from pchem_pipeline.base.wording import symbol, without_formulas
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
     PAGE_MM,
@@ -44,7 +45,6 @@ from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector import json_for_html
 from pchem_pipeline.report.pages.page import draw_figure
 from pchem_pipeline.report.style.palette import DIVERGING, LIGHT, MAP_COLOURS, shades
-from pchem_pipeline.report.style.wording import symbol, without_formulas
 
 HOSTILE = "</script><script>alert(1)</script><!-- & $\\mu$"
 

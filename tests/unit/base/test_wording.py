@@ -4,9 +4,8 @@ from collections.abc import Callable
 
 import pytest
 
-from pchem_pipeline.base.units import typeset
 from pchem_pipeline.base.variables import VARIABLES
-from pchem_pipeline.report.style.wording import (
+from pchem_pipeline.base.wording import (
     count,
     fitted_or_chosen,
     measured,
@@ -16,6 +15,7 @@ from pchem_pipeline.report.style.wording import (
     short_name,
     signed,
     symbol,
+    typeset,
     unit_text,
     visible,
 )

@@ -27,6 +27,15 @@ MAPS = tuple(_SYMBOLS)
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
+#: Electrons in plain text, not a word that is broken at a hyphen, nor a part of a file's name.
+_PLAIN_E = re.compile(r"(?:(?<![\w./])|(?<=1/))e-(?!\w|\.\w)")
+
+
+def typeset(text: str) -> str:
+    """Return a plain sentence, as a verdict has it, with the signs of a page: ``e⁻``, ``→``."""
+    return _PLAIN_E.sub("e⁻", text.replace(" -> ", " → "))
+
+
 #: Formulas of mathtext as characters, the longer ones first; what is left of them loses its marks.
 _CHARACTERS = (
     (r"\mathrm{e}^-", "ₑ"),
@@ -160,7 +169,7 @@ def p_value_text(p: float) -> str:
     return "p < 0.001" if p < 1e-3 else f"p = {short(p, 2)}"
 
 
-def percent(part: float, whole: float) -> str:
+def percent(part: float, whole: float = 1.0) -> str:
     """Return a share as ``12 %``, ``0.4 %`` or ``< 0.01 %``; ``0 %`` only for none."""
     if whole <= 0:
         return "0 %"
