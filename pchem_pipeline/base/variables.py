@@ -274,6 +274,7 @@ applied/electrons_stderr_calibration | y x | float32 | e- | 1 sigma error from t
 applied/calibration_variance | power y x | float64 | e-2 | c_0, c_1, c_2 of the variance c_0 + c_1 E + c_2 E^2
     from the calibration at a signal of E e-
 applied/mean_signal | y x | float64 | e- | mean signal of the frames
+applied/at_adc_limit | frame y x | uint8 | 1 | 1 for samples at a limit of the ADC
 applied/electron_number | frame y x | * | e- | most probable electron number
 applied/number_probability | frame y x | float32 | 1 | probability that the electron number is right
 applied/expected_number | frame y x | float32 | e- | mean of the electron number given the sample

@@ -288,6 +288,8 @@ def _create_converted(context: StageContext, job: Job, n_segments: int) -> None:
     columns = {"x": _chunks(job.source.shape)[2]}
     if "electrons" in job.kinds:
         _create(context, job, "applied/electrons", chunks=columns)
+    if job.limits is not None:
+        _create(context, job, "applied/at_adc_limit", chunks=columns)
     if "numbers" in job.kinds:
         largest = int(np.iinfo(job.number_type).max)
         # not missing_value: xarray would turn the integers into floats

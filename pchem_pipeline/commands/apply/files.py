@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.frames.sequence import FrameSequence
 
 _WHOLE = slice(None)
+_AT_LIMIT = "applied/at_adc_limit"
 _FRAMES = ("frame", "y", "x")
 #: of the coordinates, which files do without
 _AXES = tuple((axis,) for axis in _FRAMES)
@@ -128,7 +129,7 @@ def _write_fits(
         written.append(folder / f"{name}.fits")
         write_images(written[-1], [first._replace(cards=[*cards, *first.cards, *made_of]), *others])
 
-    stacks = [each for each in made if each.dims == _FRAMES]
+    stacks = [each for each in made if each.dims == _FRAMES and each.path != _AT_LIMIT]
     maps = {each.name: each for each in made if each.dims != _FRAMES}
     quality = store.read("applied/quality") & np.uint32(sum(bit for bit, _ in _DQ.values()))
     if stacks:
@@ -140,7 +141,7 @@ def _write_fits(
         readers = [reader for reader, _, _ in _files(frames)]
         cards = input_cards(frames, readers, frames.camera, frames.stated_integration_time)
         sci, err = (_map(store, maps.pop(name)) for name in ("exposure", "exposure_stderr"))
-        write("exposure", [_named("SCI", sci), _named("ERR", err), _quality(quality, 1)], cards)
+        write("exposure", [_named("SCI", sci), _named("ERR", err), _quality([quality], quality.shape)], cards)
     for name, each in maps.items():
         write(name, [_map(store, each)])
     return written
@@ -149,7 +150,10 @@ def _write_fits(
 def _stack_images(
     store: RunStore, stacks: Sequence[Variable], quality: NDArray[np.uint32]
 ) -> Callable[[int, int], list[FitsImage]]:
-    """Return what gives the images of some frames: SCI, ERR of electrons, DQ, and the other arrays."""
+    """Return what gives the images of some frames: SCI, ERR of electrons, DQ, and the other arrays.
+
+    Where limits of the ADC are known, DQ of a frame states which of its samples are at one.
+    """
     path = stacks[0].path
     depth = store.array(path).chunks[0]
     with_errors = stacks[0].name == "electrons"
@@ -157,7 +161,7 @@ def _stack_images(
         read = store.read("applied/electrons_stderr_read")
         variance = store.read("applied/calibration_variance")
 
-    @functools.lru_cache(len(stacks))  # files of few frames share a block
+    @functools.lru_cache(len(stacks) + 1)  # files of few frames share a block
     def block(path: str, number: int) -> NDArray[Any]:
         return store.read(path, (slice(number * depth, (number + 1) * depth), _WHOLE, _WHOLE))
 
@@ -175,7 +179,12 @@ def _stack_images(
             errors = (np.hypot(read, stderr_at(variance, frame)) for frame in frames)
             cards = image_cards("ERR", "e-", "1 sigma error of sample and calibration, without shot noise")
             images.append(FitsImage(errors, shape, np.dtype(np.float32), cards))
-        return [*images, _quality(quality, end - start), *others]
+        marks: Iterable[NDArray[np.uint32]] = itertools.repeat(quality, end - start)
+        if store.has(_AT_LIMIT):
+            bit = np.uint32(_DQ["at_adc_limit"][0])
+            at_limit = (frame for block in blocks(_AT_LIMIT, start, end) for frame in block)
+            marks = ((quality & ~bit) | bit * frame for frame in at_limit)
+        return [*images, _quality(marks, shape), *others]
 
     return images_of
 
@@ -184,10 +193,10 @@ def _shape(n: int, image: NDArray[Any]) -> tuple[int, ...]:
     return image.shape if n == 1 else (n, *image.shape)
 
 
-def _quality(quality: NDArray[np.uint32], n: int) -> FitsImage:
-    """Return the quality of n frames."""
+def _quality(frames: Iterable[NDArray[np.uint32]], shape: tuple[int, ...]) -> FitsImage:
+    """Return the quality of frames."""
     cards = [*image_cards("DQ", "1", "why a pixel has no value or needs caution; 0: good"), *_bits(_DQ)]
-    return FitsImage(itertools.repeat(quality, n), _shape(n, quality), quality.dtype, cards)
+    return FitsImage(frames, shape, np.dtype(np.uint32), cards)
 
 
 def _map(store: RunStore, variable: Variable) -> FitsImage:

@@ -182,6 +182,9 @@ def convert_piece(piece: Piece, output: RunStore, *, job: Job) -> None:
             add_up(frames, offsets, sums)
             if electron_frames:
                 output.write("applied/electrons", region, electrons(frames, calibration, offsets, room))
+            if job.limits is not None:
+                at_limit = (frames <= job.limits[0]) | (frames >= job.limits[1])
+                output.write("applied/at_adc_limit", region, at_limit.astype(np.uint8))
             if tables is not None:
                 found = tables.numbers(frames, _codes(frames, job, offsets), job)
                 output.write("applied/electron_number", region, found.number)
