@@ -350,6 +350,9 @@ def figures(
     dpi: Annotated[
         int, typer.Option(min=72, max=1200, help="resolution of PNG and of maps, dots per inch")
     ] = 600,
+    style: Annotated[
+        str, typer.Option(help="style sheet of matplotlib (fonts, sizes, lines): a name or a file")
+    ] = "",
     progress: Progress = "auto",
 ) -> None:
     """Write figures for a paper, with their numbers as CSV."""
@@ -362,6 +365,7 @@ def figures(
         width=width,
         only=_listed(only, "--only"),
         dpi=dpi,
+        style=style,
         progress=progress,
     ):
         typer.echo(path)

@@ -69,6 +69,7 @@ def figures_of_run(
     width: str | None = None,
     only: Sequence[str] = (),
     dpi: int = 600,
+    style: str = "",
     progress: ProgressMode = "auto",
 ) -> list[Path]:
     """Write the figures of a run and their numbers.
@@ -80,13 +81,14 @@ def figures_of_run(
         width: such as ``88mm`` or ``3.5in``; None: each figure's own.
         only: names of figures; empty: all.
         dpi: resolution of PNG, and of maps inside the other formats, dots per inch.
+        style: style sheet of matplotlib, a name or a file; empty: none.
         progress: auto | on | off.
 
     Returns:
         The files written, figure by figure.
 
     Raises:
-        ConfigError: an unknown format, width or figure.
+        ConfigError: an unknown format, width, figure or style.
         StoreError: the run has no maps, or the folder cannot be written.
     """
     check_formats(formats, FORMATS, "drawn")
@@ -97,18 +99,17 @@ def figures_of_run(
     chosen, written = _chosen(run_figures(data), only), []
     with Reporter(progress).progress("figures", len(chosen), "figure") as advance:
         for figure in chosen:
-            for name, content in paper_files(figure, tuple(dict.fromkeys(formats)), width_mm, dpi).items():
+            look = Look(width_mm or figure.width_mm, dpi=dpi, style=style)
+            for name, content in paper_files(figure, tuple(dict.fromkeys(formats)), look).items():
                 write_atomic(folder / name, content)
                 written.append(folder / name)
             advance()
     return written
 
 
-def paper_files(
-    figure: Figure, formats: Sequence[str], width_mm: float | None = None, dpi: int = 600
-) -> dict[str, bytes]:
+def paper_files(figure: Figure, formats: Sequence[str], look: Look) -> dict[str, bytes]:
     """Draw a figure and return its files and the files of its tables by name; pure."""
-    drawing = figure.draw(Look(width_mm or figure.width_mm, dpi=dpi))
+    drawing, dpi = figure.draw(look), look.dpi
     files = {
         f"{figure.name}.{kind}": drawing_bytes(drawing, kind, dpi=dpi, title=figure.title) for kind in formats
     }

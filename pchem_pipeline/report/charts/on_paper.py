@@ -18,6 +18,7 @@ from typing import Any, cast
 import matplotlib as mpl
 import numpy as np
 import PIL.Image
+from matplotlib import style as style_sheets
 from matplotlib.artist import setp
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -98,11 +99,13 @@ class Look:
         width_mm: width; panels stand side by side on a page, one above the other on a column.
         svg_text: whether text of SVG stays text; else it becomes outlines.
         dpi: dots per inch that images are drawn for at most.
+        style: style sheet of matplotlib over the package's own, a name or a file; empty: none.
     """
 
     width_mm: float = COLUMN_MM
     svg_text: bool = False
     dpi: int = 300
+    style: str = ""
 
     @property
     def wide(self) -> bool:
@@ -127,12 +130,22 @@ class Drawing(MatplotlibFigure):
 
 @contextlib.contextmanager
 def _in(look: Look) -> Iterator[None]:
-    """Hold a look, whatever the user's settings; characters that no font has are boxes."""
+    """Hold a look, whatever the user's settings; characters that no font has are boxes.
+
+    Raises:
+        ConfigError: its style sheet cannot be read.
+    """
     with mpl.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         mpl.rcdefaults()
         mpl.rcParams.update(_STYLE | LIGHT.parameters())
         mpl.rcParams["svg.fonttype"] = "none" if look.svg_text else "path"
+        try:
+            style_sheets.use(look.style or [])
+        except OSError:
+            raise ConfigError(
+                f"--style {look.style}: neither a file nor a style of matplotlib that can be read"
+            ) from None
         yield
 
 

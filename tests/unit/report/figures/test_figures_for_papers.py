@@ -56,7 +56,7 @@ def test_columns_of_different_lengths_are_refused() -> None:
 
 
 def test_the_numbers_are_those_drawn(data: ReportData, found: dict[str, Figure]) -> None:
-    files = paper_files(found["map_bias"], ())
+    files = paper_files(found["map_bias"], (), Look())
     rows = rows_of(files["map_bias_histogram.csv"])
     figure = found["map_bias"].draw(Look(88.0))
     [steps] = [artist for artist in figure.axes[0].patches if isinstance(artist, StepPatch)]
@@ -138,7 +138,7 @@ def test_what_a_verdict_draws_is_in_its_tables(found: dict[str, Figure]) -> None
 
 
 def test_files_have_the_width_asked_for_and_fonts_inside(found: dict[str, Figure]) -> None:
-    wanted = found["map_read_noise_e"], ("pdf", "png", "svg"), 120.0, 200
+    wanted = found["map_read_noise_e"], ("pdf", "png", "svg"), Look(120.0, dpi=200)
     files = paper_files(*wanted)
     assert set(files) == {
         f"map_read_noise_e{end}" for end in (".pdf", ".png", ".svg", ".csv", "_histogram.csv")
@@ -152,6 +152,16 @@ def test_files_have_the_width_asked_for_and_fonts_inside(found: dict[str, Figure
         assert image.width == pytest.approx(120.0 / 25.4 * 200, abs=1)
     assert b"<text" not in files["map_read_noise_e.svg"]
     assert paper_files(*wanted) == files
+
+
+def test_a_style_sheet_sets_the_fonts(found: dict[str, Figure], tmp_path: Path) -> None:
+    sheet = tmp_path / "journal.mplstyle"
+    sheet.write_text("font.family: DejaVu Serif")
+    files = paper_files(found["map_bias"], ("pdf",), Look(style=str(sheet)))
+    assert b"DejaVuSerif" in files["map_bias.pdf"]
+    assert b"DejaVuSerif" not in paper_files(found["map_bias"], ("pdf",), Look())["map_bias.pdf"]
+    with pytest.raises(ConfigError, match="--style nosuch: neither a file nor a style"):
+        paper_files(found["map_bias"], ("pdf",), Look(style="nosuch"))
 
 
 @pytest.mark.parametrize(
