@@ -116,6 +116,11 @@ class Effort:
         if self.spent >= self.most:
             raise EffortSpentError(doing)
 
+    @property
+    def used(self) -> str:
+        """The used share of the budget, to a tenth, in words."""
+        return f"{10 * min(math.floor(10.0 * self.spent / self.most), 10)} % of the budget used"
+
     def limit_words(self, spent: EffortSpentError, candidates: Iterable[str]) -> str:
         """State where the search ended, and which candidates (tags) were not tried."""
         untried = ", ".join(tag for tag in dict.fromkeys(candidates) if tag not in self.tried)

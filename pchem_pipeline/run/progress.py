@@ -202,8 +202,9 @@ class Reporter:
 
         def tell(words: str) -> None:
             nonlocal phase, began
-            phase, began = words, time.monotonic()
-            show("phase")
+            if words != phase:
+                phase, began = words, time.monotonic()
+                show("phase")
 
         def watch() -> None:
             while not ended.wait(1.0):

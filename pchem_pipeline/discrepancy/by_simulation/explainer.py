@@ -112,7 +112,8 @@ def find_discrepancies(
     progress("computing the statistics of each part")
     observed = ObservedFrames.of(frames)
     progress("simulating the fitted model")
-    return search(FrameExplainer.begin(observed, settings, classes, tuple(model), mapper), progress)
+    by = FrameExplainer.begin(observed, settings, classes, tuple(model), mapper)
+    return search(replace(by, progress=progress), progress)
 
 
 @dataclass
@@ -127,6 +128,7 @@ class FrameExplainer(Explainer[Screened]):
         accept: tells by the statistics of the data what is accepted.
         given: effects that the model had before the search.
         extension: the effects that it adds; None: none yet.
+        progress: is given what is done next.
     """
 
     prepared: Prepared
@@ -136,6 +138,7 @@ class FrameExplainer(Explainer[Screened]):
     accept: Acceptance
     given: tuple[Effect, ...]
     extension: Extension | None = None
+    progress: Callable[[str], None] = no_progress
     _likelihoods: dict[tuple[int, tuple[Effect, ...], tuple[Effect, ...]], PixelLikelihood] = field(
         default_factory=dict, repr=False
     )
@@ -209,7 +212,12 @@ class FrameExplainer(Explainer[Screened]):
         self.work.forget(self.given)
         self.candidates = [h.tag for h in explanation.hypotheses]
         refitter, settings = self._refitter(), self.prepared.settings
-        sets = Search(refitter, HistogramLikelihood(self._likelihood))
+
+        def report(best: str) -> None:
+            used = self.work.effort.used
+            self.progress(f"refitting the pixels with the likeliest effects; best so far: {best}; {used}")
+
+        sets = Search(refitter, HistogramLikelihood(self._likelihood), report=report)
         own, measured = (explanation.hypotheses, explanation.sets), self._measured(refitter)
         compare(sets, *own, lambda best: self._left_by(best, refitter), measured, settings.max_rounds)
         self.work.effort.choose()

@@ -113,6 +113,7 @@ class Search:
         trials: all of them.
         limit: what was next when the budget was used; None: it is not.
         rejected: sets that are not established.
+        report: is given the tags of the best set after each step.
     """
 
     refitter: Refitter
@@ -120,6 +121,7 @@ class Search:
     trials: list[Trial] = field(default_factory=list)
     limit: EffortSpentError | None = None
     rejected: list[Refitted] = field(default_factory=list)
+    report: Callable[[str], None] = lambda _: None
     _tuned: set[frozenset[str]] = field(default_factory=set, repr=False)
 
     @property
@@ -188,6 +190,8 @@ class Search:
         except Exception as error:
             note_defect(self.refitter.defects, " + ".join(h.tag for h in trial.members), error)
             trial.ended = True
+        if self.best is not None:
+            self.report(" + ".join(h.tag for h in self.best.hypotheses))
 
     def settle(self, trial: Trial, least: float = -np.inf) -> Refitted | None:
         """Simulate a trial to its best strengths; None where it cannot be fitted.

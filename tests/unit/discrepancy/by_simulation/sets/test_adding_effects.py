@@ -271,8 +271,10 @@ def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> No
 
 def test_a_set_that_cannot_come_to_another_is_not_simulated_further() -> None:
     world = World([effect("row_noise", 0.4), effect("frame_noise", 0.4)])
-    search = Search(world.refitter(), HistogramLikelihood())
+    told: list[str] = []
+    search = Search(world.refitter(), HistogramLikelihood(), report=told.append)
     both = search.at_best_fit([hypothesis("row_noise", 0.4), hypothesis("frame_noise", 0.4)])
+    assert told[-1] == "row_noise + frame_noise"
     before = world.drawn
     begun = search.at_best_fit([hypothesis("row_noise")], both.penalised_log_likelihood)
     assert world.drawn == before + 6
