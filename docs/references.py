@@ -10,8 +10,13 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
+import numpy as np
+import yaml
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
+
+#: Pictures of the effects, and how much stronger than typical they are drawn.
+PICTURES, _VISIBLE = Path(__file__).parent / "reference" / "effects", 20.0
 
 
 def write_pages(folder: Path) -> None:
@@ -192,6 +197,8 @@ def effects() -> str:
         "by readout tap or group of columns give several entries of `frame_noise`, `bias_drift`,",
         "`gain_drift` or another, each with its strength and `region`, for example `taps=64/1`.",
         "The maps of the pixels include constant differences of bias, gain and read noise between taps.",
+        "",
+        "Pictures show what an effect changes in one frame, and in one row of all frames.",
     ]
     for plane in Plane:
         members = [c for c in own if c.plane is plane]
@@ -222,6 +229,7 @@ def _effect(effect: type[Any]) -> Iterator[str]:
     if effect.signature:
         yield "Most affected statistics: " + ", ".join(f"`{s}`" for s in effect.signature) + "."
         yield ""
+    yield from _example(effect)
     yield "| setting | default | meaning |"
     yield "|---|---|---|"
     shown = {name: field for name, field in effect.model_fields.items() if name != "tag"}
@@ -233,6 +241,50 @@ def _effect(effect: type[Any]) -> Iterator[str]:
         yield "|---|---|"
         for rival, words in effect.separate.items():
             yield f"| `{rival}` | {_cell(words)} |"
+
+
+def _example(effect: type[Any]) -> Iterator[str]:
+    """Yield the YAML of an effect of typical strength, and a picture of what it changes."""
+    for one in effect.typical()[:1]:
+        values = one.model_dump(mode="json", exclude_defaults=True) | {"tag": one.tag}
+        yield from ("```yaml", *yaml.safe_dump({"model": {"effects": [values]}}).splitlines(), "```", "")
+        PICTURES.mkdir(exist_ok=True)
+        if not (path := PICTURES / f"{one.tag}.png").exists():
+            _draw(one.scaled(_VISIBLE) if one.strength else one, path)
+        yield f"![What {one.tag} changes, {_VISIBLE:g} times as strong](effects/{one.tag}.png)"
+        yield ""
+
+
+def _draw(effect: Any, path: Path) -> None:
+    """Draw what an effect changes: the same random numbers without it are subtracted."""
+    from matplotlib.figure import Figure
+
+    from pchem_pipeline.simulate.chain import simulate_block
+    from pchem_pipeline.simulate.maps import draw_truth
+    from pchem_pipeline.simulate.settings import SimulateSettings
+
+    ny, nx, n = 24, 48, 96
+    both = [
+        SimulateSettings(shape=(ny, nx), n_frames=n, bit_depth=16, effects=effects)
+        for effects in ((effect,), ())
+    ]
+    frames = [simulate_block(draw_truth(each), each, (0, n))[0].astype(float) for each in both]
+    change = frames[0] - frames[1]
+    changed = abs(change[change != 0])
+    most = float(np.percentile(changed, 95)) if changed.size else 1.0
+    frame, row = (int((change**2).sum(axis=axis).argmax()) for axis in ((1, 2), (0, 2)))
+    figure = Figure(figsize=(7.0, 2.0), layout="constrained")
+    shown = (
+        (change[frame], f"frame {frame}", "column", "row"),
+        (change[:, row].T, f"row {row}", "frame", "column"),
+    )
+    for axes, (image, title, x, y) in zip(figure.subplots(1, 2), shown, strict=True):
+        axes.imshow(image, cmap="RdBu_r", vmin=-most, vmax=most, interpolation="nearest", aspect="auto")
+        axes.set_title(f"{title} (\u00b1{most:.3g} DN)", fontsize=9)
+        axes.set_xlabel(x, fontsize=8)
+        axes.set_ylabel(y, fontsize=8)
+        axes.tick_params(labelsize=7)
+    figure.savefig(path, dpi=100)
 
 
 # -- words ---------------------------------------------------------------------------------------
