@@ -15,6 +15,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 DOCS = "\n".join(
     (ROOT / "docs" / name).read_text(encoding="utf-8")
     for name in (
+        "measure_a_sensor.md",
         "first_run.md",
         "howto/missing_effects.md",
         "howto/methods_and_plans.md",
