@@ -416,10 +416,6 @@ class Step(_Part):
         """The next best effect."""
         return self.rivals[0] if self.rivals else None
 
-    def closed_by(self, rival: Rival) -> float:
-        """Compute the relative reduction of the gap by a rival instead."""
-        return closed_share(self.gap_before, rival.gap_after)
-
     @property
     def likeliest(self) -> str:
         """Tag of the named effect, else of the likeliest candidate; empty if there is none."""
