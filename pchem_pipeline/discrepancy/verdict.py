@@ -407,11 +407,6 @@ class Step(_Part):
         return self.gap_before <= self.gap_floor
 
     @property
-    def closed(self) -> float:
-        """Relative reduction of the gap by this step."""
-        return closed_share(self.gap_before, self.gap_after)
-
-    @property
     def runner_up(self) -> Rival | None:
         """The next best effect."""
         return self.rivals[0] if self.rivals else None
