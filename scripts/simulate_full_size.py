@@ -44,7 +44,6 @@ def main() -> None:
                 "seed": given.seed,
                 "format": "raw",
             },
-            "input": {"mode": "reference"},
         }
     )
     given.folder.mkdir(parents=True, exist_ok=True)

@@ -100,7 +100,7 @@ _INPUT: tuple[tuple[str, Any, str], ...] = (
         Literal["dark", "light", "unknown"],
         "source of the charge; only with dark the charge rate is a dark current",
     ),
-    ("mode", Literal["copy", "reference"], "copy the frames into the store, or only reference the files"),
+    ("mode", Literal["copy", "reference"], "copy frames into the store, or leave them in their files"),
 )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.base.kernel_cache import cache_folder
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.inspect import survey
@@ -22,6 +23,7 @@ from pchem_pipeline.frames.registry import reader_class, reader_names
 from pchem_pipeline.frames.resolve import HISTOGRAM_SUFFIXES
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.stages.ingest import disk_words
 
 _MOST_CODES_OF = 4_000_000  # samples whose codes are counted
 
@@ -63,6 +65,7 @@ def about_files(places: Sequence[Path]) -> Iterator[str]:
     try:
         with joined(readers, report, settings, here, least=1) as frames:
             yield _stack_words(frames)
+            yield f"in a run, {disk_words(RunConfig(input=settings), frames)}"
             yield from dict.fromkeys((*frames.notes, *frames.report.notes))
     except InputError as error:
         yield f"together no stack: {error}"

@@ -78,9 +78,9 @@ class InputSettings(Section):
         "dcimg, spe, sif, nd2, histogram (ready-made histograms), or the name of a reader from a plug-in",
     )
     mode: Literal["copy", "reference"] = Field(
-        default="copy",
-        description="copy: copy the frames into the store; reference: read them from the camera files, which "
-        "must stay in place",
+        default="reference",
+        description="reference: frames stay in the camera files, which must stay in place; copy: into the "
+        "store, for files that will be moved or deleted, or are slow to read (network, compressed)",
     )
     shape: tuple[int, ...] | None = Field(
         default=None,

@@ -15,7 +15,9 @@ import numpy as np
 
 from pchem_pipeline.frames.first_look import limits_in
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
+from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.input import keep_ingested, listed_identity
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, Named, StageContext, Task
@@ -23,6 +25,7 @@ from pchem_pipeline.stages.overscan import write_overscan
 from pchem_pipeline.stages.samples import check_samples, sample_sensor
 
 if TYPE_CHECKING:
+    from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.frames.reader import FrameReader
     from pchem_pipeline.frames.sequence import FrameSequence
     from pchem_pipeline.store.run_store import RunStore
@@ -33,7 +36,10 @@ _CHUNK = (256, 128, 128)
 _MANY_FILES = 1500
 #: bytes of frames that a worker holds at once
 _UNIT_BYTES = 128 << 20
-
+#: bytes in the store for each pixel: histograms, fit and maps; for each byte of the summaries along time
+_STORED_PIXEL, _STORED_SERIES = 420, 0.3
+#: the copied frames are so much smaller than the frames
+_COPY_RATIO = 1.77
 
 #: Frames and rows, first and end each: whole chunks of ``frames/dn``.
 _Copied = tuple[int, int, int, int]
@@ -60,7 +66,7 @@ def run(context: StageContext) -> None:
     reader = open_frames(settings, context.base_dir) if done is None else done.frames
     context.begin()
     files = f"{len(reader.paths)} file{'s' * (len(reader.paths) != 1)}"
-    context.reporter.info(f"ingest: {files} read as {reader.formats}")
+    context.reporter.info(f"ingest: {files} read as {reader.formats}; {disk_words(context.config, reader)}")
     if reader.time_words:
         (context.note if reader.integration_time is None else context.reporter.info)(reader.time_words)
     if message := reader.report.message():
@@ -112,7 +118,26 @@ def create_frames(context: StageContext, reader: FrameSequence) -> None:
     shard = shard_shape(reader.shape, chunk)
     lengths, chunks = (dict(zip(("frame", "y", "x"), each, strict=True)) for each in (reader.shape, chunk))
     context.create("frames/dn", lengths=lengths, chunks=chunks, shards=shard, dtype=reader.dtype)
-    _warn_of_a_small_disk(context, math.prod(reader.shape) * reader.dtype.itemsize)
+    _warn_of_a_small_disk(context, reader)
+
+
+def stored_bytes(config: RunConfig, shape: tuple[int, int, int], itemsize: int) -> float:
+    """Return about how many bytes the store takes."""
+    n, ny, nx = shape
+    blocks = n / config.histogram.block_length(n)
+    series = 16 * (n * ny + blocks * ny * nx) + 4 * n * math.ceil(ny / ROW_GROUP) * nx
+    total = _STORED_PIXEL * ny * nx + (_STORED_SERIES * series if config.histogram.summaries else 0)
+    return total + (math.prod(shape) * itemsize / _COPY_RATIO if config.input.mode == "copy" else 0)
+
+
+def disk_words(config: RunConfig, frames: FrameSequence) -> str:
+    """Return where the frames are to be, and how much disk the store takes."""
+    how = "are copied from" if config.input.mode == "copy" else "stay in"
+    held = stored_bytes(config, frames.shape, frames.dtype.itemsize)
+    return (
+        f"frames {how} their files ({sum(map(file_size, frames.paths)) / 1e9:.2g} GB); "
+        f"the store will hold about {held / 1e9:.2g} GB"
+    )
 
 
 def chunk_shape(shape: tuple[int, int, int], itemsize: int) -> tuple[int, int, int]:
@@ -157,14 +182,12 @@ def _copy(unit: Named[_Copied], store: RunStore, *, reader: FrameReader) -> None
         store.write("frames/dn", (slice(t0, t1), slice(y, end), slice(None)), reader.read(t0, t1, y, end))
 
 
-def _warn_of_a_small_disk(context: StageContext, n_bytes: int) -> None:
+def _warn_of_a_small_disk(context: StageContext, reader: FrameSequence) -> None:
     """Say beforehand that the frames may not fit; how well they compress is not known."""
     free = context.store.free_bytes()
-    if context.fresh and n_bytes > free:
-        context.note(
-            f"{n_bytes / 1e9:.1f} GB of frames to copy (about 1.8-fold compression), "
-            f"{free / 1e9:.1f} GB free; if this does not fit, set input.mode: reference"
-        )
+    if context.fresh and math.prod(reader.shape) * reader.dtype.itemsize > free:
+        words = disk_words(context.config, reader)
+        context.note(f"{words}, {free / 1e9:.1f} GB free; if this does not fit, set input.mode: reference")
 
 
 def _run_whole(context: StageContext) -> None:

@@ -139,7 +139,7 @@ def our_run(raw: Path, folder: Path, workers: int, report: bool) -> tuple[Outcom
     config = folder / "run.yaml"
     content = {
         "run": {"store": "run.zarr", "allowed_failed_pixels": 1.0},
-        "input": {"files": [str(raw.resolve())], "mode": "reference", "integration_time": 4.87},
+        "input": {"files": [str(raw.resolve())], "integration_time": 4.87},
         "compute": {"workers": workers},
     }
     config.write_text(json.dumps(content))

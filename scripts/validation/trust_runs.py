@@ -71,7 +71,7 @@ class Case:
     mishap: str = "none"
     form: str = "tif"
     header: fits.Header = field(default_factory=fits.Header)
-    options: list[str] = field(default_factory=list)
+    options: list[str] = field(default_factory=lambda: ["--mode", "copy"])
     words: str = ""
     seconds: float | None = None
     again: Callable[[Case, Path], list[list[str]]] | None = None
@@ -213,7 +213,7 @@ def report_deleted(case: Case) -> None:
 
 def replaced_files(case: Case) -> None:
     case.form, case.until = "tif", "fit"
-    case.options += ["--mode", "reference"]
+    case.options += ["--mode", "reference"]  # the last one counts
 
     def replace(case: Case, store: Path) -> list[list[str]]:
         case.step = case.step * 1.2

@@ -29,6 +29,7 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     content = {
         "run": {"store": "run.zarr", "tile": 8},
+        "input": {"mode": "copy"},
         "simulate": {"shape": [8, 16], "n_frames": 600, "seed": 5, "integration_time": 1.0},
         "compute": {"backend": "serial", "workers": 1},
         "model": {"effects": [{"tag": "row_noise", "row_noise_dn": 0.4}]},

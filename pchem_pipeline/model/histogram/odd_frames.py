@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy import ndimage, special
+from scipy import ndimage, special, stats
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.wording import short
@@ -107,11 +107,7 @@ def frame_scores(row_sum: IntArray, row_sum_square: IntArray, columns: int) -> F
 
 def _normal_scores(values: FloatArray) -> FloatArray:
     """Return the normal quantiles of ranks along the first axis, equal values at their mean rank."""
-    ranks = np.empty(values.shape)
-    for column, rank in zip(values.T, ranks.T, strict=True):
-        ordered = np.sort(column)
-        rank[:] = np.searchsorted(ordered, column) + np.searchsorted(ordered, column, side="right") + 1
-    return np.asarray(special.ndtri(ranks / (2.0 * (len(values) + 1))))
+    return np.asarray(special.ndtri(stats.rankdata(values, axis=0) / (len(values) + 1)))
 
 
 def chance_of_copies(row_variance: FloatArray, n_frames: int) -> float:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.frames.histogram_files import is_histogram_input
@@ -15,6 +13,7 @@ from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.stage import allowed_bytes, band_bytes
 from pchem_pipeline.stages.histogram.histogram import bins_of
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
+from pchem_pipeline.stages.ingest import disk_words
 from pchem_pipeline.store.tiles import tile_grid, tile_shape
 
 if TYPE_CHECKING:
@@ -25,10 +24,6 @@ if TYPE_CHECKING:
 
 #: the program with what the later stages hold, and that for each pixel
 _REPORT_BYTES, _REPORT_PIXEL_BYTES = 400 << 20, 400
-#: bytes in the store for each pixel: histograms, fit and maps; for each byte of the summaries along time
-_STORED_PIXEL, _STORED_SERIES = 420, 0.5
-#: the copied frames are so much smaller than the frames
-_COPY_RATIO = 1.77
 
 
 @dataclass(frozen=True)
@@ -42,8 +37,7 @@ class Plan:
         tile: rows and columns of one.
         workers: number of workers.
         single_pass: the camera files are read once; else twice, by bands of rows.
-        input_bytes: of the camera files.
-        written_bytes: into the store, about.
+        disk: where the frames are to be, and how much disk the store takes.
         held_bytes: largest resident memory of the process.
         allowed_bytes: memory that it may take.
     """
@@ -54,21 +48,19 @@ class Plan:
     tile: tuple[int, int]
     workers: int
     single_pass: bool
-    input_bytes: int
-    written_bytes: int
+    disk: str
     held_bytes: int
     allowed_bytes: int
 
     def words(self) -> list[str]:
         """Return the plan as ``--dry-run`` prints it."""
         n, ny, nx = self.shape
-        how = "" if self.single_pass else ", twice, in bands of rows (once with more compute.max_memory)"
+        how = "" if self.single_pass else "; read twice, in bands of rows (once with more compute.max_memory)"
         return [
             f"plan: {n} frames of {ny} x {nx} pixels, {self.tiles} tile{'s' * (self.tiles > 1)} of "
             f"{min(self.tile[0], ny)} x {min(self.tile[1], nx)}, "
             f"{self.bins} bins, {self.workers} worker{'s' * (self.workers > 1)}",
-            f"plan: reads {self.input_bytes / 1e9:.3g} GB of camera files{how}; "
-            f"writes about {self.written_bytes / 1e9:.2g} GB",
+            f"plan: {self.disk}{how}",
             f"plan: needs at most {self.held_bytes / 2**20:.0f} MiB of memory, for any number of frames; "
             f"{self.allowed_bytes / 2**20:.0f} MiB allowed",
         ]
@@ -93,14 +85,11 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     Raises:
         InputError: the input is bad.
     """
-    from pchem_pipeline.frames.identity import file_size
     from pchem_pipeline.frames.open import open_frames
-    from pchem_pipeline.frames.resolve import input_paths
 
     frames = open_frames(config.input, base_dir)
     ny, nx = frames.shape[1:]
     workers = config.compute.count()
-    size = sum(file_size(path) for path in input_paths(config.input, base_dir))
     limit = most_bins(config.histogram.max_bins, frames.dtype)
     rows = min(ny, math.lcm(ROW_GROUP, min(frames.rows_per_read, ny)))
     bins = bins_of(frames, config.histogram.window_frames, limit, rows)
@@ -116,19 +105,7 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
         tile=tile_shape(config.run.tile, (ny, nx)),
         workers=workers,
         single_pass=single_pass,
-        input_bytes=size,
-        written_bytes=_written(config, frames.shape, frames.dtype),
+        disk=disk_words(config, frames),
         held_bytes=max(whole if single_pass else bands, report),
         allowed_bytes=allowed,
     )
-
-
-def _written(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
-    """Return about how many bytes the store takes."""
-    n, ny, nx = shape
-    blocks = n / config.histogram.block_length(n)
-    series = 16 * (n * ny + blocks * ny * nx) + 4 * n * math.ceil(ny / ROW_GROUP) * nx
-    total = _STORED_PIXEL * ny * nx + (_STORED_SERIES * series if config.histogram.summaries else 0)
-    if config.input.mode == "copy":
-        total += math.prod(shape) * dtype.itemsize / _COPY_RATIO
-    return round(total)

@@ -28,20 +28,21 @@ def test_files_are_described_and_what_cannot_be_read_says_why(tmp_path):
     (tmp_path / "b.tif").write_bytes(b"hello")
     stamps = np.r_[5:45][np.r_[:30, 33:40]]
     write_dcimg(tmp_path / "c.dcimg", FRAMES[:37], stamps=stamps)
-    described, _, note = info.about_files([tmp_path / "c.dcimg"])
+    described, _, disk, note = info.about_files([tmp_path / "c.dcimg"])
     words = (
         "dcimg, 37 frames of 8 x 9, uint16, bit depth not stated, no exposure time, frame stamps, time stamps"
     )
     assert described == f"{tmp_path / 'c.dcimg'}: {words}"
+    assert disk.startswith("in a run, frames stay in their files (")
     assert "3 are missing (after frame 29)" in note
-    good, bad, together = info.about_files([tmp_path / "a.tif", tmp_path / "b.tif"])
+    good, bad, together, _ = info.about_files([tmp_path / "a.tif", tmp_path / "b.tif"])
     assert "tiff (tifffile), 40 frames of 8 x 9, uint16, bit depth not stated, no exposure time" in good
     assert bad.startswith(f"{tmp_path / 'b.tif'}: ")
     codes = np.unique(FRAMES[[0, 20, 39]])
     assert together == f"together 40 frames of 8 x 9, DN {codes[0]} to {codes[-1]} ({codes.size} codes)"
     for i in (1, 2, 3):
         tifffile.imwrite(tmp_path / "night" / f"{i}.tif", FRAMES[i], photometric="minisblack")
-    alike, together = info.about_files([tmp_path / "night"])
+    alike, together, _ = info.about_files([tmp_path / "night"])
     assert alike.startswith(
         f"{tmp_path / 'night' / '1.tif'} to 3.tif (3 files, each): tiff (tifffile), 1 frame of 8"
     )

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.run import input as run_input
 from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.input import open_source
@@ -42,7 +43,8 @@ def write_stack(folder, parts=4):
 
 
 def make_context(folder, *, executor=None, command=None, stop=None, **settings):
-    return stage_context(folder, executor, command, stop, input={"files": ["cam"], **settings})
+    content = {"files": ["cam"], "mode": "copy", **settings}
+    return stage_context(folder, executor, command, stop, input=content)
 
 
 def run(context):
@@ -71,6 +73,7 @@ def test_copy(tmp_path, small_chunks, backend):
 def test_reference_copies_nothing(tmp_path):
     write_stack(tmp_path / "cam")
     context = make_context(tmp_path, mode="reference")
+    assert context.config.input.mode == InputSettings().mode
     assert run(context).state == "complete"
     assert not context.store.has("frames/dn")
     assert context.sensor.mode == "reference"

@@ -88,13 +88,13 @@ def test_the_plan_in_words(camera):
     config = RunConfig.model_validate(json.loads(path.read_text()))
     plan = make_plan(config, path.parent)
     assert (plan.shape, plan.tiles, plan.workers, plan.single_pass) == ((512, 256, 256), 16, 3, True)
-    size = 512 * 256 * 256 * 2
-    assert plan.input_bytes == pytest.approx(size, rel=1e-3)
     text = "\n".join(plan.words())
-    assert "reads 0.0671 GB of camera files; writes" in text
+    assert "plan: frames stay in their files (0.067 GB); the store will hold about 0.034 GB" in text
     assert "16 tiles of 64 x 64" in text
     assert "2000 MiB allowed" in text
     less = config.model_copy(update={"compute": config.compute.model_copy(update={"max_memory": 64})})
+    copies = config.model_copy(update={"input": config.input.model_copy(update={"mode": "copy"})})
+    assert "frames are copied from their files (0.067 GB); the store" in make_plan(copies, path.parent).disk
     assert "twice, in bands of rows" in "\n".join(make_plan(less, path.parent).words())
 
 
