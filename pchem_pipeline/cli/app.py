@@ -233,18 +233,16 @@ def model(
 
     A version comes from the section model of the YAML or from pchem discrepancy.
     """
-    from pchem_pipeline.commands.model import list_models, model_lines, models_json, use_model
+    from pchem_pipeline.commands.model import model_lines, models_json, use_model
     from pchem_pipeline.run.target import find_run
 
     run = find_run(target)
     if use is not None:
         say(use_model(run, use))
+    elif as_json:
+        typer.echo(models_json(run))
     else:
-        models = list_models(run)
-        if as_json:
-            typer.echo(models_json(models))
-        else:
-            say("\n".join(model_lines(models)))
+        say("\n".join(model_lines(run)))
 
 
 @_command("Look at results")

@@ -198,11 +198,10 @@ def plan(
 
     From the Cramer-Rao bound and simulated pixels.
     """
-    from pchem_pipeline.commands.plan import PlanRequest, make_plan
+    from pchem_pipeline.commands.plan import make_plan
 
-    request = PlanRequest(
-        run=run, read_noise_e=read_noise, quanta_exposure=exposure, conversion_gain=gain,
-        targets=tuple(target or ()), frames=frames, samples=samples, max_exposure=max_exposure,
-        max_frames=max_frames, json=json,
+    text = make_plan(
+        run, read_noise=read_noise, exposure=exposure, gain=gain, target=target or (), frames=frames,
+        samples=samples, max_exposure=max_exposure, max_frames=max_frames, json=json,
     )  # fmt: skip
-    say(make_plan(request))
+    say(text)

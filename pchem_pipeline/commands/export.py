@@ -73,7 +73,7 @@ def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
         elif name == "tiff":
             written += write_tiff(folder, images)
         elif name == "npz":
-            written += write_npz(folder / "maps.npz", images)
+            written += write_npz(folder / "maps.npz", {image.name: image.values for image in images})
         elif name == "emva":
             written.append(_write_emva(folder, target, store))
         elif name == "defects":

@@ -53,7 +53,7 @@ def write_stack(path: Path, frames: Any) -> Path:
     """
     dtype = _stored_type(frames)
     if not (path.exists() and _same(path, frames, dtype)):
-        write_frames("npy", path, (block.astype(dtype) for block in _blocks(frames)), frames.shape, dtype)
+        write_frames("npy", path, (block.astype(dtype) for _, block in _blocks(frames)), frames.shape, dtype)
     return path
 
 
@@ -66,29 +66,24 @@ def _stored_type(frames: Any) -> np.dtype[Any]:
     dtype = np.dtype(frames.dtype)
     if dtype.kind == "u" and dtype.itemsize <= 4:
         return np.dtype(f"u{dtype.itemsize}")
-    low = min(int(block.min()) for block in _blocks(frames))
-    high = max(int(block.max()) for block in _blocks(frames))
+    low = min(int(block.min()) for _, block in _blocks(frames))
+    high = max(int(block.max()) for _, block in _blocks(frames))
     if low < 0 or high >= 2**32:
         raise ConfigError(f"frames from {low} to {high} DN: give DN from 0 to 2^32 - 1")
     return np.dtype(np.uint16 if high < 2**16 else np.uint32)
 
 
-def _blocks(frames: Any) -> Iterator[NDArray[Any]]:
-    """Yield the frames in blocks that fit into memory."""
+def _blocks(frames: Any) -> Iterator[tuple[slice, NDArray[Any]]]:
+    """Yield the frames in blocks that fit into memory, each with its place."""
     n, rows, columns = frames.shape
     size = max(1, (64 << 20) // max(1, rows * columns * np.dtype(frames.dtype).itemsize))
     for first in range(0, n, size):
-        yield np.asarray(frames[first : first + size])
+        place = slice(first, min(first + size, n))
+        yield place, np.asarray(frames[place])
 
 
 def _same(path: Path, frames: Any, dtype: np.dtype[Any]) -> bool:
     """Return whether a file holds these frames."""
     there = np.load(path, mmap_mode="r")
-    if there.shape != tuple(frames.shape) or there.dtype != dtype:
-        return False
-    first = 0
-    for block in _blocks(frames):
-        if not np.array_equal(there[first : first + len(block)], block):
-            return False
-        first += len(block)
-    return True
+    alike = there.shape == tuple(frames.shape) and there.dtype == dtype
+    return alike and all(np.array_equal(there[place], block) for place, block in _blocks(frames))

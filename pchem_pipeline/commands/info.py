@@ -63,10 +63,10 @@ def about_files(places: Sequence[Path]) -> Iterator[str]:
         yield from report.notes
         return
     try:
-        with joined(readers, report, settings, here, least=1) as frames:
-            yield _stack_words(frames)
-            yield f"in a run, {disk_words(RunConfig(input=settings), frames)}"
-            yield from dict.fromkeys((*frames.notes, *frames.report.notes))
+        frames = joined(readers, report, settings, here, least=1)
+        yield _stack_words(frames)
+        yield f"in a run, {disk_words(RunConfig(input=settings), frames)}"
+        yield from dict.fromkeys((*frames.notes, *frames.report.notes))
     except InputError as error:
         yield f"together no stack: {error}"
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, quoted
@@ -32,29 +31,10 @@ from pchem_pipeline.store.run_store import RunStore
 _SEARCH = "discrepancy"
 
 
-@dataclass(frozen=True)
-class ListedModel:
-    """A version of the model as it is listed.
+def _listed(target: Target) -> list[tuple[ModelVersion, bool, list[str]]]:
+    """Return each version, whether it is in force, and the stages whose results rest on it.
 
-    Attributes:
-        version: of the model.
-        current: whether it is in force.
-        results: stages whose results rest on it.
-    """
-
-    version: ModelVersion
-    current: bool
-    results: tuple[str, ...]
-
-    def to_json(self) -> dict[str, object]:
-        """Return it as JSON data."""
-        names = ("number", "model", "source", "parent", "closed_fraction", "made", "digest")
-        version = {name: getattr(self.version, name) for name in names}
-        return {**version, "current": self.current, "results": list(self.results)}
-
-
-def list_models(target: Target) -> list[ListedModel]:
-    """Return the versions of the model of a run; one that is in the YAML but not in the run yet comes last.
+    One that is in the YAML but not in the run yet comes last.
 
     Raises:
         StoreError: there is no run, or it is damaged.
@@ -64,23 +44,19 @@ def list_models(target: Target) -> list[ListedModel]:
     versions = {version.number: version for version in (*model_versions(store), current)}
     states = run_status(target)
     return [
-        ListedModel(
-            version, number == current.number, tuple(state.stage for state in states if state.model == number)
-        )
+        (version, number == current.number, [state.stage for state in states if state.model == number])
         for number, version in versions.items()
     ]
 
 
-def model_lines(models: Sequence[ListedModel]) -> list[str]:
-    """Return a table of the versions of a model."""
+def model_lines(target: Target) -> list[str]:
+    """Return a table of the versions of the model of a run."""
     rows = [("model", "source", "explained", "results", "effects")]
-    for each in models:
-        version = each.version
+    for version, current, results in _listed(target):
         closed = "" if version.closed_fraction is None else f"{100 * version.closed_fraction:.1f} %"
         source = f"verdict on {version.parent}" if version.source == "verdict" else version.source
-        results = ", ".join(each.results) or "-"
-        number = f"{'*' if each.current else ' '} {version.number}"
-        rows.append((number, source, closed, results, _words(version)))
+        number = f"{'*' if current else ' '} {version.number}"
+        rows.append((number, source, closed, ", ".join(results) or "-", _words(version)))
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]) - 1)]
     return ["  ".join([*map(str.ljust, row, widths), row[-1]]) for row in rows]
 
@@ -206,6 +182,11 @@ def adopt_verdict(target: Target) -> tuple[Target, str]:
         return changed, _change_words(changed, before, version, file)
 
 
-def models_json(models: Sequence[ListedModel]) -> str:
-    """Return the versions of a model as one line of JSON."""
-    return json.dumps({"models": [each.to_json() for each in models]})
+def models_json(target: Target) -> str:
+    """Return the versions of the model of a run as one line of JSON."""
+    names = ("number", "model", "source", "parent", "closed_fraction", "made", "digest")
+    listed = [
+        {name: getattr(version, name) for name in names} | {"current": current, "results": results}
+        for version, current, results in _listed(target)
+    ]
+    return json.dumps({"models": listed})

@@ -22,18 +22,17 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, MissingDependencyError, StoreError, install_hint, quoted
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.base.wording import measured, symbol
+from pchem_pipeline.base.wording import symbol
 from pchem_pipeline.commands.figures import gather_run, millimetres
 from pchem_pipeline.commands.in_memory import paths_of, stack_of, write_stack
 from pchem_pipeline.model.fit.result import html_table
 from pchem_pipeline.model.fit.status import FitStatus, words_of
-from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD
 from pchem_pipeline.report.charts.chart import COLUMN_MM, Chart
 from pchem_pipeline.report.charts.on_paper import Look, draw_chart, draw_panels
 from pchem_pipeline.report.data import PixelFit
 from pchem_pipeline.report.figures.catalogue import run_figures
-from pchem_pipeline.report.figures.pixels import has_fit, pixels_chart
+from pchem_pipeline.report.figures.pixels import pixel_columns, pixels_chart
 from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_versions
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run, with_maps
@@ -417,7 +416,7 @@ class Run:
                 raise ConfigError(f"pixel y = {y}, x = {x} is outside the sensor of {ny} x {nx} pixels")
         maps, fit = self.group("maps"), self.group("fit")  # which read the pixels asked for alone
         chosen = [("", int(y), int(x)) for y, x in places]
-        index = pixel_index(chosen, self.shape)
+        index = pixel_index(places, nx)
         histograms = read_histograms(self._store, index, self.shape)
         channel = self._sensor.kind == "histograms"
         columns = [np.array([float(maps[name][y, x]) for _, y, x in chosen]) for name in PARAMETERS]
@@ -473,17 +472,12 @@ class Pixel(PixelFit):
     """
 
     def __repr__(self) -> str:
-        words = []
-        for name, value in self.parameters.items():
-            words.append(f"{name} = {measured(value, self.stderr.get(name, float('nan')), symbol(name)[2])}")
-        return f"<Pixel y = {self.y}, x = {self.x}: {', '.join(words)}; {self.status or 'good fit'}>"
+        words = ", ".join(f"{name} = {self.text(name)}" for name in self.parameters)
+        return f"<Pixel y = {self.y}, x = {self.x}: {words}; {self.status or 'good fit'}>"
 
     def _repr_html_(self) -> str:
         """Return the parameters as a table, for a notebook."""
-        rows = []
-        for name, value in self.parameters.items():
-            _, words, unit = symbol(name)
-            rows.append((words, measured(value, self.stderr.get(name, float("nan")), unit)))
+        rows = [(symbol(name)[1], self.text(name)) for name in self.parameters]
         head = f"pixel y = {self.y}, x = {self.x}: {self.status or 'good fit'}"
         return f"<p>{escape(head)}</p>{html_table(('parameter', 'value'), rows)}"
 
@@ -495,13 +489,7 @@ class Pixel(PixelFit):
     @cached_property
     def expected(self) -> xr.DataArray:
         """Number of frames expected at each DN from the fit; NaN where there is none."""
-        values = np.full(self.counts.size, np.nan)
-        if has_fit(self.parameters):
-            theta = (self.parameters[name] for name in PARAMETERS)
-            dn = self.origin + np.arange(self.counts.size, dtype=np.float64)
-            density = pcd(dn, *theta) if self.mass is None else self.mass
-            values = self.counts.sum() * density
-        return self._over_dn(values, "frames expected at each DN")
+        return self._over_dn(pixel_columns(self)["expected frames"], "frames expected at each DN")
 
     def _over_dn(self, values: NDArray[Any], words: str) -> xr.DataArray:
         import xarray as xr

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,68 +16,61 @@ from pchem_pipeline.planning.targets import Target, parse_target
 from pchem_pipeline.store.files import write_json
 
 
-@dataclass(frozen=True)
-class PlanRequest:
-    """What the command line asked for; None where nothing was said.
+def make_plan(
+    run: Path | None = None,
+    *,
+    read_noise: float | None = None,
+    exposure: float | None = None,
+    gain: float | None = None,
+    target: Sequence[str] = (),
+    frames: int | None = None,
+    samples: str | None = None,
+    max_exposure: float = 10.0,
+    max_frames: float = 1e7,
+    json: Path | None = None,
+) -> str:
+    """Return the plan in words; write its JSON where asked. None: nothing was said.
 
-    Attributes:
+    Args:
         run: a run whose median pixel is planned for where numbers are not given.
-        read_noise_e: s_e, e-, quantisation included.
-        quanta_exposure: H, e-.
-        conversion_gain: g, e-/DN.
-        targets: as ``name=value``.
+        read_noise: s_e, e-, quantisation included.
+        exposure: H, e-.
+        gain: g, e-/DN.
+        target: precisions as ``name=value``.
         frames: frames there are.
         samples: exposures separated by commas, or ``best``.
         max_exposure: largest exposure to choose, e-.
         max_frames: more are as good as never.
         json: file for the numbers.
-    """
-
-    run: Path | None = None
-    read_noise_e: float | None = None
-    quanta_exposure: float | None = None
-    conversion_gain: float | None = None
-    targets: tuple[str, ...] = ()
-    frames: int | None = None
-    samples: str | None = None
-    max_exposure: float = 10.0
-    max_frames: float = 1e7
-    json: Path | None = None
-
-
-def make_plan(request: PlanRequest) -> str:
-    """Return the plan in words; write its JSON where asked.
-
-    Args:
-        request: from the command line.
 
     Raises:
         ConfigError: a number is missing or wrong, or no number of frames reaches a target.
         StoreError: the run has no maps, or a file cannot be written.
     """
-    known, effects = _median_pixel(request.run) if request.run is not None else ({}, "")
-    noise = known.get("noise_e") if request.read_noise_e is None else request.read_noise_e
+    known, effects = _median_pixel(run) if run is not None else ({}, "")
+    noise = known.get("noise_e") if read_noise is None else read_noise
     if noise is None:
         raise ConfigError("--read-noise is missing: give it in e-, quantisation included, or give a run")
-    if not request.targets and (request.frames is None or request.samples is not None):
-        other = ", or --frames" if request.samples is None else ""
+    if not target and (frames is None or samples is not None):
+        other = ", or --frames" if samples is None else ""
         raise ConfigError(f"--target is missing: give a precision, such as conversion_gain=1%{other}")
-    exposure = known.get("quanta_exposure") if request.quanta_exposure is None else request.quanta_exposure
-    gain = known.get("conversion_gain", 0.09)  # e-/DN, of the cameras that this package was made for
-    if request.conversion_gain is not None:
-        gain = request.conversion_gain
-    point = Point(1.0 if exposure is None else exposure, noise, gain)
-    targets = [parse_target(text) for text in request.targets]
-    lines, content = (
-        _one(request, targets, point, exposure is not None)
-        if request.samples is None
-        else (_several(request, targets, point))
-    )
+    exposure = known.get("quanta_exposure") if exposure is None else exposure
+    usual = known.get("conversion_gain", 0.09)  # e-/DN, of the cameras that this package was made for
+    point = Point(1.0 if exposure is None else exposure, noise, usual if gain is None else gain)
+    targets = [parse_target(text) for text in target]
+    limits: Any = {"budget": frames, "max_exposure": max_exposure, "max_frames": max_frames}
+    if samples is None:
+        plan = plan_one_sample(targets, point, exposure_given=exposure is not None, **limits)
+        lines = _plan_lines(plan, targets, frames, max_exposure, exposure is not None)
+        content = _plan_json(plan, targets)
+    else:
+        split = plan_samples(targets, _exposures(samples), point, **limits)
+        lines, content = _split_lines(split, targets), _split_json(split, targets)
     if effects:
         lines += ["", _effects_line(effects, known, noise)]
-    if request.json is not None:
-        write_json(request.json, plain(content))
-        lines += ["", str(request.json)]
+    if json is not None:
+        write_json(json, plain(content))
+        lines += ["", str(json)]
     return "\n".join(lines)
 
 
@@ -118,23 +110,8 @@ def _effects_line(effects: str, known: dict[str, float], noise: float) -> str:
     return f"effects in the model of the run ({effects}): {part} is left out, so more frames may be needed"
 
 
-def _one(
-    request: PlanRequest, targets: Sequence[Target], point: Point, exposure_given: bool
-) -> tuple[list[str], dict[str, Any]]:
-    """Plan one sample."""
-    plan = plan_one_sample(
-        targets,
-        point,
-        exposure_given=exposure_given,
-        budget=request.frames,
-        max_exposure=request.max_exposure,
-        max_frames=request.max_frames,
-    )
-    return _plan_lines(plan, request, targets, exposure_given), _plan_json(plan, targets)
-
-
 def _plan_lines(
-    plan: Plan, request: PlanRequest, targets: Sequence[Target], exposure_given: bool
+    plan: Plan, targets: Sequence[Target], budget: int | None, max_exposure: float, exposure_given: bool
 ) -> list[str]:
     point = plan.point
     at = f"exposure {point.quanta_exposure:.3g} e-{'' if exposure_given else ' (the best)'}"
@@ -148,16 +125,16 @@ def _plan_lines(
             ),
             f"{'simulated, at most 5 % flagged':<34}{plan.needed:>14,.0f} frames",
         ]
-    if targets and request.frames is not None:
-        enough = plan.needed <= request.frames
-        lines.append(f"{request.frames:,} frames are {'enough' if enough else 'too few'}")
+    if targets and budget is not None:
+        enough = plan.needed <= budget
+        lines.append(f"{budget:,} frames are {'enough' if enough else 'too few'}")
     lines += ["", f"with {plan.frames:,.0f} frames, 1 sigma error per pixel (Cramer-Rao bound):"]
     for name, value in plan.precision.items():
         unit, size = ("e-", value) if name == "bias" else ("%", 100 * value)
         if name != "dark_current":  # what the charge rate is called in the dark
             lines.append(f"  {name:<20}{size:>10.3g} {unit}")
     if exposure_given and np.isfinite(plan.best_frames):
-        limit = " (the largest allowed)" if plan.best_exposure > 0.99 * request.max_exposure else ""
+        limit = " (the largest allowed)" if plan.best_exposure > 0.99 * max_exposure else ""
         best = f"best exposure: {plan.best_exposure:.3g} e-{limit}, {plan.best_frames:,.0f} frames"
         lines += ["", f"{best}, no quantity flagged in 95 % of the pixels"]
     return lines
@@ -179,21 +156,6 @@ def _plan_json(plan: Plan, targets: Sequence[Target]) -> dict[str, Any]:
         "best_exposure": plan.best_exposure,
         "best_frames": plan.best_frames,
     }
-
-
-def _several(
-    request: PlanRequest, targets: Sequence[Target], point: Point
-) -> tuple[list[str], dict[str, Any]]:
-    """Plan several samples."""
-    plan = plan_samples(
-        targets,
-        _exposures(str(request.samples)),
-        point,
-        budget=request.frames,
-        max_exposure=request.max_exposure,
-        max_frames=request.max_frames,
-    )
-    return _split_lines(plan, targets), _split_json(plan, targets)
 
 
 def _exposures(text: str) -> list[float] | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,12 +12,11 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.apply.characterisation import check_run, read_calibration
 from pchem_pipeline.config.load import make_config, write_config, yaml_text
-from pchem_pipeline.frames.formats.map_files import read_image
+from pchem_pipeline.frames.formats.map_files import read_image, write_npz
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
-from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.twin import Twin, extrapolated, redrawn, twin_maps
 
@@ -122,9 +120,7 @@ def write_twin(
         "characterises them.\n# The effects of its model are simulated, and are in the model here.\n"
     )
     text = head + _yaml_of(make_config(named, "the twin"))
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **twin.truth.arrays())
-    write_atomic(maps, buffer.getvalue())
+    write_npz(maps, twin.truth.arrays())
     write_config(output, text)
     return [output, maps]
 

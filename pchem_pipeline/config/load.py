@@ -10,6 +10,7 @@ from typing import Any, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 
 from pchem_pipeline.base.errors import ConfigError, quoted
@@ -275,6 +276,12 @@ def _shown(text: str) -> str:
     return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]} ..."
 
 
+def section_of(field: FieldInfo) -> type[BaseModel] | None:
+    """Return the section that a field holds, or None."""
+    kinds = (field.annotation, *get_args(field.annotation))
+    return next((k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)), None)
+
+
 def _keys_at(location: tuple[Any, ...], root: type[BaseModel]) -> list[str]:
     """Return the keys that the section at ``location`` knows."""
     model: Any = root
@@ -284,6 +291,5 @@ def _keys_at(location: tuple[Any, ...], root: type[BaseModel]) -> list[str]:
         fields = getattr(model, "model_fields", {})
         if name not in fields:
             return []
-        kinds = (fields[name].annotation, *get_args(fields[name].annotation))
-        model = next((k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)), None)
+        model = section_of(fields[name])
     return list(getattr(model, "model_fields", {}))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import textwrap
-from typing import Any, get_args
+from typing import Any
 
 import yaml
 from pydantic import BaseModel
@@ -12,6 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined, to_jsonable_python
 
 from pchem_pipeline.base.wording import typeset
+from pchem_pipeline.config.load import section_of
 from pchem_pipeline.config.tree import RunConfig
 
 _HEAD = """\
@@ -47,7 +48,7 @@ def commented_config(name: str, *, files: list[str], simulated: bool = False, sc
     for key, field in RunConfig.model_fields.items():
         if key == "simulate" and not simulated:
             continue
-        model = _section_of(field)
+        model = section_of(field)
         assert model is not None
         lines += [f"# {field.description}", f"{key}:", *_section(model, key, given, 1), ""]
     return "\n".join(lines)
@@ -61,7 +62,7 @@ def _section(model: type[BaseModel], path: str, given: dict[str, Any], depth: in
         value = given.get(f"{path}.{key}", _default(field))
         width = max(40, 100 - len(pad))
         lines += [f"{pad}# {line}" for line in textwrap.wrap(typeset(field.description or ""), width)]
-        section = _section_of(field)
+        section = section_of(field)
         if isinstance(value, BaseModel) and section is not None and type(value) is section:
             lines += [f"{pad}{name}:", *_section(section, f"{path}.{key}", given, depth + 1)]
         else:
@@ -77,8 +78,3 @@ def _entry(name: str, value: Any, pad: str) -> list[str]:
 def _default(field: FieldInfo) -> Any:
     value = field.get_default(call_default_factory=True, validated_data={})
     return None if value is PydanticUndefined else value
-
-
-def _section_of(field: FieldInfo) -> type[BaseModel] | None:
-    kinds = (field.annotation, *get_args(field.annotation))
-    return next((k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)), None)

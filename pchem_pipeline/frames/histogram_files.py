@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.kinds import MOST_PIECE
-from pchem_pipeline.frames.identity import content_identity
 from pchem_pipeline.frames.inspect import FileReport, InputReport, mark_repeated_paths
 from pchem_pipeline.frames.resolve import HISTOGRAM_SUFFIXES, resolve_files
 from pchem_pipeline.frames.settings import InputSettings
@@ -53,10 +52,6 @@ class HistogramInput:
     def shape(self) -> tuple[int, int]:
         """(rows, columns) of the sensor whose pixels are the channels."""
         return 1, len(self.names)
-
-    def identity(self) -> dict[str, Any]:
-        """Return names, sizes and content hashes of the files; for JSON."""
-        return content_identity(self.paths)
 
 
 @dataclass

@@ -24,16 +24,10 @@ class FileReport:
 
     Attributes:
         path: the file.
-        format: name of its format, empty if it is not known.
-        shape: (frames, rows, columns), None if it cannot be read.
-        dtype: type of the samples, empty if it cannot be read.
         problem: why the file cannot be used; empty if it can.
     """
 
     path: Path
-    format: str = ""
-    shape: tuple[int, int, int] | None = None
-    dtype: str = ""
     problem: str = ""
 
 
@@ -106,15 +100,14 @@ def survey(
 
 def _open(entry: FileReport, settings: InputSettings) -> FrameReader | None:
     try:
-        entry.format = settings.format if settings.format != "auto" else detect_format(entry.path)
-        reader = reader_class(entry.format).open(entry.path, settings)
+        name = settings.format if settings.format != "auto" else detect_format(entry.path)
+        reader = reader_class(name).open(entry.path, settings)
     except ConfigError:
         raise
     except InputError as error:
         entry.problem = str(error).removeprefix(f"{entry.path}: ")
         return None
-    entry.shape, entry.dtype = reader.shape, str(reader.dtype)
-    if reader.shape[0] == 0 or 0 in reader.shape:
+    if 0 in reader.shape:
         entry.problem = "has no frames; omit it"
         return None
     return reader
@@ -148,26 +141,16 @@ def _words(kind: tuple[tuple[int, ...], str]) -> str:
 
 def _mark_duplicates(files: list[FileReport]) -> None:
     """Mark files with the content of an earlier one: by size, then by samples, then by all bytes."""
-    by_size: defaultdict[int, list[FileReport]] = defaultdict(list)
-    for entry in files:
-        by_size[file_size(entry.path)].append(entry)
-    for group in by_size.values():
-        if len(group) < 2:
-            continue
-        by_sample: defaultdict[str, list[FileReport]] = defaultdict(list)
-        for entry in group:
-            by_sample[sample_hash(entry.path)].append(entry)
-        for alike in by_sample.values():
-            if len(alike) > 1:
-                _mark_equal(alike)
-
-
-def _mark_equal(alike: list[FileReport]) -> None:
-    first: dict[str, FileReport] = {}
-    for entry in alike:
-        original = first.setdefault(hash_file(entry.path), entry)
-        if original is not entry:
-            entry.problem = f"has the same content as {original.path.name}"
+    groups = [files]
+    for key in (file_size, sample_hash, hash_file):
+        alike: defaultdict[object, list[FileReport]] = defaultdict(list)
+        for number, group in enumerate(groups):
+            for entry in group:
+                alike[number, key(entry.path)].append(entry)
+        groups = [group for group in alike.values() if len(group) > 1]
+    for first, *others in groups:
+        for entry in others:
+            entry.problem = f"has the same content as {first.path.name}"
 
 
 _LAST_NUMBER = re.compile(r"(\d+)(?=\D*$)")

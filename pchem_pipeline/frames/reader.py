@@ -11,7 +11,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
-from pchem_pipeline.frames.identity import content_identity, quick_identity
 from pchem_pipeline.frames.settings import Area, InputSettings
 
 
@@ -121,25 +119,6 @@ class FrameReader(ABC):
     def cards(self) -> tuple[Any, ...]:
         """Return the cards of a FITS file that are not of its samples or their place; else none."""
         return ()
-
-    def identity(self) -> dict[str, Any]:
-        """Return name, size and xxh3_128 content hash of every file, and one digest over all; for JSON."""
-        return content_identity(self.paths)
-
-    def quick_identity(self) -> dict[str, Any]:
-        """Return name, size and time of change of every file, without reading them; for JSON."""
-        return quick_identity(self.paths)
-
-    def close(self) -> None:  # noqa: B027 - most readers hold nothing open
-        """Release what the reader holds open."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def described(reader: type[FrameReader]) -> str:

@@ -276,11 +276,6 @@ class FrameSequence(FrameReader):
                 )
             raise InputError(f"{text}; correct input.bit_depth, input.bit_shift or input.byte_order")
 
-    def close(self) -> None:
-        """Close all readers."""
-        for reader in self._readers:
-            reader.close()
-
 
 def _image_of(areas: Sequence[Area], shape: tuple[int, int]) -> BoolArray:
     """Return the pixels of areas, (y, x)."""

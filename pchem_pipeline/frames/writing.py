@@ -11,17 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.frames.registry import reader_class
 
-#: module and usual suffix of each format that can be written
-WRITERS = {
-    "tiff": ("tiff", ".tif"),
-    "fits": ("fits", ".fits"),
-    "hdf5": ("hdf5", ".h5"),
-    "npy": ("npy", ".npy"),
-    "raw": ("raw", ".raw"),
-    "zarr": ("omezarr", ".zarr"),
-    "ser": ("ser", ".ser"),
-}
+#: formats that can be written, by the modules of their readers
+WRITERS = ("tiff", "fits", "hdf5", "npy", "raw", "zarr", "ser")
 
 
 class StackFacts(NamedTuple):
@@ -80,11 +73,11 @@ def write_frames(
     kind = np.dtype(dtype)
     if kind.kind != "u" or kind.itemsize not in (1, 2, 4):
         raise ValueError(f"frames are uint8, uint16 or uint32, not {kind.name}")
-    module, suffix = WRITERS[format]
-    writer = importlib.import_module(f"pchem_pipeline.frames.formats.{module}").write_frames
-    path = path if path.suffix else path.with_suffix(suffix)
+    reader = reader_class(format)
+    path = path if path.suffix else path.with_suffix(reader.suffixes[0])
     stream = _checked(blocks, shape)
-    writer(path, stream, StackFacts(shape, kind.newbyteorder("="), integration_time, bit_depth))
+    facts = StackFacts(shape, kind.newbyteorder("="), integration_time, bit_depth)
+    importlib.import_module(reader.__module__).write_frames(path, stream, facts)
     for _ in stream:  # a writer may stop when it has what it was told of
         pass
     return path

@@ -57,11 +57,6 @@ def precision(point: Point, n_frames: float) -> dict[str, float]:
     return found
 
 
-def exposure_grid(low: float, high: float, n: int) -> FloatArray:
-    """Return exposures evenly spaced in their logarithm."""
-    return np.asarray(np.geomspace(low, high, n))
-
-
 def best_exposure(targets: Sequence[Target], point: Point, low: float, high: float) -> tuple[float, float]:
     """Return the exposure at which one sample needs the fewest frames for all targets.
 
@@ -80,7 +75,7 @@ def best_exposure(targets: Sequence[Target], point: Point, low: float, high: flo
         there = replace(point, quanta_exposure=float(np.exp(log_exposure)))
         return max(frames_needed(target, there) for target in targets)
 
-    grid = np.log(exposure_grid(low, high, 25))
+    grid = np.log(np.geomspace(low, high, 25))
     values = np.array([needed(x) for x in grid])
     best = int(np.argmin(values))
     if not np.isfinite(values[best]):

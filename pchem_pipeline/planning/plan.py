@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.planning.frames import best_exposure, exposure_grid, frames_needed, precision
+from pchem_pipeline.planning.frames import best_exposure, frames_needed, precision
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.split import Split, best_samples, best_split, split_frames
 from pchem_pipeline.planning.targets import Target
@@ -153,7 +153,7 @@ def _best(
     first, fewest = best_exposure((*targets, _SEEN), point, low, max_exposure)
     if not np.isfinite(first):
         return first, fewest
-    tried = [first, *exposure_grid(low, max_exposure, _TRIED).tolist()]
+    tried = [first, *np.geomspace(low, max_exposure, _TRIED).tolist()]
     points = [replace(point, quanta_exposure=h) for h in tried]
     promises = [(max(frames_needed(target, there) for target in targets), there) for there in points]
     best, frames = first, float("inf")

@@ -42,8 +42,3 @@ class Point:
                 f"--read-noise {self.read_noise_e:g}: below the rounding noise of {rounding:.3g} e- at "
                 f"{self.conversion_gain:g} e-/DN, which the read noise includes"
             )
-
-    @property
-    def read_noise_dn(self) -> float:
-        """Sigma, DN."""
-        return self.read_noise_e / self.conversion_gain

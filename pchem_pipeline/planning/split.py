@@ -15,7 +15,6 @@ import numpy as np
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.model.errors.expected_information import shared_information
-from pchem_pipeline.planning.frames import exposure_grid
 from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.targets import Target
 
@@ -70,14 +69,13 @@ def best_samples(targets: Sequence[Target], point: Point, high: float) -> Split:
         point: read noise and gain of the pixel.
         high: largest exposure allowed, e-.
     """
-    grid = [0.0, *exposure_grid(min(0.05, 0.1 * high), high, 40).tolist()]
+    grid = [0.0, *np.geomspace(min(0.05, 0.1 * high), high, 40).tolist()]
     coarse = best_split(targets, grid, point)
     kept = _merged(coarse)
     fine = [0.0] if 0.0 in kept else []
     for exposure in kept:
         if exposure > 0:
-            near = exposure_grid(exposure / 1.2, min(exposure * 1.2, high), 9)
-            fine += [float(h) for h in near]
+            fine += np.geomspace(exposure / 1.2, min(exposure * 1.2, high), 9).tolist()
     again = _merged(best_split(targets, sorted(set(fine)), point))
     return best_split(targets, again, point)
 

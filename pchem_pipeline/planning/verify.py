@@ -55,14 +55,12 @@ class Verification:
     """Outcome of a simulation.
 
     Attributes:
-        n_frames: frames of each pixel.
         n_pixels: simulated pixels.
         n_failed: of them without a value.
         n_flagged: of them flagged in what was wanted.
         checks: one a target.
     """
 
-    n_frames: int
     n_pixels: int
     n_failed: int
     n_flagged: int
@@ -172,7 +170,6 @@ def verify(
     flagged = ~failed & ((words & int(FLAGGED if every_flag else own)) != 0)
     good = errors[~failed & ~flagged]
     return Verification(
-        sum(frames),
         n_pixels,
         int(np.count_nonzero(failed)),
         int(np.count_nonzero(flagged)),

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES
+from pchem_pipeline.base.wording import measured, symbol
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
@@ -95,6 +96,11 @@ class PixelFit:
     def place(self) -> str:
         """Where the pixel is, in words."""
         return f"channel {self.x}" if self.channel else f"pixel y = {self.y}, x = {self.x}"
+
+    def text(self, name: str) -> str:
+        """Return a parameter with its standard error and unit."""
+        nan = float("nan")
+        return measured(self.parameters.get(name, nan), self.stderr.get(name, nan), symbol(name)[2])
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ def inspect_input(context: StageContext) -> None:
     if is_histogram_input(settings, context.base_dir):
         read_histograms(settings, context.base_dir)
     else:
-        open_frames(settings, context.base_dir).close()
+        open_frames(settings, context.base_dir)
 
 
 def listed_identity(context: StageContext) -> dict[str, Any]:

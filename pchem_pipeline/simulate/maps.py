@@ -32,8 +32,6 @@ from pchem_pipeline.simulate.streams import KeyedStreams
 from pchem_pipeline.simulate.truth import Defect, TruthMaps
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from pchem_pipeline.simulate.settings import SimulateSettings
 
 
@@ -57,13 +55,9 @@ def draw_truth(settings: SimulateSettings) -> TruthMaps:
         maps["quanta_exposure"] = maps["dark_current"] * settings.integration_time
     if "dn_per_electron" in maps:
         maps["conversion_gain"] = 1.0 / maps["dn_per_electron"]
-    truth = TruthMaps(
-        quanta_exposure=maps["quanta_exposure"],
-        conversion_gain=maps["conversion_gain"],
-        bias=maps["bias"],
-        analog_read_noise_e=maps["analog_read_noise_e"],
-        defect=np.zeros(maps["bias"].shape, np.uint8),
-    )
+    names = ("quanta_exposure", "conversion_gain", "bias", "analog_read_noise_e")
+    exposure, gain, bias, noise = (maps[name] for name in names)
+    truth = TruthMaps(exposure, gain, bias, noise, np.zeros(settings.shape, np.uint8))
     return _with_defects(truth, settings)
 
 
@@ -105,20 +99,18 @@ def _pattern(pattern: Pattern, streams: KeyedStreams, shape: tuple[int, int]) ->
     # position from -1/2 to 1/2 across the sensor; a single row or column is in the middle
     y = (streams.rows[:, None] - (shape[0] - 1) / 2) / max(shape[0] - 1, 1)
     x = (streams.columns[None, :] - (shape[1] - 1) / 2) / max(shape[1] - 1, 1)
+    shift: Any
     match pattern:
         case ColumnPattern():
-            return _floats(pattern.amplitude * streams.normal(("x",))[0])
+            shift = streams.normal(("x",))[0]
         case RowPattern():
-            return _floats(pattern.amplitude * streams.normal(("y",))[0])
+            shift = streams.normal(("y",))[0]
         case GradientPattern():
             angle = np.deg2rad(pattern.angle)
-            return _floats(pattern.amplitude * (x * np.cos(angle) + y * np.sin(angle)))
+            shift = x * np.cos(angle) + y * np.sin(angle)
         case RadialPattern():
-            return _floats(pattern.amplitude * 2.0 * (x**2 + y**2))
-
-
-def _floats(values: ArrayLike) -> FloatArray:
-    return np.asarray(values, dtype=np.float64)
+            shift = 2.0 * (x**2 + y**2)
+    return np.asarray(pattern.amplitude * shift, dtype=np.float64)
 
 
 def _refuse_impossible(name: str, values: FloatArray) -> None:

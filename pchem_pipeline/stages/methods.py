@@ -7,7 +7,6 @@ its numbers in its marker, so that a stopped comparison goes on where it was.
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +23,7 @@ from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Named, StageContext
 from pchem_pipeline.stages.identities import methods_settings
-from pchem_pipeline.store.files import read_json
+from pchem_pipeline.store.files import read_json, write_json
 from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
@@ -150,7 +149,7 @@ def run(context: StageContext) -> None:
     }
     for remark in result["remarks"]:
         context.note(remark)
-    context.store.write_file(METHODS_FILE, (json.dumps(result, indent=2, allow_nan=False) + "\n").encode())
+    write_json(context.store.path / METHODS_FILE, result)
 
 
 def _conditions(units: Sequence[_Unit]) -> dict[str, Any] | None:

@@ -7,7 +7,6 @@ names of the files) beside them; maps and the first true electron numbers go int
 from __future__ import annotations
 
 import functools
-import io
 import math
 import shutil
 from collections import deque
@@ -21,9 +20,10 @@ from zipfile import BadZipFile
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
-from pchem_pipeline.frames.formats.map_files import read_image
+from pchem_pipeline.frames.formats.map_files import read_image, write_npz
 from pchem_pipeline.frames.identity import content_identity
-from pchem_pipeline.frames.writing import WRITERS, write_frames
+from pchem_pipeline.frames.registry import reader_class
+from pchem_pipeline.frames.writing import write_frames
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.stage import Named, StageContext
 from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
@@ -31,7 +31,7 @@ from pchem_pipeline.simulate.maps import draw_truth
 from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
-from pchem_pipeline.store.files import storage_error, write_atomic
+from pchem_pipeline.store.files import in_storage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -203,7 +203,7 @@ def _in_order(
 def _files(settings: SimulateSettings) -> list[tuple[str, int, int]]:
     """Return name, first frame and frame after the last of every file."""
     n, per_file = settings.n_frames, settings.frames_per_file or settings.n_frames
-    suffix = WRITERS[settings.format][1]
+    suffix = reader_class(settings.format).suffixes[0]
     if per_file >= n:
         return [(f"frames{suffix}", 0, n)]
     width = max(5, len(str(math.ceil(n / per_file))))
@@ -235,13 +235,11 @@ def _prepare(folder: Path, settings: SimulateSettings) -> None:
         StoreError: the disk is too small or refuses.
     """
     needed = settings.n_frames * math.prod(settings.shape) * dn_dtype(settings.bit_depth).itemsize
-    try:
+    with in_storage(folder):
         if folder.exists() and any(folder.iterdir()):
             _remove_simulated(folder)
         folder.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(folder).free
-    except OSError as error:
-        raise storage_error(error, folder) from error
     if needed > free:
         raise StoreError(
             f"{folder}: the frames need {needed / 1e9:.2f} GB, {free / 1e9:.2f} GB are "
@@ -270,11 +268,9 @@ def _remove_simulated(folder: Path) -> None:
 
 
 def _write_truth(path: Path, truth: TruthMaps, settings: SimulateSettings, files: list[str]) -> None:
-    facts: dict[str, Any] = {
+    facts = {
         "files": np.array(files),
         "integration_time": settings.integration_time,
         "seed": settings.seed,
     }
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, allow_pickle=False, **truth.arrays(), **facts)
-    write_atomic(path, buffer.getvalue())
+    write_npz(path, truth.arrays() | facts)

@@ -21,10 +21,7 @@ def make_folder(path: Path) -> None:
 
 def write(path: Path, data: Data) -> None:
     """Write a file that nobody looks at yet."""
-    with path.open("wb", buffering=0) as file:
-        rest = memoryview(data).cast("B")
-        while rest:
-            rest = rest[file.write(rest) :]
+    path.write_bytes(data)
 
 
 def replace(source: Path, target: Path) -> None:

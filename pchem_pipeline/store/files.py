@@ -58,6 +58,15 @@ def storage_error(error: OSError, path: object) -> StoreError:
     return StoreError(f"cannot use {path}: {error.strerror or error}; {cure}")
 
 
+@contextlib.contextmanager
+def in_storage(path: object) -> Iterator[None]:
+    """Turn what the file system refuses inside into the `storage_error` of a path."""
+    try:
+        yield
+    except OSError as error:
+        raise storage_error(error, path) from error
+
+
 def is_fatal(error: BaseException) -> bool:
     """Return whether an error will hit every other tile as well (disk full, no permission)."""
     return isinstance(error, OSError) and error.errno in _CURES
@@ -152,15 +161,11 @@ def remove_files(*paths: Path) -> None:
     """
     there = [path for path in paths if isinstance(path, RemotePath) or os.path.lexists(path)]
     for path in there:
-        try:
+        with in_storage(path):
             disk.remove(path)
-        except OSError as error:
-            raise storage_error(error, path) from error
     for folder in {path.parent for path in there if not isinstance(path, RemotePath)}:
-        try:
+        with in_storage(folder):
             disk.sync_folder(folder)
-        except OSError as error:
-            raise storage_error(error, folder) from error
 
 
 def remove_folder(path: Path) -> None:
@@ -172,12 +177,10 @@ def remove_folder(path: Path) -> None:
     if isinstance(path, RemotePath):
         path.remove_folder()
         return
-    try:
+    with in_storage(path):
         if path.is_dir():
             disk.remove_tree(path)
             disk.sync_folder(path.parent)
-    except OSError as error:
-        raise storage_error(error, path) from error
 
 
 def link_out_of(folder: Path) -> Path | None:
@@ -274,12 +277,9 @@ def read_record(path: Path, cure: str = "delete it and run again") -> dict[str, 
     Raises:
         StoreError: it is damaged.
     """
-    try:
+    with in_storage(path), contextlib.suppress(FileNotFoundError):
         return checked(path.read_bytes(), path, cure)[0]
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise storage_error(error, path) from error
+    return None
 
 
 def with_digest(content: dict[str, Any], *, inside: bool = False) -> dict[str, Any]:

@@ -56,15 +56,17 @@ def locked(run: Path, private: Path) -> Iterator[None]:
         held = FileLock(private / _FILE)
         held.acquire(timeout=_PATIENCE)
     except Timeout as error:
-        raise LockedError(
-            f"{run} is in use by another pchem process; wait for it or use another --store"
-        ) from error
+        raise _in_use(run) from error
     except OSError as error:
         raise storage_error(error, private) from error
     try:
         yield
     finally:
         held.release()
+
+
+def _in_use(run: Path) -> LockedError:
+    return LockedError(f"{run} is in use by another pchem process; wait for it or use another --store")
 
 
 def is_locked(run: Path, private: Path) -> bool:
@@ -111,7 +113,7 @@ def _acquired(run: Path, lock: RemotePath) -> bytes:
                     f"{_free(lock)}"
                 )
             lock.unlink(missing_ok=True)
-    raise LockedError(f"{run} is in use by another pchem process; wait for it or use another --store")
+    raise _in_use(run)
 
 
 def _owner(run: Path, lock: RemotePath) -> dict[str, Any]:

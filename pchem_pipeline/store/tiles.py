@@ -110,14 +110,10 @@ def roi_tiles(roi: tuple[int, int, int, int], grid: list[Tile]) -> list[Tile]:
     y0, y1, x0, x1 = roi
     tiles = [t for t in grid if t.y0 < y1 and y0 < t.y1 and t.x0 < x1 and x0 < t.x1]
     last = grid[-1]
-    if not tiles or y0 >= y1 or x0 >= x1 or y0 < 0 or x0 < 0:
+    outside = not tiles or y0 >= y1 or x0 >= x1 or y0 < 0 or x0 < 0
+    if outside or y1 > last.y1 or x1 > last.x1:
         raise ConfigError(
-            f"--roi {y0}:{y1},{x0}:{x1} is outside the sensor of {last.y1} x {last.x1} pixels (y x x); "
-            f"choose within 0:{last.y1},0:{last.x1}"
-        )
-    if y1 > last.y1 or x1 > last.x1:
-        raise ConfigError(
-            f"--roi {y0}:{y1},{x0}:{x1} exceeds the sensor of {last.y1} x {last.x1} pixels (y x x); choose "
-            f"within 0:{last.y1},0:{last.x1}"
+            f"--roi {y0}:{y1},{x0}:{x1} {'is outside' if outside else 'exceeds'} the sensor of {last.y1} x "
+            f"{last.x1} pixels (y x x); choose within 0:{last.y1},0:{last.x1}"
         )
     return tiles

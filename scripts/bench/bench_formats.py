@@ -111,8 +111,8 @@ def main() -> None:
     from pchem_pipeline.frames.settings import InputSettings
     from pchem_pipeline.frames.stream import HashedFrameStream
 
-    with open_frames(InputSettings(files=(str(given.raw.resolve()),)), Path()) as reader:
-        stack = reader.read(0, min(given.frames, reader.shape[0]))
+    reader = open_frames(InputSettings(files=(str(given.raw.resolve()),)), Path())
+    stack = reader.read(0, min(given.frames, reader.shape[0]))
     print(machine())
     print(f"{stack.shape[0]} frames of {stack.shape[1]} x {stack.shape[2]}; MB/s of decoded samples")
     print(f"{'file':<12}{'bare':>8}{'ours':>8}{'ours + hash':>13}  ({given.threads} threads)")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
-from pchem_pipeline.commands.plan import PlanRequest, make_plan
+from pchem_pipeline.commands.plan import make_plan
 from pchem_pipeline.commands.view import RunView
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
@@ -84,7 +84,7 @@ def test_a_plan_has_the_noise_of_the_effects(both):
     path, _ = both
     store = RunStore.open(path.parent / "run.zarr")
     error = np.median(store.read("maps/conversion_gain_stderr") / store.read("maps/conversion_gain"))
-    words = make_plan(PlanRequest(path.parent / "run.zarr", frames=3000))
+    words = make_plan(path.parent / "run.zarr", frames=3000)
     planned = float(re.search(r"conversion_gain +([\d.]+) %", words)[1])
     assert planned == pytest.approx(100 * error, rel=0.1)
     assert "effects in the model of the run (signal_dependent_noise, row_noise, nonlinearity): noise" in words

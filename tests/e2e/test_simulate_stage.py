@@ -46,9 +46,9 @@ def simulated(target, **options):
 
 
 def frames_of(target):
-    with open_frames(target.config.input, target.base_dir) as reader:
-        frames = np.empty(reader.shape, reader.dtype)
-        reader.read_into(frames, 0, reader.shape[0])
+    reader = open_frames(target.config.input, target.base_dir)
+    frames = np.empty(reader.shape, reader.dtype)
+    reader.read_into(frames, 0, reader.shape[0])
     return frames
 
 
@@ -80,8 +80,8 @@ def test_integration_time_and_bit_depth_travel_with_the_files(tmp_path):
     target = prepare(tmp_path, format="tiff")
     simulated(target)
     bare = target.changed("input", integration_time=None, bit_depth=None)
-    with open_frames(bare.config.input, target.base_dir) as reader:
-        assert (reader.integration_time, reader.bit_depth) == (2.5, 12)
+    reader = open_frames(bare.config.input, target.base_dir)
+    assert (reader.integration_time, reader.bit_depth) == (2.5, 12)
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,7 @@ def opened(path: Path, **settings: Any) -> FrameSequence:
 
 
 def read(path: Path, **settings: Any) -> NDArray[Any]:
-    with opened(path, **settings) as frames:
-        return frames.read()
+    return opened(path, **settings).read()
 
 
 def refused(words: str, path: Path, use: Callable[..., Any] = read, **settings: Any) -> None:

@@ -23,6 +23,7 @@ from helpers.layouts import LAYOUTS, tiff_pages, write
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.config.load import make_config
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
+from pchem_pipeline.frames.identity import content_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.run.stage import Command
@@ -189,16 +190,16 @@ def read_all(place):
     if is_histogram_input(settings, place):
         found = read_histograms(settings, place)
         return np.concatenate([found.origin.ravel(), found.counts.ravel().astype(np.int64)])
-    with open_frames(settings, place) as stack:
-        stack.identity()
-        n, rows, columns = stack.shape
-        step = max(1, MOST_READ // max(1, columns * stack.dtype.itemsize))
-        rows = min(rows, step)
-        many = min(n, max(1, step // rows), 64)
-        first = stack.read(0, many, 0, rows)
-        if many < n:
-            stack.read(n - 1, n, 0, rows)
-        return first
+    stack = open_frames(settings, place)
+    content_identity(stack.paths)
+    n, rows, columns = stack.shape
+    step = max(1, MOST_READ // max(1, columns * stack.dtype.itemsize))
+    rows = min(rows, step)
+    many = min(n, max(1, step // rows), 64)
+    first = stack.read(0, many, 0, rows)
+    if many < n:
+        stack.read(n - 1, n, 0, rows)
+    return first
 
 
 def peak_memory():

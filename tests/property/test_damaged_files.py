@@ -77,9 +77,9 @@ def test_bytes_behind_an_array_are_told(tmp_path):
     with path.open("wb") as file:
         np.save(file, frames())
         np.save(file, frames())
-    with open_frames(InputSettings(files=(str(path),)), tmp_path) as stack:
-        assert stack.shape[0] == 6
-        assert "992 bytes after the array" in stack.notes[0]
+    stack = open_frames(InputSettings(files=(str(path),)), tmp_path)
+    assert stack.shape[0] == 6
+    assert "992 bytes after the array" in stack.notes[0]
 
 
 def test_a_zarr_array_that_claims_to_be_huge(tmp_path):

@@ -41,6 +41,7 @@ from pchem_pipeline.commands.apply.tasks import (
 )
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.effects.framework.compose import model_words
+from pchem_pipeline.frames.identity import quick_identity
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
@@ -204,7 +205,7 @@ def _make_job(
         "run": target.store.name,
         "run_digest": digest,
         "model": model_words(effects),
-        "frames": frames.quick_identity()["files"],
+        "frames": quick_identity(frames.paths)["files"],
         "settings": {**settings, "kinds": list(wanted.kinds)},
     }
     return job, calibration, content, remarks

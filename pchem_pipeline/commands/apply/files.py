@@ -15,7 +15,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.base.variables import Variable, variables_of
 from pchem_pipeline.commands.apply.finish import FLAGS
 from pchem_pipeline.frames.formats.fits_files import FitsImage, image_cards, input_cards, write_images
-from pchem_pipeline.frames.formats.map_files import Cube, write_tiff_cube
+from pchem_pipeline.frames.formats.map_files import write_tiff_cube
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.run_store import RunStore
@@ -67,8 +67,8 @@ def _write_tiff(store: RunStore, path: Path, variable: Variable, content: dict[s
     if dtype == np.float64:
         dtype = np.dtype(np.float32)  # the largest that ImageJ reads
     facts = {**content, **{key: array.attrs[key] for key in ("sentences", "no_number") if key in array.attrs}}
-    blocks = _blocks(store, variable.path)
-    write_tiff_cube(path, Cube(variable.name, blocks, shape, dtype, variable.unit, variable.long_name, facts))
+    about = {name: getattr(variable, name) for name in ("name", "unit", "long_name")} | {"provenance": facts}
+    write_tiff_cube(path, _blocks(store, variable.path), shape, dtype, about)
     return path
 
 

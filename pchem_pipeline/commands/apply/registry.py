@@ -48,8 +48,8 @@ def run_for(target: Path, files: Sequence[str], max_age: float | None) -> tuple[
     if not runs:
         return target, ""
     settings = InputSettings(files=tuple(files))
-    with open_frames(settings, Path.cwd(), check_duplicates=False, least=1) as frames:
-        name, camera, shapes = frames.paths[0], frames.camera, {frames.shape[1:], frames.whole_shape}
+    frames = open_frames(settings, Path.cwd(), check_duplicates=False, least=1)
+    name, camera, shapes = frames.paths[0], frames.camera, {frames.shape[1:], frames.whole_shape}
     fitting, against = {}, []
     for path, sensor in runs.items():
         why = unlike(camera, sensor.camera)

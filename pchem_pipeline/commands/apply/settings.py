@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 #: What can be asked for.
 KINDS = ("electrons", "numbers", "exposure")
-#: Formats of the output.
-FORMATS = ("zarr", "tiff", "fits")
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class ApplySettings:
             frames), ``flat`` (none) or ``run`` (of the characterisation).
         reference: pixels that tell the offsets of frames, rows and columns, which are subtracted: ``pixels``
             (all, of the offsets in the model of the run), ``overscan`` or ``none``.
-        format: one of `FORMATS`.
+        format: of the output: zarr, tiff or fits.
         dataset: which frames inside an HDF5, zarr or FITS file; None: as the run has it.
     """
 

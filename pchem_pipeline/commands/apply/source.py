@@ -90,8 +90,8 @@ def _with_region(settings: InputSettings, region: list[int], sensor: SensorInfo,
         InputError: the frames are of another size than both.
     """
     whole = settings.model_copy(update={"roi": None, "overscan": None})
-    with open_frames(whole, Path.cwd(), check_duplicates=False, least=1) as frames:
-        shape, name = frames.whole_shape, frames.paths[0]
+    frames = open_frames(whole, Path.cwd(), check_duplicates=False, least=1)
+    shape, name = frames.whole_shape, frames.paths[0]
     if shape == sensor.shape:
         return whole
     if sensor.whole is not None and shape != sensor.whole:

@@ -60,11 +60,6 @@ class FitsImage(NamedTuple):
     cards: Sequence[Any]
 
 
-def header_alone(cards: Sequence[Any]) -> FitsImage:
-    """Return a primary image without samples."""
-    return FitsImage((), (), np.dtype(np.uint8), cards)
-
-
 def image_cards(name: str, unit: str, long_name: str) -> list[tuple[str, str]]:
     """Return the cards that say what an image is; see `base.variables`."""
     unit = _UNITS.get(unit, "")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.formats.fits_files import FitsImage, header_alone, image_cards, write_images
+from pchem_pipeline.frames.formats.fits_files import FitsImage, image_cards, write_images
 from pchem_pipeline.frames.registry import require
 from pchem_pipeline.store.files import whole_file
 
@@ -54,7 +54,8 @@ def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) 
         StoreError: the folder cannot be written.
         MissingDependencyError: astropy is not installed.
     """
-    images = [header_alone([(key, value) for key, value in header.items() if value is not None])]
+    cards: list[Any] = [(key, value) for key, value in header.items() if value is not None]
+    images = [FitsImage((), (), np.dtype(np.uint8), cards)]
     for image in maps:
         cards = image_cards(image.name, image.unit, image.long_name)
         images.append(FitsImage([image.values], image.values.shape, image.values.dtype, cards))
@@ -89,71 +90,50 @@ def write_tiff(folder: Path, maps: Sequence[MapImage], suffix: str = ".tif") -> 
     return written
 
 
-def write_npz(path: Path, maps: Sequence[MapImage]) -> list[Path]:
-    """Write all maps into one npz file, each under its name.
-
-    Args:
-        path: the file.
-        maps: the maps.
-
-    Returns:
-        The file written.
+def write_npz(path: Path, arrays: Mapping[str, Any]) -> list[Path]:
+    """Write arrays into one npz file, each under its name, and return the file.
 
     Raises:
         StoreError: the folder cannot be written.
     """
-    arrays: dict[str, Any] = {image.name: image.values for image in maps}
     with whole_file(path) as part:
         np.savez_compressed(part, allow_pickle=False, **arrays)
     return [path]
 
 
-@dataclass(frozen=True)
-class Cube:
-    """A stack of images and what it is.
+def write_tiff_cube(
+    path: Path,
+    blocks: Iterable[NDArray[Any]],
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    about: Mapping[str, Any],
+) -> None:
+    """Write a page for each image: an ImageJ stack, or BigTIFF where that is too small.
 
-    Attributes:
-        name: as in the store.
+    Args:
+        path: the file.
         blocks: arrays (any number of images, rows, columns), in order.
         shape: (images, rows, columns) of all together.
         dtype: type of the samples.
-        unit: physical unit.
-        long_name: one sentence.
-        facts: provenance, as JSON data.
-    """
-
-    name: str
-    blocks: Iterable[NDArray[Any]]
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    unit: str
-    long_name: str
-    facts: Mapping[str, Any]
-
-
-def write_tiff_cube(path: Path, cube: Cube) -> None:
-    """Write a page for each image: an ImageJ stack, or BigTIFF where that is too small.
+        about: what the images are, as JSON data.
 
     Raises:
         StoreError: the folder cannot be written.
     """
     import tifffile
 
-    size = int(np.prod(cube.shape)) * cube.dtype.itemsize
-    about = {
-        "name": cube.name,
-        "unit": cube.unit,
-        "long_name": cube.long_name,
-        "provenance": dict(cube.facts),
-    }
-    images = (image for block in cube.blocks for image in np.ascontiguousarray(block, cube.dtype))
-    n, rows, columns = cube.shape
+    images = (image for block in blocks for image in np.ascontiguousarray(block, dtype))
+    n, rows, columns = shape
+    size = n * rows * columns * dtype.itemsize
     with whole_file(path) as part:
-        if size + (1 << 25) < _LARGEST_TIFF and cube.dtype.str[1:] in ("u1", "u2", "f4"):
+        if size + (1 << 25) < _LARGEST_TIFF and dtype.str[1:] in (
+            "u1",
+            "u2",
+            "f4",
+        ):
             frames = {"axes": "TZCYXS", "Info": json.dumps(about), "unit": "pixel"}
             # all axes: a last one of one column would be taken for samples of a pixel
-            shape = (n, 1, 1, rows, columns, 1)
-            options = {"shape": shape, "dtype": cube.dtype, "photometric": "minisblack"}
+            options = {"shape": (n, 1, 1, rows, columns, 1), "dtype": dtype, "photometric": "minisblack"}
             tifffile.imwrite(part, images, imagej=True, metadata=frames, **options)
         else:
             with tifffile.TiffWriter(part, bigtiff=True) as file:

@@ -27,9 +27,9 @@ from pchem_pipeline.frames.formats.contiguous import (
 )
 from pchem_pipeline.frames.formats.kinds import check_coded, check_samples, mosaic_note
 from pchem_pipeline.frames.formats.tiff_facts import (
+    LINEARIZATION_TAG,
     active_area,
     check_chain,
-    has_table,
     images_behind_one_page,
     mosaic,
     stated_channels,
@@ -179,7 +179,7 @@ def _value_notes(path: Path, pages: Sequence[Any]) -> list[str]:
     notes += unwritten_notes(path, counts.count(0), len(counts), "strips or tiles")
     if pattern := mosaic(pages[0]):
         notes.append(mosaic_note(path, pattern))
-    if has_table(pages[0]):
+    if LINEARIZATION_TAG in pages[0].tags:
         notes.append(
             f"{path.name}: its samples are codes of a table (LinearizationTable), not proportional to light; "
             "read as stored"

@@ -43,7 +43,7 @@ _MOST_PAGES = 100_000
 _EXPOSURE_TAG, _EXIF_TAG = 33434, 34665
 _MICRO_MANAGER_TAG = 51123
 _STK_PLANES_TAG = 33629
-_CFA_PATTERN_TAG, _TABLE_TAG, _ACTIVE_AREA_TAG = 33422, 50712, 50829
+_CFA_PATTERN_TAG, LINEARIZATION_TAG, _ACTIVE_AREA_TAG = 33422, 50712, 50829
 #: colours of a mosaic by their numbers; most pixels of its pattern
 _COLOURS, _LARGEST_MOSAIC = "RGBCMYW", 36
 _MAKE_TAG, _MODEL_TAG, _DATE_TAG = 271, 272, 306
@@ -157,7 +157,8 @@ def stated_facts(file: Any, page: Any) -> StatedFacts:
         _ratio(exif.get("ExposureTime")) if isinstance(exif := _tag(head, _EXIF_TAG), dict) else None,
         duration_of("Exposure-ms", record.get("Exposure-ms"), "ms"),
     )
-    depths = (_ome_depth(_ome(file)), own.bit_depth, _odd_depth(page.bitspersample))
+    bits = page.bitspersample  # which say nothing where they are those of a whole type
+    depths = (_ome_depth(_ome(file)), own.bit_depth, None if bits in (8, 16, 32) else bits_of(bits))
     names = [each.name for each in fields(CameraFacts)]
     camera = CameraFacts(*(first_of(getattr(each, name) for each in cameras) for name in names))
     return StatedFacts(camera, agreed_duration(times), first_of(depths))
@@ -169,11 +170,6 @@ def mosaic(page: Any) -> str:
         return ""
     pattern = bytes(_tag(page, _CFA_PATTERN_TAG) or b"")[:_LARGEST_MOSAIC]
     return "".join(_COLOURS[each] for each in pattern if each < len(_COLOURS)) or "CFA"
-
-
-def has_table(page: Any) -> bool:
-    """Return whether a table says what light the samples of a DNG stand for."""
-    return _TABLE_TAG in page.tags
 
 
 def active_area(page: Any) -> Area | None:
@@ -193,11 +189,6 @@ def _ome_time(text: str) -> Duration | None:
 def _ome_depth(text: str) -> int | None:
     match = re.search(r'SignificantBits="(\d+)"', text)
     return bits_of(int(match[1])) if match else None
-
-
-def _odd_depth(bits: Any) -> int | None:
-    """Return the bits of a stored sample where they are not those of a whole type."""
-    return None if bits in (8, 16, 32) else bits_of(bits)
 
 
 def _ratio(value: Any) -> Duration | None:

@@ -264,20 +264,16 @@ def status_chart(
     counts in the legend. Pixels that no fit has reached yet have a colour of their own.
     """
     last = len(_STATUS_COLOURS) - 1
-    missing = None if unfitted is None or not unfitted.any() else unfitted & (status == 0)
+    missing = np.zeros(status.shape, bool) if unfitted is None else unfitted & (status == 0)
     colour_of_word = np.zeros(int(status.max(initial=0)) + 1, np.uint8)
     for index in range(len(rows), 0, -1):
         colour_of_word[(np.arange(colour_of_word.size) & int(rows[index - 1][0])) != 0] = min(index, last - 1)
     colour = colour_of_word[status]
-    good = int(np.count_nonzero(status == 0))
-    keys = [("band", f"good fit: {_share(good, status.size)}")]
-    if missing is not None:
-        colour[missing] = last
-        n_missing = int(missing.sum())
-        keys = [
-            ("band", f"good fit: {_share(good - n_missing, status.size)}"),
-            (_STATUS_COLOURS[last], f"not fitted yet: {_share(n_missing, status.size)}"),
-        ]
+    colour[missing] = last
+    n_missing = int(missing.sum())
+    keys = [("band", f"good fit: {_share(int((status == 0).sum()) - n_missing, status.size)}")]
+    if unfitted is not None and unfitted.any():
+        keys.append((_STATUS_COLOURS[last], f"not fitted yet: {_share(n_missing, status.size)}"))
     keys += [
         (_STATUS_COLOURS[min(i + 1, last - 1)], plain(f"{text}: {_share(n, status.size)}"))
         for i, (_, text, n) in enumerate(rows)

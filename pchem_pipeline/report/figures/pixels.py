@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.base.wording import cut, measured, plain, short, stored_unit, symbol
+from pchem_pipeline.base.wording import cut, plain, short, stored_unit, symbol
 from pchem_pipeline.model.law.pcd import pcd, thresholds
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
@@ -67,7 +67,7 @@ def pixel_figures(data: ReportData) -> Iterator[Figure]:
         return
     words = []
     for pixel in data.pixels:
-        numbers = ", ".join(f"{symbol(name)[1]} {_value_text(pixel, name)}" for name in _TITLE_NAMES)
+        numbers = ", ".join(f"{symbol(name)[1]} {pixel.text(name)}" for name in _TITLE_NAMES)
         state = f" ({pixel.status})" if pixel.status else ""
         words.append(f"{pixel.label} {pixel.place}: {numbers}{state}".strip())
     yield Figure(
@@ -84,14 +84,9 @@ def pixel_figures(data: ReportData) -> Iterator[Figure]:
     )
 
 
-def _value_text(pixel: PixelFit, name: str) -> str:
-    nan = float("nan")
-    return measured(pixel.parameters.get(name, nan), pixel.stderr.get(name, nan), symbol(name)[2])
-
-
 def _fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
     """Return the histograms of pixels with what their fits expect, and their parameters."""
-    parts = [_pixel_columns(pixel) for pixel in pixels]
+    parts = [pixel_columns(pixel) for pixel in pixels]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     units = {"y": "pixel", "x": "pixel", "dn": "DN", "residual": "standard deviations"}
     facts: dict[str, list[Any]] = {
@@ -112,7 +107,8 @@ def _codes(pixel: PixelFit) -> IntArray:
     return pixel.origin + np.arange(pixel.counts.size)
 
 
-def _pixel_columns(pixel: PixelFit) -> dict[str, NDArray[Any]]:
+def pixel_columns(pixel: PixelFit) -> dict[str, NDArray[Any]]:
+    """Return the histogram of a pixel, what its fit expects at each DN, and the residuals; NaN without."""
     dn, n = _codes(pixel), pixel.counts.size
     expected = np.full(n, np.nan)
     if has_fit(pixel.parameters):
@@ -219,7 +215,7 @@ def _one_pixel(pixel: PixelFit, letter: str) -> Stack:
 
 
 def _residual_strip(pixel: PixelFit, where: slice, label: str) -> Panel:
-    columns = _pixel_columns(pixel)
+    columns = pixel_columns(pixel)
     enough = np.isfinite(columns["residual"][where])
     dn, residual = (columns[name][where][enough] for name in ("dn", "residual"))
     limit = float(np.clip(1.15 * np.max(np.abs(residual), initial=0.0), 3.5, 12.0))
@@ -242,7 +238,7 @@ def _title(pixel: PixelFit, letter: str) -> str:
     lines = [f"{head}: {pixel.place}" if head else pixel.place]
     if has_fit(pixel.parameters):
         known = (name for name in _TITLE_NAMES if name in pixel.parameters)
-        words = [f"{symbol(name)[0]} = {_value_text(pixel, name)}" for name in known]
+        words = [f"{symbol(name)[0]} = {pixel.text(name)}" for name in known]
         lines += ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
     if pixel.status:
         lines += textwrap.wrap(

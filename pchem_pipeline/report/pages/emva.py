@@ -173,11 +173,8 @@ def _ladder_rows(samples: Samples, kept: NDArray[Any], of: Callable[[str], Float
         samples.arrays[name][lit][:, kept] for name in ("quanta_exposure", "linearity_residual")
     )
     brightest = exposure[np.argmax(np.nanmean(exposure, axis=1))]
-    ratio, floor = (
-        brightest / np.sqrt(brightest + of("read_noise_e") ** 2),
-        _root_mean_square(of("read_noise_e")),
-    )
-    signal = _mean(brightest)
+    ratio = brightest / np.sqrt(brightest + of("read_noise_e") ** 2)
+    signal, floor = _mean(brightest), _root_mean_square(of("read_noise_e"))
     rows = [
         EmvaRow(
             "signal-to-noise ratio at the largest exposure", "SNR", *_mean(ratio), "",
@@ -216,9 +213,8 @@ def _ladder_rows(samples: Samples, kept: NDArray[Any], of: Callable[[str], Float
 
 
 def _mean(values: FloatArray) -> tuple[float, float]:
-    return float(values.mean()), float(
-        values.std(ddof=1) / np.sqrt(values.size)
-    ) if values.size > 1 else np.nan
+    error = float(values.std(ddof=1) / np.sqrt(values.size)) if values.size > 1 else np.nan
+    return float(values.mean()), error
 
 
 def _root_mean_square(values: FloatArray) -> tuple[float, float]:

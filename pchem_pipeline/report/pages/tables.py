@@ -556,7 +556,8 @@ def method_rows(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
             continue
         errors = method["errors"]
         gain = errors.get("conversion_gain", {})
-        ratio = _ratio(gain.get("rmse"), gain.get("bound")) if result["reference"] == "truth" else "-"
+        known = result["reference"] == "truth" and gain.get("rmse") is not None and gain.get("bound")
+        ratio = f"{gain['rmse'] / gain['bound']:.2f}" if known else "-"
         if not errors:
             cells = ["reference", *[""] * 6]
         else:
@@ -570,10 +571,6 @@ def method_rows(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
         value = "-" if gain_value is None else f"{gain_value:.5g}"
         rows.append((method["title"], f"{method['n_answered']:,}", value, *cells, time))
     return rows
-
-
-def _ratio(value: float | None, bound: float | None) -> str:
-    return "-" if value is None or not bound else f"{value / bound:.2f}"
 
 
 def method_tables(data: ReportData) -> list[Table]:

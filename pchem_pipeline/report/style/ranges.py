@@ -24,22 +24,16 @@ class DisplayRange:
 
     Attributes:
         low, high: ends of the axis.
-        n_below, n_above: finite values beyond the ends.
+        n_outside: finite values beyond the ends, which are not drawn.
         n_missing: values that are NaN or infinite.
         logarithmic: whether the drawn part spans decades.
     """
 
     low: float
     high: float
-    n_below: int
-    n_above: int
+    n_outside: int
     n_missing: int
     logarithmic: bool
-
-    @property
-    def n_outside(self) -> int:
-        """Number of finite values that are not drawn."""
-        return self.n_below + self.n_above
 
     def remark(self) -> str:
         """Return a note on what is not drawn, e.g. ``3 outside the axis; 5 without a value``."""
@@ -69,7 +63,7 @@ def robust_range(values: NDArray[Any] | Ordered) -> DisplayRange:
     """
     known = Ordered.of(values)
     if known.size == 0:
-        return DisplayRange(0.0, 1.0, 0, 0, known.n_missing, False)
+        return DisplayRange(0.0, 1.0, 0, known.n_missing, False)
     smallest, largest = float(known.values[0]), float(known.values[-1])
     bulk_low, bulk_high = known.quantiles([0.01, 0.99]).tolist()
     logarithmic = bulk_low > 0 and bulk_high / bulk_low > DECADES
@@ -83,7 +77,7 @@ def robust_range(values: NDArray[Any] | Ordered) -> DisplayRange:
         pad = max(abs(low) * 0.05, 1e-9)
         low, high = low - pad, high + pad
     return DisplayRange(
-        low, high, known.n_below(low), known.n_above(high), known.n_missing, bool(logarithmic)
+        low, high, known.n_below(low) + known.n_above(high), known.n_missing, bool(logarithmic)
     )
 
 

@@ -163,7 +163,7 @@ def read_maps(
         some = order[start : start + threads]
         tasks = [functools.partial(_coded, maps, entry, index, budget > 0) for entry in some]
         for entry, values in call_all(tasks, threads):
-            if entry.same_as is not None and not _is_packed(found.get(entry.same_as[0])):
+            if entry.same_as is not None and getattr(found.get(entry.same_as[0]), "packed", None) is None:
                 entry = replace(
                     entry, same_as=None, packed=packed_map(maps, entry.path) if budget > 0 else None
                 )
@@ -178,10 +178,6 @@ def read_maps(
                 exact[entry.path] = values
     paths = [entry.path for entry in listed]
     return [found[path] for path in paths], {path: exact[path] for path in paths if path in exact}
-
-
-def _is_packed(entry: MapEntry | None) -> bool:
-    return entry is not None and entry.packed is not None
 
 
 def _coded(maps: Arrays, entry: MapEntry, index: IntArray, pack: bool) -> tuple[MapEntry, FloatArray]:

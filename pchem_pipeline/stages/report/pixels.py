@@ -99,9 +99,9 @@ def _nearest(
         reach *= 2.0
 
 
-def pixel_index(chosen: Sequence[Chosen], shape: tuple[int, int]) -> IntArray:
-    """Return ``y * nx + x`` of chosen pixels."""
-    return np.array([y * shape[1] + x for _, y, x in chosen], dtype=np.int64)
+def pixel_index(pixels: Sequence[tuple[int, int]], nx: int) -> IntArray:
+    """Return ``y * nx + x`` of pixels (y, x)."""
+    return np.array([y * nx + x for y, x in pixels], dtype=np.int64)
 
 
 def pixel_fits(
@@ -201,8 +201,8 @@ def choose_inspected(
     everything, most = (min(n, MAX_BINS // bins) for n in (everything, most))
     rng, p = np.random.default_rng(20_231), fit.get("goodness_p", np.full(status.shape, np.nan))
     reasons = [
-        ("shown in the report", "", _places(shown, nx)),
-        ("from the search for missing effects", "", _places(suspects, nx)),
+        ("shown in the report", "", pixel_index(shown, nx)),
+        ("from the search for missing effects", "", pixel_index(suspects, nx)),
         (
             "poorest goodness of fit",
             "fit/goodness_p",
@@ -222,10 +222,6 @@ def choose_inspected(
         Notable(words, tuple(i for i in where.tolist() if i in there), path) for words, path, where in reasons
     ]
     return index, [each for each in found if each.pixels]
-
-
-def _places(pixels: Sequence[tuple[int, int]], nx: int) -> IntArray:
-    return np.array([y * nx + x for y, x in pixels], dtype=np.int64)
 
 
 def _smallest(values: FloatArray, n: int) -> IntArray:

@@ -149,7 +149,7 @@ def _of_pixels(run: StoredRun, asked: Sequence[tuple[int, int]]) -> tuple[list[P
     verdict = data.discrepancy
     suspects = [] if verdict is None else [p for place in verdict.found.where for p in place.pixels]
     full, reasons = choose_inspected(data.maps, data.fit, places, suspects, bins=bins)
-    index = np.concatenate([pixel_index(shown, data.shape), full])
+    index = np.concatenate([pixel_index(places, data.shape[1]), full])
     histograms = read_histograms(store, index, data.shape)
     drawn, held = slice(0, len(shown)), slice(len(shown), None)
     some = slice(0, len(shown) + 300)  # those with the mass of a model with effects

@@ -103,8 +103,8 @@ def test_a_region_of_frames_of_another_size_is_refused(tmp_path, monkeypatch):
     for name, dn in given.items():
         np.save(f"{name}.npy", dn)
     for name in ("whole", "region"):
-        with open_like_run(target, sensor, [f"{name}.npy"]) as found:
-            np.testing.assert_array_equal(found.read(), frames[:, 2:6, 3:7])
+        found = open_like_run(target, sensor, [f"{name}.npy"])
+        np.testing.assert_array_equal(found.read(), frames[:, 2:6, 3:7])
     with pytest.raises(
         InputError, match=r"other.npy: frames of 12 x 12 .* \[2, 6, 3, 7\] of frames of 8 x 9"
     ):
@@ -125,7 +125,7 @@ def test_the_dataset_of_other_frames_may_be_another(tmp_path, monkeypatch):
     ):
         config = RunConfig.model_validate({"input": {"files": ["a.h5"], "dataset": own}})
         target = Target(config, tmp_path, tmp_path / "run.zarr")
-        with open_like_run(target, sensor, ["night.h5"], given) as frames:
-            np.testing.assert_array_equal(frames.read(), found)
+        frames = open_like_run(target, sensor, ["night.h5"], given)
+        np.testing.assert_array_equal(frames.read(), found)
     with pytest.raises(InputError, match=r"several datasets: .*; choose one with input\.dataset"):
         open_like_run(target, sensor, ["night.h5"])

@@ -32,9 +32,9 @@ TAKEN = 1_769_860_800.0  # 2026-01-31T12:00:00 UTC
 
 
 def facts(path, **settings):
-    with opened(path, **settings) as frames:
-        np.testing.assert_array_equal(frames.read(), STACK)
-        return frames.camera
+    frames = opened(path, **settings)
+    np.testing.assert_array_equal(frames.read(), STACK)
+    return frames.camera
 
 
 @pytest.mark.parametrize(
@@ -118,9 +118,9 @@ def test_several_files_share_what_they_state_alike(tmp_path):
         cards = {"CCD-TEMP": temperature, "SERIALNO": f"{i}"}  # which counts the files
         cards["DATE-OBS"] = f"2026-01-31T12:00:0{i}"
         write_fits(tmp_path / f"{i}.fits", STACK[i], INSTRUME="C", **cards)
-    with opened(tmp_path / "*.fits") as frames:
-        assert frames.camera == CameraFacts("C", None, pytest.approx(-57.4 / 3), TAKEN)
-        assert [note for note in frames.notes if "-20.4 to -17 °C" in note]
+    frames = opened(tmp_path / "*.fits")
+    assert frames.camera == CameraFacts("C", None, pytest.approx(-57.4 / 3), TAKEN)
+    assert [note for note in frames.notes if "-20.4 to -17 °C" in note]
     steady, remark = shared_facts([CameraFacts(temperature=1.0), CameraFacts(temperature=1.9)])
     assert (steady.temperature, remark) == (1.45, "")
     assert shared_facts([CameraFacts(temperature=1.0), CameraFacts()])[0].temperature is None
@@ -137,8 +137,8 @@ def test_files_of_two_cameras_are_no_stack(tmp_path):
         with pytest.raises(InputError, match=words.format(a, b)):
             open_frames(InputSettings(files=files), tmp_path)
     write_fits(tmp_path / "4.fits", STACK[4])  # says nothing, contradicts nothing
-    with open_frames(InputSettings(files=("0.fits", "1.fits", "4.fits")), tmp_path) as frames:
-        assert frames.camera.serial is None
+    frames = open_frames(InputSettings(files=("0.fits", "1.fits", "4.fits")), tmp_path)
+    assert frames.camera.serial is None
 
 
 def test_files_of_two_settings_are_no_stack(tmp_path):
@@ -157,9 +157,9 @@ def test_files_of_two_settings_are_no_stack(tmp_path):
         open_frames(InputSettings(files=("*.fits",)), tmp_path)
     with pytest.raises(InputError, match=r"IMAGETYP = DARK in 0\.fits, IMAGETYP = LIGHT in 3\.fits"):
         open_frames(InputSettings(files=("0.fits", "3.fits")), tmp_path)
-    with open_frames(InputSettings(files=("0.fits", "1.fits")), tmp_path) as frames:
-        assert frames.camera.setup == {"GAIN": "0", "READMODE": "fast", "IMAGETYP": "DARK"}
-        assert frames.camera.words() == "GAIN 0, READMODE fast, IMAGETYP DARK"
+    frames = open_frames(InputSettings(files=("0.fits", "1.fits")), tmp_path)
+    assert frames.camera.setup == {"GAIN": "0", "READMODE": "fast", "IMAGETYP": "DARK"}
+    assert frames.camera.words() == "GAIN 0, READMODE fast, IMAGETYP DARK"
 
 
 @pytest.mark.parametrize(
@@ -277,10 +277,10 @@ def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path):
     seconds = dict.fromkeys(("unit.fits", "a.zarr", "b.zarr", "c.zarr", "a.h5", "a.raw"), 0.1)
     seconds |= {"plain.fits": 100.0, "d.zarr": 100.0, "doubt.fits": None}
     for name, right in seconds.items():
-        with opened(tmp_path / name) as stack:
-            assert stack.integration_time == (None if right is None else pytest.approx(right)), name
-            assert name in stack.time_words
-            assert "--integration-time" not in stack.time_words or right is None
+        stack = opened(tmp_path / name)
+        assert stack.integration_time == (None if right is None else pytest.approx(right)), name
+        assert name in stack.time_words
+        assert "--integration-time" not in stack.time_words or right is None
 
 
 def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path):
@@ -291,15 +291,15 @@ def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path):
         "alone": ({"TELAPSE": (12.0, "[s]")}, 12.0),
     }
     for name, (header, seconds) in cards.items():
-        with opened(write_fits(tmp_path / f"{name}.fits", STACK, **header)) as stack:
-            assert stack.integration_time == seconds
+        stack = opened(write_fits(tmp_path / f"{name}.fits", STACK, **header))
+        assert stack.integration_time == seconds
     write_hdf5(tmp_path / "a.h5", frames=STACK, exposure_ms=100, integration_time=0.2)
     both_of = {"apart.fits": "EXPTIME = 0.1 ([s]), but EXPOSURE = 0.2 ([s])", "a.h5": "0.2 (s), but"}
     for name, both in both_of.items():
-        with opened(tmp_path / name) as stack:
-            assert stack.integration_time is None
-            assert both in stack.time_words
-            assert "set input.integration_time (--integration-time SECONDS)" in stack.time_words
+        stack = opened(tmp_path / name)
+        assert stack.integration_time is None
+        assert both in stack.time_words
+        assert "set input.integration_time (--integration-time SECONDS)" in stack.time_words
 
 
 @pytest.mark.parametrize(
@@ -321,5 +321,5 @@ def test_every_format_with_attributes_takes_the_same_names(tmp_path):
     array[:] = frames
     array.attrs.update(exposure_time=20, exposure_time_units="ms", bit_depth_readout=12)
     for name in ("a.h5", "capture"):
-        with opened(tmp_path / name) as stack:
-            assert (stack.integration_time, stack.bit_depth) == (pytest.approx(0.02), 12)
+        stack = opened(tmp_path / name)
+        assert (stack.integration_time, stack.bit_depth) == (pytest.approx(0.02), 12)

@@ -5,6 +5,7 @@ import pytest
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
+from pchem_pipeline.frames.identity import content_identity
 from pchem_pipeline.frames.settings import InputSettings
 
 DN = np.array([100, 101, 102, 104])
@@ -76,7 +77,7 @@ def test_several_files_and_large_counts(tmp_path):
     assert found.counts.dtype == np.uint64
     assert found.counts[0].tolist() == [[1, 2, 0], [2**40, 1, 1]]
     assert found.origin.tolist() == [[0, -5]]
-    assert [file["name"] for file in found.identity()["files"]] == ["c2.csv", "c10.csv"]
+    assert [file["name"] for file in content_identity(found.paths)["files"]] == ["c2.csv", "c10.csv"]
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.identity import hash_file
+from pchem_pipeline.frames.identity import content_identity, hash_file, quick_identity
 from pchem_pipeline.frames.inspect import _gaps
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import natural_key, resolve_files
@@ -78,8 +78,8 @@ def test_folder_of_several_formats(tmp_path):
     np.save(tmp_path / "a.npy", STACK)
     tifffile.imwrite(tmp_path / "a.tif", STACK + 1, photometric="minisblack")
     not_opened(r"several formats \(npy, tiff\); set input.format", tmp_path / ".")
-    with open_frames(InputSettings(files=(".",), format="tiff"), tmp_path) as reader:
-        np.testing.assert_array_equal(reader.read(), STACK + 1)
+    reader = open_frames(InputSettings(files=(".",), format="tiff"), tmp_path)
+    np.testing.assert_array_equal(reader.read(), STACK + 1)
 
 
 def test_content_wins_over_suffix(tmp_path):
@@ -276,22 +276,22 @@ def test_identity(tmp_path):
             np.save(folder / f"a_{i + 1:05d}.npy", STACK[4 * i : 4 * i + 4])
     settings = InputSettings(files=("*.npy",))
     here, there = open_frames(settings, first), open_frames(settings, second)
-    identity = here.identity()
-    assert identity == there.identity()
+    identity = content_identity(here.paths)
+    assert identity == content_identity(there.paths)
     assert [file["name"] for file in identity["files"]] == ["a_00001.npy", "a_00002.npy", "a_00003.npy"]
     assert identity["files"][0]["xxh3_128"] == hash_file(first / "a_00001.npy")
     assert str(tmp_path) not in str(identity)
-    before = there.quick_identity()
+    before = quick_identity(there.paths)
     changed = np.load(second / "a_00002.npy")
     changed[0, 0, 0] ^= 1
     np.save(second / "a_00002.npy", changed)
     os.utime(second / "a_00002.npy", ns=(1, 1))
-    assert there.identity()["digest"] != identity["digest"]
-    assert there.quick_identity() != before
+    assert content_identity(there.paths)["digest"] != identity["digest"]
+    assert quick_identity(there.paths) != before
     assert [file["size"] for file in before["files"]] == [file["size"] for file in identity["files"]]
     (second / "a_00003.npy").unlink()
     with pytest.raises(InputError, match="check that it is still there"):
-        there.quick_identity()
+        quick_identity(there.paths)
 
 
 def test_hash_of_a_file_is_that_of_its_bytes(tmp_path):
@@ -343,23 +343,23 @@ def test_overscan_is_excluded(tmp_path, cards, settings, active, overscan):
     """``overscan``: None is all outside of the light-sensitive area."""
     stack = np.arange(4 * 6 * 8, dtype=np.uint16).reshape(4, 6, 8)
     write_fits(tmp_path / "a.fits", stack, **cards)
-    with opened(tmp_path / "a.fits", **settings) as frames:
-        if active is None:
-            assert frames.excluded is None
-            assert not frames.overscan_pixels.any()
-            return
-        y0, y1, x0, x1 = active
-        inside, dark = np.zeros((2, *frames.shape[1:]), bool)
-        inside[y0:y1, x0:x1] = True
-        dark[np.s_[:] if overscan is None else overscan] = True
-        np.testing.assert_array_equal(frames.excluded, ~inside)
-        assert frames.exclusions == ("overscan",)
-        np.testing.assert_array_equal(frames.overscan_pixels, dark & ~inside)
-        top, _, left, _ = settings.get("roi", (0, 0, 0, 0))
-        whole = stack[:, top : top + frames.shape[1], left : left + frames.shape[2]]
-        shown = inside | frames.overscan_pixels
-        np.testing.assert_array_equal(frames.with_overscan().read()[:, shown], whole[:, shown])
-        assert (np.ptp(frames.read()[:, ~inside], axis=0) == 0).all()
+    frames = opened(tmp_path / "a.fits", **settings)
+    if active is None:
+        assert frames.excluded is None
+        assert not frames.overscan_pixels.any()
+        return
+    y0, y1, x0, x1 = active
+    inside, dark = np.zeros((2, *frames.shape[1:]), bool)
+    inside[y0:y1, x0:x1] = True
+    dark[np.s_[:] if overscan is None else overscan] = True
+    np.testing.assert_array_equal(frames.excluded, ~inside)
+    assert frames.exclusions == ("overscan",)
+    np.testing.assert_array_equal(frames.overscan_pixels, dark & ~inside)
+    top, _, left, _ = settings.get("roi", (0, 0, 0, 0))
+    whole = stack[:, top : top + frames.shape[1], left : left + frames.shape[2]]
+    shown = inside | frames.overscan_pixels
+    np.testing.assert_array_equal(frames.with_overscan().read()[:, shown], whole[:, shown])
+    assert (np.ptp(frames.read()[:, ~inside], axis=0) == 0).all()
 
 
 def test_overscan_outside_of_the_frames_is_refused(tmp_path):
@@ -385,15 +385,13 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path):
         name = "mask.npy" if mask_too else None
         y0, y1, x0, x1 = roi or (0, 6, 0, 8)
         excluded = ((stack[0] == 2**32 - 1) | (mask_too * (mask != 0)))[y0:y1, x0:x1]
-        with opened(tmp_path / "a.npy", mask=name, roi=roi) as frames:
-            np.testing.assert_array_equal(frames.excluded, excluded)
-            assert frames.exclusions == ("marker 2^32-1", "mask")[: 1 + mask_too]
-            wanted = stack[:, y0:y1, x0:x1]
-            middle = np.quantile(wanted[0][~excluded], 0.5, method="lower")
-            np.testing.assert_array_equal(frames.read(), np.where(excluded, middle, wanted))
-            np.testing.assert_array_equal(
-                frames.read(2, 5, 1, 4), np.where(excluded, middle, wanted)[2:5, 1:4]
-            )
+        frames = opened(tmp_path / "a.npy", mask=name, roi=roi)
+        np.testing.assert_array_equal(frames.excluded, excluded)
+        assert frames.exclusions == ("marker 2^32-1", "mask")[: 1 + mask_too]
+        wanted = stack[:, y0:y1, x0:x1]
+        middle = np.quantile(wanted[0][~excluded], 0.5, method="lower")
+        np.testing.assert_array_equal(frames.read(), np.where(excluded, middle, wanted))
+        np.testing.assert_array_equal(frames.read(2, 5, 1, 4), np.where(excluded, middle, wanted)[2:5, 1:4])
     for values, words in (
         (mask[1:], r"mask of shape \(5, 8\)"),
         (np.ones((6, 8)), "every pixel is excluded"),
@@ -409,8 +407,8 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path):
 def test_fits_adds_what_its_header_says(tmp_path):
     stack = np.random.default_rng(4).integers(0, 4096, (9, 6, 8)).astype(np.uint16)
     write_fits(tmp_path / "a.fits", (stack.astype(np.int32) - 1000).astype(np.int16), BZERO=1000)
-    with opened(tmp_path / "a.fits") as frames:
-        np.testing.assert_array_equal(frames.read(), stack)
+    frames = opened(tmp_path / "a.fits")
+    np.testing.assert_array_equal(frames.read(), stack)
 
 
 def test_files_with_names_that_are_special_and_files_that_are_none(tmp_path):

@@ -68,8 +68,8 @@ def test_packed_files_are_refused(tmp_path, pack, name, given):
         open_frames(InputSettings(files=(str(path),), format=given), tmp_path)
     samples = tmp_path / "a.raw"
     samples.write_bytes(b"PK\x03\x04" + bytes(20))
-    with open_frames(InputSettings(files=(str(samples),), shape=(3, 2), dtype="uint16"), tmp_path) as reader:
-        assert reader.shape == (2, 3, 2)
+    reader = open_frames(InputSettings(files=(str(samples),), shape=(3, 2), dtype="uint16"), tmp_path)
+    assert reader.shape == (2, 3, 2)
 
 
 @pytest.fixture(autouse=True)

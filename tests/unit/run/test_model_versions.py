@@ -10,7 +10,7 @@ from helpers.commands import arrays_of, assert_equal_arrays, invoke
 from helpers.discrepancy_material import verdict_of
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
-from pchem_pipeline.commands.model import adopt_verdict, list_models, model_lines, use_model
+from pchem_pipeline.commands.model import adopt_verdict, model_lines, use_model
 from pchem_pipeline.config.load import dump_config, load_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.verdict import VERDICT_FILE
@@ -208,7 +208,7 @@ def test_a_verdict_is_put_in_force_and_taken_back(run):
     run_stages(find_run(run), DONE, QUIET)
     after = arrays_of(run.parent / "run.zarr", ("fit", "maps"))
     assert not np.array_equal(before["fit/read_noise_dn"], after["fit/read_noise_dn"])
-    lines = model_lines(list_models(find_run(run)))
+    lines = model_lines(find_run(run))
     assert [" ".join(line.split()) for line in lines[1:]] == [
         "1 config discrepancy plain model",
         "* 2 verdict on 1 90.0 % fit, maps plain model + row_noise 1.2 DN",

@@ -63,8 +63,8 @@ STACK = np.random.default_rng(8).integers(0, 4096, (6, 32, 48)).astype(np.uint16
 
 
 def rows_per_read(path, **settings):
-    with open_frames(InputSettings(files=(path.name,), **settings), path.parent) as reader:
-        return reader.rows_per_read
+    reader = open_frames(InputSettings(files=(path.name,), **settings), path.parent)
+    return reader.rows_per_read
 
 
 @pytest.mark.parametrize(
@@ -88,8 +88,8 @@ def test_the_largest_of_several_files_counts(tmp_path):
         tifffile.imwrite(
             tmp_path / name, stack, photometric="minisblack", compression="zlib", rowsperstrip=rows
         )
-    with open_frames(InputSettings(files=("*.tif",)), tmp_path) as reader:
-        assert reader.rows_per_read == 16
+    reader = open_frames(InputSettings(files=("*.tif",)), tmp_path)
+    assert reader.rows_per_read == 16
 
 
 @pytest.mark.parametrize(

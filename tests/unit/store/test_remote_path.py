@@ -168,7 +168,7 @@ OF_THE_DISK = {
     "store/disk.py", "store/files.py", "store/lock.py",
 }  # fmt: skip
 #: what other objects have, too
-OF_OTHERS = {"PIL.Image.open", "self.group", "path.group", "image.group", "reader_class(entry.format).open"}
+OF_OTHERS = {"PIL.Image.open", "self.group", "path.group", "image.group", "reader_class(name).open"}
 
 
 def test_methods_that_an_object_storage_has_not_are_used_where_paths_are_of_the_disk():

@@ -26,8 +26,8 @@ def test_world_coordinates_stay_with_the_pixels_of_a_region(tmp_path):
     primary = fits.PrimaryHDU()
     primary.header.update({"OBJECT": "M 13", "EXPTIME": 2.5})
     fits.HDUList([primary, image]).writeto(tmp_path / "a.fits.fz")
-    with opened(tmp_path / "a.fits.fz", roi=(3, 8, 4, 12)) as frames:
-        header = header_of(frames)
+    frames = opened(tmp_path / "a.fits.fz", roi=(3, 8, 4, 12))
+    header = header_of(frames)
     world = [
         WCS(each, naxis=2).wcs_pix2world([[x, y]], 0) for each, x, y in ((header, 1, 2), (image.header, 5, 5))
     ]
@@ -46,8 +46,8 @@ def test_cards_that_break_the_standard_do_no_harm(tmp_path):
             at = whole.index(f"{name:8}=".encode())
             whole = whole[:at] + f"{name:8}= {value}".ljust(80).encode() + whole[at + 80 :]
         path.write_bytes(whole)
-    with opened(tmp_path / "*.fits") as frames:
-        header = header_of(frames)
+    frames = opened(tmp_path / "*.fits")
+    header = header_of(frames)
     write_images(tmp_path / "made.fits", [FitsImage([STACK[0]], (8, 12), STACK.dtype, header.cards)])
     np.testing.assert_array_equal(fits.getdata(tmp_path / "made.fits"), STACK[0])
     assert fits.getheader(tmp_path / "made.fits")["DOME"] == "open"

@@ -8,6 +8,7 @@ from helpers.camera_files import not_opened, opened, read
 from helpers.dcimg_files import MARKER, SESSION, put, write_dcimg
 
 from pchem_pipeline.frames.formats.dcimg import DcimgReader
+from pchem_pipeline.frames.identity import content_identity
 from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.frames.stream import HashedFrameStream
 
@@ -38,12 +39,10 @@ def test_samples_that_are_stored_apart_come_to_their_place(tmp_path, version, dt
 def test_they_do_so_in_the_stream_that_hashes_the_file(tmp_path, version):
     path = tmp_path / "a.dcimg"
     write_dcimg(path, STACK, version=version, row=4)
-    with (
-        opened(path) as frames,
-        HashedFrameStream(frames, [(0, 4), (4, 6), (6, 9)], 7, files=[path]) as stream,
-    ):
+    frames = opened(path)
+    with HashedFrameStream(frames, [(0, 4), (4, 6), (6, 9)], 7, files=[path]) as stream:
         found = np.concatenate([np.concatenate([*parts], axis=1) for _, parts in stream])
-        assert stream.identity() == frames.identity()
+        assert stream.identity() == content_identity(frames.paths)
     np.testing.assert_array_equal(found, STACK)
 
 

@@ -30,12 +30,11 @@ def test_facts_are_taken_from_the_header(tmp_path, keyword, extension):
 def test_values_that_may_be_no_samples_are_reported(tmp_path):
     for i in range(3):
         write_fits(tmp_path / f"f{i}.fits", STACK[i : i + 3], BLANK=-32768)
-    with open_frames(InputSettings(files=(str(tmp_path),)), tmp_path) as reader:
-        assert reader.report.notes == [
-            "f0.fits and 2 more: BLANK = -32768 marks pixels without a value; read as stored",
-            "f0.fits and 2 more: its 3 planes are read as frames; if they are colours, write one file per "
-            "colour",
-        ]
+    reader = open_frames(InputSettings(files=(str(tmp_path),)), tmp_path)
+    assert reader.report.notes == [
+        "f0.fits and 2 more: BLANK = -32768 marks pixels without a value; read as stored",
+        "f0.fits and 2 more: its 3 planes are read as frames; if they are colours, write one file per colour",
+    ]
 
 
 def test_a_mosaic_is_read_as_its_samples(tmp_path):
@@ -92,11 +91,11 @@ def test_extensions_of_a_frame_each_are_a_stack(tmp_path, coding):
 
     for names in ([""] * 5, [f"FRAME_{i}" for i in range(5)]):
         write({"EXPTIME": 0.25001}, names=names)
-        with open_frames(InputSettings(files=("a.fits",)), tmp_path) as reader:
-            np.testing.assert_array_equal(reader.read(), STACK)
-            np.testing.assert_array_equal(reader.read(1, 4, 3, 9), STACK[1:4, 3:9])
-            assert reader.integration_time == 0.25
-            assert "its 5 images are read as frames" in reader.report.notes[0]
+        reader = open_frames(InputSettings(files=("a.fits",)), tmp_path)
+        np.testing.assert_array_equal(reader.read(), STACK)
+        np.testing.assert_array_equal(reader.read(1, 4, 3, 9), STACK[1:4, 3:9])
+        assert reader.integration_time == 0.25
+        assert "its 5 images are read as frames" in reader.report.notes[0]
     for differing in ("EXPTIME", "GAIN", "DETSEC"):
         write({differing: 3})
         refused(rf"4 \(\w+\), 5 \(\w+\), which differ in {differing}; choose one", path)

@@ -21,16 +21,16 @@ def test_nd2(tmp_path, compressed):
     pytest.importorskip("nd2")
     path = tmp_path / "a.nd2"
     path.write_bytes(nd2_bytes(STACK, words=WORDS, compressed=compressed))
-    with opened(path) as reader:
-        assert (reader.integration_time, reader.bit_depth) == (pytest.approx(0.1), 12)
-        assert reader.camera.words() == "Flash4.0, serial number VSC-01412"
-        assert not reader.report.notes
-        for each in (reader, pickle.loads(pickle.dumps(reader))):
-            np.testing.assert_array_equal(each.read(), STACK)
-            np.testing.assert_array_equal(each.read(1, 4, 2, 9), STACK[1:4, 2:9])
-        with ThreadPoolExecutor(4) as pool:
-            found = list(pool.map(lambda t: reader.read(t % 5, t % 5 + 1)[0], range(40)))
-        np.testing.assert_array_equal(found, STACK[np.arange(40) % 5])
+    reader = opened(path)
+    assert (reader.integration_time, reader.bit_depth) == (pytest.approx(0.1), 12)
+    assert reader.camera.words() == "Flash4.0, serial number VSC-01412"
+    assert not reader.report.notes
+    for each in (reader, pickle.loads(pickle.dumps(reader))):
+        np.testing.assert_array_equal(each.read(), STACK)
+        np.testing.assert_array_equal(each.read(1, 4, 2, 9), STACK[1:4, 2:9])
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda t: reader.read(t % 5, t % 5 + 1)[0], range(40)))
+    np.testing.assert_array_equal(found, STACK[np.arange(40) % 5])
     path.write_bytes(nd2_bytes(STACK[:, :1]))
     np.testing.assert_array_equal(opened(path).read(), STACK[:, :1])
 

@@ -17,13 +17,13 @@ def test_sif(tmp_path):
     pytest.importorskip("sif_parser")
     path = tmp_path / "a.sif"
     path.write_bytes(sif_bytes(STACK))
-    with opened(path) as reader:
-        np.testing.assert_array_equal(reader.read(), STACK)
-        np.testing.assert_array_equal(reader.read(1, 4, 2, 9), STACK[1:4, 2:9])
-        assert reader.integration_time == 0.25
-        assert reader.camera.words() == "DU-897_BV, sensor at -80 °C, binning 1 x 1, gain 300"
-        np.testing.assert_allclose(reader.timestamps, 1.7e9 + 0.5 * np.arange(5))
-        assert not reader.report.notes
+    reader = opened(path)
+    np.testing.assert_array_equal(reader.read(), STACK)
+    np.testing.assert_array_equal(reader.read(1, 4, 2, 9), STACK[1:4, 2:9])
+    assert reader.integration_time == 0.25
+    assert reader.camera.words() == "DU-897_BV, sensor at -80 °C, binning 1 x 1, gain 300"
+    np.testing.assert_allclose(reader.timestamps, 1.7e9 + 0.5 * np.arange(5))
+    assert not reader.report.notes
     path.write_bytes(sif_bytes(STACK, sums=3, step=0))
     reader = opened(path)
     assert reader.timestamps is None

@@ -27,14 +27,14 @@ def test_version_2(tmp_path, dtype):
 def test_version_3_has_stamps_behind_its_frames(tmp_path):
     path = tmp_path / "a.spe"
     path.write_bytes(spe_bytes(STACK, version=3.0, numbers=NUMBERS))
-    with opened(path) as reader:
-        np.testing.assert_array_equal(reader.read(), STACK)
-        np.testing.assert_array_equal(reader.read(3, 5, 0, 1), STACK[3:, :1])
-        assert (reader.integration_time, reader.bit_depth) == (0.25, 16)
-        assert reader.camera.words() == "BLAZE, serial number 0705, sensor at -95 °C, gain High"
-        zero = np.datetime64("2026-01-31T11:00:00.5").astype("datetime64[ns]").astype(float) / 1e9
-        np.testing.assert_allclose(reader.timestamps - zero, [0.5 * i for i in range(5)], atol=1e-5)
-        assert not reader.report.notes
+    reader = opened(path)
+    np.testing.assert_array_equal(reader.read(), STACK)
+    np.testing.assert_array_equal(reader.read(3, 5, 0, 1), STACK[3:, :1])
+    assert (reader.integration_time, reader.bit_depth) == (0.25, 16)
+    assert reader.camera.words() == "BLAZE, serial number 0705, sensor at -95 °C, gain High"
+    zero = np.datetime64("2026-01-31T11:00:00.5").astype("datetime64[ns]").astype(float) / 1e9
+    np.testing.assert_allclose(reader.timestamps - zero, [0.5 * i for i in range(5)], atol=1e-5)
+    assert not reader.report.notes
     lost = [*NUMBERS[:3], *((a, b, count + 2) for a, b, count in NUMBERS[3:])]
     path.write_bytes(spe_bytes(STACK, version=3.0, numbers=lost))
     assert "2 are missing (after frame 2)" in opened(path).report.notes[0]

@@ -11,7 +11,7 @@ from helpers.camera_files import opened, read, refused
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
-from pchem_pipeline.frames.formats.map_files import Cube, write_tiff_cube
+from pchem_pipeline.frames.formats.map_files import write_tiff_cube
 from pchem_pipeline.frames.formats.tiff import TiffReader
 from pchem_pipeline.frames.settings import InputSettings
 
@@ -48,7 +48,7 @@ def test_twelve_bits_packed(tmp_path):
 @pytest.mark.parametrize("shape", [(3, 5, 1), (3, 1, 5), (3, 4, 5)])
 def test_calibrated_frames_of_one_row_or_column_are_pages(tmp_path, shape, dtype):
     stack = np.arange(np.prod(shape)).reshape(shape).astype(dtype)
-    write_tiff_cube(tmp_path / "a.tif", Cube("electrons", iter([stack]), shape, stack.dtype, "e-", "-", {}))
+    write_tiff_cube(tmp_path / "a.tif", iter([stack]), shape, stack.dtype, {"unit": "e-"})
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
         np.testing.assert_array_equal([page.asarray() for page in file.pages], stack)
         assert file.is_imagej == (dtype == "float32")
@@ -195,12 +195,12 @@ def test_dng_with_its_preview_edges_and_table(tmp_path):
             preview = {"photometric": "rgb", "subfiletype": 1, "subifds": 1, "extratags": [*DNG, exposure]}
             file.write(np.zeros((7, 11, 3), np.uint8), **preview)
             file.write(frame, photometric="cfa", extratags=[*CFA, area])
-    with opened(tmp_path / "*.dng") as reader:
-        excluded = np.ones(STACK.shape[1:], bool)
-        excluded[2:21, 3:30] = False
-        np.testing.assert_array_equal(reader.excluded, excluded)
-        np.testing.assert_array_equal(reader.read()[:, ~excluded], STACK[:, ~excluded])
-        assert reader.integration_time == 0.02
+    reader = opened(tmp_path / "*.dng")
+    excluded = np.ones(STACK.shape[1:], bool)
+    excluded[2:21, 3:30] = False
+    np.testing.assert_array_equal(reader.excluded, excluded)
+    np.testing.assert_array_equal(reader.read()[:, ~excluded], STACK[:, ~excluded])
+    assert reader.integration_time == 0.02
     write_mosaic(tmp_path / "table.dng", [*DNG, (50712, "H", 3, (0, 4, 9), True)])
     notes = TiffReader.open(tmp_path / "table.dng", InputSettings()).notes
     assert any("codes of a table" in note for note in notes)

@@ -14,7 +14,7 @@ def test_hot_pixels_do_not_stretch_the_axis_and_are_counted() -> None:
     values[7:9] = np.nan
     shown = robust_range(values)
     assert shown.high < 0.5
-    assert shown.n_above == 7 + int((values[9:] > shown.high).sum())
+    assert shown.n_outside == 7 + int(((values[9:] > shown.high) | (values[9:] < shown.low)).sum())
     assert shown.n_missing == 2
     assert f"{shown.n_outside} outside the axis" in shown.remark()
     assert "2 without a value" in shown.remark()
