@@ -324,9 +324,12 @@ class RunStore:
             return {} if found is None else dict(found.attrs)
 
     def set_attributes(self, name: str, values: Mapping[str, Any]) -> None:
-        """Add attributes (JSON) to a group, making the group where needed."""
+        """Add attributes (JSON) to a group; one that is not there is made with them, in one write."""
         with self._translated(name):
-            self._root.require_group(name).attrs.update(values)
+            if name in self._root:
+                self._root[name].attrs.update(values)
+            else:
+                self._root.create_group(name, attributes=dict(values))
 
     # -- files --------------------------------------------------------------------------------
 

@@ -246,9 +246,10 @@ def _output_store(place: Path, content: dict[str, Any], *, force: bool) -> tuple
     Raises:
         ConfigError: it holds something else, or other frames.
     """
-    if place.exists() and not (place / "zarr.json").exists() and (not place.is_dir() or any(place.iterdir())):
+    names = {each.name for each in place.iterdir()} if place.is_dir() else set()
+    begun = {name for name in names if not name.startswith(".zarr.json.")}  # not what a killed process left
+    if "zarr.json" not in begun and (begun or (place.exists() and not place.is_dir())):
         raise _exists(place, ours=False)
-    begun = {each.name for each in place.iterdir()} if place.exists() else set()
     if not begun <= {"zarr.json", ".pchem"}:
         try:
             there = RunStore.open(place).attributes("applied").get("provenance", {})

@@ -8,6 +8,7 @@ import xarray as xr
 import zarr
 
 from pchem_pipeline.base.errors import LockedError, StoreError
+from pchem_pipeline.store import disk
 from pchem_pipeline.store.files import fingerprint_of
 from pchem_pipeline.store.records import Records
 from pchem_pipeline.store.run_store import RunStore
@@ -214,3 +215,15 @@ def test_markers_that_a_writer_removes_while_they_are_listed_are_no_markers(tmp_
     monkeypatch.setattr(Path, "glob", removed_first)
     assert records.done("fit", "a" * 64) == set()
     assert not (tmp_path / "done" / "fit").exists()
+
+
+def test_a_new_group_is_never_on_the_disk_without_its_attributes(tmp_path, monkeypatch):
+    store = RunStore.create(tmp_path / "run.zarr")
+    written = []
+    write = disk.write
+    monkeypatch.setattr(disk, "write", lambda path, data: (written.append(bytes(data)), write(path, data))[1])
+    store.set_attributes("applied", {"provenance": "theirs"})
+    assert written
+    assert all(b"theirs" in each for each in written)
+    store.set_attributes("applied", {"title": "more"})
+    assert store.attributes("applied") == {"provenance": "theirs", "title": "more"}
