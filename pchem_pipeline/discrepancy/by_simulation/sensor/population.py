@@ -12,7 +12,7 @@ its curvature; with these parabolas (m, T) maximise the marginal likelihood (EM:
 1977, ex. 4.5.2), and the maxima are found anew, a few times over (Laplace's approximation; Lindstrom and
 Bates 1990). Maxima an electron apart count with their evidence. Where most pixels are ambiguous Laplace's
 approximation is skewed, and the same way in all of them: there m comes from the cumulants of all pixels, with
-its error.
+its error, unless the fits are clearly likelier.
 """
 
 from __future__ import annotations
@@ -58,6 +58,7 @@ _SHIFTS = (0, 1, -1)  # electrons by which a bias may be mistaken
 _ALIKE = np.array([0.3, 0.02, 0.5, 0.15])  # scatter of theta of pixels that are much alike
 _WIDEST_DRAW = 1.5  # of log H and log sigma_R^2 from the maximum
 _ARRIVED = 0.2  # nats, twice the rise that a further step promises: more, and a point is no maximum
+_SKEWED = 1.0  # nats per pixel: by so much Laplace's approximation may be wrong where peaks are not resolved
 _AGAIN = 100  # resamplings of the pixels behind the error of the centre
 _LARGEST_ERROR = np.array([0.8, 0.25, np.inf, 0.8])  # of theta
 _USUAL_NOISE, _NOISE_RANGE = 0.3, 0.2  # e-^2: squared read noise where peaks are hardly resolved, its scatter
@@ -161,15 +162,15 @@ def posterior_of(
     if some.size > MOST_LEARNT_FROM:
         some = np.sort(np.random.default_rng(0).choice(some, MOST_LEARNT_FROM, replace=False))
     shifts = (0,) if mistaken <= _HARDLY_ANY else _SHIFTS
-    best, most = None, -np.inf
+    best, least = None, -np.inf
     for start, population in _seeds(pixels, parameters, mistaken):
         starts = np.stack([_shifted(start, each) for each in shifts])
         if replaced is not None:
             starts = np.concatenate([starts, _usual(pixels, population)[None]])
         about = pixels.about(starts)
         maxima, learnt, evidence = _learn(pixels.of(some), about.of(some), population)
-        if evidence > most:
-            best, most = (about.with_those(maxima, some), learnt), evidence
+        if evidence > least:
+            best, least = (about.with_those(maxima, some), learnt), evidence + _SKEWED
     assert best is not None
     return _climb(pixels, *best, _LAST_STEPS).posterior(best[1])
 
@@ -418,10 +419,11 @@ def _inside(theta: FloatArray) -> FloatArray:
 
 
 def _seeds(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> list[tuple[FloatArray, Population]]:
-    """Return starts of theta (n, 4) and of the population: from the fits, or from all pixels' cumulants.
+    """Return starts of theta (n, 4) and of the population: from the fits, and from all pixels' cumulants.
 
     Where peaks are hardly resolved the fits of single pixels lead far from the truth, all to the same side.
-    Of effects in the law the cumulants know nothing: with them either start may be the better one.
+    Where they are resolved, but pixels differ widely, or effects are in the law, the cumulants of all do. The
+    fits are taken where they are clearly likelier; a few mistaken pixels need no other start.
     """
     known = np.asarray(np.isfinite(parameters).all(axis=1))
     mean, k = _cumulants(pixels)
@@ -435,7 +437,7 @@ def _seeds(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> list[tup
     start[:, 2] = mean - np.exp(centre[0] + centre[1])
     found: list[tuple[FloatArray, Population]] = []
     resolved = mistaken <= MANY_MISTAKEN
-    if known.any() and (resolved or not pixels.law.neutral or pixels.replaced is not None):
+    if known.any():
         fits = np.where(known[:, None], to_theta(np.where(known[:, None], parameters, 1.0)), start)
         found.append((fits, _first_guess(fits[known])))
         if resolved:

@@ -163,6 +163,20 @@ def test_pixels_of_a_sharp_sensor_stay_what_they_are():
     assert (sensor.usual(1).usable == some).all()
 
 
+def test_bright_pixels_under_a_lens_are_learnt_though_a_third_may_be_an_electron_off():
+    """Their peaks are sharp; drawn as alike in exposure, two in three were electrons off."""
+    camera = PlainCamera(0.2, 18.0, 17.0, (12, 20), 1500, SPREAD, "vignetted")
+    truth, seen, sensor = learnt(camera, 8)
+    assert seen.ambiguous > MANY_MISTAKEN
+    off = (seen.maps.bias - truth[..., 2]) * np.exp(-truth[..., 1])
+    drawn = sensor.draw(3)
+    left = (drawn.bias - truth[..., 2]) * np.exp(-truth[..., 1])
+    wrong, before = (np.mean(np.abs(each[drawn.usable]) > 0.5) for each in (left, off))
+    assert wrong < before + 5 * np.sqrt(before * (1 - before) / truth[..., 0].size)
+    gain = np.log(drawn.conversion_gain[drawn.usable]) + truth[..., 1][drawn.usable]
+    assert abs(np.median(gain)) < 0.002
+
+
 def test_a_sensor_of_three_kinds_of_pixels_is_learnt():
     """Each kind stands out in another cumulant: none of them is left out for it."""
     codes, electrons = np.arange(2000), np.arange(200)
