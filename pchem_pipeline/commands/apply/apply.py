@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 
 #: Name of the work in the records of the output.
 STAGE = "apply"
-_VERSION = 4
+_VERSION = 5
 _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27

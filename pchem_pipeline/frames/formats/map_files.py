@@ -126,11 +126,7 @@ def write_tiff_cube(
     n, rows, columns = shape
     size = n * rows * columns * dtype.itemsize
     with whole_file(path) as part:
-        if size + (1 << 25) < _LARGEST_TIFF and dtype.str[1:] in (
-            "u1",
-            "u2",
-            "f4",
-        ):
+        if size + (1 << 25) < _LARGEST_TIFF and dtype.str[1:] in ("u1", "u2", "f4"):
             frames = {"axes": "TZCYXS", "Info": json.dumps(about), "unit": "pixel"}
             # all axes: a last one of one column would be taken for samples of a pixel
             options = {"shape": (n, 1, 1, rows, columns, 1), "dtype": dtype, "photometric": "minisblack"}
