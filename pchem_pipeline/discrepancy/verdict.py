@@ -115,7 +115,7 @@ class Size(_Part):
 
     def words(self) -> str:
         """Describe the size: ``samples change by 0.5 DN rms, 22 % of the read noise``."""
-        which = "samples" if self.samples >= RARE else f"{percent(self.samples)} of these samples"
+        which = "samples" if self.samples >= RARE else f"{percent(self.samples)} of samples"
         return f"{which} change by {short(self.dn, 2)} DN rms, {self.beside_noise()}"
 
     def beside_noise(self) -> str:

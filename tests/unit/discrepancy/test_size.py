@@ -74,7 +74,7 @@ def test_without_usable_pixels_there_is_no_size() -> None:
         ),
         (
             Size(electrons=213.0, dn=2028.0, of_read_noise=831.06, samples=0.0081),
-            "0.81 % of these samples change by 2028 DN rms, 831 times the read noise",
+            "0.81 % of samples change by 2028 DN rms, 831 times the read noise",
         ),
         (
             Size(electrons=1.1, dn=12.0, of_read_noise=3.41),
