@@ -486,8 +486,8 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
     nats = f"{micronats(gap.before)} → {micronats(gap.after)}" if extended else micronats(gap.before)
     unit, chance = "micronats per sample", f"sampling noise up to {micronats(gap.floor)}"
     if not extended or gap.after <= gap.floor:
-        now = ", reached" if extended and not gap.within_chance else ""
-        return [KeyFact("gap between data and model", nats, (unit, chance + now))]
+        now = "now within " if extended and not gap.within_chance else ""
+        return [KeyFact("gap between data and model", nats, (unit, now + chance))]
     more = (f"{nats} {unit}", chance + _interval(gap))
     nearest = " by the closest effect, which is rejected" if found.verdict == "unexplained" else ""
     return [KeyFact(f"of the gap closed{nearest}", percent(gap.closed_fraction), more)]
@@ -603,6 +603,5 @@ def _compared(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
         own, other = micronats(step.gap_after), micronats(rival.gap_after)
         why = f"{why}{'; it' if why else ''} leaves a gap of {other} micronats per sample instead of {own}"
     if why:
-        yield Flag(
-            "note", f"The next best effect instead of {step.effect}, {data.title(rival.effect)},{why}."
-        )
+        titles = f"{data.title(step.likeliest)}, {data.title(rival.effect)}"
+        yield Flag("note", f"The next best effect instead of {titles},{why}.")

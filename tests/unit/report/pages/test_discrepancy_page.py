@@ -97,7 +97,7 @@ def test_a_named_effect_has_all_its_evidence(base: ReportData) -> None:
         "samples change by 0.35 DN rms",
         "standard deviation of the rows' offsets",
         "477 → 0.4",
-        "sampling noise up to 0.66, reached",
+        "now within sampling noise up to 0.66",
         "0.3512 ± 0.0041 DN",
         "micronats per sample instead of 0.4",
         "it leaves a misfit of 9.1 sigma: row means",
