@@ -368,7 +368,7 @@ def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> st
     if state == "consistent":
         seen = " (histograms of single pixels only; frames, rows, columns and neighbours were not tested)"
         seen = seen if data == "histograms" else ""
-        return f"Data and model agree in every statistic tested{seen}{_nearly(found)}."
+        return f"No statistic tested disagrees with the model{seen}{_nearly(found)}."
     if state == "cannot_tell":
         return (
             "Frame order, neighbours and codes agree with the model; the shape of the histograms cannot be "
@@ -389,8 +389,8 @@ def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> st
         words = f"{_rest(found)}{_shown(found)}{_left(added)}"
         return f"The data show {_and(titles)}{words}{_broken(found)}."
     return (
-        f"The data show {_and(titles)}; with {'them' if len(titles) > 1 else 'it'}, data and model "
-        f"agree within sampling noise{_left(added)}."
+        f"The data show {_and(titles)}; with {'them' if len(titles) > 1 else 'it'} in the model, no "
+        f"statistic tested disagrees{_left(added)}."
     )
 
 

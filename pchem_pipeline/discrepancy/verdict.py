@@ -270,6 +270,12 @@ class GapChange(_Part):
         """Whether the gap is within sampling noise before anything is added."""
         return self.before <= self.floor
 
+    @property
+    def left(self) -> str:
+        """The gap after, micronats; where it has reached sampling noise, that."""
+        reached = self.after <= self.floor < self.before
+        return f"< {micronats(self.floor)}" if reached else micronats(self.after)
+
 
 class Change(_Part):
     """A p-value before and after effects were added."""
@@ -400,11 +406,6 @@ class Step(_Part):
     moved: dict[str, Moved] = {}
     separate: dict[str, str] = {}
     pulls: tuple[Pull, ...] = ()
-
-    @property
-    def within_chance(self) -> bool:
-        """Whether the gap is within sampling noise without it."""
-        return self.gap_before <= self.gap_floor
 
     @property
     def runner_up(self) -> Rival | None:

@@ -544,7 +544,7 @@ class Clipping(Effect, tag="clipping"):
     factors = Factors("code", "all pixels", "constant")
     signature = ("code.top", "code.bottom", "code.largest", "shape.goodness.cnt")
     separate: ClassVar[Mapping[str, str]] = {
-        "adc_dnl": "a shifted bias: a limit is fixed in DN, with no samples beyond",
+        "adc_dnl": "more light: there are no samples beyond a limit",
         "adc_inl": "a shifted bias or more light: clipping affects one code, INL all",
     }
     low: Code | None = Field(default=None, ge=0, description="smallest value, DN; null: limit of the ADC")

@@ -237,8 +237,7 @@ class GainDrift(Drift, tag="gain_drift"):
     drift: Ratio = Field(
         ge=-0.5,
         le=0.5,
-        description="relative change of the gain (DN/e-) from the first frame to the last, no unit; "
-        "path: its scale",
+        description="relative change of the gain from first to last frame, no unit; path: its scale",
     )
 
     @model_validator(mode="after")
@@ -278,17 +277,17 @@ class ExposureDrift(Drift, tag="exposure_drift"):
     """
 
     plane = Plane.EXPOSURE
-    title = "illumination or dark-current drift"
+    title = "exposure drift (of the light or the dark current)"
     source = "Widenhorn et al. 2002, Proc. SPIE 4669, 193 (dark current and temperature)"
     factors = Factors("light", "all pixels", "drifting")
     signature = ("frame.charge.trend", "frame.charge.slow", "time.block.charge.chi", "frame.charge.lag1")
     strength = "drift"
     separate: ClassVar[Mapping[str, str]] = {
-        "glow": "a map of the change along the run: a drift is proportional to H, a glow local",
-        "gain_drift": "readout residuals of bright and dim pixels: constant with an exposure drift",
-        "bias_drift": "covered pixels, or frames without exposure: constant with an exposure drift",
-        "persistence": "a map of the change: proportional to H for a drift",
-        "exposure_flicker": "a reference photodiode, or the logged temperature",
+        "glow": "a map of the change along the run: light drifts as H, a glow is local",
+        "gain_drift": "the peak spacing: constant with an exposure drift",
+        "bias_drift": "frames of zero integration time: constant with an exposure drift",
+        "persistence": "a run after long darkness: no persistence",
+        "exposure_flicker": "a photodiode or a thermometer: follows a drift",
     }
     #: at 1.6 % end to end, rising and falling, straight and settling
     typical_values = (
@@ -300,7 +299,7 @@ class ExposureDrift(Drift, tag="exposure_drift"):
     drift: Ratio = Field(
         ge=-2,
         le=2,
-        description="relative change of the exposure, (H_last - H_first) / H_mean; path: its range",
+        description="relative change of the exposure from first to last frame, no unit; path: its range",
     )
 
     @model_validator(mode="before")
@@ -365,7 +364,7 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
     """
 
     plane = Plane.EXPOSURE
-    title = "illumination flicker (intensity noise)"
+    title = "exposure flicker (intensity noise)"
     source = "EMVA Standard 1288, release 4.0 (2021), sec. 6; Petermann 1988, Laser Diode Modulation"
     factors = Factors("light", "all pixels", "new in each frame")
     signature = ("frame.charge.variance", "frame.charge.line", "frame.charge.largest", "frame.charge.lag1")
@@ -374,7 +373,7 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
     may_be_at_bound = ("phase_cycles",)
     separate: ClassVar[Mapping[str, str]] = {
         "glow": "a map of the bright frames: flicker is proportional to H, a glow local",
-        "exposure_drift": "a longer run: flicker has no trend",
+        "exposure_drift": "a longer run: flicker averages out",
         "frame_noise": "covered pixels, or frames without exposure: constant with flicker",
         "overdispersed_counts": "pixels of one frame: all are correlated by flicker",
     }

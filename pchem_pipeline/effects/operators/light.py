@@ -66,7 +66,7 @@ class Glow(Effect, tag="glow"):
     may_be_at_bound = ("centre_y", "centre_x")
     separate: ClassVar[Mapping[str, str]] = {
         "exposure_flicker": "a map of the bright frames: flicker is proportional to H, a glow local",
-        "exposure_drift": "a map of the change along the run: a drift is proportional to H, a glow local",
+        "exposure_drift": "a map of the change along the run: light drifts as H, a glow is local",
         "persistence": "a run after a longer time in the dark: persistence is gone, a glow grows again",
         "cosmic_rays": "longer runs: a glow is always at the same place",
         "optical_crosstalk": "dark frames without the source of the glow: crosstalk remains",

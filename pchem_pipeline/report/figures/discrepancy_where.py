@@ -123,8 +123,8 @@ def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "where",
         "Rows and columns",
         "Left and middle: means of rows and of columns of the first frames. Right: scatter of each row or "
-        "column over all frames, relative to independent pixels (1). Stripes in the readout are row or "
-        "column noise, slanted lines are periodic pickup.",
+        "column over all frames, relative to independent pixels (1). Hints: stripes in the readout, row or "
+        "column noise; slanted lines, periodic pickup.",
         "Scatter of the means over the frames, relative to independent pixels (1). " + "; ".join(words) + ".",
         tables,
         _lines_chart(data.arrays, origin),
@@ -394,9 +394,9 @@ def code_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "Along the digital numbers",
         "All usable pixels together. Top: samples at each DN (gray) and expectation from the fitted PCDs "
         "(black; with added effects: purple). Bottom: difference from the plain model in sigma, even and "
-        "odd DN in two colours; the gray band is 2 sigma. A single tall line is saturation or clipping, "
-        "alternating colours are differential nonlinearity of the ADC, a slow wave is integral "
-        "nonlinearity. Yellow: codes named in the verdict.",
+        "odd DN in two colours; the gray band is 2 sigma. Hints: a tall line at an end, clipping; "
+        "alternating colours, differential nonlinearity of the ADC; a slow wave, integral nonlinearity. "
+        "Yellow: codes named in the verdict.",
         alt,
         (table,),
         _codes_chart(table, data.found.where),

@@ -51,7 +51,7 @@ def probability_text(p: float) -> str:
     """Format a p-value."""
     if not math.isfinite(p):
         return ""
-    return "< 0.001" if p < 0.001 else "> 0.999" if p > 0.999 else f"{p:.3f}"
+    return "< 0.001" if p < 0.001 else "> 0.99" if p > 0.99 else short(p, 2)
 
 
 def parameter_name(name: str) -> str:
@@ -205,7 +205,7 @@ def _separate(steps: Sequence[Step]) -> Table:
     return Table(
         "discrepancy-separate",
         "Measurements that decide",
-        "What distinguishes the effects above from similar ones.",
+        "How to tell the effects of the verdict from similar ones.",
         [{"similar effect": rival, "measurement: difference": text} for rival, text in found],
     )
 
@@ -274,7 +274,7 @@ def _moved(found: Verdict) -> Table:
         "discrepancy-moved",
         "Changes of the parameter maps",
         "Median over the pixels concerned of (with the effect − without it), also in standard errors per "
-        "pixel. An effect in fewer than half of them does not change a median.",
+        "pixel. An effect in few of them hardly moves a median.",
         rows,
     )
 
@@ -350,23 +350,23 @@ PARTS = (
     Section(
         "signature",
         "Largest disagreement, before and after",
-        "The statistic that the added effect changes most (else the largest disagreement), and all "
+        "The statistic that the added effect changes most (or, if none, the largest disagreement), and all "
         "statistics before and after, in standard deviations of the statistic under the model (sigma).",
         "",
     ),
     Section(
         "where",
         "Where data and model disagree",
-        "Effects of light and charge show in the charge channel, effects of the electronics in the readout "
-        "residuals. Figures show the training frames, numbers training and test frames.",
+        "Light and charge show mainly in the charge channel, electronics mainly in the readout residuals. "
+        "Figures show the training frames, numbers training and test frames.",
         "No data were kept for figures.",
     ),
     Section(
         "evidence",
         "Identification of the effect",
         "Log-likelihood of each fitted candidate on test frames, nats; larger is better. A difference below "
-        "three standard errors is not decisive.",
-        "No candidates were compared: data and model agree within sampling noise.",
+        "three standard errors, where given, is not decisive.",
+        "No candidates were compared: no statistic tested disagrees with the model.",
     ),
     Section(
         "shown",
@@ -452,10 +452,10 @@ def frames_text(found: Verdict) -> str:
     dealt = f"{seen.train:,} for training, {seen.test:,} for testing, {seen.final:,} for the gap"
     if seen.histograms is not None:
         return f"{count(seen.histograms, 'histogram')}, samples split at random: {dealt}."
-    share = f" ({percent(seen.share)} of the run's samples)" if math.isfinite(seen.share) else ""
+    share = f" ({percent(seen.share)} of the run's samples)" if seen.share < 1.0 else ""
     place = f"rows {seen.rows[0]} to {seen.rows[1] - 1}, columns {seen.columns[0]} to {seen.columns[1] - 1}"
     rest = seen.frames - seen.train - seen.test - seen.final
-    over = f"; {rest} left over" if rest > 0 else ""
+    over = f"; {rest} unused" if rest > 0 else ""
     words = f"{count(seen.frames, 'frame')} of {place}{share}: {dealt}{over}."
     again = "" if seen.elsewhere is None else f" The final model was {seen.elsewhere.says()}."
     return words + again + _unfitted_text(found)
@@ -483,11 +483,10 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(gap.before):
         return []
     extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
-    nats = f"{micronats(gap.before)} → {micronats(gap.after)}" if extended else micronats(gap.before)
+    nats = f"{micronats(gap.before)} → {gap.left}" if extended else micronats(gap.before)
     unit, chance = "micronats per sample", f"sampling noise up to {micronats(gap.floor)}"
     if not extended or gap.after <= gap.floor:
-        now = "now within " if extended and not gap.within_chance else ""
-        return [KeyFact("gap between data and model", nats, (unit, now + chance))]
+        return [KeyFact("gap between data and model", nats, (unit, chance))]
     more = (f"{nats} {unit}", chance + _interval(gap))
     nearest = " by the closest effect, which is rejected" if found.verdict == "unexplained" else ""
     return [KeyFact(f"of the gap closed{nearest}", percent(gap.closed_fraction), more)]
@@ -525,7 +524,7 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
         KeyFact(
             f"largest change: {parameter_name(name)}",
             f"{_signed(largest.median, 2)} {unit}".strip(),
-            (f"{_signed(largest.in_stderr, 2)} times the standard error of a pixel{small}",),
+            (f"{_signed(largest.in_stderr, 2)} standard errors of one pixel{small}",),
         )
     ]
 
@@ -538,7 +537,7 @@ def _chance_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(found.p_global.before):
         return []
     more = ["of the largest disagreement of all statistics"]
-    more += [f"t-distribution, scatter from {found.replicates} replicates"] if found.replicates else []
+    more += [f"t-distribution, scatter of {found.replicates} simulations"] if found.replicates else []
     before, after = probability_text(found.p_global.before), probability_text(found.p_global.after)
     value = f"{before} → {after}" if after and found.effects else before
     return [KeyFact("p-value", value, tuple(more))]
@@ -593,15 +592,11 @@ def _closing(found: Verdict) -> Iterator[Flag]:
 
 
 def _compared(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
-    """State what the next best effect leaves of the gap."""
+    """State why the next best effect is rejected."""
     rival = step.runner_up
     if rival is None:
         return
     why = f" is rejected, since {rival.why}" if rival.why else ""
-    # changes of sampling noise mean nothing
-    if not step.within_chance:
-        own, other = micronats(step.gap_after), micronats(rival.gap_after)
-        why = f"{why}{'; it' if why else ''} leaves a gap of {other} micronats per sample instead of {own}"
     if why:
         titles = f"{data.title(step.likeliest)}, {data.title(rival.effect)}"
         yield Flag("note", f"The next best effect instead of {titles},{why}.")

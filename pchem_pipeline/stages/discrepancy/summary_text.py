@@ -135,13 +135,9 @@ def _gap(found: Verdict) -> list[str]:
         return []
     words = f"gap between data and model: {micronats(gap.before)}"
     if found.steps and math.isfinite(gap.after):
-        words += f" → {micronats(gap.after)}"
+        words += f" → {gap.left}"
     words += f" micronats per sample (sampling noise: up to {micronats(gap.floor)})"
     if found.steps and gap.after > gap.floor and math.isfinite(gap.closed_fraction):
         nearest = " by the closest effect" if found.verdict == "unexplained" else ""
         words += f", {percent(gap.closed_fraction)} closed{nearest}"
-    for step in found.steps:
-        # reductions of sampling noise mean nothing
-        if step.effect and not step.within_chance and (other := step.runner_up) is not None:
-            words += f"; with {other.effect} instead of {step.effect}: {micronats(other.gap_after)}"
     return _wrapped(words)

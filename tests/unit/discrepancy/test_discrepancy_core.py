@@ -372,7 +372,7 @@ def test_what_nearly_disagrees_is_said_beside_consistent() -> None:
         for quiet, z in ((True, calm), (False, high))
         for gap in (near, far)
     }
-    assert words[True, True] == "Data and model agree in every statistic tested."
+    assert words[True, True] == "No statistic tested disagrees with the model."
     assert "; borderline: " in words[False, True]
     assert "take more frames to decide" in words[True, False]
     assert "all statistics together exceed" in words[True, False]
