@@ -248,7 +248,7 @@ def test_a_described_sensor_is_said_so_and_keeps_the_component_in_its_model() ->
     assert found.model((), (effect,)) == (effect,)
     step = addition.step(None)
     assert (step.verdict, step.effect) == ("described", None)
-    assert "empirically, 0.4 % of the samples are shifted by -8 DN; this" in _sentence(found, {})
+    assert "empirically, 0.40 % of the samples are shifted by -8 DN; this" in _sentence(found, {})
     assert "still disagree" in _sentence(replace(found, still=True), {})
 
 
