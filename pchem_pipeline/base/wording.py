@@ -164,9 +164,17 @@ def count(number: int, noun: str) -> str:
     return f"{number:,} {noun}{plural}"
 
 
+def probability_text(p: float) -> str:
+    """Return ``< 0.001``, ``0.034`` or ``> 0.99``; nothing where it is not known."""
+    if not math.isfinite(p):
+        return ""
+    return "< 0.001" if p < 0.001 else "> 0.99" if p > 0.99 else short(p, 2)
+
+
 def p_value_text(p: float) -> str:
     """Return ``p < 0.001`` or ``p = 0.034``."""
-    return "p < 0.001" if p < 1e-3 else f"p = {short(p, 2)}"
+    text = probability_text(p)
+    return f"p {text}" if text[:1] in ("<", ">") else f"p = {text}"
 
 
 def percent(part: float, whole: float = 1.0) -> str:

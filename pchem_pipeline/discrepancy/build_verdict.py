@@ -364,7 +364,7 @@ def _nearly(found: Findings) -> str:
 def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Return the verdict in one sentence: the effect, its size, and the remaining discrepancy."""
     state, data, added = found.state, found.samples, found.added
-    titles = [_told(each, sizes) for each in added.additions if each.named]
+    titles = [_summary(each, sizes) for each in added.additions if each.named]
     if state == "consistent":
         seen = " (histograms of single pixels only; frames, rows, columns and neighbours were not tested)"
         seen = seen if data == "histograms" else ""
@@ -406,7 +406,7 @@ def _ambiguous(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, sc
     unknown = [" or ".join(_title(c.effect) for c in each.candidates) for each in open_ones]
     factors = "".join(_factor_words(each.factors) for each in open_ones)
     doubtful = [each for each in additions if each.alone and each.fits and not each.confirmed]
-    weak = _and([_told(each, sizes) for each in doubtful])
+    weak = _and([_summary(each, sizes) for each in doubtful])
     certain = all(each.certain for each in doubtful)
     why = f"not confirmed by the final {data}" if certain else f"too weak in these {data} to be certain"
     also = f"The data show {_and(titles)}; the model also" if titles else "The model"
@@ -426,7 +426,7 @@ def _factor_words(factors: Mapping[str, tuple[str, ...]]) -> str:
     return words
 
 
-def _told(each: Addition, sizes: Mapping[Effect, schema.Size | None]) -> str:
+def _summary(each: Addition, sizes: Mapping[Effect, schema.Size | None]) -> str:
     """Describe an effect by its name, its place, its leading parameter and its size."""
     effect, size = each.effect, sizes.get(each.effect)
     numbers = list(schema.parameters_of(effect, each.stderr).items())[:1]

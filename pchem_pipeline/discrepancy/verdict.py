@@ -271,8 +271,8 @@ class GapChange(_Part):
         return self.before <= self.floor
 
     @property
-    def left(self) -> str:
-        """The gap after, micronats; where it has reached sampling noise, that."""
+    def after_text(self) -> str:
+        """The gap with the effects, micronats: ``< 13`` where it is within sampling noise of up to 13."""
         reached = self.after <= self.floor < self.before
         return f"< {micronats(self.floor)}" if reached else micronats(self.after)
 
@@ -369,7 +369,7 @@ class Step(_Part):
     Attributes:
         effect: tag of the named effect; None if ambiguous or rejected.
         verdict: verdict of this step alone.
-        why: reason of its rejection, starting with "it"; empty if it is not rejected.
+        why: reason of its rejection; empty if it is not rejected.
         candidates: effects compared, the likeliest first.
         parameters: parameters of the named or the likeliest effect.
         form: its text fields that differ from their default.

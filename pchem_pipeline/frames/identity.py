@@ -14,10 +14,8 @@ import xxhash
 
 from pchem_pipeline.base.errors import InputError
 
-#: bytes that a thread reads or decodes at a time
-SCRATCH_BYTES = 8 << 20
-#: bytes that are still in the cache of a core when they are hashed, and copied, after they were read
-HASHED_BYTES = 1 << 20
+#: bytes that a thread reads or decodes at a time: they are still in its cache when they are hashed and copied
+SCRATCH_BYTES = 1 << 20
 
 
 def _parts(path: Path) -> list[Path]:
@@ -86,7 +84,7 @@ class FileHasher:
         if part is not self.path and not self._begun:
             self._hasher.update(f"{part.relative_to(self.path).as_posix()}\0{size}\0".encode())
         self._begun = True
-        view = memoryview(bytearray(max(1, min(HASHED_BYTES, size - self._offset))))
+        view = memoryview(bytearray(max(1, min(SCRATCH_BYTES, size - self._offset))))
         with part.open("rb", buffering=0) as stream:
             stream.seek(self._offset)
             while count is None or self.done < count:

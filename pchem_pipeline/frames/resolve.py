@@ -60,8 +60,8 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
     if missing:
         more = f" and {len(missing) - 1} more (last {missing[-1].name})" if len(missing) > 1 else ""
         raise InputError(
-            f"{missing[0]}{more}: no such file or folder; restore it, or correct its path (files that "
-            "have to go: ingest them with input.mode: copy before)"
+            f"{missing[0]}{more}: no such file or folder; restore it, or correct its path (a run keeps its "
+            "own copy of the frames with input.mode: copy)"
         )
     for path in found:
         if not (path.is_file() or path.is_dir()):

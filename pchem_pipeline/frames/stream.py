@@ -21,13 +21,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, unstore
-from pchem_pipeline.frames.identity import (
-    HASHED_BYTES,
-    SCRATCH_BYTES,
-    FileHasher,
-    file_size,
-    identity_of_hashes,
-)
+from pchem_pipeline.frames.identity import SCRATCH_BYTES, FileHasher, file_size, identity_of_hashes
 from pchem_pipeline.frames.reader import FrameReader, changed
 from pchem_pipeline.frames.sequence import FrameSequence
 
@@ -217,7 +211,7 @@ class HashedFrameStream(FrameStream):
     ) -> None:
         """Take frames that lie plainly in a file from the bytes that are hashed."""
         layout, (first, end) = reader.layout, frames
-        step = max(1, HASHED_BYTES // max(layout.frame_bytes, 1))
+        step = max(1, SCRATCH_BYTES // max(layout.frame_bytes, 1))
         for a in range(first, end, step):
             offsets = layout.offsets[a : min(a + step, end)]
             hasher.read_to(int(offsets[0]))

@@ -121,7 +121,7 @@ def create_frames(context: StageContext, reader: FrameSequence) -> None:
     _warn_of_a_small_disk(context, reader)
 
 
-def stored_bytes(config: RunConfig, shape: tuple[int, int, int], itemsize: int) -> float:
+def _stored_bytes(config: RunConfig, shape: tuple[int, int, int], itemsize: int) -> float:
     """Return about how many bytes the store takes."""
     n, ny, nx = shape
     blocks = n / config.histogram.block_length(n)
@@ -133,7 +133,7 @@ def stored_bytes(config: RunConfig, shape: tuple[int, int, int], itemsize: int) 
 def disk_words(config: RunConfig, frames: FrameSequence) -> str:
     """Return where the frames are to be, and how much disk the store takes."""
     how = "are copied from" if config.input.mode == "copy" else "stay in"
-    held = stored_bytes(config, frames.shape, frames.dtype.itemsize)
+    held = _stored_bytes(config, frames.shape, frames.dtype.itemsize)
     return (
         f"frames {how} their files ({sum(map(file_size, frames.paths)) / 1e9:.2g} GB); "
         f"the store will hold about {held / 1e9:.2g} GB"

@@ -23,7 +23,7 @@ from pchem_pipeline.commands.apply.characterisation import (
 )
 from pchem_pipeline.commands.apply.files import check_names, write_files
 from pchem_pipeline.commands.apply.finish import finish_maps
-from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece
+from pchem_pipeline.commands.apply.settings import ApplySettings, Job, Piece, at_limit
 from pchem_pipeline.commands.apply.source import (
     check_camera,
     check_level,
@@ -156,7 +156,7 @@ def _make_job(
     modes, overscan = _offsets_to_remove(effects, target, frames, wanted.reference)
     some, cut = some_of(frames if overscan is None else frames.with_overscan()), 0.0
     if limits is not None:
-        cut = float(np.mean((some <= limits[0]) | (some >= limits[1])))
+        cut = float(np.mean(at_limit(some, limits)))
     kept = ", ".join(modes.removed) if cut > _MOST_CUT and overscan is None else ""
     if kept:
         modes = CommonModes()

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.use.common_modes import CommonModes
@@ -18,6 +19,11 @@ if TYPE_CHECKING:
 
 #: What can be asked for.
 KINDS = ("electrons", "numbers", "exposure")
+
+
+def at_limit(codes: NDArray[Any], limits: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return which samples are at the first or the last code of the ADC, or beyond."""
+    return np.asarray((codes <= limits[0]) | (codes >= limits[1]))
 
 
 @dataclass(frozen=True)

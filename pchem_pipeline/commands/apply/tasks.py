@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Float32Array
 from pchem_pipeline.commands.apply.characterisation import read_calibration, with_moments, write_moments
-from pchem_pipeline.commands.apply.settings import Job, Piece
+from pchem_pipeline.commands.apply.settings import Job, Piece, at_limit
 from pchem_pipeline.frames.stream import FrameStream
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.store.run_store import RunStore
@@ -183,8 +183,7 @@ def convert_piece(piece: Piece, output: RunStore, *, job: Job) -> None:
             if electron_frames:
                 output.write("applied/electrons", region, electrons(frames, calibration, offsets, room))
             if job.limits is not None:
-                at_limit = (frames <= job.limits[0]) | (frames >= job.limits[1])
-                output.write("applied/at_adc_limit", region, at_limit.astype(np.uint8))
+                output.write("applied/at_adc_limit", region, at_limit(frames, job.limits).astype(np.uint8))
             if tables is not None:
                 found = tables.numbers(frames, _codes(frames, job, offsets), job)
                 output.write("applied/electron_number", region, found.number)
@@ -221,8 +220,7 @@ class _Tables:
         """
         found = self.tables.convert(codes, lift=job.lift * job.parts, expected=job.expected)
         if job.removed and job.limits is not None:
-            high = frames >= job.limits[1]
-            at = (frames <= job.limits[0]) | high
+            at, high = at_limit(frames, job.limits), frames >= job.limits[1]
             for t in np.flatnonzero(at.any(axis=(1, 2))).tolist():
                 self._censored(found, t, codes[t][at[t]], np.flatnonzero(at[t]), high[t][at[t]], job)
         return found

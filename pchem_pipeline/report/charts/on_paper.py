@@ -18,7 +18,6 @@ from typing import Any, cast
 import matplotlib as mpl
 import numpy as np
 import PIL.Image
-from matplotlib import style as style_sheets
 from matplotlib.artist import setp
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -140,13 +139,19 @@ def _in(look: Look) -> Iterator[None]:
         mpl.rcdefaults()
         mpl.rcParams.update(_STYLE | LIGHT.parameters())
         mpl.rcParams["svg.fonttype"] = "none" if look.svg_text else "path"
-        try:
-            style_sheets.use(look.style or [])
-        except OSError:
-            raise ConfigError(
-                f"--style {look.style}: neither a file nor a style of matplotlib that can be read"
-            ) from None
+        if look.style:
+            _use(look.style)
         yield
+
+
+def _use(sheet: str) -> None:
+    from matplotlib import style  # reads all sheets of matplotlib
+
+    try:
+        style.use(sheet)
+    except OSError:
+        words = "neither a file nor a style of matplotlib that can be read"
+        raise ConfigError(f"--style {sheet}: {words}") from None
 
 
 def _lay_out(drawing: Drawing) -> None:

@@ -10,7 +10,9 @@ from pchem_pipeline.base.wording import (
     count,
     fitted_or_chosen,
     measured,
+    p_value_text,
     percent,
+    probability_text,
     short,
     signed,
     symbol,
@@ -45,13 +47,6 @@ _SURVEYED = {
     "spread": "levels change along the run",
     "unfitted": "clustered pixels without a reliable fit",
 }
-
-
-def probability_text(p: float) -> str:
-    """Format a p-value."""
-    if not math.isfinite(p):
-        return ""
-    return "< 0.001" if p < 0.001 else "> 0.99" if p > 0.99 else short(p, 2)
 
 
 def parameter_name(name: str) -> str:
@@ -230,7 +225,7 @@ def _parameters(data: DiscrepancyData) -> Table:
             {
                 "parameter": f"{tag}: {name}",
                 "value": value,
-                "meaning": meaning(tag, name),
+                "meaning": _meaning(tag, name),
                 "effect": f"{data.title(tag)}{place}{_how(step, data.found)}" if i == 0 else "",
                 "source": effects[tag].source if i == 0 and tag in effects else "",
             }
@@ -242,7 +237,7 @@ def _parameters(data: DiscrepancyData) -> Table:
     )
 
 
-def meaning(tag: str, name: str) -> str:
+def _meaning(tag: str, name: str) -> str:
     """Return what a parameter of an effect is, in a few words."""
     known = effect_classes().get(tag)
     return name if known is None or name not in known.model_fields else typeset(known.meaning(name))
@@ -335,7 +330,7 @@ def _examined(data: DiscrepancyData) -> Table:
         rows += [(f"share: {kind}", percent(share)) for kind, share in examined.surveyed_by.items()]
     for place in examined.places:
         words = Region.model_validate(place.region).describe()
-        rows.append((_surveyed(place.map, data), f"{words} (p {probability_text(place.p)})"))
+        rows.append((_surveyed(place.map, data), f"{words} ({p_value_text(place.p)})"))
     cells = [{"item": item, "value": value} for item, value in rows]
     return Table("discrepancy-examined", "Survey of the whole sensor", "", cells)
 
@@ -483,7 +478,7 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(gap.before):
         return []
     extended = any(found.added(step) for step in found.steps) and math.isfinite(gap.after)
-    nats = f"{micronats(gap.before)} → {gap.left}" if extended else micronats(gap.before)
+    nats = f"{micronats(gap.before)} → {gap.after_text}" if extended else micronats(gap.before)
     unit, chance = "micronats per sample", f"sampling noise up to {micronats(gap.floor)}"
     if not extended or gap.after <= gap.floor:
         return [KeyFact("gap between data and model", nats, (unit, chance))]
@@ -504,7 +499,7 @@ def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
     for step in data.found.steps:
         if (step.effect or step.verdict == "described") and step.parameters:
             (first, value), *others = _values(step).items()
-            more = [meaning(step.likeliest, first), *(f"{name} {text}" for name, text in others[:2])]
+            more = [_meaning(step.likeliest, first), *(f"{name} {text}" for name, text in others[:2])]
             more += [] if step.size is None else [step.size.words()]
             more += [f"in {step.place}"] if step.place else []
             more += [] if data.found.part_of_model(step) else ["proposed, not in the model"]
@@ -558,7 +553,7 @@ def _remarks(data: DiscrepancyData) -> Iterator[Flag]:
     if extended:
         yield from _closing(found)
     for step in extended:
-        yield from _compared(step, data)
+        yield from _next_best(step, data)
     for step in found.steps:
         for rival, measurement in step.separate.items() if step.verdict == "ambiguous" else ():
             yield Flag("note", f"To distinguish {data.title(rival)}: {measurement}.")
@@ -591,12 +586,9 @@ def _closing(found: Verdict) -> Iterator[Flag]:
         yield Flag(level, f"{left} of the gap remains: {words}.")
 
 
-def _compared(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
+def _next_best(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
     """State why the next best effect is rejected."""
     rival = step.runner_up
-    if rival is None:
-        return
-    why = f" is rejected, since {rival.why}" if rival.why else ""
-    if why:
+    if rival is not None and rival.why:
         titles = f"{data.title(step.likeliest)}, {data.title(rival.effect)}"
-        yield Flag("note", f"The next best effect instead of {titles},{why}.")
+        yield Flag("note", f"The next best effect instead of {titles}, is rejected, since {rival.why}.")

@@ -135,7 +135,7 @@ def _gap(found: Verdict) -> list[str]:
         return []
     words = f"gap between data and model: {micronats(gap.before)}"
     if found.steps and math.isfinite(gap.after):
-        words += f" → {gap.left}"
+        words += f" → {gap.after_text}"
     words += f" micronats per sample (sampling noise: up to {micronats(gap.floor)})"
     if found.steps and gap.after > gap.floor and math.isfinite(gap.closed_fraction):
         nearest = " by the closest effect" if found.verdict == "unexplained" else ""
