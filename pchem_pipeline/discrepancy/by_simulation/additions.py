@@ -247,8 +247,7 @@ class Extension:
         if not other.closes:
             why = "it explains nothing at any strength"
         elif abs(other.rest[worst]) > CERTAIN:
-            # in the unit of all other pulls
-            left = self.first.shifted(other.mean - self.first.mean).pulls(self.accept.z.both, 2)[worst]
+            left = float(other.rest[worst])
             says = STATISTICS[self.first.names[worst]].says(left)
             why = f"it leaves a misfit of {sigma_text(left)}: {says}"
         elif other.error is not None:
