@@ -90,8 +90,11 @@ def nothing_left_of_a_refusal(place: Path) -> Iterator[None]:
 
 def _is_empty(place: Path) -> bool:
     """Return whether no stage has done anything in a store, which may be bare or not exist."""
+    # where the write of an array failed, zarr may still be at others
+    if place.exists() and not {each.name for each in place.iterdir()} <= {"zarr.json", "model", ".pchem"}:
+        return False
     if not (place / ".pchem").is_dir():
-        return not place.exists() or {each.name for each in place.iterdir()} <= {"zarr.json"}
+        return True
     records = RunStore.open(place).records
     return all(records.known(name) is None for name in STAGES)
 

@@ -390,6 +390,10 @@ def test_the_run_of_a_folder_is_chosen_by_camera_setting_and_date(lab, night):
     assert "taken 2.0 days after the frames, more than --max-age 1" in refused.stderr
     refused = lab("apply", "runs/old.zarr", "dated.tif", "--output", "out.zarr", "--max-age", "1")
     assert (refused.code, "is no folder of finished runs" in refused.stderr) == (2, True)
+    shutil.copytree(runs / "old.zarr", runs / "again.zarr")
+    refused = lab("apply", "runs", "dated.tif", "--output", "out.zarr")
+    assert "again.zarr and old.zarr in runs were taken at the same time; name one" in refused.stderr
+    shutil.rmtree(runs / "again.zarr")
     night_file(lab, "undated.tif", **record)
     refused = lab("apply", "runs", "undated.tif", "--output", "out.zarr")
     assert "without a date, so none of new.zarr, old.zarr can be chosen" in refused.stderr

@@ -40,7 +40,7 @@ def run_for(target: Path, files: Sequence[str], max_age: float | None) -> tuple[
 
     Raises:
         ConfigError: ``max_age`` without a folder of runs.
-        InputError: no run fits, the one that fits is too old, or dates are needed and not known.
+        InputError: no run fits, the one that fits is too old, or dates do not tell which is the last.
     """
     runs = finished_runs(target) if target.is_dir() and stored_config(target) is None else {}
     if not runs and max_age is not None:
@@ -72,6 +72,8 @@ def run_for(target: Path, files: Sequence[str], max_age: float | None) -> tuple[
         listed = ", ".join(path.name for path in fitting)
         raise InputError(f"{name}: files or runs without a date, so none of {listed} can be chosen; name one")
     age, path = max((each for each in dated if each[0] <= 0.0), default=min(dated))
+    if len(same := [other.name for other_age, other in dated if other_age == age]) > 1:
+        raise InputError(f"{' and '.join(same)} in {target} were taken at the same time; name one")
     days = abs(age) / _DAY
     words = f"{days:.1f} days {'before' if age <= 0.0 else 'after'} the frames"
     if max_age is not None and days > max_age:

@@ -22,6 +22,7 @@ from pchem_pipeline.run.signals import InterruptedRunError, StopRequest, stop_on
 from pchem_pipeline.run.stage import WHOLE, Command, StageContext, open_store
 from pchem_pipeline.runner import execute as runner
 from pchem_pipeline.runner.execute import execute
+from pchem_pipeline.runner.session import nothing_left_of_a_refusal
 from pchem_pipeline.store.run_store import RunStore
 
 CALLS: list[str] = []
@@ -409,3 +410,13 @@ def test_record_keeps_what_was_used(make):
     assert record.peak_rss_bytes > 0
     text = json.dumps(record.content)
     assert str(context.store.path) not in text
+
+
+@pytest.mark.parametrize(("begun", "stays"), [([], False), (["histogram"], True)])
+def test_a_store_is_removed_after_a_refusal_only_while_no_stage_has_written(tmp_path, begun, stays):
+    with pytest.raises(StoreError), nothing_left_of_a_refusal(tmp_path / "run.zarr"):
+        store = RunStore.create(tmp_path / "run.zarr")
+        for name in begun:
+            store.set_attributes(name, {})
+        raise StoreError("the disk is full")
+    assert (tmp_path / "run.zarr").exists() == stays
