@@ -107,7 +107,7 @@ def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
         lines += ["", *_headline(numbers["headline"])]
     shown = " ".join(answer["text"] for answer in numbers["answers"] if not answer["criteria"])
     for flag in numbers["flags"]:
-        if flag["level"] in ("serious", "caution") and flag["text"] not in shown:
+        if flag["level"] != "good" and flag["text"] not in shown:
             lines += _wrapped(f"{flag['level'].capitalize()}: {flag['text']}", "  ", "")
     lines.append("")
     for i, step in enumerate(numbers["next"]):
