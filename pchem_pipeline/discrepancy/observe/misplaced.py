@@ -53,8 +53,9 @@ def misplaced_lines(
     if min(usable.shape) < 2:
         return z, shares
     chosen = frames[:: max(1, -(-frames.size // MOST_PAIRED))]
+    of_rows = _Table.of(counts, origin, usable)
     for lines in get_args(Lines):
-        table = _Table.of(counts, origin, usable, lines)
+        table = of_rows.along(lines)
         turned = _turned(chosen, lines)
         strides = 0, max(1, len(turned) // turned.shape[2])
         gain, chance = (table.compared(turned, each, whole=False)[0] for each in strides)
@@ -94,7 +95,7 @@ def _moved(
     """Return which lines are likelier misplaced than not, (frame, line), by the histograms of ``own``."""
     histograms = histogram_frames(own)
     counts = histograms.counts.reshape(usable.size, -1)
-    table = _Table.of(counts, histograms.origin.ravel().astype(np.int64), usable, lines)
+    table = _Table.of(counts, histograms.origin.ravel().astype(np.int64), usable).along(lines)
     ratios = table.compared(_turned(frames, lines), 0, whole=True)[1].astype(np.float64)
     likelier = (np.exp(np.minimum(ratios, _FARTHEST)) * share).sum(axis=2)
     return np.asarray(likelier > 1.0 - share.sum())
@@ -127,28 +128,34 @@ class _Table:
     ratios: Float32Array
 
     @classmethod
-    def of(cls, counts: NDArray[Any], origin: IntArray, usable: BoolArray, lines: Lines) -> _Table:
-        """Return it for histograms (y * x, B) whose bins begin at ``origin``, DN."""
+    def of(cls, counts: NDArray[Any], origin: IntArray, usable: BoolArray) -> _Table:
+        """Return it of rows, for histograms (y * x, B) whose bins begin at ``origin``, DN."""
         some = np.flatnonzero((counts > 0).any(axis=0))
         # one more on either side stands for all codes beyond
         real = np.pad(counts[:, some[0] : some[-1] + 1], ((0, 0), (1, 1))) + np.float32(0.5)
         # in place: of a window of many pixels these are the largest arrays of all that observe it
         real /= real.sum(axis=1, keepdims=True)
-        logs = np.log(real, out=real).astype(np.float32).reshape(*usable.shape, -1)
+        own = np.log(real, out=real).astype(np.float32).reshape(*usable.shape, -1)
         del real
         first = (origin + some[0] - 1).reshape(usable.shape)
-        axis = int(lines == "columns")
-        own, begin, count = (np.ascontiguousarray(a.swapaxes(0, axis)) for a in (logs, first, usable))
         ratios, codes = np.empty((*own.shape, len(STEPS)), np.float32), np.arange(own.shape[2])
         for j, (dy, dx) in enumerate(STEPS):
             # where one of two pixels does not count, it tells nothing
             (other, there), (start, _), (counts_there, _) = (
-                neighbours(each.reshape(*count.shape, -1), (dy, dx, 0)) for each in (own, begin, count)
+                neighbours(each.reshape(*usable.shape, -1), (dy, dx, 0)) for each in (own, first, usable)
             )
-            at = np.clip(codes + begin[:, :, None] - start, 0, codes.size - 1)
-            known = there[:, :, :1] & count[:, :, None] & counts_there
+            at = np.clip(codes + first[:, :, None] - start, 0, codes.size - 1)
+            known = there[:, :, :1] & usable[:, :, None] & counts_there
             ratios[..., j] = known * (np.take_along_axis(other, at, axis=2) - own)
-        return cls(begin, ratios)
+        return cls(first, ratios)
+
+    def along(self, lines: Lines) -> _Table:
+        """Return it with the lines in the place of the rows."""
+        if lines == "rows":
+            return self
+        order = [STEPS.index((dx, dy)) for dy, dx in STEPS]
+        turned = self.first.T, self.ratios.swapaxes(0, 1)[..., order]
+        return _Table(*map(np.ascontiguousarray, turned))
 
     def compared(self, lines: NDArray[Any], stride: int, *, whole: bool) -> tuple[FloatArray, Float32Array]:
         """Return what a share of misplaced rows gains each, and likelihood ratios (frame, y, N_PLACES)."""

@@ -17,7 +17,8 @@ from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.observe import laws
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
-from pchem_pipeline.discrepancy.observe.tables import FOLD, CodeSums, PixelLaws
+from pchem_pipeline.discrepancy.observe.tables import PixelLaws
+from pchem_pipeline.discrepancy.observe.tables_numba import FOLD, CodeSums
 from pchem_pipeline.discrepancy.observe.view import OF_LINES, FrameView
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals
 from pchem_pipeline.model.arithmetic.significance import OUTLYING

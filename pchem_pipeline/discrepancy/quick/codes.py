@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray
 from pchem_pipeline.discrepancy.observe.laws import pile_up, poisson
-from pchem_pipeline.discrepancy.observe.tables import CodeSums, PixelHistograms, pixel_laws
+from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, pixel_laws
+from pchem_pipeline.discrepancy.observe.tables_numba import CodeSums
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 from pchem_pipeline.discrepancy.quick.frames import normal_p

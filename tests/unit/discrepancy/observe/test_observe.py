@@ -15,7 +15,8 @@ from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import _without_steps, observe, observe_histograms
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
-from pchem_pipeline.discrepancy.observe.tables import efficient_scores, whiten
+from pchem_pipeline.discrepancy.observe.tables import efficient_scores
+from pchem_pipeline.discrepancy.observe.tables_numba import N_TESTS, sum_scores, whiten
 from pchem_pipeline.discrepancy.where import expected_beyond, rare_samples, single_samples
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, SCORES, Evidence, PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
@@ -33,12 +34,15 @@ def _law(width: float = WIDTH) -> np.ndarray:
 
 def whitened(law: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """Whiten the law (code, column) of one pixel in place; return the factor, and what scores its samples."""
-    columns = np.ascontiguousarray(law.T)[:, None]
-    factor = whiten(columns, inverse[None])
-    law[:] = columns[:, 0].T
-    return factor[:, :, 0], lambda seen: efficient_scores(
-        columns, inverse[None], seen[None], factor, np.array([H])
-    )[0, 0]
+    factor = np.zeros((cell_scores_numba.N_NUISANCE, cell_scores_numba.N_COLUMNS))
+    whiten(law, inverse, factor)
+
+    def scored(seen: np.ndarray) -> np.ndarray:
+        sums = np.zeros((N_TESTS, N_TESTS + 3))
+        sum_scores(law, inverse, seen, sums)
+        return efficient_scores(sums[None], factor[None], np.array([seen.sum()]), np.array([H]))[0, 0]
+
+    return factor, scored
 
 
 def _numbers(n: int, block: int) -> np.ndarray:
