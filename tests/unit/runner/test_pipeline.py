@@ -414,9 +414,13 @@ def test_record_keeps_what_was_used(make):
 
 @pytest.mark.parametrize(("begun", "stays"), [([], False), (["histogram"], True)])
 def test_a_store_is_removed_after_a_refusal_only_while_no_stage_has_written(tmp_path, begun, stays):
-    with pytest.raises(StoreError), nothing_left_of_a_refusal(tmp_path / "run.zarr"):
-        store = RunStore.create(tmp_path / "run.zarr")
-        for name in begun:
-            store.set_attributes(name, {})
-        raise StoreError("the disk is full")
+    def refused():
+        with nothing_left_of_a_refusal(tmp_path / "run.zarr"):
+            store = RunStore.create(tmp_path / "run.zarr")
+            for name in begun:
+                store.set_attributes(name, {})
+            raise StoreError("the disk is full")
+
+    with pytest.raises(StoreError):
+        refused()
     assert (tmp_path / "run.zarr").exists() == stays
