@@ -446,9 +446,7 @@ def test_figures_are_saved_words_explained_and_folded_parts_opened(tab, tmp_path
     assert (tmp_path / "csv").read_text().startswith("bit,meaning,pixels\n")
 
 
-@pytest.mark.parametrize(
-    "hash_", ["#pixel=70,0", "#pixel=-1,4&map=<script>", "#pixel=1e3,2&colours=x", "#map=__proto__"]
-)
+@pytest.mark.parametrize("hash_", ["#pixel=70,0&map=<script>", "#pixel=-1e3,2&colours=x", "#map=__proto__"])
 def test_addresses_of_nothing_do_no_harm(open_tab, store, hash_):
     tab = open_tab(file_url(store) + hash_)
     named = hash_[1:].split("&")[0].replace("=", " ")
@@ -458,7 +456,7 @@ def test_addresses_of_nothing_do_no_harm(open_tab, store, hash_):
     assert tab.page.get_attribute("#inspector-app", "data-map") == "maps/read_noise_e"
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (800, "dark"), (1280, "light")])
+@pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (800, "dark")])
 def test_it_fits_every_width_in_light_and_dark(open_tab, store, width, scheme):
     tab = open_tab(f"{file_url(store)}#pixel=20,30", width, scheme)
     tab.wait(20 * NX + 30)
@@ -501,7 +499,7 @@ NAMES = (
 )
 
 
-@pytest.mark.parametrize(("width", "channels"), [(390, False), (1280, True), (390, True)])
+@pytest.mark.parametrize(("width", "channels"), [(390, False), (1000, True)])
 def test_names_in_all_scripts_are_shown_not_run_and_keep_the_page_as_wide_as_the_window(
     open_tab, tmp_path, width, channels
 ):
