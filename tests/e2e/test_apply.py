@@ -283,7 +283,7 @@ def test_killed_it_goes_on_and_gives_the_same(lab):
     given += ["killed.zarr", "--workers", "2"]
     (lab.folder / "killed.zarr").mkdir()  # as a process leaves it that is killed at its first file
     (lab.folder / "killed.zarr" / ".zarr.json.01.partial").touch()
-    for seconds in (2.0, 3.0, 4.0):
+    for seconds in (1.5, 2.5):
         with lab.start(*given) as process:
             try:
                 process.wait(timeout=seconds)
@@ -529,7 +529,6 @@ def astronomer(make_once):
         for name, n, exposure, noise in (
             ("dark", 1500, 2.0, ROW_NOISE),
             ("night", 300, 0.7, ROW_NOISE),
-            ("quiet", 300, 0.7, 0.0),
             ("cold", 50, 0.7, ROW_NOISE),
         ):
             light = np.full((24, 40), exposure) * (np.arange(40) < 40 - OVERSCAN)
@@ -570,16 +569,6 @@ def test_overscan_takes_row_noise_from_frames_as_far_as_theory_allows(astronomer
     claimed = 1 - found.number_probability.values[LIGHT][:, good].mean()
     assert abs(wrong / claimed - 1) < 0.2
     assert np.isnan(found.electrons.values[..., 39 - OVERSCAN :]).all()
-
-
-def test_overscan_without_row_noise_costs_nothing(astronomer, shell):
-    given = ["apply", astronomer / "run.zarr", astronomer / "quiet.fits", "--what", "electrons", "--output"]
-    true, variances = np.load(astronomer / "quiet.npy"), []
-    for name, *options in (("out.zarr", "--reference", "overscan"), ("kept.zarr",)):
-        shell.ok(*given, name, *options)
-        off = opened(shell.folder / name).electrons.values[LIGHT] - true
-        variances.append(np.nanmean(off.var(axis=0)))
-    assert variances[0] < 1.002 * variances[1]
 
 
 def test_overscan_tells_a_bias_that_moved(astronomer, shell):

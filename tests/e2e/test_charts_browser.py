@@ -99,7 +99,7 @@ def test_every_chart_is_drawn(report, names, width, scheme):
     assert page.evaluate("() => document.scrollingElement.scrollWidth") <= width
 
 
-def test_a_drag_zooms_and_a_double_click_goes_back(report):
+def test_mouse_and_keys_zoom_and_read_values(report):
     page = report()
     figure = chart(page, "ensemble")
     top, strip = (figure.locator("canvas").nth(i) for i in (0, 1))
@@ -113,9 +113,22 @@ def test_a_drag_zooms_and_a_double_click_goes_back(report):
     page.mouse.move(5, 5)
     page.wait_for_timeout(50)
     assert [each.evaluate(SHOWN) for each in (top, strip)] == before
+    figure = chart(page, "frame_means")
+    panel, canvas = figure.locator(".panel").nth(0), figure.locator("canvas").nth(0)
+    before = canvas.evaluate(SHOWN)
+    panel.focus()
+    page.keyboard.press("ArrowRight")
+    assert "frame: " in figure.locator(".spoken").nth(0).inner_text()
+    assert "mean" in figure.locator(".spoken").nth(0).inner_text()
+    page.keyboard.press("+")
+    page.wait_for_timeout(50)
+    assert canvas.evaluate(SHOWN) != before
+    page.keyboard.press("0")
+    page.wait_for_timeout(50)
+    assert canvas.evaluate(SHOWN) == before
 
 
-def test_the_legend_has_values_and_hides_what_it_names(report, data):
+def test_the_legend_has_values_and_hides_what_it_names_and_a_picture_is_saved(report, data, tmp_path):
     page = report()
     figure = chart(page, "electron_numbers")
     button = figure.get_by_role("button", name="estimated electron numbers")
@@ -140,23 +153,12 @@ def test_the_legend_has_values_and_hides_what_it_names(report, data):
     button.press("Enter")
     page.wait_for_timeout(50)
     assert (button.get_attribute("aria-pressed"), canvas.evaluate(SHOWN)) == ("true", before)
-
-
-def test_keys_read_values_and_zoom(report):
-    page = report()
-    figure = chart(page, "frame_means")
-    panel, canvas = figure.locator(".panel").nth(0), figure.locator("canvas").nth(0)
-    before = canvas.evaluate(SHOWN)
-    panel.focus()
-    page.keyboard.press("ArrowRight")
-    assert "frame: " in figure.locator(".spoken").nth(0).inner_text()
-    assert "mean" in figure.locator(".spoken").nth(0).inner_text()
-    page.keyboard.press("+")
-    page.wait_for_timeout(50)
-    assert canvas.evaluate(SHOWN) != before
-    page.keyboard.press("0")
-    page.wait_for_timeout(50)
-    assert canvas.evaluate(SHOWN) == before
+    figure = chart(page, "ensemble")
+    with page.expect_download() as download:
+        figure.get_by_role("button", name="Save ensemble as SVG").click()
+    path = tmp_path / "ensemble.svg"
+    download.value.save_as(path)
+    assert "<svg" in path.read_text()
 
 
 def test_paper_and_readers_without_scripts_get_the_plain_picture(report):
@@ -181,16 +183,6 @@ def test_a_chart_follows_the_width_of_the_window(report):
     assert max(narrow) <= 420
     assert max(narrow) != wide
     assert page.evaluate("() => document.scrollingElement.scrollWidth") <= 420
-
-
-def test_a_picture_is_saved_from_the_page(report, tmp_path):
-    page = report()
-    figure = chart(page, "ensemble")
-    with page.expect_download() as download:
-        figure.get_by_role("button", name="Save ensemble as SVG").click()
-    path = tmp_path / "ensemble.svg"
-    download.value.save_as(path)
-    assert "<svg" in path.read_text()
 
 
 def test_pictures_are_dark_on_a_dark_screen_and_light_as_files(report, tmp_path):

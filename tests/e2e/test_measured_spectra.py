@@ -14,6 +14,7 @@ SPECTRA = sorted(SIPM.glob("*.csv"))
 
 YAML = """
 run: {store: sipm.zarr}
+discrepancy: {replicates: 24}
 input:
   files:
 """

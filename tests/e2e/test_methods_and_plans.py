@@ -23,7 +23,7 @@ def exposures(tmp_path_factory):
         (shell.folder / f"{name}.yaml").write_text(text)
         for stage in ("ingest", "histogram"):
             shell.ok(stage, f"{name}.yaml", "--quiet")
-    shell.ok("run", "bright.yaml", "--quiet")
+    shell.ok("run", "bright.yaml", "--until", "ensemble", "--quiet")
     return shell
 
 

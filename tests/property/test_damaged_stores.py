@@ -144,9 +144,7 @@ def test_any_file_is_damaged(finished, tmp_path, step):
         check(folder, f"{victim} {kind}", expected, FORCED[i % len(FORCED)])
 
 
-@pytest.mark.parametrize(
-    ("array", "reader"), [("histogram/counts", "fit"), ("fit/bias", "maps"), ("maps/read_noise_e", "report")]
-)
+@pytest.mark.parametrize(("array", "reader"), [("histogram/counts", "fit"), ("maps/read_noise_e", "report")])
 def test_chunks_that_are_exchanged_or_cut_are_found(finished, tmp_path, array, reader):
     """Each has the right checksum, in the wrong place."""
     expected = numbers(finished / "run.zarr")

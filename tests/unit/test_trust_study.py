@@ -76,7 +76,6 @@ def test_runs_are_compared_with_what_was_simulated(tmp_path, monkeypatch):
     assert good["wrong"] == []
     assert not good["traceback"]
     assert good["pixels"] > 0
-    assert not trust_runs.study_run(0, tmp_path / "repeated", "repeated")["silent"]
     brighter = ("nothing", lambda case: case.truth["quanta_exposure"].__imul__(1.2))
     monkeypatch.setitem(trust_runs.MISHAPS, "none", brighter)
     bad = trust_runs.study_run(0, tmp_path / "bad", "none")
