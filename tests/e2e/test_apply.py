@@ -15,6 +15,7 @@ import xarray as xr
 import yaml
 from helpers.commands import Shell, imported_by
 from helpers.known_camera import KnownCamera
+from helpers.without_pictures import undrawn
 
 from pchem_pipeline.commands.apply.characterisation import read_calibration
 from pchem_pipeline.frames.camera import CameraFacts
@@ -538,7 +539,8 @@ def astronomer(make_once):
             image.header.update(TRIMSEC=f"[1:{39 - OVERSCAN},1:24]", BIASSEC=f"[{41 - OVERSCAN}:40,1:24]")
             image.writeto(folder / f"{name}.fits")
             np.save(folder / f"{name}.npy", electrons[LIGHT])
-        Shell(folder).ok("run", "dark.fits", "--store", "run.zarr", "--bit-depth", "14")
+        with undrawn():
+            Shell(folder).ok("run", "dark.fits", "--store", "run.zarr", "--bit-depth", "14")
 
     return make_once("astronomer", make) / "nuit é"
 

@@ -18,11 +18,6 @@ input: {files: [a.npy]}
 """
 
 
-def _longer(frames):
-    """Return ten times as many frames, none of them a copy of another."""
-    return np.random.default_rng(3).permuted(np.tile(frames, (10, 1, 1)), axis=0)
-
-
 def tiff(path, data=GOOD):
     tifffile.imwrite(path, data, photometric="minisblack")
 
@@ -47,7 +42,7 @@ def test_bad_files_are_one_clear_line(shell, case):
     assert result.stdout == ""
 
 
-def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
+def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell, undrawn):
     rng = np.random.default_rng(8)
     stack = np.rint(rng.poisson(2, (1500, 8, 8)) * 10 + rng.normal(100, 3, (1500, 8, 8))).astype(np.uint16)
     stack[:, :3] = 100
@@ -65,7 +60,7 @@ def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
     assert (shell.folder / "run.zarr" / "report.html").exists()
 
 
-def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell):
+def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell, undrawn):
     np.save(shell.folder / "a.npy", np.full((100, 8, 8), 100, np.uint16))
     (shell.folder / "run.yaml").write_text(OF_ONE_FILE)
     result = shell("run", "run.yaml")
@@ -75,34 +70,6 @@ def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell):
     assert "warning: no pixel has a value, so there is no ensemble" in result.stderr
     assert (shell.folder / "run.zarr" / "report.html").exists()
     assert {words.split()[0] for words in shell.states("run.yaml").values()} == {"complete"}
-
-
-def test_input_that_is_refused_costs_a_finished_run_nothing(shell):
-    """A cron job meets a half-written file: the frames copied the night before are the only ones left."""
-    night = shell.folder / "night"
-    night.mkdir()
-    for name, part in (("a", GOOD[:20]), ("b", GOOD[20:])):
-        tiff(night / f"{name}.tif", _longer(part) + (name == "b"))
-    (shell.folder / "run.yaml").write_text(OF_ONE_FILE.replace("[a.npy]", "[night/*.tif], mode: copy"))
-    shell.ok("run", "run.yaml", "--until", "maps")
-    store = shell.folder / "run.zarr"
-    before = {name: RunStore.open(store).read(name) for name in ("frames/dn", "fit/bias")}
-    content = (night / "b.tif").read_bytes()
-    (night / "a.tif").unlink()
-    # no files at all: what was copied stays valid; an empty file, and one file twice
-    for names, other, code in (("", b"", 0), ("bc", b"", 4), ("bc", content, 4)):
-        for path in night.iterdir():
-            path.unlink()
-        for name in names:
-            (night / f"{name}.tif").write_bytes(content if name == "b" else other)
-        assert shell("run", "run.yaml", "--until", "maps").code == code
-        for name, values in before.items():
-            assert np.array_equal(RunStore.open(store).read(name), values, equal_nan=True)
-        shell.ok("status", "run.yaml")
-        shell.ok("export", "run.zarr", "--format", "npz", "--output", "maps")
-    (night / "c.tif").unlink()
-    shell.ok("run", "run.yaml", "--until", "maps")
-    assert len(RunStore.open(store).read("frames/dn")) == 200
 
 
 def test_a_stage_that_cannot_read_its_input_keeps_what_it_made(shell, frames):
@@ -163,13 +130,6 @@ def test_refusals_of_a_run_leave_neither_store_nor_yaml(shell):
     ):
         assert words in shell.refused(code, *command)
         assert sorted(path.name for path in shell.folder.iterdir()) == ["a.npy", "a.yaml"], command
-
-
-def test_a_run_in_place_of_frames_is_one_line(shell, finished):
-    shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
-    said = shell.refused(4, "apply", "run.yaml", "run.zarr", "--output", "calibrated.zarr")
-    assert "several datasets" in said
-    assert not (shell.folder / "calibrated.zarr").exists()
 
 
 @pytest.mark.parametrize("command", ["fit", "discrepancy"])

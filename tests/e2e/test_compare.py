@@ -31,15 +31,6 @@ from pchem_pipeline.store.run_store import RunStore, stored_config
 
 
 @pytest.fixture
-def pages(monkeypatch):
-    """What pages would be made of: drawing them takes most of the time."""
-    found = []
-    render = "pchem_pipeline.commands.compare.compare.render_comparison"
-    monkeypatch.setattr(render, lambda what, draw: found.append(what) or ("", ""))
-    return found
-
-
-@pytest.fixture
 def copies(shell, finished):
     for name in ("a", "b"):
         shutil.copytree(finished, shell.folder / f"{name}.zarr")
@@ -99,7 +90,7 @@ def test_nothing_changed_is_proven_by_digests(shell, copies):
         assert source.startswith(("data:image/", "#"))
 
 
-def test_one_value_that_moved_is_found(shell, copies, pages):
+def test_one_value_that_moved_is_found(shell, copies, undrawn):
     bias = copies.read("maps/bias")
     y, x = np.argwhere(np.isfinite(bias))[5]
     bias[y, x] *= 1 + 1e-9
@@ -119,7 +110,7 @@ def test_one_value_that_moved_is_found(shell, copies, pages):
     assert "equal" in {row.state for row in equal.arrays}
 
 
-def test_lost_and_new_arrays_settings_and_versions(shell, copies):
+def test_lost_and_new_arrays_settings_and_versions(shell, copies, undrawn):
     copies.delete("fit/goodness_p")
     copies.delete("fit/n_iterations")
     shutil.rmtree(shell.folder / "a.zarr" / "ensemble" / "epcd_independent")
@@ -148,7 +139,7 @@ def other_capture(store, *, exposure=1.0, seed=1, noise=2**0.5):
     store.set_attributes("frames", {"sensor": sensor})
 
 
-def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished):
+def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished, undrawn):
     other_capture(copies)
     shutil.copytree(finished, shell.folder / "warm <b>.zarr")
     warm = RunStore.open(shell.folder / "warm <b>.zarr", writable=True)
@@ -174,7 +165,7 @@ def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished):
     assert "<b>.zarr" not in page
 
 
-def test_the_history_of_a_camera(shell, copies, finished):
+def test_the_history_of_a_camera(shell, copies, finished, undrawn):
     """Pixels that moved are found at the stated rate, run by run, and the medians against the labels."""
     other_capture(copies)
     shutil.copytree(finished, shell.folder / "c.zarr")
@@ -255,8 +246,11 @@ def test_the_history_has_date_and_temperature_of_the_files(shell, copies, finish
     assert figure.tables[0]["label"].tolist() == [-20.0, -5.5]
 
 
-def test_nights_of_one_camera(shell, finished, pages, monkeypatch):
+def test_nights_of_one_camera(shell, finished, monkeypatch):
     """Nothing is said where nothing changed; a jump is told once since the last run, then since the first."""
+    pages = []  # what they would be made of
+    render = "pchem_pipeline.commands.compare.compare.render_comparison"
+    monkeypatch.setattr(render, lambda found, draw: pages.append(found) or ("", ""))
     monkeypatch.setattr("pchem_pipeline.commands.compare.compare.warn_if_old", lambda *_: None)
 
     def tonight(n):
@@ -334,7 +328,7 @@ def test_a_wrong_limit_is_refused(shell, copies, limit, said):
         compared(shell, "a.zarr", "b.zarr", limits=[limit])
 
 
-def test_nothing_to_compare_is_a_change(shell, copies, pages):
+def test_nothing_to_compare_is_a_change(shell, copies, undrawn):
     other_capture(copies)
     put(copies, "maps/quality", np.full_like(copies.read("maps/quality"), 2))
     assert "No pixel has a good fit in both runs." in here(shell, "a.zarr", "b.zarr")

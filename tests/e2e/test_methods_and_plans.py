@@ -27,7 +27,7 @@ def exposures(tmp_path_factory):
     return shell
 
 
-def test_methods_with_other_exposures(exposures):
+def test_methods_with_other_exposures(exposures, undrawn):
     result = exposures.ok(
         "methods", "bright.zarr", "--with", "dark.zarr", "--with", "half.zarr", "--study-pixels", "0"
     )

@@ -7,6 +7,7 @@ import sys
 from contextlib import chdir
 from pathlib import Path
 
+import pytest
 from helpers.places import ROOT
 
 from pchem_pipeline.base.errors import ExitCode
@@ -55,6 +56,7 @@ def run_line(shell, line):
         path.write_text(text)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_commands_in_readme_work(shell, frames):
     for path in sorted(frames.iterdir())[2:]:
         path.unlink()

@@ -71,7 +71,7 @@ def test_pixels_are_drawn_again_by_their_number_and_counted_in_tables():
     assert trust_study.interval(0, 1000) == "0 (0 to 0.37)"
 
 
-def test_runs_are_compared_with_what_was_simulated(tmp_path, monkeypatch):
+def test_runs_are_compared_with_what_was_simulated(tmp_path, monkeypatch, undrawn):
     good = trust_runs.study_run(0, tmp_path / "good", "none")
     assert good["wrong"] == []
     assert not good["traceback"]
