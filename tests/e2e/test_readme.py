@@ -63,12 +63,12 @@ def test_the_commands_in_readme_work(shell, frames):
     found = list(dict.fromkeys(blocks("bash") + blocks("bash", DOCS)))
     assert "".join(found).count("pchem ") >= 10
     for block in found:
-        if "<<" in block:  # it writes a script, which needs the installed command
+        lines, *script = re.split("^(?=cat >)", block, flags=re.M)
+        for line in lines.splitlines():
+            run_line(shell, line)
+        for each in script:  # which needs the installed command
             environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-            subprocess.run(["bash", "-ec", block], cwd=shell.folder, env=environment, check=True, timeout=300)
-        else:
-            for line in block.splitlines():
-                run_line(shell, line)
+            subprocess.run(["bash", "-ec", each], cwd=shell.folder, env=environment, check=True, timeout=300)
     assert (shell.folder / "run.zarr" / "report.html").exists()
     with chdir(shell.folder):
         exec(blocks("python")[0], {})
