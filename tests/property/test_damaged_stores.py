@@ -136,7 +136,7 @@ def files_of(folder):
     return sorted(path.relative_to(folder) for path in files)
 
 
-@pytest.mark.parametrize("step", [211, pytest.param(1, marks=(pytest.mark.long, pytest.mark.timeout(7200)))])
+@pytest.mark.parametrize("step", [191, pytest.param(1, marks=(pytest.mark.long, pytest.mark.timeout(7200)))])
 def test_any_file_is_damaged(finished, tmp_path, step):
     expected = numbers(finished / "run.zarr")
     files, rng = files_of(finished), np.random.default_rng(step)
