@@ -27,6 +27,15 @@ def _forget_stores():
     open_store.cache_clear()
 
 
+@pytest.fixture
+def undrawn():
+    """Pages without pictures: fast."""
+    from helpers.without_pictures import undrawn
+
+    with undrawn():
+        yield
+
+
 @pytest.fixture(scope="session")
 def make_once(tmp_path_factory):
     """Fill a folder by a function once for all workers of a session; none of them may change it then."""

@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 from helpers.commands import RUN, Shell
+from helpers.without_pictures import undrawn
 
 CAMERA = """
 run: {store: truth.zarr, tile: 8}
@@ -46,12 +47,13 @@ def frames(shell, camera):
 
 @pytest.fixture(scope="session")
 def finished(make_once, camera):
-    """An uninterrupted run of the camera's frames, tiles of 8 pixels; do not change it."""
+    """An uninterrupted run of the camera's frames, tiles of 8 pixels, without pictures; do not change it."""
 
     def run(folder):
         shutil.copytree(camera / "frames", folder / "frames")
         (folder / "run.yaml").write_text(RUN)
-        Shell(folder).ok("run", "run.yaml")
+        with undrawn():
+            Shell(folder).ok("run", "run.yaml")
 
     return make_once("finished", run) / "run.zarr"
 

@@ -15,6 +15,7 @@ import xarray as xr
 import yaml
 from helpers.commands import Shell, imported_by
 from helpers.known_camera import KnownCamera
+from helpers.without_pictures import undrawn
 
 from pchem_pipeline.commands.apply.characterisation import read_calibration
 from pchem_pipeline.frames.camera import CameraFacts
@@ -283,7 +284,7 @@ def test_killed_it_goes_on_and_gives_the_same(lab):
     given += ["killed.zarr", "--workers", "2"]
     (lab.folder / "killed.zarr").mkdir()  # as a process leaves it that is killed at its first file
     (lab.folder / "killed.zarr" / ".zarr.json.01.partial").touch()
-    for seconds in (2.0, 3.0, 4.0):
+    for seconds in (1.5, 2.5):
         with lab.start(*given) as process:
             try:
                 process.wait(timeout=seconds)
@@ -533,7 +534,6 @@ def astronomer(make_once):
         for name, n, exposure, noise in (
             ("dark", 1500, 2.0, ROW_NOISE),
             ("night", 300, 0.7, ROW_NOISE),
-            ("quiet", 300, 0.7, 0.0),
             ("cold", 50, 0.7, ROW_NOISE),
         ):
             light = np.full((24, 40), exposure) * (np.arange(40) < 40 - OVERSCAN)
@@ -543,7 +543,8 @@ def astronomer(make_once):
             image.header.update(TRIMSEC=f"[1:{39 - OVERSCAN},1:24]", BIASSEC=f"[{41 - OVERSCAN}:40,1:24]")
             image.writeto(folder / f"{name}.fits")
             np.save(folder / f"{name}.npy", electrons[LIGHT])
-        Shell(folder).ok("run", "dark.fits", "--store", "run.zarr", "--bit-depth", "14")
+        with undrawn():
+            Shell(folder).ok("run", "dark.fits", "--store", "run.zarr", "--bit-depth", "14")
 
     return make_once("astronomer", make) / "nuit é"
 
@@ -574,16 +575,6 @@ def test_overscan_takes_row_noise_from_frames_as_far_as_theory_allows(astronomer
     claimed = 1 - found.number_probability.values[LIGHT][:, good].mean()
     assert abs(wrong / claimed - 1) < 0.2
     assert np.isnan(found.electrons.values[..., 39 - OVERSCAN :]).all()
-
-
-def test_overscan_without_row_noise_costs_nothing(astronomer, shell):
-    given = ["apply", astronomer / "run.zarr", astronomer / "quiet.fits", "--what", "electrons", "--output"]
-    true, variances = np.load(astronomer / "quiet.npy"), []
-    for name, *options in (("out.zarr", "--reference", "overscan"), ("kept.zarr",)):
-        shell.ok(*given, name, *options)
-        off = opened(shell.folder / name).electrons.values[LIGHT] - true
-        variances.append(np.nanmean(off.var(axis=0)))
-    assert variances[0] < 1.002 * variances[1]
 
 
 def test_overscan_tells_a_bias_that_moved(astronomer, shell):

@@ -1,7 +1,6 @@
 """Bad input: one line with what, where and the cure, its exit code, and nothing lost."""
 
 import shutil
-import subprocess
 
 import numpy as np
 import pytest
@@ -17,11 +16,6 @@ OF_ONE_FILE = """
 run: {store: run.zarr}
 input: {files: [a.npy]}
 """
-
-
-def _longer(frames):
-    """Return ten times as many frames, none of them a copy of another."""
-    return np.random.default_rng(3).permuted(np.tile(frames, (10, 1, 1)), axis=0)
 
 
 def tiff(path, data=GOOD):
@@ -48,9 +42,9 @@ def test_bad_files_are_one_clear_line(shell, case):
     assert result.stdout == ""
 
 
-def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
+def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell, undrawn):
     rng = np.random.default_rng(8)
-    stack = np.rint(rng.poisson(2, (2000, 8, 8)) * 10 + rng.normal(100, 3, (2000, 8, 8))).astype(np.uint16)
+    stack = np.rint(rng.poisson(2, (1500, 8, 8)) * 10 + rng.normal(100, 3, (1500, 8, 8))).astype(np.uint16)
     stack[:, :3] = 100
     np.save(shell.folder / "a.npy", stack)
     np.save(shell.folder / "mask.npy", np.repeat([[1.0], [0.0]], [3, 5], axis=0).repeat(8, axis=1))
@@ -60,13 +54,13 @@ def test_too_many_failed_pixels_is_exit_code_3_with_a_report(shell):
     left_out = np.arange(8)[:, None] < 3
     assert ((store.read("fit/fit_status") == FitStatus.EXCLUDED) == left_out).all()
     assert (np.isnan(store.read("fit/conversion_gain")) == left_out).all()
-    assert store.read("histogram/counts")[4, 4].sum() == 1995
+    assert store.read("histogram/counts")[4, 4].sum() == 1495
     (shell.folder / "run.yaml").write_text(OF_ONE_FILE)
     assert "24 of 64 pixels have no value" in shell.refused(3, "run", "run.yaml")
     assert (shell.folder / "run.zarr" / "report.html").exists()
 
 
-def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell):
+def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell, undrawn):
     np.save(shell.folder / "a.npy", np.full((100, 8, 8), 100, np.uint16))
     (shell.folder / "run.yaml").write_text(OF_ONE_FILE)
     result = shell("run", "run.yaml")
@@ -78,40 +72,11 @@ def test_all_pixels_failed_is_exit_code_3_that_no_retry_is_asked_for(shell):
     assert {words.split()[0] for words in shell.states("run.yaml").values()} == {"complete"}
 
 
-def test_input_that_is_refused_costs_a_finished_run_nothing(shell):
-    """A cron job meets a half-written file: the frames copied the night before are the only ones left."""
-    night = shell.folder / "night"
-    night.mkdir()
-    for name, part in (("a", GOOD[:20]), ("b", GOOD[20:])):
-        tiff(night / f"{name}.tif", _longer(part) + (name == "b"))
-    (shell.folder / "run.yaml").write_text(OF_ONE_FILE.replace("[a.npy]", "[night/*.tif], mode: copy"))
-    shell.ok("run", "run.yaml", "--until", "maps")
-    store = shell.folder / "run.zarr"
-    before = {name: RunStore.open(store).read(name) for name in ("frames/dn", "fit/bias")}
-    content = (night / "b.tif").read_bytes()
-    (night / "a.tif").unlink()
-    # no files at all: what was copied stays valid; an empty file, and one file twice
-    for names, other, code in (("", b"", 0), ("bc", b"", 4), ("bc", content, 4)):
-        for path in night.iterdir():
-            path.unlink()
-        for name in names:
-            (night / f"{name}.tif").write_bytes(content if name == "b" else other)
-        assert shell("run", "run.yaml", "--until", "maps").code == code
-        for name, values in before.items():
-            assert np.array_equal(RunStore.open(store).read(name), values, equal_nan=True)
-        shell.ok("status", "run.yaml")
-        shell.ok("export", "run.zarr", "--format", "npz", "--output", "maps")
-    (night / "c.tif").unlink()
-    shell.ok("run", "run.yaml", "--until", "maps")
-    assert len(RunStore.open(store).read("frames/dn")) == 200
-
-
 def test_a_stage_that_cannot_read_its_input_keeps_what_it_made(shell, frames):
     """The camera files of a run that refers to them are away for a while."""
-    (shell.folder / "run.yaml").write_text(RUN + "histogram: {max_bins: 1024}\n")
-    text = (shell.folder / "run.yaml").read_text()
+    text = RUN + "histogram: {max_bins: 1024}\n"
     (shell.folder / "run.yaml").write_text(text)
-    shell.alone().ok("run", "run.yaml", "--until", "fit", "--workers", "1", "--max-memory", "3000")
+    shell.ok("run", "run.yaml", "--until", "fit", "--workers", "1", "--max-memory", "3000")
     store = RunStore.open(shell.folder / "run.zarr")
     # what one command was given is no setting of the run
     assert "max_memory: null" in stored_config(store.path)
@@ -126,37 +91,6 @@ def test_a_stage_that_cannot_read_its_input_keeps_what_it_made(shell, frames):
     (shell.folder / "run.yaml").write_text(text)
     again = shell.ok("run", "run.yaml", "--until", "fit")
     assert "histogram: up to date" in again.stderr
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 300 kB that can be made read-only."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    if subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", place], capture_output=True
-    ).returncode:
-        pytest.skip("mounting needs privileges")
-    yield place
-    subprocess.run(["umount", "-l", place], check=True)
-
-
-@pytest.mark.parametrize(
-    ("mishap", "words"),
-    [
-        ("size=300k", "the disk is full: free space and run again"),
-        ("ro", "choose another place for the store"),
-    ],
-)
-def test_a_disk_that_takes_no_more_stops_with_its_cure_and_the_run_goes_on(
-    shell, frames, small_disk, mishap, words
-):
-    subprocess.run(["mount", "-o", f"remount,{mishap}", small_disk], check=True)
-    (shell.folder / "run.yaml").write_text(RUN.replace("run.zarr", str(small_disk / "run.zarr")))
-    assert words in shell.refused(4, "run", "run.yaml", "--quiet")
-    if mishap != "ro":
-        subprocess.run(["mount", "-o", "remount,size=200m", small_disk], check=True)
-        shell.ok("run", "run.yaml", "--until", "maps", "--quiet")
 
 
 @pytest.mark.parametrize("stage", ["histogram", "fit", "report", "electrons"])
@@ -198,13 +132,6 @@ def test_refusals_of_a_run_leave_neither_store_nor_yaml(shell):
         assert sorted(path.name for path in shell.folder.iterdir()) == ["a.npy", "a.yaml"], command
 
 
-def test_a_run_in_place_of_frames_is_one_line(shell, finished):
-    shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
-    said = shell.refused(4, "apply", "run.yaml", "run.zarr", "--output", "calibrated.zarr")
-    assert "several datasets" in said
-    assert not (shell.folder / "calibrated.zarr").exists()
-
-
 @pytest.mark.parametrize("command", ["fit", "discrepancy"])
 def test_a_region_beyond_the_sensor_is_one_line(shell, command, finished):
     shutil.copytree(finished.parent, shell.folder, dirs_exist_ok=True)
@@ -213,8 +140,3 @@ def test_a_region_beyond_the_sensor_is_one_line(shell, command, finished):
         "pchem: --roi 0:99,0:9 exceeds the sensor of 20 x 28 pixels (y x x); choose within 0:20,0:28"
     )
     assert sorted((shell.folder / "run.zarr").rglob("*")) == before
-
-
-def test_usage_errors_are_exit_code_2(shell):
-    for command in (("fit",), ("fit", "run.zarr", "--workers", "0"), ("no-such-command",)):
-        assert shell(*command).code == 2

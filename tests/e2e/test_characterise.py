@@ -40,7 +40,7 @@ def test_pixels_whose_gain_or_bias_is_open_do_not_widen_the_components(noise, ex
         assert width[k] == pytest.approx(right, rel=0.3)
 
 
-def test_an_array_becomes_a_run_and_nothing_is_done_twice(frames, tmp_path):
+def test_an_array_becomes_a_run_and_nothing_is_done_twice(frames, tmp_path, undrawn):
     def again(stack, seconds=2.0):
         return pchem_pipeline.characterise(
             stack, store=tmp_path / "night.zarr", integration_time=seconds, settings=FAST, kind="dark"

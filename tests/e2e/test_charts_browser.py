@@ -9,15 +9,19 @@ import pytest
 from helpers.discrepancy_material import discrepancy_data
 from helpers.quick_stacks import stack, sums_of
 from helpers.report_material import report_data
+from helpers.without_pictures import DOT
 
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
 from pchem_pipeline.report.figures.stability import stability_figures
+from pchem_pipeline.report.pages.page import draw_figure
 from pchem_pipeline.report.pages.report import render_report
 
 #: What a canvas shows, as text; its number of different colours.
 SHOWN = "(canvas) => canvas.toDataURL()"
 COLOURS = """(canvas) => new Set(new Uint32Array(
     canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.buffer)).size"""
+#: Figures whose pictures are looked at: the others need none where charts are drawn.
+LOOKED_AT = ("ensemble", "map_bias")
 OPEN = "() => { for (const each of document.querySelectorAll('details.folded')) each.open = true; }"
 
 
@@ -35,7 +39,11 @@ def data():
 @pytest.fixture(scope="module")
 def page_url(data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("charts")
-    for name, text in render_report(data).items():
+
+    def some(figures):
+        return {each.name: draw_figure(each) if each.name in LOOKED_AT else DOT for each in figures}
+
+    for name, text in render_report(data, some).items():
         (folder / name).write_text(text)
     return (folder / "report.html").as_uri()
 
@@ -79,7 +87,7 @@ def drag(page, over, start, end):
     page.mouse.move(5, 5)
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(1200, "light"), (1200, "dark"), (400, "light")])
+@pytest.mark.parametrize(("width", "scheme"), [(1200, "light"), (400, "dark")])
 def test_every_chart_is_drawn(report, names, width, scheme):
     page = report(width, color_scheme=scheme)
     assert names["discrepancy"]
@@ -99,7 +107,7 @@ def test_every_chart_is_drawn(report, names, width, scheme):
     assert page.evaluate("() => document.scrollingElement.scrollWidth") <= width
 
 
-def test_a_drag_zooms_and_a_double_click_goes_back(report):
+def test_mouse_and_keys_zoom_and_read_values(report):
     page = report()
     figure = chart(page, "ensemble")
     top, strip = (figure.locator("canvas").nth(i) for i in (0, 1))
@@ -113,9 +121,22 @@ def test_a_drag_zooms_and_a_double_click_goes_back(report):
     page.mouse.move(5, 5)
     page.wait_for_timeout(50)
     assert [each.evaluate(SHOWN) for each in (top, strip)] == before
+    figure = chart(page, "frame_means")
+    panel, canvas = figure.locator(".panel").nth(0), figure.locator("canvas").nth(0)
+    before = canvas.evaluate(SHOWN)
+    panel.focus()
+    page.keyboard.press("ArrowRight")
+    assert "frame: " in figure.locator(".spoken").nth(0).inner_text()
+    assert "mean" in figure.locator(".spoken").nth(0).inner_text()
+    page.keyboard.press("+")
+    page.wait_for_timeout(50)
+    assert canvas.evaluate(SHOWN) != before
+    page.keyboard.press("0")
+    page.wait_for_timeout(50)
+    assert canvas.evaluate(SHOWN) == before
 
 
-def test_the_legend_has_values_and_hides_what_it_names(report, data):
+def test_the_legend_has_values_and_hides_what_it_names_and_a_picture_is_saved(report, data, tmp_path):
     page = report()
     figure = chart(page, "electron_numbers")
     button = figure.get_by_role("button", name="estimated electron numbers")
@@ -140,23 +161,12 @@ def test_the_legend_has_values_and_hides_what_it_names(report, data):
     button.press("Enter")
     page.wait_for_timeout(50)
     assert (button.get_attribute("aria-pressed"), canvas.evaluate(SHOWN)) == ("true", before)
-
-
-def test_keys_read_values_and_zoom(report):
-    page = report()
-    figure = chart(page, "frame_means")
-    panel, canvas = figure.locator(".panel").nth(0), figure.locator("canvas").nth(0)
-    before = canvas.evaluate(SHOWN)
-    panel.focus()
-    page.keyboard.press("ArrowRight")
-    assert "frame: " in figure.locator(".spoken").nth(0).inner_text()
-    assert "mean" in figure.locator(".spoken").nth(0).inner_text()
-    page.keyboard.press("+")
-    page.wait_for_timeout(50)
-    assert canvas.evaluate(SHOWN) != before
-    page.keyboard.press("0")
-    page.wait_for_timeout(50)
-    assert canvas.evaluate(SHOWN) == before
+    figure = chart(page, "ensemble")
+    with page.expect_download() as download:
+        figure.get_by_role("button", name="Save ensemble as SVG").click()
+    path = tmp_path / "ensemble.svg"
+    download.value.save_as(path)
+    assert "<svg" in path.read_text()
 
 
 def test_paper_and_readers_without_scripts_get_the_plain_picture(report):
@@ -181,16 +191,6 @@ def test_a_chart_follows_the_width_of_the_window(report):
     assert max(narrow) <= 420
     assert max(narrow) != wide
     assert page.evaluate("() => document.scrollingElement.scrollWidth") <= 420
-
-
-def test_a_picture_is_saved_from_the_page(report, tmp_path):
-    page = report()
-    figure = chart(page, "ensemble")
-    with page.expect_download() as download:
-        figure.get_by_role("button", name="Save ensemble as SVG").click()
-    path = tmp_path / "ensemble.svg"
-    download.value.save_as(path)
-    assert "<svg" in path.read_text()
 
 
 def test_pictures_are_dark_on_a_dark_screen_and_light_as_files(report, tmp_path):

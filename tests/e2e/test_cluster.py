@@ -37,64 +37,74 @@ def workers_of(file, **settings):
     return ComputeSettings(backend="distributed", scheduler=str(file), **settings)
 
 
-@pytest.fixture
-def executor(processes):
-    file, _ = processes
-    made = make_executor(workers_of(file))
-    made._client.wait_for_workers(2, timeout=60)
-    yield made
-    made.close()
+class Counted:
+    """What an executor says, and how often it asks whether to go on."""
+
+    def __init__(self):
+        self.lines, self.asked = [], 0
+
+    def check(self):
+        self.asked += 1
 
 
-@pytest.fixture
-def deserted(processes):
-    """The file of a scheduler whose workers are gone."""
-    file, (_, *workers) = processes
-    for worker in workers:
-        worker.kill()
-        worker.wait()
-    return file
+def numbers_of_workers(folder):
+    return {int(path.name.split("-")[1]) for path in folder.glob("[0-9]*-*")}
 
 
-def test_a_killed_worker_costs_nothing_but_time(processes, executor, tmp_path):
-    _, (_, worker, _) = processes
+def test_a_killed_worker_costs_nothing_but_time_and_the_last_one_is_waited_for(processes, tmp_path):
+    file, (_, first, last) = processes
+    heard = Counted()
+    executor = make_executor(workers_of(file, wait_for_workers=2), heard.lines.append, heard.check)
+    executor._client.wait_for_workers(2, timeout=60)
     found = {}
 
     def on_result(number, outcome):
         found[number] = outcome.value
-        if worker.poll() is None and any(tmp_path.glob(f"[0-9]*-{worker.pid}")):  # it has had its share
-            worker.send_signal(signal.SIGKILL)
+        if first.poll() is None and first.pid in numbers_of_workers(tmp_path):  # it has had its share
+            first.send_signal(signal.SIGKILL)
 
     executor.map(functools.partial(slow_square, tmp_path), range(20), on_result)
     assert found == {number: number**2 for number in range(20)}
-    assert worker.wait(10) == -signal.SIGKILL
-    who = {int(path.name.split("-")[1]) for path in tmp_path.glob("[0-9]*-*")}
-    assert worker.pid in who  # it had its share, and the other one did the rest
+    assert first.wait(10) == -signal.SIGKILL
+    who = numbers_of_workers(tmp_path)
+    assert first.pid in who  # it had its share, and the other one did the rest
     assert len(who) == 2
+    assert heard.lines == []
+    found.clear()
+    try:
+        task = functools.partial(slow_square, tmp_path)
+        with pytest.raises(IncompleteRunError, match="had no worker for 2 s"):
+            executor.map(task, range(400), lambda number, _: (found.setdefault(number), last.kill()))
+    finally:
+        executor.close()
+    assert 1 <= len(found) < 10
+    assert len(heard.lines) == 1
 
 
-def test_a_scheduler_that_goes_away_is_one_line(processes, executor, tmp_path):
+def test_other_versions_are_refused_and_a_scheduler_that_goes_away_is_one_line(
+    processes, monkeypatch, tmp_path
+):
     file, (scheduler, *_) = processes
-    found = []
+    executor = make_executor(workers_of(file))
+    executor._client.wait_for_workers(2, timeout=60)
+    here, found, task = cluster.library_versions(), [], functools.partial(slow_square, tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(cluster, "library_versions", lambda: {**here, "numpy": "1.2.3"})
+        with pytest.raises(ConfigError, match=r"has numpy .* instead of 1\.2\.3; install the same versions"):
+            executor.map(task, range(4), lambda number, _: found.append(number))
+    assert not numbers_of_workers(tmp_path)
 
-    def on_result(number, outcome):
+    def on_result(number, _):
         found.append(number)
         if len(found) == 3:
             scheduler.send_signal(signal.SIGKILL)
 
     with pytest.raises(IncompleteRunError, match="stopped; finished tiles are kept") as caught:
-        executor.map(functools.partial(slow_square, tmp_path), range(400), on_result)
+        executor.map(task, range(400), on_result)
+    executor.close()
     assert str(file) in str(caught.value)
     assert "\n" not in str(caught.value)
     assert 3 <= len(found) < 400
-
-
-def test_other_versions_are_refused(executor, monkeypatch, tmp_path):
-    here = cluster.library_versions()
-    monkeypatch.setattr(cluster, "library_versions", lambda: {**here, "numpy": "1.2.3"})
-    with pytest.raises(ConfigError, match=r"has numpy .* instead of 1\.2\.3; install the same versions"):
-        executor.map(functools.partial(slow_square, tmp_path), range(4), lambda item, outcome: None)
-    assert not list(tmp_path.glob("[0-9]*-*"))
 
 
 def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bits(shell, finished):
@@ -116,53 +126,21 @@ def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bi
     assert_same_results(store, finished)
 
 
-class Counted:
-    """What an executor says, and how often it asks whether to go on."""
-
-    def __init__(self):
-        self.lines, self.asked = [], 0
-
-    def check(self):
-        self.asked += 1
-
-
-def test_a_scheduler_without_workers_is_said_and_given_up(deserted):
+def test_a_scheduler_without_workers_is_said_and_given_up(tmp_path):
     heard, words = Counted(), r"had no worker for 1 s \(compute.wait_for_workers\)"
-    with pytest.raises(IncompleteRunError, match=words) as caught:
-        make_executor(workers_of(deserted, wait_for_workers=1), heard.lines.append, heard.check)
-    assert heard.lines == [f"waiting for workers of the dask scheduler {deserted}"]
+    with cluster_processes(tmp_path, 0) as (file, _):
+        with pytest.raises(IncompleteRunError, match=words) as caught:
+            make_executor(workers_of(file, wait_for_workers=1), heard.lines.append, heard.check)
+
+        def stopped():
+            raise InterruptedRunError(signal.SIGTERM)
+
+        with pytest.raises(InterruptedRunError, match="stopped by SIGTERM"):
+            make_executor(workers_of(file), check=stopped)
+    assert heard.lines == [f"waiting for workers of the dask scheduler {file}"]
     assert heard.asked > 3
-    assert str(deserted) in str(caught.value)
+    assert str(file) in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_workers_that_all_leave_are_waited_for_and_given_up(processes, tmp_path):
-    file, (_, *workers) = processes
-    heard = Counted()
-    executor = make_executor(workers_of(file, wait_for_workers=3), heard.lines.append, heard.check)
-    executor._client.wait_for_workers(2, timeout=60)
-    found = []
-
-    def on_result(number, outcome):
-        found.append(number)
-        for worker in workers:
-            worker.kill()
-
-    try:
-        with pytest.raises(IncompleteRunError, match="had no worker for 3 s"):
-            executor.map(functools.partial(slow_square, tmp_path), range(400), on_result)
-    finally:
-        executor.close()
-    assert 1 <= len(found) < 10
-    assert len(heard.lines) == 1
-
-
-def test_a_signal_ends_the_wait_for_workers(deserted):
-    def check():
-        raise InterruptedRunError(signal.SIGTERM)
-
-    with pytest.raises(InterruptedRunError, match="stopped by SIGTERM"):
-        make_executor(workers_of(deserted), check=check)
 
 
 def test_paused_workers_are_not_waited_for_forever(monkeypatch):

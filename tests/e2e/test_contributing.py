@@ -43,9 +43,7 @@ def write_examples(folder):
 def done(tmp_path_factory):
     """The folder in which all commands of the page were run, in order."""
     folder = tmp_path_factory.mktemp("contributing")
-    shutil.copytree(
-        ROOT / "pchem_pipeline", folder / "pchem_pipeline", ignore=shutil.ignore_patterns("__pycache__")
-    )
+    shutil.copytree(ROOT / "pchem_pipeline", folder / "pchem_pipeline")
     write_examples(folder)
     install(folder / "lab_effects", folder / "site")
     (folder / "bin").mkdir()

@@ -16,8 +16,8 @@ CAMERA = """
 run: {store: run.zarr, tile: 8}   # small tiles
 input: {files: [frames/frames.npy], bit_depth: 14}
 simulate:
-  shape: [16, 16]
-  n_frames: 1800
+  shape: [12, 16]
+  n_frames: 1500
   seed: 5
   output: frames
   format: npy
@@ -90,7 +90,7 @@ def test_the_fit_runs_with_the_extended_model_and_loses_its_bias(searched):
     shell, _, before = searched
     truth, after = read(shell, "truth/read_noise_dn"), read(shell, "fit/read_noise_dn")
     bias_before, bias_after = np.median(before - truth), np.median(after - truth)
-    # row noise of 1.2 DN on 3.4 DN: 6 % too much before; the median of 256 pixels is known to 0.01 DN
+    # row noise of 1.2 DN on 3.4 DN: 6 % too much before; the median of 192 pixels is known to 0.012 DN
     assert bias_before > 0.1
     assert abs(bias_after) < bias_before / 5
 
@@ -117,7 +117,7 @@ def test_an_effect_that_the_model_has_is_not_added_twice(searched, fitted, tmp_p
     assert (tmp_path / "run.effects.yaml").read_text() == text
 
 
-def test_a_killed_search_without_the_truth_goes_on_to_the_same_verdict(searched, fitted, tmp_path):
+def test_a_stopped_search_without_the_truth_goes_on_to_the_same_verdict(searched, fitted, tmp_path):
     shell, _, _ = searched
     # the section that made the frames may not tell what was put into them either
     text = CAMERA.replace("row_noise_dn: 1.2", "row_noise_dn: 2.5")
@@ -125,13 +125,12 @@ def test_a_killed_search_without_the_truth_goes_on_to_the_same_verdict(searched,
     (tmp_path / "frames" / "truth.npz").unlink()
     shutil.rmtree(tmp_path / "run.zarr" / "truth")
     markers = tmp_path / "run.zarr" / ".pchem" / "done" / "discrepancy"
-    for wanted, number, code in ((9, signal.SIGTERM, 143), (24, signal.SIGKILL, -signal.SIGKILL)):
-        with other.start("discrepancy", "run.yaml", "--no-refit") as process:
-            while process.poll() is None and len(list(markers.glob("*/*"))) < wanted:
-                time.sleep(0.02)
-            process.send_signal(number)
-            assert process.wait(20) == code  # clusters wait for 30 s
-        assert not (tmp_path / "run.zarr" / "discrepancy.json").exists()
+    with other.start("discrepancy", "run.yaml", "--no-refit") as process:
+        while process.poll() is None and len(list(markers.glob("*/*"))) < 16:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 143  # clusters wait for 30 s
+    assert not (tmp_path / "run.zarr" / "discrepancy.json").exists()
     other.ok("discrepancy", "run.yaml", "--no-refit")
     assert verdict(other) == verdict(shell)
     assert (tmp_path / "run.yaml").read_text() == text  # --no-refit leaves the model alone
@@ -141,8 +140,8 @@ def test_a_killed_search_without_the_truth_goes_on_to_the_same_verdict(searched,
     ("old", "new", "message"),
     [
         ("[row_noise, frame_noise]", "[row_nois]", "unknown effects row_nois"),
-        ("n_frames: 1800", "n_frames: 250", "take more frames"),
-        ("shape: [16, 16]", "shape: [4, 4]", "32 are needed"),
+        ("n_frames: 1500", "n_frames: 250", "take more frames"),
+        ("shape: [12, 16]", "shape: [4, 4]", "32 are needed"),
     ],
 )
 def test_what_cannot_be_searched_is_one_clear_line(tmp_path, old, new, message):

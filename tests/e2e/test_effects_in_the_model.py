@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.without_pictures import undrawn
 
 from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
 from pchem_pipeline.commands.plan import make_plan
@@ -62,7 +63,8 @@ def both(tmp_path_factory):
     before = {"pulls": mean_pulls(store), "facts": dict(store.attributes("ensemble"))}
     configured(folder, EFFECTS)
     before["states"] = states(path)
-    run_stages(find_run(path), ["fit", "maps", "ensemble", "report"], QUIET)
+    with undrawn():
+        run_stages(find_run(path), ["fit", "maps", "ensemble", "report"], QUIET)
     return path, before
 
 

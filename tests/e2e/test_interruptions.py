@@ -26,7 +26,6 @@ def wait_for_stage(run, process, stage):
 def test_stopped_and_killed_again_and_again_it_ends_with_the_same_bits(run, finished):
     """scripts/validation/kills.py has hundreds of moments."""
     for stage, number, code in (
-        ("ingest", signal.SIGKILL, -signal.SIGKILL),
         ("histogram", signal.SIGINT, 130),
         ("fit", signal.SIGTERM, 143),
         ("ensemble", signal.SIGKILL, -signal.SIGKILL),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.commands import Shell
 from helpers.places import ROOT
+from helpers.without_pictures import undrawn
 
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.commands.first_screen import run_to_first_screen
@@ -57,7 +58,8 @@ def joint(tmp_path_factory):
     shell = Shell(folder)
     manual = (ROOT / "docs" / "howto" / "several_exposures.md").read_text(encoding="utf-8")
     [command] = re.findall(r"^\$ (pchem joint .*)$", manual, re.MULTILINE)
-    result = shell.ok(*command.split()[1:])
+    with undrawn():
+        result = shell.ok(*command.split()[1:])
     assert result.stdout.strip() == str(folder.resolve() / "dark.zarr" / "report.html")
     return folder
 

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from helpers.commands import Shell
+from helpers.without_pictures import undrawn
 
 from pchem_pipeline.methods.base import methods
 from pchem_pipeline.store.run_store import RunStore
@@ -23,10 +24,12 @@ def exposures(tmp_path_factory):
         (shell.folder / f"{name}.yaml").write_text(text)
         for stage in ("ingest", "histogram"):
             shell.ok(stage, f"{name}.yaml", "--quiet")
-    shell.ok("run", "bright.yaml", "--quiet")
+    with undrawn():
+        shell.ok("run", "bright.yaml", "--quiet")
     return shell
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_methods_with_other_exposures(exposures):
     result = exposures.ok(
         "methods", "bright.zarr", "--with", "dark.zarr", "--with", "half.zarr", "--study-pixels", "0"

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-SECRET = b"wJalrXUtnFEMI"
+SECRET = "wJalrXUtnFEMI"
 
 
 def ask(url, data=None, method="GET"):
@@ -35,9 +35,9 @@ def put(url, data=b""):
     ask(url, data or None, "PUT")
 
 
-@pytest.fixture
-def server(tmp_path):
-    """The address of an S3 server with nothing in it."""
+@pytest.fixture(scope="module")
+def server():
+    """The address of an S3 server with an empty bucket."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -57,15 +57,23 @@ def server(tmp_path):
 
 
 @pytest.fixture
-def cloud(shell, server, tmp_path):
-    """A shell whose S3 is that server."""
-    return shell.alone(
-        AWS_ENDPOINT_URL=server,
-        AWS_ACCESS_KEY_ID="key",
-        AWS_SECRET_ACCESS_KEY=SECRET.decode(),
-        AWS_DEFAULT_REGION="us-east-1",
-        XDG_CACHE_HOME=str(tmp_path / "cache"),
-    )
+def keys(server, tmp_path):
+    """The environment of a shell whose S3 is that server."""
+    return {
+        "AWS_ENDPOINT_URL": server,
+        "AWS_ACCESS_KEY_ID": "key",
+        "AWS_SECRET_ACCESS_KEY": SECRET,
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "XDG_CACHE_HOME": str(tmp_path / "cache"),
+    }
+
+
+@pytest.fixture
+def cloud(shell, keys, monkeypatch):
+    """A shell with that environment."""
+    for name, value in keys.items():
+        monkeypatch.setenv(name, value)
+    return shell
 
 
 def test_frames_are_read_from_s3_and_fetched_once(cloud, server, camera, finished, tmp_path):
@@ -75,8 +83,7 @@ def test_frames_are_read_from_s3_and_fetched_once(cloud, server, camera, finishe
         "bit_depth", "mode: reference, bit_depth"
     )
     (cloud.folder / "run.yaml").write_text(text)
-    cloud.ok("ingest", "run.yaml")
-    cloud.ok("histogram", "run.yaml")
+    cloud.ok("run", "run.yaml", "--until", "histogram")
     assert_same_results(cloud.folder / "run.zarr", finished, rtol=1e-12, groups=("histogram", "summary"))
     fetched = sorted((tmp_path / "cache").rglob("*.tif"))
     before = [path.stat().st_mtime_ns for path in fetched]
@@ -110,25 +117,24 @@ STORED = (
 @pytest.mark.parametrize(
     "text", [RUN.replace("frames/*.tif", '"s3://lab/a.tif"'), STORED], ids=["frames", "store"]
 )
-def test_a_server_that_does_not_answer_is_one_line(cloud, frames, text):
+def test_a_server_that_does_not_answer_is_one_line(shell, keys, frames, text):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        cloud.environment["AWS_ENDPOINT_URL"] = f"http://127.0.0.1:{free.getsockname()[1]}"
-    cloud.environment["AWS_MAX_ATTEMPTS"] = "1"
-    (cloud.folder / "run.yaml").write_text(text)
-    result = cloud("ingest", "run.yaml")
+        keys |= {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{free.getsockname()[1]}", "AWS_MAX_ATTEMPTS": "1"}
+    (shell.folder / "run.yaml").write_text(text)
+    result = shell.alone(**keys)("ingest", "run.yaml")
     assert result.code == 4
     assert result.last.startswith("pchem: s3://lab/")
     assert "check address, keys and network" in result.last
     assert "Traceback" not in result.stderr
-    assert SECRET.decode() not in result.stderr
+    assert SECRET not in result.stderr
 
 
 def fetched(server, folder):
     """Return the folder with all that the bucket holds, fetched by plain HTTP."""
     last, more = "", True
     while more:
-        page = ask(f"{server}/lab?list-type=2&start-after={quote(last)}").decode()
+        page = ask(f"{server}/lab?list-type=2&prefix=night/run.zarr&start-after={quote(last)}").decode()
         keys = re.findall("<Key>(.*?)</Key>", page)
         for key in keys:
             (folder / key).parent.mkdir(parents=True, exist_ok=True)
@@ -142,6 +148,16 @@ def test_a_run_whose_store_is_on_s3(cloud, server, frames, finished, tmp_path):
     cloud.ok("run", "run.yaml", "--until", "maps")
     store = fetched(server, tmp_path / "first")
     assert_same_results(store, finished, rtol=1e-12, groups=("histogram", "summary", "fit", "maps"))
+    # it is locked for all machines
+    lock = f"{server}/lab/night/run.zarr/.pchem/lock.json"
+    put(lock, b'{"token": "x", "host": "far", "machine": "far 1", "pid": 7}')
+    words = "s3://lab/night/run.zarr is in use by pchem on far (process 7, since "
+    assert words in cloud.refused(75, "ingest", "run.yaml")
+    put(lock, b"{")
+    said = cloud.refused(75, "ingest", "run.yaml")
+    assert "lock.json is damaged; if no pchem command uses this run: python -c" in said
+    code = said.partition('python -c "')[2].rstrip('"')
+    subprocess.run([sys.executable, "-c", code], check=True)
     cloud.ok("export", "s3://lab/night/run.zarr", "--format", "npz", "--output", "out")
     (written,) = (cloud.folder / "out").glob("*.npz")
     with np.load(written) as maps:
@@ -153,36 +169,8 @@ def test_a_run_whose_store_is_on_s3(cloud, server, frames, finished, tmp_path):
     cloud.ok("fit", "run.yaml", "--backend", "processes", "--workers", "1")
     store = fetched(server, tmp_path / "second")
     assert_same_results(store, finished, rtol=1e-12, groups=("histogram", "fit"))
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        ask(lock)
     states = [words.split()[0] for words in cloud.states("s3://lab/night/run.zarr").values()]
     assert states[:4] == ["complete"] * 4
     assert not list(cloud.folder.glob("s3*"))
-
-
-@pytest.mark.long
-def test_a_report_in_a_store_on_s3_begun_from_files(cloud, server, frames, finished, tmp_path):
-    url = "s3://lab/night/run.zarr"
-    options = ("--integration-time", "4.87", "--bit-depth", "14")
-    result = cloud.ok("run", "frames", "--store", url, *options)
-    assert result.stdout.strip() == f"{url}/report.html"
-    assert (cloud.folder / "run.yaml").exists()
-    store = fetched(server, tmp_path / "fetched")
-    assert_same_results(store, finished, rtol=1e-12, groups=("frames", "histogram"))
-    assert 'id="figure-ensemble"' in (store / "report.html").read_text()
-    assert not [path for path in store.rglob("*") if path.is_file() and SECRET in path.read_bytes()]
-
-
-def test_a_store_on_s3_is_locked_for_all_machines(cloud, server, frames):
-    (cloud.folder / "run.yaml").write_text(STORED)
-    cloud.ok("ingest", "run.yaml")
-    lock = f"{server}/lab/night/run.zarr/.pchem/lock.json"
-    put(lock, b'{"token": "x", "host": "far", "machine": "far 1", "pid": 7}')
-    words = "s3://lab/night/run.zarr is in use by pchem on far (process 7, since "
-    assert words in cloud.refused(75, "ingest", "run.yaml")
-    put(lock, b"{")
-    said = cloud.refused(75, "ingest", "run.yaml")
-    assert "lock.json is damaged; if no pchem command uses this run: python -c" in said
-    code = said.partition('python -c "')[2].rstrip('"')
-    subprocess.run([sys.executable, "-c", code], env=cloud.environment, check=True)
-    cloud.ok("ingest", "run.yaml")
-    with pytest.raises(urllib.error.HTTPError, match="404"):
-        ask(lock)

@@ -76,12 +76,14 @@ def test_a_changed_setting_redoes_just_the_stages_that_read_it(shell, frames, fi
 
 
 @pytest.mark.parametrize(
-    ("tile", "backend", "mode"), [(64, "processes", "copy"), (8, "distributed", "reference")]
+    ("tile", "backend", "workers", "mode"), [(64, "processes", 1, "copy"), (8, "distributed", 2, "reference")]
 )
-def test_neither_tiling_nor_backend_nor_mode_changes_the_answer(shell, frames, finished, tile, backend, mode):
+def test_neither_tiling_nor_backend_nor_mode_changes_the_answer(
+    shell, frames, finished, tile, backend, workers, mode
+):
     text = RUN.replace("tile: 8", f"tile: {tile}").replace("bit_depth", f"mode: {mode}, bit_depth")
     (shell.folder / "run.yaml").write_text(text)
-    shell.ok("run", "run.yaml", "--until", "ensemble", "--backend", backend, "--workers", "2")
+    shell.ok("run", "run.yaml", "--until", "ensemble", "--backend", backend, "--workers", workers)
     assert_same_results(finished, shell.folder / "run.zarr", rtol=1e-12)
 
 

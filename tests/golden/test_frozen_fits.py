@@ -1,4 +1,7 @@
-"""Fits of every kind are those that were frozen: a few dozen histograms, the odd ones among them, all fields.
+"""Fits of every kind are those that were frozen, all fields of a few dozen histograms.
+
+These cover read noise, exposure and gain, and some are such as no model describes: one code, two, no
+electrons, peaks that cannot be told apart, an even spread, samples at the end of the ADC, a few far out.
 
 ``FREEZE_FITS=1 pytest tests/golden/test_frozen_fits.py`` freezes anew what the package finds today; what
 changed, and why, belongs into the commit. Whole runs are compared by ``scripts/validation/nets.py``.
@@ -11,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
 from pchem_pipeline.effects.framework.registry import effect_class
@@ -40,8 +42,6 @@ SETTINGS = {
 SAMPLES = (1.0, 3.0, 8.0, 0.0)  # exposures of a joint fit, relative; the last holds no electrons
 
 HISTOGRAM = ("counts", "origin")
-
-Arrays = dict[str, NDArray[Any]]
 
 
 def fitted(kind, histograms):
@@ -149,56 +149,9 @@ def differences(old, new):
     return wrong
 
 
-def drawn_histograms():
-    """Draw histograms that cover read noise, exposure and gain, and some such as no model describes."""
-    rng = np.random.default_rng(20261122)
-    found: Arrays = {}
-
-    def keep(name, x):
-        x = np.clip(np.rint(x), *ADC).astype(np.int64)
-        origin = x.min(axis=1)
-        counts = np.zeros((x.shape[0], int((x.max(axis=1) - origin).max()) + 1), np.uint16)
-        np.add.at(counts, (np.arange(x.shape[0])[:, None], x - origin[:, None]), 1)
-        found[f"{name}_counts"], found[f"{name}_origin"] = counts, origin
-
-    def pixels(n, frames, exposure, step, noise):
-        k = rng.poisson(np.reshape(exposure, (-1, 1)), (n, frames)).astype(float)
-        g, mu, s = (rng.uniform(*each, (n, 1)) for each in (step, (95, 105), noise))
-        return mu, g, k, s * rng.standard_normal(k.shape)
-
-    mu, step, k, read = pixels(40, 3000, np.geomspace(0.05, 9, 40), (8, 14), (0.18, 0.55))
-    fine = mu + step * (k + read)
-    fine[:6] += step[:6] * 0.3 * np.sqrt(k[:6]) * rng.standard_normal(k[:6].shape)
-    fine[6:10] += step[6:10] * rng.choice([-1.0, 0.0, 1.0], p=[0.1, 0.8, 0.1], size=k[6:10].shape)
-    n = fine.shape[1]
-    odd = [
-        np.full(n, 100.0),
-        100.3 + 3.0 * rng.standard_normal(n),
-        100.0 + (rng.random(n) < 0.5),
-        100.0 + 11.0 * (rng.poisson(2.0, n) + 1.4 * rng.standard_normal(n)),
-        16_340 + 11.0 * (rng.poisson(2.0, n) + 0.3 * rng.standard_normal(n)),
-        rng.uniform(50, 300, n),
-        100.0 + 11.0 * (rng.poisson(1.5, n) + 0.3 * rng.standard_normal(n)) + 250.0 * (rng.random(n) < 0.001),
-    ]
-    keep("fine", np.concatenate([fine, np.stack(odd)]))
-    mu, step, k, read = pixels(24, 3000, np.geomspace(0.3, 6, 24), (1.1, 5), (0.2, 0.45))
-    keep("coarse", np.concatenate([mu + step * (k + read), np.stack(odd[:3])]))
-    exposures = np.linspace(0.3, 0.8, 16)
-    step, mu, s = (rng.uniform(*each, (16, 1)) for each in ((3.0, 12.0), (95, 105), (0.25, 0.9)))
-    for j, scale in enumerate(SAMPLES):
-        k = rng.poisson(scale * exposures[:, None], (16, 1500))
-        keep(f"joint_{j}", mu + step * (k + s * rng.standard_normal(k.shape)))
-    for j in range(len(SAMPLES)):
-        for name in HISTOGRAM:
-            found[f"joint_{name}_{j}"] = found.pop(f"joint_{j}_{name}")
-    return found
-
-
 def freeze():
-    """Keep today's fits of the frozen histograms, which are drawn anew only where there are none."""
-    histograms = drawn_histograms()
-    if FROZEN.exists():
-        with np.load(FROZEN) as stored:
-            histograms = {name: array for name, array in stored.items() if "/" not in name}
+    """Keep today's fits of the frozen histograms."""
+    with np.load(FROZEN) as stored:
+        histograms = {name: array for name, array in stored.items() if "/" not in name}
     answers = {f"{kind}/{name}": each for kind in SETTINGS for name, each in fitted(kind, histograms).items()}
     np.savez_compressed(FROZEN, **histograms, **answers)

@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 from helpers.report_material import draw_dn, report_data
+from helpers.without_pictures import page_without_pictures
 
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.report.data import ReportData
-from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.inspector import InspectorData, PixelSample
-from pchem_pipeline.report.pages.page import Drawn
-from pchem_pipeline.report.pages.report import render_report
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.report.inspector import inspector_data, read_maps
 from pchem_pipeline.stages.report.pixels import choose_inspected
@@ -61,16 +59,6 @@ def inspected(store: RunStore, data: ReportData) -> ReportData:
     """Return the same report with its inspector."""
     inspector = inspector_of(store, data.maps, data.fit, [(0, 0)])
     return replace(data, inspector=lambda: inspector, pixels=data.pixels[:1])
-
-
-def page_without_pictures(data: ReportData) -> str:
-    """Return the page with a dot for every figure: fast."""
-
-    def dots(figures: Sequence[Figure]) -> dict[str, Drawn]:
-        dot = Drawn("data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA=", 10, 10)
-        return {figure.name: dot for figure in figures}
-
-    return render_report(data, dots)["report.html"]
 
 
 def make_run(

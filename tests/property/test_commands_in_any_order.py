@@ -13,7 +13,7 @@ from hypothesis.strategies import floats, sampled_from
 CAMERA = """
 run: {store: truth.zarr, tile: 8}
 simulate:
-  {shape: [12, 16], n_frames: 900, seed: 5, output: frames, frames_per_file: 300, integration_time: 1.0}
+  {shape: [10, 12], n_frames: 900, seed: 5, output: frames, frames_per_file: 300, integration_time: 1.0}
 """
 RUN = """
 run: {{store: {store}, tile: {tile}}}

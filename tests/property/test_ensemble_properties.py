@@ -16,8 +16,6 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.model.maps.maps import display_edges
-from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile
 
 RNG = np.random.default_rng(21)
@@ -79,19 +77,6 @@ def test_numbers_have_the_largest_joint_mass(exposure, gain, bias, noise, data):
     # a code where two numbers are as good as alike may have either; one that is never seen may have any
     known = (most > 1e-16) & ((joint > (1 - 1e-6) * most).sum(axis=0) == 1)
     np.testing.assert_array_equal(found[known], joint.argmax(axis=0)[known])
-
-
-@given(st.lists(st.floats(allow_nan=False, allow_infinity=False, width=32), min_size=1, max_size=40))
-@settings(deadline=None)
-def test_the_display_of_a_map_follows_the_ranks(values):
-    array, levels = np.array(values), np.arange(1, 100) / 100
-    known = Ordered.of(array)
-    edges = display_edges(known, levels)
-    assert (edges[1:] >= edges[:-1]).all()
-    found = np.searchsorted(edges, array, side="right") / 100
-    # the root of 3 q^2 - 2 q^3 = rank in 0..1, in closed form
-    expected = 0.5 - np.sin(np.arcsin(1.0 - 2.0 * known.shares(array)) / 3.0)
-    assert (np.abs(found + 0.005 - expected) < 0.005 + 1e-9).all()
 
 
 _N = 24

@@ -14,7 +14,7 @@ CANDIDATES = (
     "branching_counts", "overdispersed_counts", "signal_dependent_noise", "nonlinearity",
     "heavy_tailed_noise", "noise_skew", "row_noise",
 )  # fmt: skip
-SETTINGS = DiscrepancySettings(replicates=24, candidates=CANDIDATES, seed=3)
+SETTINGS = DiscrepancySettings(replicates=20, candidates=CANDIDATES, seed=3)
 
 
 def branching_numbers(rng, mean, branching, size):
@@ -59,10 +59,9 @@ def counted(x, **sample):
     return SampleHistograms(np.array(counts, np.uint32), origin, **sample)
 
 
-@pytest.mark.parametrize("seed", [101, 103])
-def test_a_peak_that_is_taken_for_that_of_no_electron_is_put_right_with_the_effect(seed):
+def test_a_peak_that_is_taken_for_that_of_no_electron_is_put_right_with_the_effect():
     """The plain fit of some bright pixels is an electron off; with the effect from there, too, it misfits."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(101)
     h, step, bias = (rng.uniform(*limits, PIXELS) for limits in ((0.6, 4.0), (13.0, 15.0), (80.0, 120.0)))
     k = branching_numbers(rng, np.broadcast_to(h[:, None], (PIXELS, SAMPLES)), 0.1, (PIXELS, SAMPLES))
     electrons = k + 0.2 * rng.normal(size=k.shape)

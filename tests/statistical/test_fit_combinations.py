@@ -10,14 +10,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 from iminuit import Minuit
-from numpy.typing import NDArray
 
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-Array = NDArray[np.float64]
 
 N, FIRST, N_CODES, FRAMES = 240, 40, 330, 3000
 LAW = SampleLaw().with_variance(per_electron=0.02).with_levels(curvature=0.006)

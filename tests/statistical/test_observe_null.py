@@ -7,7 +7,7 @@ from helpers.small_stacks import small_stack
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import observe
 
-N_STACKS, SHAPE, N_FRAMES, BLOCK = 60, (24, 24), 600, 50
+N_STACKS, SHAPE, N_FRAMES, BLOCK = 45, (24, 24), 600, 50
 LIMIT = 5.0 / np.sqrt(N_STACKS)
 #: Statistics of events that all but never happen without an effect: always 0.
 SILENT = (

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.drawn_pixels import draw
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 from scipy.stats import binom, kstest
 
@@ -14,8 +13,6 @@ from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
-
-Array = NDArray[np.float64]
 
 
 def judge_together(fit):

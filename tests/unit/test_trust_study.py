@@ -71,12 +71,11 @@ def test_pixels_are_drawn_again_by_their_number_and_counted_in_tables():
     assert trust_study.interval(0, 1000) == "0 (0 to 0.37)"
 
 
-def test_runs_are_compared_with_what_was_simulated(tmp_path, monkeypatch):
+def test_runs_are_compared_with_what_was_simulated(tmp_path, monkeypatch, undrawn):
     good = trust_runs.study_run(0, tmp_path / "good", "none")
     assert good["wrong"] == []
     assert not good["traceback"]
     assert good["pixels"] > 0
-    assert not trust_runs.study_run(0, tmp_path / "repeated", "repeated")["silent"]
     brighter = ("nothing", lambda case: case.truth["quanta_exposure"].__imul__(1.2))
     monkeypatch.setitem(trust_runs.MISHAPS, "none", brighter)
     bad = trust_runs.study_run(0, tmp_path / "bad", "none")

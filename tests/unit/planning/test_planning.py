@@ -263,18 +263,16 @@ def test_rivals_need_more_frames_than_the_bound_asks_for(exposure, noise, gain):
     there = point(exposure, noise, gain)
     plan = one(["conversion_gain=1%"], there)
     assert plan.needed > 2 * plan.bounds[0]
-    spoilt, good = (simulated(["conversion_gain=1%"], there, n, 400) for n in (*plan.bounds, plan.needed))
-    assert spoilt.n_flagged > 0.2 * 400
-    assert good.n_flagged < (0.05 + 5 * np.sqrt(0.05 * 0.95 * (1 / 200 + 1 / 400))) * 400
+    n, few = 200, (0.05 + 5 * np.sqrt(0.05 * 0.95 * (1 / 200 + 1 / 200))) * 200
+    spoilt, good = (simulated(["conversion_gain=1%"], there, k, n) for k in (*plan.bounds, plan.needed))
+    assert spoilt.n_flagged > 0.2 * n
+    assert good.n_flagged < few
     assert good.checks[0].rmse < 0.01
-
-
-def test_near_two_dn_per_electron_the_best_exposure_leaves_few_pixels_flagged():
-    plan = one(["conversion_gain=1%"], point(1.6, 0.2, 0.47))
-    best = point(plan.best_exposure, 0.2, 0.47)
-    found = simulated(["conversion_gain=1%"], best, plan.best_frames, 400, every_flag=True)
-    assert found.n_flagged < (0.05 + 5 * np.sqrt(0.05 * 0.95 * (1 / 200 + 1 / 400))) * 400
-    assert found.checks[0].reached
+    if gain > 0.4:  # the best exposure leaves few pixels flagged in anything
+        best = point(plan.best_exposure, noise, gain)
+        found = simulated(["conversion_gain=1%"], best, plan.best_frames, n, every_flag=True)
+        assert found.n_flagged < few
+        assert found.checks[0].reached
 
 
 def test_frames_of_no_use_are_not_simulated():

@@ -22,7 +22,7 @@ GROUPS = ("frames", "histogram", "summary")
 
 @pytest.fixture(scope="module")
 def frames():
-    stack = small_stack((70, 20), 700, 3)
+    stack = small_stack((70, 12), 700, 3)
     stack[650, 5, 6] = 30_000  # a glitch among the new frames
     return stack
 

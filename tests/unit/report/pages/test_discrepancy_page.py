@@ -225,12 +225,6 @@ def test_hostile_words_are_shown_not_run(base: ReportData) -> None:
         assert "{{ 7*7 }}" in page.text
 
 
-def test_hostile_tags_are_drawn_as_they_are() -> None:
-    spoiled = json.loads(json.dumps(result("named")).replace("row_noise", "<script>$x^{"))
-    for figure in discrepancy_figures(DiscrepancyData(Verdict.model_validate(spoiled))):
-        figure.draw(Look())
-
-
 def test_each_array_may_be_missing() -> None:
     whole = discrepancy_data("named")
     names = [figure.name for figure in discrepancy_figures(whole)]
@@ -245,7 +239,7 @@ def test_each_array_may_be_missing() -> None:
     ]
 
 
-@pytest.mark.parametrize("shape", [(1, 6), (3, 3), (2, 90)])
+@pytest.mark.parametrize("shape", [(1, 6), (2, 90)])
 def test_odd_sensors_are_drawn(shape: tuple[int, int]) -> None:
     arrays = evidence_arrays(evidence(shape, n_frames=40))
     for figure in discrepancy_figures(DiscrepancyData(verdict_of("named"), arrays)):

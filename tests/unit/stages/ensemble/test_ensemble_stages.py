@@ -133,7 +133,7 @@ def test_no_integration_time_means_no_charge_rate(sensor, tmp_path):
     assert "integration_time" in context.notes[0]
 
 
-@pytest.mark.parametrize("kind", ["dark", "light", "unknown"])
+@pytest.mark.parametrize("kind", ["dark", "light"])
 def test_dark_current_is_of_the_dark_alone(sensor, tmp_path, kind):
     completed(sensor(), "maps")
     context = make_context(tmp_path, input={"kind": kind})

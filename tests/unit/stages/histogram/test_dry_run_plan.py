@@ -64,7 +64,7 @@ def _run(path):
     return json.loads(outcome.stdout)
 
 
-@pytest.mark.parametrize(("limit", "lengths"), [(None, (256, 1024)), (320, (1024,))])
+@pytest.mark.parametrize(("limit", "lengths"), [(None, (256, 1024)), (320, (256,))])
 def test_memory_is_what_was_said_whatever_the_number_of_frames(camera, limit, lengths):
     compute = {"workers": 2, **({} if limit is None else {"max_memory": limit})}
     peaks = []

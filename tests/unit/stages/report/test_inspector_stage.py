@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers.inspector_material import inspector_of, page_without_pictures, write_run
+from helpers.inspector_material import inspector_of, write_run
 from helpers.report_material import report_data
+from helpers.without_pictures import page_without_pictures
 
 from pchem_pipeline.base import variables
 from pchem_pipeline.base.variables import Variable

@@ -5,8 +5,8 @@ import shutil
 
 import numpy as np
 import pytest
-from helpers.inspector_material import page_without_pictures
 from helpers.stage_runs import completed, stage_context
+from helpers.without_pictures import page_without_pictures
 from helpers.written_fit import write_fit
 
 from pchem_pipeline.base.errors import ConfigError
