@@ -145,7 +145,7 @@ def test_effective_tests_of_copies_are_those_of_one() -> None:
 
 def test_an_effect_that_only_widens_a_statistic_makes_no_false_deviation() -> None:
     rng = np.random.default_rng(17)
-    tests, low, unaware = 400, 0, 0
+    tests, low, unaware = 200, 0, 0
     for _ in range(tests):
         before = _null(rng)
         wide = np.where(np.arange(40) == 7, 4.0, 1.0)
@@ -322,7 +322,7 @@ def test_a_right_model_fitted_to_other_frames_is_below_the_floor_in_19_of_20() -
     null, scale = _null(rng, b=200), np.ones(40)
     metric, scale[0] = StatisticsGap(null, 1000), 10.0
     counted = []
-    for _ in range(300):
+    for _ in range(150):
         replicates = 0.3 + scale * rng.standard_normal((24, 40))
         error = np.zeros((1, 40))
         error[0, 0] = 10.0
@@ -331,7 +331,7 @@ def test_a_right_model_fitted_to_other_frames_is_below_the_floor_in_19_of_20() -
         gaps = [metric.gap(z, mean, replicates, s) for s in (error, None)]
         counted.append([gap.at_floor for gap in gaps])
     right, fixed = np.mean(counted, axis=0)
-    assert abs(right - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 300)
+    assert abs(right - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 150)
     assert fixed < 0.9
 
 

@@ -104,7 +104,6 @@ def test_a_poor_sensor_with_a_bent_curve_is_learnt_under_its_law():
 @pytest.mark.parametrize(
     "effect",
     [
-        PixelCorrection(threshold_dn=32),
         PixelCorrection(threshold_dn=32, region=Region(columns=((0, 10),))),
         PixelCorrection(threshold_dn=28, share=0.6, predictor="mean"),
         PixelCorrection(threshold_dn=18),
