@@ -145,7 +145,7 @@ def test_a_strength_is_told_though_the_plain_fit_has_the_bias_off_by_an_electron
 
 def test_rare_and_wide_tails_are_told_though_they_led_plain_fits_astray() -> None:
     """A fit that must count a sample far below all others lowers the bias for it, at times by electrons."""
-    frames = frames_of(mixture(np.random.default_rng(21), 0.003, 8.0)[:1000], 22, exposure=3.5)
+    frames = frames_of(mixture(np.random.default_rng(21), 0.003, 8.0)[:1500], 22, exposure=3.5)
     maps = fitted_maps(frames, np.zeros((SIDE, SIDE), np.bool_))
     mistaken = np.abs(maps.quanta_exposure - 3.5)[maps.usable] > 0.5
     assert np.mean(mistaken) > 0.02
