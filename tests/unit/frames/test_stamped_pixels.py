@@ -67,7 +67,11 @@ STAMPED = {
     ("name", "layout"),
     [
         *((name, "npy") for name in STAMPED),
-        *((name, layout) for name in ("16 bits", "8 bits, binary") for layout in ("tiff, zlib", "zarr", "dcimg")),
+        *(
+            (name, layout)
+            for name in ("16 bits", "8 bits, binary")
+            for layout in ("tiff, zlib", "zarr", "dcimg")
+        ),
         ("32 bits", "tiff, zlib"),
         ("32 bits", "zarr"),
     ],

@@ -264,7 +264,9 @@ def test_offsets_that_jump_or_alternate_and_lamps_that_drift_are_no_two_exposure
 def test_a_period_of_the_frames_and_even_and_odd_ones_are_told_apart() -> None:
     rng = np.random.default_rng(6)
     t = np.arange(SHAPE[0])[:, None, None]
-    wave = by_name(without_codes(stack(rng, SHAPE, lambda dn: dn + 0.35 * np.sin(2 * np.pi * t / 7.3))))["period"]
+    wave = by_name(without_codes(stack(rng, SHAPE, lambda dn: dn + 0.35 * np.sin(2 * np.pi * t / 7.3))))[
+        "period"
+    ]
     assert wave.found
     period = float(wave.where.split()[1])
     assert abs(1.0 / period - 1.0 / 7.3) < 1.0 / SHAPE[0]
