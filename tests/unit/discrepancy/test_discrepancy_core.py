@@ -93,13 +93,8 @@ def test_splits_share_no_frame_and_keep_blocks_whole() -> None:
         blocks = part.reshape(-1, 20)
         assert np.all(np.diff(blocks, axis=1) == 1)
         assert np.all(blocks[:, 0] % 20 == 0)
-
-
-def test_splits_see_the_same_stretch_of_the_run() -> None:
-    splits = split_frames(np.arange(6000), 100)
-    centres = [part.mean() for part in (splits.train, splits.test, splits.final)]
-    # a slow drift must look alike in all three: centres within a block of the middle
-    assert np.ptp(centres) < 100
+    # a slow drift must look alike in all three: their middles are a block apart at most
+    assert np.ptp([part.mean() for part in parts]) <= 20
 
 
 def test_no_block_spans_a_gap_in_the_numbering() -> None:
@@ -174,20 +169,6 @@ def test_factors_and_their_errors_are_those_of_least_squares() -> None:
     pulls_ = np.array(pulls)
     assert np.all(np.abs(pulls_.mean(axis=0)) < 5 / np.sqrt(400))
     assert np.all(np.abs(pulls_.std(axis=0) - 1) < 5 / np.sqrt(800))
-
-
-def test_the_right_one_of_three_is_the_likeliest() -> None:
-    rng = np.random.default_rng(15)
-    prints = {tag: rng.normal(size=40) for tag in ("row_noise", "frame_noise", "exposure_drift")}
-    hypotheses = [_hypothesis(tag, print_) for tag, print_ in prints.items()]
-    noise = Noise(UNIT.times(0.5), 0.1)
-    shift = 3.0 * prints["frame_noise"] + rng.normal(size=40) / np.sqrt(2.0)
-    sets = likeliest_sets(hypotheses, shift, noise)
-    assert {h.tag for h in sets[0].hypotheses} == {"frame_noise"}
-    best = sets[0].log_score(shift, noise)
-    for other in ("row_noise", "exposure_drift"):
-        fit = fit_set([_hypothesis(other, prints[other])], shift, noise)
-        assert fit.log_score(shift, noise) < best - 5.0
 
 
 def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_sensor() -> None:

@@ -89,33 +89,22 @@ def parts_of(frames):
 
 
 @pytest.mark.parametrize(
-    ("add", "region"),
+    ("seed", "add", "place", "least"),
     [
-        (rows_of_columns, Region(columns=((17, 22),))),
-        (frames_of_quadrant, Region(rows=((12, 24),), columns=((0, 12),))),
-        (every_eighth, Region.model_validate("every=8/3")),
+        (1, rows_of_columns, Region(columns=((17, 22),)), 0.8),
+        (1, frames_of_quadrant, Region(rows=((12, 24),), columns=((0, 12),)), 0.8),
+        (1, every_eighth, Region.model_validate("every=8/3"), 0.8),
+        (3, rows_of_frames, When(range=((600, 760),)), 0.8),
+        # what no map and no series of means shows
+        (1, tails_of_columns, Region(columns=((14, 18),)), 0.7),
+        (1, tails_of_frames, When(range=((640, 800),)), 0.6),
     ],
 )
-def test_a_part_of_the_sensor_that_differs_is_suspected(add, region):
-    [part] = parts_of(camera(1, add))
-    assert part.when is None
-    assert part.region.overlap(region, SHAPE) >= 0.8
-
-
-def test_frames_that_differ_are_suspected():
-    [part] = parts_of(camera(3, rows_of_frames))
-    assert part.region is None
-    assert part.when.overlap(When(range=((600, 760),)), FRAMES) >= 0.8
-
-
-def test_a_part_of_sensor_or_run_with_heavy_tails_is_suspected():
-    """What no map and no series of means shows."""
-    [part] = parts_of(camera(1, tails_of_columns))
-    assert part.when is None
-    assert part.region.overlap(Region(columns=((14, 18),)), SHAPE) >= 0.7
-    [part] = parts_of(camera(1, tails_of_frames))
-    assert part.region is None
-    assert part.when.overlap(When(range=((640, 800),)), FRAMES) >= 0.6
+def test_a_part_of_sensor_or_run_that_differs_is_suspected(seed, add, place, least):
+    [part] = parts_of(camera(seed, add))
+    found, other = (part.region, part.when) if isinstance(place, Region) else (part.when, part.region)
+    assert other is None
+    assert found.overlap(place, SHAPE if isinstance(place, Region) else FRAMES) >= least
 
 
 @pytest.mark.parametrize("add", [nothing, everywhere, tails_everywhere])
@@ -251,18 +240,10 @@ def test_what_is_a_spot_by_itself_is_not_cut_off_by_the_part_that_showed_it():
     assert SensorWindow.whole((26, 24)).found(image, part).region == part.region
 
 
-def split_of(frames):
-    return ObservedFrames.of(stacked(frames)).frames
-
-
-def stacked(frames):
-    numbers = np.arange(len(frames))
-    splits = split_frames(numbers, block_length(len(frames)))
-    return FrameStack(frames, numbers, splits, len(frames), 12, 1.0)
-
-
 def test_the_ends_of_a_range_are_told_beyond_the_blocks_that_were_not_seen():
-    frames = split_of(camera(11, late_flicker, (16, 24), 1400))
+    numbers, splits = np.arange(1400), split_frames(np.arange(1400), block_length(1400))
+    stack = FrameStack(camera(11, late_flicker, (16, 24), 1400), numbers, splits, 1400, 12, 1.0)
+    frames = ObservedFrames.of(stack).frames
     [part] = frames.parts
     assert part.region is None
     assert part.when.overlap(When(range=((1176, 1336),)), 1400) >= 0.9
