@@ -76,7 +76,7 @@ def test_too_few_codes_hold_no_edges(n):
     assert few_shifts(np.full(n, 0.01), np.full(n, 200.0)) is None
 
 
-FRAMES, SIDE, WIDTH = 900, 12, 40
+FRAMES, SIDE, WIDTH = 600, 12, 40
 
 
 def tilted(rms: float) -> NDArray[np.uint16]:
