@@ -19,6 +19,9 @@ from numba.core.ccallback import CFunc
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, DefaultPassBuilder, _LowerResult
 from numba.core.compiler_machinery import register_pass
+from numba.core.datamodel import register_default
+from numba.core.datamodel.models import OpaqueModel
+from numba.core.imputils import lower_constant
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
 
@@ -159,8 +162,27 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
         return self.callee._numba_type_
 
 
+class _CalleeType(numba.types.Dispatcher):  # type: ignore[misc]
+    """A kernel that another one names or is given: called by name, so it needs no address.
+
+    The address of its object, numba's own way, holds for one process: what has it in it is in no cache.
+    """
+
+
+register_default(_CalleeType)(OpaqueModel)
+
+
+@lower_constant(_CalleeType)  # type: ignore[untyped-decorator]
+def _no_address(context: Any, builder: Any, kind: Any, kernel: Any) -> Any:
+    return context.get_dummy_value()
+
+
 class _Callee(CPUDispatcher):  # type: ignore[misc]
     """A kernel as other kernels see it."""
+
+    @property
+    def _numba_type_(self) -> Any:
+        return _CalleeType(self)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the signature of a call; numba's own way is to compile anew for each constant."""

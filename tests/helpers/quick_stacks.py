@@ -44,13 +44,13 @@ def sums_of(frames: Array, block: int = 256) -> StackSums:
     """The summaries as the stage ``histogram`` makes them; odd frames are in none of the sums."""
     lines = line_sums(frames)
     mean, variance = frame_statistics(lines.row_sum, lines.row_sum_square, frames.shape[2])
-    _, digest = np.unique(frames.reshape(len(frames), -1), axis=0, return_inverse=True)
+    _, digest = np.unique([hash(frame.tobytes()) for frame in frames], return_inverse=True)
     level = np.median(lines.row_sum - np.median(lines.row_sum, axis=0), axis=1) / frames.shape[2]
     scores = frame_scores(lines.row_sum, lines.row_sum_square, frames.shape[2])
     moved = MovedFrames()
     for part in np.array_split(frames[:, :ROW_GROUP], -(-len(frames) // 256)):
         moved.add(part)
-    odd = odd_frames(level, variance, digest.ravel(), frames[0].size, scores=scores, moved=moved.found)
+    odd = odd_frames(level, variance, digest, frames[0].size, scores=scores, moved=moved.found)
     numbers = np.setdiff1d(np.arange(len(frames)), left_out(odd, len(frames)))
     frames = frames[numbers]
     n, ny, nx = frames.shape

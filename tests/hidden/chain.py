@@ -112,11 +112,7 @@ def hide(
 
 
 def _one_frame(
-    t: int,
-    sensor: Sensor,
-    effects: tuple[Hidden, ...],
-    light: np.random.Generator,
-    dark: np.random.Generator,
+    t: int, sensor: Sensor, effects: tuple[Hidden, ...], light: np.random.Generator, dark: np.random.Generator
 ) -> np.ndarray:
     h = sensor.exposure
     for effect in effects:

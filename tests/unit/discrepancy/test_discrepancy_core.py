@@ -93,13 +93,8 @@ def test_splits_share_no_frame_and_keep_blocks_whole() -> None:
         blocks = part.reshape(-1, 20)
         assert np.all(np.diff(blocks, axis=1) == 1)
         assert np.all(blocks[:, 0] % 20 == 0)
-
-
-def test_splits_see_the_same_stretch_of_the_run() -> None:
-    splits = split_frames(np.arange(6000), 100)
-    centres = [part.mean() for part in (splits.train, splits.test, splits.final)]
-    # a slow drift must look alike in all three: centres within a block of the middle
-    assert np.ptp(centres) < 100
+    # a slow drift must look alike in all three: their middles are a block apart at most
+    assert np.ptp([part.mean() for part in parts]) <= 20
 
 
 def test_no_block_spans_a_gap_in_the_numbering() -> None:
@@ -145,7 +140,7 @@ def test_effective_tests_of_copies_are_those_of_one() -> None:
 
 def test_an_effect_that_only_widens_a_statistic_makes_no_false_deviation() -> None:
     rng = np.random.default_rng(17)
-    tests, low, unaware = 400, 0, 0
+    tests, low, unaware = 200, 0, 0
     for _ in range(tests):
         before = _null(rng)
         wide = np.where(np.arange(40) == 7, 4.0, 1.0)
@@ -174,20 +169,6 @@ def test_factors_and_their_errors_are_those_of_least_squares() -> None:
     pulls_ = np.array(pulls)
     assert np.all(np.abs(pulls_.mean(axis=0)) < 5 / np.sqrt(400))
     assert np.all(np.abs(pulls_.std(axis=0) - 1) < 5 / np.sqrt(800))
-
-
-def test_the_right_one_of_three_is_the_likeliest() -> None:
-    rng = np.random.default_rng(15)
-    prints = {tag: rng.normal(size=40) for tag in ("row_noise", "frame_noise", "exposure_drift")}
-    hypotheses = [_hypothesis(tag, print_) for tag, print_ in prints.items()]
-    noise = Noise(UNIT.times(0.5), 0.1)
-    shift = 3.0 * prints["frame_noise"] + rng.normal(size=40) / np.sqrt(2.0)
-    sets = likeliest_sets(hypotheses, shift, noise)
-    assert {h.tag for h in sets[0].hypotheses} == {"frame_noise"}
-    best = sets[0].log_score(shift, noise)
-    for other in ("row_noise", "exposure_drift"):
-        fit = fit_set([_hypothesis(other, prints[other])], shift, noise)
-        assert fit.log_score(shift, noise) < best - 5.0
 
 
 def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_sensor() -> None:
@@ -322,7 +303,7 @@ def test_a_right_model_fitted_to_other_frames_is_below_the_floor_in_19_of_20() -
     null, scale = _null(rng, b=200), np.ones(40)
     metric, scale[0] = StatisticsGap(null, 1000), 10.0
     counted = []
-    for _ in range(300):
+    for _ in range(150):
         replicates = 0.3 + scale * rng.standard_normal((24, 40))
         error = np.zeros((1, 40))
         error[0, 0] = 10.0
@@ -331,7 +312,7 @@ def test_a_right_model_fitted_to_other_frames_is_below_the_floor_in_19_of_20() -
         gaps = [metric.gap(z, mean, replicates, s) for s in (error, None)]
         counted.append([gap.at_floor for gap in gaps])
     right, fixed = np.mean(counted, axis=0)
-    assert abs(right - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 300)
+    assert abs(right - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 150)
     assert fixed < 0.9
 
 

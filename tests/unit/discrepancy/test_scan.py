@@ -36,25 +36,24 @@ def disc() -> Mask:
     ("mask", "shift", "least"),
     [
         (mask_of(columns=[40, 56]), 0.7, 0.9),
-        (mask_of(rows=[17, 18]), 1.5, 1.0),
-        (mask_of(rows=[0, 24], columns=[32, 64]), 0.8, 0.9),
+        (mask_of(rows=[17, 18]), -1.5, 1.0),
+        (mask_of(rows=[0, 24], columns=[32, 64]), -0.8, 0.9),
         (mask_of(taps={"every": 8, "which": 5}), 1.0, 1.0),
         (mask_of(columns=[12, 64]), 0.7, 0.9),
-        (disc(), 1.5, 0.8),
+        (disc(), -1.5, 0.8),
     ],
 )
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_place_is_found_where_it_is(mask: Mask, shift: float, least: float, sign: float) -> None:
+def test_a_place_is_found_where_it_is(mask: Mask, shift: float, least: float) -> None:
     rng = np.random.default_rng(int(mask.sum()))
-    values = rng.standard_normal(SHAPE) + sign * shift * mask
+    values = rng.standard_normal(SHAPE) + shift * mask
     first, *others = scan_map(values, np.ones(SHAPE, bool))
     assert others == []
     assert first.region.overlap(Region.of_mask(mask), SHAPE) >= least
     assert first.log_p < -20
     assert first.only_there
-    assert np.sign(first.z) == sign
+    assert np.sign(first.z) == np.sign(shift)
     # five standard errors of the mean inside
-    assert abs(first.inside - sign * shift) < 5.0 / np.sqrt(mask.sum()) + 0.1 * shift
+    assert abs(first.inside - shift) < 5.0 / np.sqrt(mask.sum()) + 0.1 * abs(shift)
 
 
 def test_two_places_are_found_one_after_the_other() -> None:
@@ -79,12 +78,12 @@ def test_single_pixels_are_listed_and_pixels_that_do_not_count_are_not() -> None
 
 
 def test_chance_and_what_is_everywhere_alike_have_no_place() -> None:
-    """At 5 %, of 100 maps 5 are allowed; five standard errors above that is 16."""
+    """At 5 %, of 60 maps 3 are allowed; five standard errors above that is 11."""
     rng = np.random.default_rng(4)
     shapes = [(16, 16), (24, 90), (64, 20), (50, 50)]
-    maps = [rng.standard_normal(shapes[i % 4]) + 0.5 * (i % 3) for i in range(100)]
+    maps = [rng.standard_normal(shapes[i % 4]) + 0.5 * (i % 3) for i in range(60)]
     found = sum(bool(scan_map(m, np.ones(m.shape, bool), significance=0.05)) for m in maps)
-    assert found <= 16
+    assert found <= 11
 
 
 def test_pairs_with_the_next_column_reach_one_further() -> None:
@@ -171,23 +170,11 @@ def test_channels_side_by_side_are_a_sensor_of_one_row(shape: tuple[int, int]) -
 
 
 def test_ranges_of_frames_come_by_chance_as_often_as_told() -> None:
-    numbers = np.arange(600)
-    chances = [
-        found[0].p
-        for seed in range(200)
-        if (
-            found := scan_series(
-                np.random.default_rng(seed).standard_normal(600),
-                numbers,
-                significance=0.1,
-                most=1,
-                shortest=64,
-            )
-        )
-    ]
-    # binomial: three standard deviations above 0.1 (of 200) and, so that it is no mere bound, ten below
-    assert 4 <= len(chances) <= 33
-    rng = np.random.default_rng(999)
+    numbers, rng = np.arange(600), np.random.default_rng(999)
+    drawn = rng.standard_normal((100, 600))
+    seen = [scan_series(each, numbers, significance=0.1, most=1, shortest=64) for each in drawn]
+    # binomial: three standard deviations around 0.1 of 100
+    assert 1 <= sum(map(bool, seen)) <= 19
     shifted = rng.standard_normal(600) + 0.75 * ((numbers >= 200) & (numbers < 264))
     [one] = scan_series(shifted, numbers, significance=1e-3, shortest=64)
     assert one.z < 7.5  # a count of all ranges would ask for 6.5 and more
@@ -216,13 +203,13 @@ def test_events_of_a_place_are_found_there(place: Mask) -> None:
 
 
 def test_events_have_no_place_by_chance_and_follow_the_share_of_each_pixel() -> None:
-    """Of 200 maps at 5 %, ten are allowed; five standard errors above that is 26."""
+    """Of 80 maps at 5 %, four are allowed; five standard errors above that is 13."""
     share = np.where(mask_of(SQUARE, columns=[0, 16]), 0.1, 0.005)
     rng = np.random.default_rng(1)
-    drawn = [rng.random(SQUARE) < share for _ in range(200)]
-    assert sum(bool(scan_event_map(seen, share, EVERY, significance=0.05)) for seen in drawn) <= 26
+    drawn = [rng.random(SQUARE) < share for _ in range(80)]
+    assert sum(bool(scan_event_map(seen, share, EVERY, significance=0.05)) for seen in drawn) <= 13
     # taken for alike, the pixels of either half are a place
-    assert sum(bool(scan_event_map(seen, np.ones(SQUARE), EVERY)) for seen in drawn[:20]) == 20
+    assert sum(bool(scan_event_map(seen, np.ones(SQUARE), EVERY)) for seen in drawn[:10]) == 10
 
 
 def test_a_binomial_tail_is_that_of_the_law() -> None:

@@ -20,16 +20,15 @@ MAPS = PixelMaps(
 
 
 @pytest.mark.parametrize(
-    ("tag", "fields", "electrons", "draws"),
+    ("tag", "fields", "electrons", "draws", "n_frames"),
     [
-        ("row_noise", {"row_noise_dn": 0.5}, 0.5 * GAIN, 12 * 20_000),
-        ("frame_noise", {"frame_noise_dn": 0.2}, 0.2 * GAIN, 20_000),
-        ("signal_dependent_noise", {"noise_e": 0.1}, 0.1 * np.sqrt(EXPOSURE), 144 * 20_000),
+        ("row_noise", {"row_noise_dn": 0.5}, 0.5 * GAIN, 12 * 20_000, 300),
+        ("frame_noise", {"frame_noise_dn": 0.2}, 0.2 * GAIN, 20_000, 4000),
+        ("signal_dependent_noise", {"noise_e": 0.1}, 0.1 * np.sqrt(EXPOSURE), 144 * 20_000, 4000),
         # not the electrons that a simulation happens to move: few samples, one each
-        ("overdispersed_counts", {"relative_variance": 0.01}, 0.1 * EXPOSURE, 144 * 20_000),
+        ("overdispersed_counts", {"relative_variance": 0.01}, 0.1 * EXPOSURE, 144 * 20_000, 300),
     ],
 )
-@pytest.mark.parametrize("n_frames", [300, 4000])
 def test_the_size_is_what_the_law_of_the_effect_says(
     tag: str, fields: dict[str, float], electrons: float, draws: int, n_frames: int
 ) -> None:

@@ -20,15 +20,7 @@ from pchem_pipeline.discrepancy.verdict import (
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 
 OPTIONAL = {"schema_version", "set_aside"}
-OPTIONAL_OF_STEP = {
-    "gap_interval_after",
-    "families",
-    "size",
-    "rivals",
-    "moved",
-    "separate",
-    "pulls",
-}
+OPTIONAL_OF_STEP = {"gap_interval_after", "families", "size", "rivals", "moved", "separate", "pulls"}
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)

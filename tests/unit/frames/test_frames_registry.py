@@ -1,9 +1,7 @@
 """Readers from elsewhere, doubles, missing optional libraries, and import manners."""
 
-import builtins
 import bz2
 import gzip
-import importlib
 import lzma
 import re
 import sys
@@ -13,6 +11,8 @@ from typing import ClassVar
 import numpy as np
 import pytest
 from astropy.io import fits
+from helpers.nd2_files import nd2_bytes
+from helpers.sif_files import sif_bytes
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependencyError
@@ -126,31 +126,23 @@ def test_plug_in_that_is_no_reader(monkeypatch, name, cls):
         registry.reader_class(name)
 
 
-@pytest.mark.parametrize(("format", "library"), [("fits", "astropy"), ("hdf5", "h5py")])
+@pytest.mark.parametrize(
+    ("format", "library"), [("fits", "astropy"), ("hdf5", "h5py"), ("nd2", "nd2"), ("sif", "sif_parser")]
+)
 def test_missing_library_is_named_with_what_installs_it(tmp_path, monkeypatch, format, library):
     stack = np.zeros((2, 3, 4), np.uint16)
-    path = write_frames(format, tmp_path / "a", iter([stack]), stack.shape, "uint16")
-    for name in list(sys.modules):
-        if name == library or name.startswith(f"{library}."):
-            monkeypatch.delitem(sys.modules, name)
-    real = builtins.__import__
-
-    def importer(name, *rest):
-        if name.split(".")[0] == library:
-            raise ModuleNotFoundError(f"No library named {name!r}", name=name)
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", importer)
-    real_import = importlib.import_module
-
-    def import_module(name, *rest):
-        return importer(name) if name.split(".")[0] == library else real_import(name, *rest)
-
-    monkeypatch.setattr(importlib, "import_module", import_module)
-    for action in (
-        lambda: open_frames(InputSettings(files=(str(path),)), tmp_path),
-        lambda: write_frames(format, tmp_path / "b", iter([stack]), stack.shape, "uint16"),
-    ):
+    by_hand = {"nd2": nd2_bytes, "sif": sif_bytes}.get(format)
+    actions = [lambda: open_frames(InputSettings(files=(str(path),)), tmp_path)]
+    if by_hand:
+        path = tmp_path / f"a.{format}"
+        path.write_bytes(by_hand(stack))
+    else:
+        path = write_frames(format, tmp_path / "a", iter([stack]), stack.shape, "uint16")
+        actions.append(lambda: write_frames(format, tmp_path / "b", iter([stack]), stack.shape, "uint16"))
+    assert registry.detect_format(path) == format
+    for name in {library, *(name for name in sys.modules if name.startswith(f"{library}."))}:
+        monkeypatch.setitem(sys.modules, name, None)
+    for action in actions:
         with pytest.raises(MissingDependencyError) as caught:
             action()
-        assert re.search(rf"pip install '{library}>=[\d.]+'", str(caught.value))
+        assert re.search(rf"pip install '{library.replace('_', '-')}>=[\d.]+'", str(caught.value))

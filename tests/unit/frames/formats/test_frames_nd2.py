@@ -1,16 +1,12 @@
 """ND2, written by hand chunk by chunk."""
 
 import pickle
-import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from helpers.camera_files import opened, refused
 from helpers.nd2_files import nd2_bytes
-
-from pchem_pipeline.base.errors import MissingDependencyError
-from pchem_pipeline.frames.registry import detect_format
 
 STACK = np.random.default_rng(18).integers(0, 4096, (5, 11, 13)).astype("<u2")
 WORDS = "Flash4.0, SN:VSC-01412&#13;&#10;Sample 1:&#13;&#10;  Exposure: 100 ms&#13;&#10;  Binning: 1x1"
@@ -49,12 +45,3 @@ def test_refusals(tmp_path):
     ):
         path.write_bytes(data)
         refused(words, path)
-
-
-def test_without_its_library_one_line_says_what_to_install(tmp_path, monkeypatch):
-    path = tmp_path / "a.nd2"
-    path.write_bytes(nd2_bytes(STACK))
-    assert detect_format(path) == "nd2"
-    monkeypatch.setitem(sys.modules, "nd2", None)
-    with pytest.raises(MissingDependencyError, match="ND2 files needs nd2; install it: pip install 'nd2>="):
-        opened(path)

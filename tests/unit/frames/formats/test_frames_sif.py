@@ -1,14 +1,9 @@
 """SIF, written by hand line by line."""
 
-import sys
-
 import numpy as np
 import pytest
 from helpers.camera_files import opened, refused
 from helpers.sif_files import sif_bytes
-
-from pchem_pipeline.base.errors import MissingDependencyError
-from pchem_pipeline.frames.registry import detect_format
 
 STACK = np.random.default_rng(17).integers(0, 65536, (5, 11, 13)).astype(np.uint32)
 
@@ -41,14 +36,3 @@ def test_refusals(tmp_path):
         refused(r"a\.sif: .*(not a valid SIF file, or )?truncated", path)
     path.write_bytes(sif_bytes(STACK - 0.5))
     refused("samples such as .*, raw whole numbers are needed", path)
-
-
-def test_without_its_library_one_line_says_what_to_install(tmp_path, monkeypatch):
-    path = tmp_path / "a.sif"
-    path.write_bytes(sif_bytes(STACK))
-    assert detect_format(path) == "sif"
-    monkeypatch.setitem(sys.modules, "sif_parser", None)
-    with pytest.raises(
-        MissingDependencyError, match=r"SIF files needs sif_parser; install it: pip install 'sif-parser>="
-    ):
-        opened(path)

@@ -185,10 +185,7 @@ def test_what_cannot_be_is_refused() -> None:
 
 
 def test_its_words_say_what_happens_to_electrons() -> None:
-    modes = (
-        ElectronMode(fate="followed", place=(1, 0, 0)),
-        ElectronMode(fate="lost", weight=0.5),
-    )
+    modes = (ElectronMode(fate="followed", place=(1, 0, 0)), ElectronMode(fate="lost", weight=0.5))
     assert EmpiricalElectrons(chance=0.04, modes=modes).describe() == (
         "electron numbers are not independent (+0.04 electrons in the sample one frame later per electron; "
         "a sample of k electrons loses 0.02 k (k - 1) of them)"

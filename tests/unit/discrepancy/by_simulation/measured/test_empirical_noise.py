@@ -22,7 +22,7 @@ from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise, Noi
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-ROWS, COLUMNS, FRAMES, STEP = 16, 18, 900, 12.0
+ROWS, COLUMNS, FRAMES, STEP = 14, 16, 900, 12.0
 SHAPE = (ROWS, COLUMNS)
 AMPLITUDE, NEXT = 0.9, 0.7  # DN, and the weight of the neighbour
 POWER = AMPLITUDE**2 * (1 + NEXT**2)
@@ -206,7 +206,7 @@ def test_it_is_found_beside_a_named_effect_and_closes_the_gap():
     def hidden(rng):
         return of_next_rows(rng) + 0.7 * rng.standard_normal((FRAMES, ROWS, 1))
 
-    settings = DiscrepancySettings(candidates=("row_noise",), replicates=24, extended_replicates=12)
+    settings = DiscrepancySettings(candidates=("row_noise",), replicates=20, extended_replicates=12)
     found = find_discrepancies(stack(42, hidden), settings=settings)
     verdict = found.verdict
     assert (verdict.verdict, verdict.effects) == ("described", ("row_noise",))

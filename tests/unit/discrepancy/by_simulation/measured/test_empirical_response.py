@@ -17,11 +17,7 @@ from pchem_pipeline.discrepancy.size import size_of
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
-from pchem_pipeline.effects.operators.couple import (
-    EmpiricalResponse,
-    ResponseTerm,
-    excess_moments,
-)
+from pchem_pipeline.effects.operators.couple import EmpiricalResponse, ResponseTerm, excess_moments
 
 SHAPE, FRAMES, STEP, NOISE = (14, 18), 1200, 14.0, 0.25
 EVERYWHERE = np.ones(SHAPE, bool)

@@ -82,9 +82,7 @@ def test_effects_that_leave_a_tenth_of_what_they_closed_get_no_name_where_the_fi
     assert not Gap(0.3, 0.01, (-0.1, 0.7), {}).too_wide(1.0)
 
 
-def test_the_clearer_of_noise_and_gain_is_told_and_a_wave_first(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_clearer_of_noise_and_gain_is_told_and_a_wave_first(monkeypatch: pytest.MonkeyPatch) -> None:
     unexplained = unexplained_beside(Goodness())
     samples = SimpleNamespace(of=lambda _: None, maps=None, evidence=None, inside=None)
     monkeypatch.setattr(unexplained, "_of", lambda *_: samples)

@@ -60,14 +60,23 @@ def logs_error(seen, some):
     return found[np.isfinite(found).all(axis=1)]
 
 
+def seen_in(frames):
+    return observe(frames, np.arange(len(frames)), n_run=len(frames), block_frames=50)
+
+
+def truth_in_logs(camera, seed):
+    """Return the parameters of a camera's pixels as a fit has them, (row, column, 4)."""
+    exposure, step, bias, noise = camera.maps(np.random.default_rng(seed))
+    return np.stack([np.log(exposure), np.log(step), bias, 2 * np.log(noise * step)], axis=-1)
+
+
 def learnt(camera, seed):
     """Return the truth (n, 4), the fits' evidence, and the sensor learnt from the same frames."""
-    exposure, step, bias, noise = camera.maps(np.random.default_rng(seed))
-    truth = np.stack([np.log(exposure), np.log(step), bias, 2 * np.log(noise * step)], axis=-1)
     frames = camera.frames(seed)
-    seen = observe(frames, np.arange(len(frames)), n_run=len(frames), block_frames=50)
+    seen = seen_in(frames)
     fit = Refit(seen.maps, {}, seen.covariance)
-    return truth, seen, learn_sensor(frames, np.arange(len(frames)), fit, (), seen.ambiguous)
+    sensor = learn_sensor(frames, np.arange(len(frames)), fit, (), seen.ambiguous)
+    return truth_in_logs(camera, seed), seen, sensor
 
 
 def test_bright_pixels_find_their_gain_under_a_strong_effect():
@@ -78,7 +87,7 @@ def test_bright_pixels_find_their_gain_under_a_strong_effect():
     light = exposure * np.exp(width * rng.standard_normal(shape) - 0.5 * width**2)
     values = bias + step * (rng.poisson(light) + noise * rng.standard_normal(shape))
     frames = np.rint(values).astype(np.uint16)
-    seen = observe(frames, np.arange(1500), n_run=1500, block_frames=50)
+    seen = seen_in(frames)
     effect = OverdispersedCounts(relative_variance=0.1, exposures="lognormal")
     fit = refit_maps(frames, seen.maps, [effect], seen.covariance)
     off = np.log(fit.maps.conversion_gain * step)[fit.maps.usable]
@@ -94,7 +103,7 @@ def test_a_poor_sensor_with_a_bent_curve_is_learnt_under_its_law():
     values = bias + step * (rng.poisson(exposure, shape) + noise * rng.standard_normal(shape))
     frames = np.rint(values + 1.5 * np.sin(2 * np.pi * values / 120.0)).astype(np.uint16)
     numbers = np.arange(1500)
-    seen = observe(frames, numbers, n_run=1500, block_frames=50)
+    seen = seen_in(frames)
     fit = refit_maps(frames, seen.maps, [effect], seen.covariance)
     sensor = learn_sensor(frames, numbers, fit, [effect], MANY_MISTAKEN + 0.1)
     off = logs(sensor.draw(1), sensor.drawn)[:, 0] - np.log(exposure[sensor.drawn])
@@ -104,7 +113,6 @@ def test_a_poor_sensor_with_a_bent_curve_is_learnt_under_its_law():
 @pytest.mark.parametrize(
     "effect",
     [
-        PixelCorrection(threshold_dn=32),
         PixelCorrection(threshold_dn=32, region=Region(columns=((0, 10),))),
         PixelCorrection(threshold_dn=28, share=0.6, predictor="mean"),
         PixelCorrection(threshold_dn=18),
@@ -116,13 +124,11 @@ def test_a_sensor_is_learnt_from_corrected_samples(effect):
     From 1.5 electrons above it on most plain fits are ambiguous, and cumulants of all pixels no start.
     """
     camera = PlainCamera(0.3, 1.5, 12.0, (20, 20), 1500, SPREAD)
-    exposure, step, bias, noise = camera.maps(np.random.default_rng(6))
-    truth = np.stack([np.log(exposure), np.log(step), bias, 2 * np.log(noise * step)], axis=-1)
-    before, numbers = camera.frames(6), np.arange(1500)
+    truth, before, numbers = truth_in_logs(camera, 6), camera.frames(6), np.arange(1500)
     inside = np.zeros((20, 20), bool)
     inside[1:-1, 1 : -1 if effect.region is None else 10] = True
     frames = np.where(inside, effect.apply(before, context_of((20, 20), 1500)), before)
-    seen = observe(frames, numbers, n_run=1500, block_frames=50)
+    seen = seen_in(frames)
     fit = Refit(seen.maps, {}, seen.covariance)
     sensor = learn_sensor(frames, numbers, fit, [effect], seen.ambiguous, before=before)
     some = sensor.drawn & inside
@@ -299,12 +305,10 @@ class ColumnMemory(Effect):
 def test_a_sensor_is_moved_to_another_law_as_the_fits_of_its_pixels_are():
     """Row noise in half of the columns is in their plain read noise; under its law each pixel has its own."""
     camera, rng = PlainCamera(0.3, 2.5, 12.0, (20, 20), 1500, SPREAD), np.random.default_rng(5)
-    exposure, step, bias, noise = camera.maps(np.random.default_rng(4))
-    truth = np.stack([np.log(exposure), np.log(step), bias, 2 * np.log(noise * step)], axis=-1)
-    noisy = np.tile(np.arange(20) < 10, (20, 1))
+    truth, noisy = truth_in_logs(camera, 4), np.tile(np.arange(20) < 10, (20, 1))
     frames = camera.frames(4) + np.rint(noisy * 2.5 * rng.standard_normal((1500, 20, 1)))
     frames, numbers = frames.astype(np.uint16), np.arange(1500)
-    seen = observe(frames, numbers, n_run=1500, block_frames=50)
+    seen = seen_in(frames)
     plain = learn_sensor(frames, numbers, Refit(seen.maps, {}, seen.covariance), (), seen.ambiguous)
     effect = RowNoise(row_noise_dn=2.5, region=Region(columns=((0, 10),)))
     fit = refit_maps(frames, seen.maps, [effect], seen.covariance)
@@ -333,7 +337,7 @@ def test_what_an_effect_without_a_law_adds_is_not_simulated_twice():
     frames[:, 1:] += effect.share * frames[:, :-1]
     frames = np.rint(frames).astype(np.uint16)
     numbers = np.arange(len(frames))
-    seen = observe(frames, numbers, n_run=len(frames), block_frames=50)
+    seen = seen_in(frames)
     sensor = learn_sensor(frames, numbers, Refit(seen.maps, {}, seen.covariance), (), seen.ambiguous)
     taken = Acquisition(numbers, len(frames), 50, 12)
 
@@ -361,7 +365,7 @@ def test_exposure_that_an_effect_adds_to_a_spot_is_not_simulated_twice():
     electrons = rng.poisson(exposure + ghost) + noise * rng.standard_normal(ghost.shape)
     frames = np.rint(bias + step * electrons).astype(np.uint16)
     numbers = np.arange(900)
-    seen = observe(frames, numbers, n_run=900, block_frames=50)
+    seen = seen_in(frames)
     added = added_exposures([effect], frames, numbers, seen.maps)
     bright = spot > 0.5
 
@@ -387,7 +391,7 @@ def test_a_bias_that_the_plain_fit_has_off_by_an_electron_is_found_under_the_rig
     late = rng.standard_exponential(shape) - 1
     skewed = np.sqrt(1 - share**2) * rng.standard_normal(shape) - share * late
     frames = np.rint(bias + step * (rng.poisson(exposure, shape) + noise * skewed)).astype(np.uint16)
-    seen = observe(frames, np.arange(900), n_run=900, block_frames=50)
+    seen = seen_in(frames)
     fit = refit_maps(frames, seen.maps, [NoiseSkew(share=-share)], seen.covariance)
 
     def off(maps):
@@ -405,7 +409,7 @@ def test_one_sample_far_below_all_others_leads_no_pixel_astray_under_a_law_that_
     struck = rng.random((16, 16)) < 0.3
     depth = rng.uniform(2.5, 4.5, int(struck.sum()))  # e- below the bias
     frames[300][struck] = np.rint(bias[struck] - 13.0 * depth)
-    seen = observe(frames, np.arange(750), n_run=750, block_frames=50)
+    seen = seen_in(frames)
     tails = HeavyTailedNoise(share=0.001, factor=12.0)
     fit = refit_maps(frames, seen.maps, [tails], seen.covariance)
 
@@ -423,7 +427,7 @@ def test_parameters_move_by_the_pixels_that_an_effect_is_about():
     frames = camera.frames(4).astype(np.int64)
     frames[:, :, 6:] += np.rint(2.5 * rng.standard_normal((900, 8, 1))).astype(np.int64)
     frames = np.maximum(frames, 0).astype(np.uint16)
-    seen = observe(frames, np.arange(900), n_run=900, block_frames=50)
+    seen = seen_in(frames)
     noise = RowNoise(row_noise_dn=2.5, region=Region(columns=((6, 8),)))
     fit = refit_maps(frames, seen.maps, [noise], seen.covariance)
     # 12 x 0.3 = 3.6 DN of read noise, and 4.4 with 2.5 more

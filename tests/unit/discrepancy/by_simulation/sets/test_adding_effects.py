@@ -11,10 +11,7 @@ from scipy import stats
 
 from pchem_pipeline.discrepancy.build_verdict import Findings
 from pchem_pipeline.discrepancy.by_simulation.acceptance import Acceptance
-from pchem_pipeline.discrepancy.by_simulation.additions import (
-    Extension,
-    unexplained_of_its_kind,
-)
+from pchem_pipeline.discrepancy.by_simulation.additions import Extension, unexplained_of_its_kind
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
@@ -583,12 +580,7 @@ def test_effects_that_move_the_same_statistics_are_seen_where_they_leave_nothing
 UNMOVED = SimpleNamespace(fit=SimpleNamespace(moved={}))
 
 
-def add(
-    world: World,
-    monkeypatch: pytest.MonkeyPatch,
-    *hypotheses: Hypothesis,
-    final: Any = None,
-) -> Any:
+def add(world: World, monkeypatch: pytest.MonkeyPatch, *hypotheses: Hypothesis, final: Any = None) -> Any:
     """Return a search that added what it found, and the null that it came to."""
     z = world.z if final is None else Measured(world.z.train, world.z.test, final)
     work: Any = SimpleNamespace(mapped=lambda _: UNMOVED, forget=lambda _: None, effort=Effort(None))
