@@ -29,6 +29,19 @@ from sample.inner_numba import shifted
 def doubled(x):
     return 2 * shifted(x)
 """
+GIVEN = """
+from numba import types
+from pchem_pipeline.base.kernel import callback, kernel
+from sample.inner_numba import shifted
+@kernel
+def applied(function, x):
+    total = 0
+    {long}
+    return total
+def passed(x):
+    return applied(shifted, x) - applied(shifted, x - 1)
+given = callback(passed, types.int64, (types.int64,))
+""".format(long="; ".join(f"total += function(x % {i})" for i in range(1, 99)))  # LLVM does not inline it
 APART = """
 from pchem_pipeline.base.kernel import kernel
 def powered(power):
@@ -50,17 +63,18 @@ CALLS = (
 
 @pytest.fixture
 def sample(tmp_path):
-    """A package of three modules with kernels, one of which calls another's."""
+    """A package of modules with kernels, some of which call another's."""
     folder = tmp_path / "here" / "sample"
     folder.mkdir(parents=True)
     (folder / "__init__.py").touch()
     (folder / "inner_numba.py").write_text(INNER.format(shift=1))
     (folder / "outer_numba.py").write_text(OUTER)
     (folder / "apart_numba.py").write_text(APART)
+    (folder / "given_numba.py").write_text(GIVEN)
     return folder
 
 
-def start(sample, names="squared, cubed", cache=None):
+def start(sample, names="squared, cubed", cache=None, calls=CALLS):
     """Call kernels in a process of its own, which prints their values and how many it compiled."""
     path = [sample.parent, Path(pchem_pipeline.__file__).parents[1]]
     environment = {
@@ -70,7 +84,7 @@ def start(sample, names="squared, cubed", cache=None):
         # Python tells files of one size that change within a second apart by nothing
         "PYTHONDONTWRITEBYTECODE": "1",
     }
-    command = [sys.executable, "-c", CALLS.format(names=names)]
+    command = [sys.executable, "-c", calls.format(names=names)]
     return subprocess.Popen(
         command, cwd="/", env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -100,6 +114,13 @@ def test_only_what_uses_a_changed_file_is_compiled_again(sample):
         file.write_bytes(file.read_bytes()[:1000])
     assert end(start(elsewhere)) == "[8, 9, 27] 1"
     assert end(start(elsewhere)) == "[8, 9, 27] 0"
+
+
+def test_code_with_a_kernel_that_is_given_to_another_is_kept(sample):
+    calls = "from sample.given_numba import given; print(given.ctypes(3))"
+    for _ in range(2):
+        assert end(start(sample, calls=calls)) == "94"
+        assert len(list((sample.parents[1] / "cache").glob("*passed*.nbc"))) == 1
 
 
 def test_a_kernel_is_compiled_by_one_of_two_processes(sample):
