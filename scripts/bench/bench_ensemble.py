@@ -24,7 +24,6 @@ from pchem_pipeline.model.checks.residuals import central_window, noise_floor, r
 from pchem_pipeline.model.electrons.electrons import KnownPixels, Outcomes, number_tables
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, mass_sums, nuced_axis, tally
 from pchem_pipeline.model.ensemble.ensemble_binned import (
-    HistogramChoice,
     epcd_dependent,
     epcd_independent,
     nuced_dependent,
@@ -153,7 +152,6 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
         raw += data.raw
         nuced += data.nuced
         raw_all += tally(chunk.all_frames[use], chunk.origin[use], part, dn, axis).raw
-    choice = HistogramChoice(bins)
     curves = {"epcd_exact": sums.raw / n, "nuced_exact": sums.nuced / n / axis.width}
     for name, function, where in (
         ("epcd_dependent", epcd_dependent, dn),
@@ -162,11 +160,10 @@ def compare(chunks: list[Chunk], n_frames: int, n_chosen: int, bins: int, clock:
         ("nuced_independent", nuced_independent, axis),
     ):
         began = time.process_time()
-        curves[name] = function(pixels, where, choice)  # type: ignore[operator]
+        curves[name] = function(pixels, where, bins)  # type: ignore[operator]
         clock.lap(f"{name}, {bins} bins", began)
     total = n_chosen * n
-    coverage = EnsembleSettings().rmse_coverage
-    window, nuced_window = central_window(raw, coverage), central_window(nuced, coverage)
+    window, nuced_window = central_window(raw), central_window(nuced)
     floor = noise_floor(counting_variance(sums.raw, sums.raw_square, n, n_chosen), window)
     nuced_variance = counting_variance(sums.nuced, sums.nuced_square, n, n_chosen, axis.width)
     nuced_floor = noise_floor(nuced_variance, nuced_window)

@@ -28,21 +28,20 @@ class ChiSquare:
     p: float
 
 
-def central_window(counts: NDArray[np.integer[Any]], coverage: float) -> slice:
-    """Find the bins that hold the central part of the data.
+def central_window(counts: NDArray[np.integer[Any]]) -> slice:
+    """Find the bins that hold the central 99.9 % of the data.
 
     A few hot pixels stretch the axis over thousands of empty bins; an RMSE over all of them would shrink with
     the length of the axis. This window does not.
 
     Args:
         counts: samples in each bin, shape (n,), not all zero.
-        coverage: part of the samples to hold, 0..1; each tail left out holds at most half of the rest.
 
     Returns:
         The bins as a slice.
     """
     cumulative = np.cumsum(counts)
-    tail = 0.5 * (1.0 - coverage) * cumulative[-1]
+    tail = 0.0005 * cumulative[-1]
     first = int(np.searchsorted(cumulative, tail, side="right"))
     last = int(np.searchsorted(cumulative, cumulative[-1] - tail, side="left"))
     return slice(first, max(last, first) + 1)

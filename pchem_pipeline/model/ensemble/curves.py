@@ -21,7 +21,6 @@ from pchem_pipeline.model.checks.residuals import (
 from pchem_pipeline.model.ensemble.components import component_widths
 from pchem_pipeline.model.ensemble.ensemble import electron_pmf
 from pchem_pipeline.model.ensemble.ensemble_binned import (
-    HistogramChoice,
     electron_pmf_binned,
     epcd_dependent,
     epcd_independent,
@@ -38,10 +37,6 @@ _SMALLEST_COMPONENT = 1e-4
 _WAYS = ("exact", "dependent", "independent")
 
 Arrays = dict[str, NDArray[Any]]
-
-
-def _choice(settings: EnsembleSettings) -> HistogramChoice:
-    return HistogramChoice(settings.parameter_bins, settings.parameter_range, settings.cell_representative)
 
 
 def curves(
@@ -61,7 +56,7 @@ def curves(
     Returns:
         Arrays of the group ``ensemble``, and numbers for its attributes.
     """
-    axes, choice = totals.axes, _choice(settings)
+    axes, bins = totals.axes, settings.parameter_bins
     width = axes.nuced.width
     variance, nuced_variance = totals.variance("pcd_variance"), totals.variance("nuced_variance") / width**2
     arrays: Arrays = {
@@ -71,14 +66,14 @@ def curves(
         "density": totals.mean("share"),
         "density_all": totals.mean("share_all"),
         "epcd_exact": totals.mean("pcd"),
-        "epcd_dependent": within_limits(epcd_dependent, pixels, axes.dn, choice, limits),
-        "epcd_independent": within_limits(epcd_independent, pixels, axes.dn, choice, limits),
+        "epcd_dependent": within_limits(epcd_dependent, pixels, axes.dn, bins, limits),
+        "epcd_independent": within_limits(epcd_independent, pixels, axes.dn, bins, limits),
         "electrons": axes.nuced.electrons,
         "nuced_counts": totals.counts("nuced_counts"),
         "nuced_density": totals.mean("nuced_share") / width,
         "nuced_exact": totals.mean("nuced") / width,
-        "nuced_dependent": nuced_dependent(pixels, axes.nuced, choice),
-        "nuced_independent": nuced_independent(pixels, axes.nuced, choice),
+        "nuced_dependent": nuced_dependent(pixels, axes.nuced, bins),
+        "nuced_independent": nuced_independent(pixels, axes.nuced, bins),
     }
     errors = [np.sqrt(totals.variance(name)) for name in MODEL_ERRORS]
     if any(each.any() for each in errors):
@@ -86,7 +81,7 @@ def curves(
     for prefix, noise in (("", variance), ("nuced_", nuced_variance)):
         exact = arrays["nuced_exact" if prefix else "epcd_exact"]
         arrays[f"{prefix}residual"] = normalised_residuals(arrays[f"{prefix}density"], exact, noise)
-    facts = _agreement(arrays, variance, nuced_variance, totals, settings.rmse_coverage)
+    facts = _agreement(arrays, variance, nuced_variance, totals)
     facts |= {
         "nuced_bin_width": width,
         "samples_beyond_dn": totals.count("outside"),
@@ -101,11 +96,10 @@ def _agreement(
     variance: FloatArray,
     nuced_variance: FloatArray,
     totals: EnsembleTotals,
-    coverage: float,
 ) -> dict[str, Any]:
     """Return RMSEs, their noise floors, chi-square, and the windows they were taken over."""
-    window = central_window(arrays["counts"], coverage)
-    nuced_window = central_window(arrays["nuced_counts"], coverage)
+    window = central_window(arrays["counts"])
+    nuced_window = central_window(arrays["nuced_counts"])
     found = {f"epcd_{way}": rmse(arrays["density"], arrays[f"epcd_{way}"], window) for way in _WAYS}
     found["noise_floor"] = noise_floor(variance, window)
     for way in _WAYS:
@@ -159,7 +153,7 @@ def electron_numbers(
         "electron_counts": totals.counts("electron_counts"),
         "electron_mass": totals.mean("electron_share"),
         "electron_pmf": electron_pmf(pixels.quanta_exposure, n_k),
-        "electron_pmf_binned": electron_pmf_binned(pixels.quanta_exposure, n_k, _choice(settings)),
+        "electron_pmf_binned": electron_pmf_binned(pixels.quanta_exposure, n_k, settings.parameter_bins),
         "electron_pmf_map": totals.mean("electron_expected"),
     }
     mass = arrays["electron_pmf_map"]

@@ -84,7 +84,7 @@ class AxisSums:
     nuced_sum_square: float
 
 
-def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None, steps: int = 1) -> NucedAxis:
+def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None) -> NucedAxis:
     """Choose the bins of the NUCed histogram.
 
     A pixel's NUCed values lie on a lattice of pitch g. A bin of width w holds ``floor(w/g)`` or one more
@@ -95,15 +95,13 @@ def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None, 
         pixels: the pixels.
         dn: axis of the raw data; the NUCed axis reaches no further than it does for the median pixel's
             neighbours (1st to 99th percentile of g and mu), so that one strange gain cannot stretch it.
-        width: bin width, e-; None: ``steps`` times the median g.
-        steps: DN per bin where ``width`` is None.
+        width: bin width, e-; None: the median g.
 
     Returns:
         The axis.
     """
     gain, bias = pixels.conversion_gain, pixels.bias
-    pitch = float(np.median(gain))
-    bin_width = steps * pitch if width is None else width
+    bin_width = float(np.median(gain)) if width is None else width
     tail = 10.0 * float(np.percentile(pixels.read_noise_e, 99))
     largest_gain = float(np.percentile(gain, 99))
     lowest = max(-tail, (dn.start - float(np.percentile(bias, 99))) * largest_gain)

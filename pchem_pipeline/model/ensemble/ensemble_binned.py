@@ -3,8 +3,8 @@
 The paper approximates the joint density of the parameters by a 4-D histogram (dependent) or by the product of
 four histograms (independent) and replaces the integral of eq. full_ensemble_dist by a sum (Hendrickson
 et al. 2023, Sec. IV-C). Bins are equally wide over the central part of each map, with one more bin at each
-end for the rest. What stands for a cell is its centre, as in a plain histogram, or the mean of the
-pixels in it, which removes the error of first order in the bin width.
+end for the rest. The mean of the pixels in a cell stands for it, not its centre: without the error of first
+order in the bin width.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,23 +38,6 @@ _ALIKE = 4.0
 
 
 @dataclass(frozen=True)
-class HistogramChoice:
-    """How parameter maps are binned.
-
-    Attributes:
-        bins: bins of each parameter over the central part of its map.
-        span: ``"full"``, minimum to maximum, or ``"central"``, the 1st to 99th percentile and half of that
-            distance beyond on either side, but not beyond the extremes.
-        representative: ``"mean"`` of the pixels in a cell, or its ``"centre"`` (the cells beyond the
-            bins have no centre and always use the mean).
-    """
-
-    bins: int = 64
-    span: Literal["central", "full"] = "central"
-    representative: Literal["mean", "centre"] = "mean"
-
-
-@dataclass(frozen=True)
 class Cells:
     """Occupied cells of a histogram of d parameters.
 
@@ -67,58 +50,51 @@ class Cells:
     values: FloatArray
 
 
-def joint_cells(columns: Sequence[FloatArray], choice: HistogramChoice) -> Cells:
+def joint_cells(columns: Sequence[FloatArray], bins: int) -> Cells:
     """Histogram pixels in d dimensions and keep the occupied cells only.
 
     Args:
         columns: d parameters, each of shape (n,).
-        choice: the bins.
+        bins: of each parameter.
 
     Returns:
         At most n cells.
     """
     index: IntArray = np.zeros(columns[0].size, dtype=np.int64)
-    edges = [_edges(column, choice) for column in columns]
+    edges = [_edges(column, bins) for column in columns]
     for column, edge in zip(columns, edges, strict=True):
         place = np.searchsorted(edge, column, side="right")
         place[column == edge[-1]] = edge.size - 1  # the last bin is closed
         index *= edge.size + 1
         index += place
-    shape = tuple(edge.size + 1 for edge in edges)
-    cells, inverse = _occupied(index, math.prod(shape))
+    inverse = _occupied(index, math.prod(edge.size + 1 for edge in edges))
     occupants = np.bincount(inverse)
-    values = np.empty((len(columns), occupants.size))
-    places = np.unravel_index(cells, shape)
-    for d, (column, edge, place) in enumerate(zip(columns, edges, places, strict=True)):
-        values[d] = np.bincount(inverse, weights=column) / occupants
-        if choice.representative == "centre":
-            inner = (place > 0) & (place < edge.size)
-            values[d, inner] = 0.5 * (edge[place[inner] - 1] + edge[place[inner]])
+    values = np.array([np.bincount(inverse, weights=column) / occupants for column in columns])
     return Cells(occupants / columns[0].size, values)
 
 
-def _occupied(index: IntArray, n_cells: int) -> tuple[IntArray, IntArray]:
-    """Return the cells that occur, in order, and for each pixel which of them is its own."""
+def _occupied(index: IntArray, n_cells: int) -> IntArray:
+    """Return for each pixel the number of its cell among those that occur."""
     if n_cells > _MOST_CELLS * index.size:
-        return np.unique(index, return_inverse=True)
+        return np.unique(index, return_inverse=True)[1]
     cells = np.flatnonzero(np.bincount(index, minlength=n_cells))
     number = np.zeros(n_cells, dtype=np.int64)
     number[cells] = np.arange(cells.size)
-    return cells, number[index]
+    return np.asarray(number[index])
 
 
-def _edges(column: FloatArray, choice: HistogramChoice) -> FloatArray:
+def _edges(column: FloatArray, bins: int) -> FloatArray:
+    """Return the edges of equal bins: the 1st to 99th percentile, and half of that on either side."""
     low, high = float(column.min()), float(column.max())
-    if choice.span == "central":
-        first, last = np.percentile(column, [1.0, 99.0])
-        beyond = 0.5 * (last - first)
-        low, high = max(low, float(first - beyond)), min(high, float(last + beyond))
+    first, last = np.percentile(column, [1.0, 99.0])
+    beyond = 0.5 * (last - first)
+    low, high = max(low, float(first - beyond)), min(high, float(last + beyond))
     if not high > low:  # a constant map: one bin that holds it
         return np.array([low, np.nextafter(low, np.inf)])
-    return np.linspace(low, high, choice.bins + 1)
+    return np.linspace(low, high, bins + 1)
 
 
-def epcd_dependent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) -> FloatArray:
+def epcd_dependent(pixels: UsablePixels, dn: DnAxis, bins: int) -> FloatArray:
     """Ensemble PCD with the joint density of (H, g, mu, sigma^2) from a 4-D histogram.
 
     Hendrickson et al. 2023, eq. full_ensemble_dist with integrals replaced by sums, dependent parameters.
@@ -126,18 +102,18 @@ def epcd_dependent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) ->
     Args:
         pixels: the pixels.
         dn: where to evaluate it.
-        choice: the bins.
+        bins: of each parameter.
 
     Returns:
         f_E, 1/DN, shape (n_dn,).
     """
     *first, sigma = pixels.maps
-    cells = joint_cells((*first, sigma**2), choice)
+    cells = joint_cells((*first, sigma**2), bins)
     exposure, gain, bias, variance = cells.values
     return weighted_mass(UsablePixels(exposure, gain, bias, np.sqrt(variance)), dn, cells.share)
 
 
-def epcd_independent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) -> FloatArray:
+def epcd_independent(pixels: UsablePixels, dn: DnAxis, bins: int) -> FloatArray:
     """Ensemble PCD with the joint density as the product of four histograms.
 
     The product of B bins each has B^4 cells, too many to visit. Its characteristic function factors
@@ -148,14 +124,14 @@ def epcd_independent(pixels: UsablePixels, dn: DnAxis, choice: HistogramChoice) 
     Args:
         pixels: the pixels.
         dn: where to evaluate it.
-        choice: the bins.
+        bins: of each parameter.
 
     Returns:
         f_E, 1/DN, shape (n_dn,); correct to about 1e-15 absolute unless it is so wide that narrow noise is
         widened.
     """
     exposures, gains, biases, variances = (
-        joint_cells((column,), choice) for column in (*pixels.maps[:3], pixels.read_noise_dn**2)
+        joint_cells((column,), bins) for column in (*pixels.maps[:3], pixels.read_noise_dn**2)
     )
     density = np.zeros(dn.size)
     scale = np.floor(np.log(np.maximum(exposures.values[0], 1.0)) / math.log(_ALIKE))
@@ -210,10 +186,10 @@ def _period(exposures: Cells, gains: Cells, biases: Cells, variances: Cells, dn:
 
 
 def within_limits(
-    curve: Callable[[UsablePixels, DnAxis, HistogramChoice], FloatArray],
+    curve: Callable[[UsablePixels, DnAxis, int], FloatArray],
     pixels: UsablePixels,
     dn: DnAxis,
-    choice: HistogramChoice,
+    bins: int,
     limits: tuple[int, int] | None,
 ) -> FloatArray:
     """Return a density of the raw ensemble with the mass beyond the limits of the codes at these.
@@ -222,7 +198,7 @@ def within_limits(
         curve: of an unlimited ADC, :func:`epcd_dependent` or :func:`epcd_independent`.
         pixels: the pixels.
         dn: where to evaluate it.
-        choice: the bins.
+        bins: of each parameter.
         limits: first and last code, DN; those at an end of ``dn`` count. None: no limits.
 
     Returns:
@@ -233,7 +209,7 @@ def within_limits(
     if low:
         lowest = float(np.min(pixels.bias - (REACH + 1.0) * pixels.read_noise_dn))
         below = math.ceil(min(max(dn.start - lowest, 0.0), _LONGEST))
-    whole = curve(pixels, DnAxis(dn.start - below, dn.size + below), choice)
+    whole = curve(pixels, DnAxis(dn.start - below, dn.size + below), bins)
     found = whole[below:].copy()
     found[0] += whole[:below].sum()
     if high:  # a density at the integers adds up to 1
@@ -241,7 +217,7 @@ def within_limits(
     return found
 
 
-def nuced_dependent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:
+def nuced_dependent(pixels: UsablePixels, axis: NucedAxis, bins: int) -> FloatArray:
     """NUCed ensemble PCD with the joint density of (H, sigma_e-^2) from a 2-D histogram.
 
     Hendrickson et al. 2023, eq. partial_ensemble_dist, dependent parameters; each value is the mean of the
@@ -250,16 +226,16 @@ def nuced_dependent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramChoi
     Args:
         pixels: the pixels.
         axis: bins of the NUCed value.
-        choice: the bins of the parameters.
+        bins: of each parameter.
 
     Returns:
         f_E', 1/e-, shape (n_bins,).
     """
-    cells = joint_cells((pixels.quanta_exposure, pixels.read_noise_e**2), choice)
+    cells = joint_cells((pixels.quanta_exposure, pixels.read_noise_e**2), bins)
     return _in_bins(cells.values[0], np.zeros(cells.share.size), cells.values[1], axis, cells.share)
 
 
-def nuced_independent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramChoice) -> FloatArray:
+def nuced_independent(pixels: UsablePixels, axis: NucedAxis, bins: int) -> FloatArray:
     """NUCed ensemble PCD with the joint density as the product of two histograms.
 
     Hendrickson et al. 2023, eq. partial_ensemble_dist, independent parameters, averaged over each bin.
@@ -267,13 +243,13 @@ def nuced_independent(pixels: UsablePixels, axis: NucedAxis, choice: HistogramCh
     Args:
         pixels: the pixels.
         axis: bins of the NUCed value.
-        choice: the bins of the parameters.
+        bins: of each parameter.
 
     Returns:
         f_E', 1/e-, shape (n_bins,).
     """
-    mass = electron_pmf_binned(pixels.quanta_exposure, _enough_k(pixels.quanta_exposure), choice)
-    noise = joint_cells((pixels.read_noise_e**2,), choice)
+    mass = electron_pmf_binned(pixels.quanta_exposure, _enough_k(pixels.quanta_exposure), bins)
+    noise = joint_cells((pixels.read_noise_e**2,), bins)
     share = np.multiply.outer(mass, noise.share)
     electrons, variance = np.broadcast_arrays(np.arange(mass.size)[:, None], noise.values)
     some = share > NEGLIGIBLE
@@ -289,7 +265,7 @@ def _in_bins(
     return weighted_mass(pixels, DnAxis(axis.start, axis.size), share) / width
 
 
-def electron_pmf_binned(quanta_exposure: FloatArray, n_k: int, choice: HistogramChoice) -> FloatArray:
+def electron_pmf_binned(quanta_exposure: FloatArray, n_k: int, bins: int) -> FloatArray:
     """Mass of the ensemble electron number with the density of H from a histogram of its map.
 
     Hendrickson et al. 2023, eq. K_ensemble_pmf with the integral replaced by a sum.
@@ -297,12 +273,12 @@ def electron_pmf_binned(quanta_exposure: FloatArray, n_k: int, choice: Histogram
     Args:
         quanta_exposure: H of each pixel, e-, shape (n,).
         n_k: number of masses, for k = 0 .. n_k - 1.
-        choice: the bins.
+        bins: of each parameter.
 
     Returns:
         p_Ke(k), shape (n_k,).
     """
-    cells = joint_cells((quanta_exposure,), choice)
+    cells = joint_cells((quanta_exposure,), bins)
     return electron_pmf(cells.values[0], n_k, cells.share)
 
 

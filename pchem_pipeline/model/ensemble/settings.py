@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, field_validator
 
@@ -57,30 +57,15 @@ class EnsembleSettings(Section):
         le=200,
         description="bins of each parameter in the 4-D, 2-D and 1-D histograms of the parameter maps",
     )
-    parameter_range: Literal["central", "full"] = Field(
-        default="central",
-        description="range of the equal-width bins: 1st to 99th percentile of each map, extended by half of "
-        "this on either side, with one more bin at each end for the rest; or minimum to maximum, which a "
-        "single hot pixel can stretch",
-    )
-    cell_representative: Literal["mean", "centre"] = Field(
-        default="mean",
-        description="parameters of a bin: mean of its pixels, or its centre",
-    )
     nuced_bin_width: float | None = Field(
         default=None,
         ge=1e-3,
-        description="bin width of the NUCed histogram, e-; null: median conversion gain times "
-        "nuced_bin_steps (same number of DN in each bin)",
+        description="bin width of the NUCed histogram, e-; null: median conversion gain (same number of DN "
+        "in each bin)",
     )
-    nuced_bin_steps: int = Field(
-        default=1, ge=1, le=100, description="DN per bin of the NUCed histogram when nuced_bin_width is null"
-    )
-    rmse_coverage: float = Field(
-        default=0.999,
-        gt=0,
-        le=1,
-        description="central part of the data over which RMSE and its noise floor are computed",
+    removed: ClassVar[tuple[str, ...]] = (
+        *("parameter_range", "cell_representative"),
+        *("nuced_bin_steps", "rmse_coverage"),
     )
 
     @field_validator("frames")

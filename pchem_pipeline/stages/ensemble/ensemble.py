@@ -134,7 +134,7 @@ class _Fitted:
         start = int(np.maximum(self.low, self.origin).min())
         end = int(np.minimum(self.high, self.origin + self.bins - 1).max()) + 1
         dn = DnAxis(start, end - start)
-        nuced = nuced_axis(self.pixels, dn, width=settings.nuced_bin_width, steps=settings.nuced_bin_steps)
+        nuced = nuced_axis(self.pixels, dn, width=settings.nuced_bin_width)
         largest = min(float(self.pixels.quanta_exposure.max()), 60_000.0)
         mass = electron_pmf(self.pixels.quanta_exposure, int(largest + 12 * math.sqrt(largest) + 40))
         n_k = int(np.searchsorted(np.cumsum(mass), 1.0 - 1e-7)) + 2
