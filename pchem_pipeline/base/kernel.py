@@ -159,13 +159,13 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
 
     @property
     def _numba_type_(self) -> Any:
-        return self.callee._numba_type_
+        return _CalleeType(self.callee)
 
 
 class _CalleeType(numba.types.Dispatcher):  # type: ignore[misc]
-    """A kernel that another one names or is given: called by name, so it needs no address.
+    """A kernel in another one: called by name, so that it needs no address.
 
-    The address of its object, numba's own way, holds for one process: what has it in it is in no cache.
+    numba would put the address of its object in, which is valid in one process only: such code is not cached.
     """
 
 
@@ -179,10 +179,6 @@ def _no_address(context: Any, builder: Any, kind: Any, kernel: Any) -> Any:
 
 class _Callee(CPUDispatcher):  # type: ignore[misc]
     """A kernel as other kernels see it."""
-
-    @property
-    def _numba_type_(self) -> Any:
-        return _CalleeType(self)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return the signature of a call; numba's own way is to compile anew for each constant."""

@@ -195,7 +195,6 @@ class ReportData:
         overscan: ``bias`` and ``read_noise_dn`` of the pixels without electrons, (y, x), NaN elsewhere.
         overscan_facts: ``frame_variance`` and ``row_variance`` there, DN^2.
         channel_names: names of the channels of ready-made histograms.
-        percentiles: percentiles of the summaries, %.
         outlier_sigmas: robust standard deviations beyond which a pixel is an outlier.
         allowed_failed: fraction of pixels without a value that is accepted.
         config_yaml: the resolved configuration.
@@ -238,7 +237,6 @@ class ReportData:
     overscan: Mapping[str, FloatArray] = field(default_factory=dict)
     overscan_facts: Mapping[str, float] = field(default_factory=dict)
     channel_names: Sequence[str] = ()
-    percentiles: tuple[float, ...] = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
     outlier_sigmas: float = 6.0
     allowed_failed: float = 0.1
     config_yaml: str = ""
@@ -397,8 +395,7 @@ class ReportData:
         return found
 
     def _summarised(self, known: Ordered) -> MapSummary:
-        percentiles = tuple(dict.fromkeys((*self.percentiles, 5.0, 95.0)))
-        return summarise(known, percentiles=percentiles, outlier_sigmas=self.outlier_sigmas)
+        return summarise(known, outlier_sigmas=self.outlier_sigmas)
 
     def pixel_error(self, name: str, *, with_flagged: bool = False) -> float | None:
         """Return the median standard error of a pixel in a map; None where it is not known.

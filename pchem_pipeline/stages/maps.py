@@ -176,7 +176,6 @@ def _summarise(context: StageContext, names: list[str]) -> None:
         summary = summarise(
             values,
             left_out=(status & int(flags_of(name))) != 0,
-            percentiles=settings.percentiles,
             outlier_sigmas=settings.outlier_sigmas,
         )
         percentiles = {f"{p:g}": value for p, value in summary.percentiles.items()}

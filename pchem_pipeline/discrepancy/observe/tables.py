@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.observe.tables_numba import (
     SINGULAR,
     CodeSums,
     Fits,
-    Samples,
+    Histograms,
     compare_pixels,
     supports,
 )
@@ -148,7 +148,7 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: BoolArray)
     moments, support = np.zeros(n, MOMENTS), np.tile(np.array([0, 1, 0]), (n, 1))
     tables = np.zeros((1 + int(length[good].sum()), 2), np.float32)
     factors, sums = np.zeros((n, N_NUISANCE, N_COLUMNS)), np.zeros((n, N_TESTS, N_TESTS + 3))
-    histograms = Samples(kernel_counts(seen.counts), seen.origin, seen.outside)
+    histograms = Histograms(kernel_counts(seen.counts), seen.origin, seen.outside)
     compare_pixels(histograms, fits, good, moments, factors, sums, support, tables, codes)
     scores = np.full((n, 3, N_TESTS), np.nan)
     inside = seen.samples - moments["low"][:, 0] - moments["high"][:, 0]

@@ -25,7 +25,7 @@ _NOTHING = 1e-14
 _TOTAL, _CUBE, _FOURTH = N_TESTS, N_TESTS + 1, N_TESTS + 2
 
 
-class Samples(NamedTuple):
+class Histograms(NamedTuple):
     """Histograms of n pixels: counts (n, B), DN of bin 0 (n,), samples below and above (n, 2)."""
 
     counts: NDArray[Any]
@@ -272,7 +272,7 @@ def _add_codes(
 
 @kernel
 def compare_pixels(
-    seen: Samples,
+    seen: Histograms,
     fits: Fits,
     good: BoolArray,
     moments: Any,

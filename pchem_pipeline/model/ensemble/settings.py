@@ -12,16 +12,11 @@ from pchem_pipeline.base.settings import Section
 class MapsSettings(Section):
     """How the maps are summarised, and which pixels are called misfits; no setting changes a parameter."""
 
-    percentiles: tuple[float, ...] = Field(
-        default=(1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0),
-        description="percentiles in the summary of each map, % of the pixels that have a value",
-    )
     outlier_sigmas: float = Field(
         default=6.0,
         gt=0,
         description="outliers: beyond this many robust standard deviations (1.4826 MAD) from the median",
     )
-
     false_discovery_rate: float = Field(
         default=0.05,
         gt=0,
@@ -32,15 +27,7 @@ class MapsSettings(Section):
     worst_pixels: int = Field(
         default=6, ge=0, le=16, description="number of worst-fitting pixels that are listed and drawn"
     )
-
-    @field_validator("percentiles")
-    @classmethod
-    def _within_0_100(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        if any(not 0 <= p <= 100 for p in value):
-            raise ValueError("percentiles must be 0 to 100")
-        if list(value) != sorted(set(value)):
-            raise ValueError("percentiles must increase, none twice")
-        return value
+    removed: ClassVar[tuple[str, ...]] = ("percentiles",)
 
 
 class EnsembleSettings(Section):

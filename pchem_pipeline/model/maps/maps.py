@@ -160,11 +160,15 @@ def status_counts(fit_status: NDArray[np.integer[Any]]) -> dict[str, int]:
     return counts
 
 
+#: Percentiles in the summary of a map, %.
+PERCENTILES = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
+
+
 def summarise(
     values: FloatArray | Ordered,
     *,
     left_out: BoolArray | None = None,
-    percentiles: tuple[float, ...] = (1, 5, 25, 50, 75, 95, 99),
+    percentiles: tuple[float, ...] = PERCENTILES,
     outlier_sigmas: float = 6.0,
 ) -> MapSummary:
     """Describe a map by order statistics alone.

@@ -94,7 +94,7 @@ def _numbers_of(name: str, summary: MapSummary, data: ReportData) -> dict[str, A
         "median": summary.median,
         "median_stderr": summary.median_stderr,
         "robust_sd": summary.robust_sd,
-        "percentiles": {f"{p:g}": summary.percentiles[p] for p in data.percentiles},
+        "percentiles": {f"{p:g}": value for p, value in summary.percentiles.items()},
         "minimum": summary.minimum,
         "maximum": summary.maximum,
         "n_pixels": summary.n_valid,

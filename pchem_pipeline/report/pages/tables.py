@@ -160,7 +160,7 @@ def _parameter_row(data: ReportData, name: str) -> Row:
         "median": measured(summary.median, summary.median_stderr),
         "spread": short(summary.robust_sd),
         f"error per {data.noun}": "not known" if error is None else short(error, 2),
-        **{f"{p:g} %": short(summary.percentiles[p], 4) for p in data.percentiles if p != 50.0},
+        **{f"{p:g} %": short(value, 4) for p, value in summary.percentiles.items() if p != 50.0},
         "outliers": f"{summary.n_low + summary.n_high:,}",
         "pixels": f"{summary.n_valid:,}",
     }

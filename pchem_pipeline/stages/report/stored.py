@@ -128,7 +128,6 @@ def read_run(
         overscan=groups["overscan"],
         overscan_facts=store.attributes("overscan"),
         channel_names=[short_name(name) for name in sensor.names],
-        percentiles=config.maps.percentiles,
         outlier_sigmas=config.maps.outlier_sigmas,
         allowed_failed=config.run.allowed_failed_pixels,
         criteria=config.report.criteria,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.ensemble.settings import EnsembleSettings, MapsSettings
+from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
@@ -163,8 +163,6 @@ def test_median_error_of_a_normal_map():
     ("settings", "values", "words"),
     [
         (EnsembleSettings, {"frames": 0}, "at least one frame"),
-        (MapsSettings, {"percentiles": (50.0, 10.0)}, "increase"),
-        (MapsSettings, {"percentiles": (50.0, 110.0)}, "0 to 100"),
     ],
 )
 def test_settings_refuse_nonsense(settings, values, words):
