@@ -107,8 +107,10 @@ def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
         lines += ["", *_headline(numbers["headline"])]
     shown = " ".join(answer["text"] for answer in numbers["answers"] if not answer["criteria"])
     for flag in numbers["flags"]:
-        if flag["level"] != "good" and flag["text"] not in shown:
-            lines += _wrapped(f"{flag['level'].capitalize()}: {flag['text']}", "  ", "")
+        level = flag["level"]
+        told = level in ("serious", "caution") or (level == "note" and flag["about"] == "sensor")
+        if told and flag["text"] not in shown:
+            lines += _wrapped(f"{level.capitalize()}: {flag['text']}", "  ", "")
     lines.append("")
     for i, step in enumerate(numbers["next"]):
         words = " ".join(run if word == "RUN" else word for word in step["command"].split(" "))

@@ -90,7 +90,7 @@ def nothing_left_of_a_refusal(place: Path) -> Iterator[None]:
 
 def _is_empty(place: Path) -> bool:
     """Return whether no stage has done anything in a store, which may be bare or not exist."""
-    # where the write of an array failed, zarr may still be at others
+    # where the write of a chunk failed, zarr may still be writing others
     if place.exists() and not {each.name for each in place.iterdir()} <= {"zarr.json", "model", ".pchem"}:
         return False
     if not (place / ".pchem").is_dir():

@@ -154,8 +154,8 @@ class _Table:
         if lines == "rows":
             return self
         order = [STEPS.index((dx, dy)) for dy, dx in STEPS]
-        turned = self.first.T, self.ratios.swapaxes(0, 1)[..., order]
-        return _Table(*map(np.ascontiguousarray, turned))
+        ratios = np.take(self.ratios.swapaxes(0, 1), order, axis=-1)
+        return _Table(np.ascontiguousarray(self.first.T), ratios)
 
     def compared(self, lines: NDArray[Any], stride: int, *, whole: bool) -> tuple[FloatArray, Float32Array]:
         """Return what a share of misplaced rows gains each, and likelihood ratios (frame, y, N_PLACES)."""

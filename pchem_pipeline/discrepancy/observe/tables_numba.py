@@ -151,6 +151,41 @@ def sum_scores(law: FloatArray, inverse: FloatArray, seen: FloatArray, sums: Flo
 
 
 @kernel
+def _count(
+    counts: NDArray[Any], start: int, ends: tuple[int, int, int, int], within: FloatArray, moments: Any
+) -> None:
+    """Fill the samples of each code of the support; add those beyond it, and far beyond, to the moments.
+
+    Args:
+        counts: histogram of a pixel.
+        start: code of its bin 0.
+        ends: first and last code of the support, and those that are not far beyond it.
+        within: out, samples of the codes of the support.
+        moments: of the pixel, one of :data:`~.tables.MOMENTS`.
+    """
+    low, high, far_low, far_high = ends
+    for b in range(counts.size):
+        count, x = float(counts[b]), start + b
+        moments.low[0] += count if x < low else 0.0
+        moments.high[0] += count if x > high else 0.0
+        moments.far_low[0] += count if x < far_low else 0.0
+        moments.far_high[0] += count if x > far_high else 0.0
+        if low <= x <= high:
+            within[x - low] = count
+
+
+@kernel
+def _expect(law: FloatArray, inverse: FloatArray, seen: FloatArray, expected: FloatArray) -> None:
+    """Add the samples expected of each code, the parameters moved, to first order, to suit the samples."""
+    for i in range(N_NUISANCE):
+        moved = 0.0
+        for x in range(seen.size):
+            moved += law[x, i] * seen[x] * inverse[x]
+        for x in range(seen.size):
+            expected[x] += moved * law[x, i]
+
+
+@kernel
 def _goodness(
     law: FloatArray, seen: FloatArray, expected: FloatArray, shortest: float
 ) -> tuple[float, float, float]:
@@ -322,31 +357,18 @@ def compare_pixels(
             good[p] = False
             continue
         found = moments[p]
-        found.low[0] = found.far_low[0] = seen.outside[p, 0]
-        found.high[0] = found.far_high[0] = seen.outside[p, 1]
         found.low[1], found.high[1] = below, above
         found.far_low[1], found.far_high[1] = far_below, far_above
-        for b in range(seen.counts.shape[1]):
-            count, x = float(seen.counts[p, b]), seen.origin[p] + b - window
-            if count == 0.0:
-                continue
-            found.low[0] += count if x < low else 0.0
-            found.high[0] += count if x > high else 0.0
-            found.far_low[0] += count if x < far_low else 0.0
-            found.far_high[0] += count if x > far_high else 0.0
-            if low <= x <= high:
-                within[x - low] = count
-            if 0 <= x + window - codes.first < codes.single.shape[1]:
-                codes.single[0, x + window - codes.first] += count
+        found.low[0] = found.far_low[0] = seen.outside[p, 0]
+        found.high[0] = found.far_high[0] = seen.outside[p, 1]
+        _count(seen.counts[p], seen.origin[p] - window, (low, high, far_low, far_high), within, found)
         whiten(law, inverse, factors[p])
         sum_scores(law, inverse, within, score_sums[p])
-        # the parameters moved, to first order, to suit the samples
-        for i in range(N_NUISANCE):
-            moved = 0.0
-            for x in range(size):
-                moved += law[x, i] * within[x] * inverse[x]
-            for x in range(size):
-                expected[x] += moved * law[x, i]
+        _expect(law, inverse, within, expected)
+        for b in range(seen.counts.shape[1]):
+            at = seen.origin[p] + b - codes.first
+            if 0 <= at < codes.single.shape[1]:
+                codes.single[0, at] += seen.counts[p, b]
         for x in range(full.shape[0]):
             at = window + x - codes.first
             if 0 <= at < codes.single.shape[1]:

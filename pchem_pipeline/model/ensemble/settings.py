@@ -51,8 +51,10 @@ class EnsembleSettings(Section):
         "in each bin)",
     )
     removed: ClassVar[tuple[str, ...]] = (
-        *("parameter_range", "cell_representative"),
-        *("nuced_bin_steps", "rmse_coverage"),
+        "parameter_range",
+        "cell_representative",
+        "nuced_bin_steps",
+        "rmse_coverage",
     )
 
     @field_validator("frames")

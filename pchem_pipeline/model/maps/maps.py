@@ -16,6 +16,9 @@ from pchem_pipeline.model.maps.ordered import Ordered
 
 GOOD, CAUTION, NO_VALUE = 0, 1, 2
 
+#: Percentiles in the summary of a map, %.
+PERCENTILES = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
+
 
 @dataclass(frozen=True)
 class MapSummary:
@@ -158,10 +161,6 @@ def status_counts(fit_status: NDArray[np.integer[Any]]) -> dict[str, int]:
         if bit:
             counts[str(bit.name).lower()] = int(np.count_nonzero(fit_status & int(bit)))
     return counts
-
-
-#: Percentiles in the summary of a map, %.
-PERCENTILES = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
 
 
 def summarise(
