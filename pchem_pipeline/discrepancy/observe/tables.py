@@ -172,9 +172,6 @@ def _code_axis(window: IntArray) -> tuple[int, int]:
     return first, last - first + 1
 
 
-# -- efficient scores --------------------------------------------------------------------------------
-
-
 def efficient_scores(
     sums: FloatArray, factors: FloatArray, samples: FloatArray, exposure: FloatArray
 ) -> FloatArray:

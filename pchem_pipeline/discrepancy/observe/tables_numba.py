@@ -154,15 +154,7 @@ def sum_scores(law: FloatArray, inverse: FloatArray, seen: FloatArray, sums: Flo
 def _count(
     counts: NDArray[Any], start: int, ends: tuple[int, int, int, int], within: FloatArray, moments: Any
 ) -> None:
-    """Fill the samples of each code of the support; add those beyond it, and far beyond, to the moments.
-
-    Args:
-        counts: histogram of a pixel.
-        start: code of its bin 0.
-        ends: first and last code of the support, and those that are not far beyond it.
-        within: out, samples of the codes of the support.
-        moments: of the pixel, one of :data:`~.tables.MOMENTS`.
-    """
+    """Fill the samples of each code of the support; add those beyond it, and far beyond, to the moments."""
     low, high, far_low, far_high = ends
     for b in range(counts.size):
         count, x = float(counts[b]), start + b
@@ -265,16 +257,8 @@ def _add_codes(
 ) -> None:
     """Add residuals of a pixel and their covariance: per code, per code modulo 16, per bin of codes.
 
-    In the bins they are weighted with what a shift of the scale does to each code, so that they sum to the
-    shift of the scale there.
-
-    Args:
-        law: whitened, (code, ...).
-        seen: samples of each code.
-        expected: those expected.
-        shift: what a shift of the scale does to each code.
-        first: place of the first code on the axis of the sums.
-        sums: to add to.
+    In the bins they are weighted with ``shift``, what a shift of the scale does to each code, so that they
+    sum to the shift of the scale there. ``first`` is the place of the first code on the axis of the sums.
     """
     last, n = first + seen.size - 1, seen.sum()
     if first < 0 or last >= sums.single.shape[1]:
