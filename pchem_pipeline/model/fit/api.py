@@ -32,10 +32,8 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 Counts = NDArray[np.integer]
 
-WARM_UP = (
-    2  # EM steps before the first Newton step, of several samples; the start of one is good enough without
-)
-_CLEAR_GAP = search_numba.CLEAR_GAP
+#: EM steps before the first Newton step, of several samples; the start of one is good enough without.
+_WARM_UP = 2
 # Frames and degrees of freedom below which it matters that merging bins for the chi-square test hides part of
 # what the parameters know: it is half a degree of freedom or so.
 _FEW_FRAMES, _FEW_GROUPS = 5000, 40
@@ -64,46 +62,35 @@ def fit_histograms(
 ) -> FitResult:
     """Estimate (H, g, mu, sigma) of every pixel from its histograms by maximum likelihood.
 
-    The likelihood is that of the PCD at whole DN (Hendrickson et al. 2023, eq. X_density); of several
-    exposures of a pixel (Hendrickson and Haefner 2024), which share g, mu and sigma, the product. A start
-    from the empirical characteristic function, or from the line of variance against mean, is improved by
-    damped Newton steps with Louis' observed information, by
-    EM steps, eqs. (update_eqns) to (gamma_nk), where that does not help (``algorithm: em``: by EM steps
-    alone), until the expected rise is below the tolerance. The neighbours (H -+ 1, mu +- 1/g) are tried,
-    unless a good fit leaves them no chance, and the likeliest is kept; a pixel whose goodness of fit or read
-    noise raises suspicion gets other starts. No pixel raises: what cannot be fitted holds NaN and a reason.
-    The answer for a pixel does not depend on the others in the batch.
+    The likelihood is that of the PCD at whole DN (Hendrickson et al. 2023, eq. X_density), or the product
+    over the exposures of a pixel, which share g, mu and sigma (Hendrickson and Haefner 2024). A start from
+    the empirical characteristic function, or from the line of variance against mean, is improved by damped
+    Newton steps with Louis' observed information, where these do not help by EM steps, eqs. (update_eqns) to
+    (gamma_nk), until the expected rise is below the tolerance. The neighbours (H -+ 1, mu +- 1/g) are tried
+    unless a good fit rules them out, and a suspicious goodness of fit or read noise asks for more starts; the
+    likeliest maximum is kept. No pixel raises: what cannot be fitted holds NaN and a reason. The answer for a
+    pixel does not depend on the others in the batch.
 
-    Under another ``law``, and where the settings ask for the exact likelihood, a second fit starts from that
-    one: the mass of every code is an integral over its cell, not a density at its middle, so that rounding,
-    code edges and clipping are exact, and the likelihood is bounded at any read noise.
+    Under another ``law``, and with the exact likelihood, a second fit starts from that one: each code has the
+    integral over its cell, so that rounding, code edges and clipping are exact.
 
-    Samples that the model does not expect at all are left out (setting ``tail_guard``): a few outliers move
-    nothing, and a pixel without any has the very estimates that it would have without the guard.
+    Samples that the model does not expect at all are left out (setting ``tail_guard``).
 
     Args:
-        counts: histograms, shape (n, B), any unsigned type; or a list of them, (n, B_j), one for each
-            exposure.
-        origin: DN of bin 0, shape (n,); or a list of them.
-        under: frames below bin 0, of all samples, shape (n,); such pixels are fitted inside the window and
-            flagged.
+        counts: histograms, shape (n, B), any unsigned type; or one array (n, B_j) for each exposure.
+        origin: DN of bin 0, shape (n,); or one array for each exposure.
+        under: frames below bin 0, of all samples, shape (n,); such pixels are flagged.
         over: frames above the last bin, shape (n,).
         dark: which samples hold no electrons (H = 0 exactly); none by default.
-        law: law of the samples of these pixels, or a list of them, one for each exposure; the PCD if None.
+        law: law of the samples, or one for each exposure; the PCD if None.
         settings: how to fit; the defaults if None.
         adc_limits: first and last code of the ADC, DN, unless samples lie beyond; pixels that reach them are
             flagged, and the exact likelihood counts what lies beyond there.
-        start: a fit of the same histograms with the PCD, from which that under the law starts; or
-            (H_1 ... H_J, g, mu, sigma) known to be near the answer, shape (n, J + 3), NaN where nothing is
-            known. In the latter case the maximum next to it is taken where it fits well, without a look at
-            its neighbours: the bias is not tested for ambiguity, and the likelihood gap is that to one
-            Gaussian.
-        excluding: intervals of e- on the comb of the fit with the PCD: codes there are set aside. The
-            likelihood is conditional on the other codes (a truncated sample, Fisher 1931), so the number of
-            samples in them does not matter either.
-
-    Returns:
-        Estimates, covariances and a status word per pixel.
+        start: a fit of the same histograms with the PCD; or (H_1 ... H_J, g, mu, sigma) near the answer,
+            shape (n, J + 3), NaN where unknown. Where the maximum next to such parameters fits well, its
+            neighbours are not tried: the likelihood gap is that to one Gaussian.
+        excluding: intervals of e- on the comb of the fit with the PCD. The likelihood is conditional on the
+            codes outside them (a truncated sample, Fisher 1931).
 
     Raises:
         ValueError: if there is no sample, their shapes disagree, or none holds electrons.
@@ -142,12 +129,10 @@ def likelihood_moments(
 ) -> Moments:
     """Return mean square deviations of (H, g, mu, sigma) from their estimates, of pixels that are fitted.
 
-    The inverse information is the covariance of a likelihood that falls as a normal law does. Where the read
-    noise is high, or frames are few, the likelihood falls more slowly, to one side, or has a second maximum
-    an electron away. So the moments are taken over the likelihood itself, as over a posterior: along the bias
+    With high read noise, or few frames, the likelihood is no normal law, and may have a second maximum an
+    electron away. So the moments are taken over the likelihood itself, as over a posterior: along the bias
     over its profile, and across it by Laplace's approximation (Tierney and Kadane 1986) under Jeffreys'
-    prior, whose volume cancels that of the approximation. They are about the estimate, not the mean: it is
-    the estimate that is used.
+    prior, whose volume cancels that of the approximation. They are about the estimate, not the mean.
 
     Args:
         counts: histograms, shape (n, B).
@@ -179,10 +164,9 @@ def satellite_threshold(law: SampleLaw) -> float:
     """Return the rise of the log-likelihood, nats, that free satellite peaks must bring to be kept.
 
     At a weight of 0, the border of what is allowed, twice the rise is 0 or, half of the time, chi-square
-    with one degree of freedom. The amplitude means nothing there, so the largest of the rises at all
-    amplitudes counts (Davies 1987); by Bonferroni's bound over them a pixel without satellites is given some
-    with about the probability ``free_satellite_alarm``: neighbouring amplitudes rise together, which lowers
-    it, and the best one is refined, which raises it.
+    with one degree of freedom. The largest of the rises at all amplitudes counts (Davies 1987); by
+    Bonferroni's bound a pixel without satellites is given some with about the probability
+    ``free_satellite_alarm``.
     """
     trials = max(len(law.free_satellites), 1)
     return 0.5 * float(chdtri(1.0, min(1.0, 2.0 * law.free_satellite_alarm / trials)))
@@ -200,13 +184,8 @@ def _check(samples: Sequence[Counts], origins: Sequence[Counts], dark: Sequence[
 
 def _shaped(result: FitResult, *columns: int) -> FitResult:
     """Return a result with the arrays of samples of shape (n, *columns)."""
-    n = result.bias.size
-    return replace(
-        result,
-        quanta_exposure=result.quanta_exposure.reshape(n, *columns),
-        mean=result.mean.reshape(n, *columns),
-        variance=result.variance.reshape(n, *columns),
-    )
+    shape, names = (result.bias.size, *columns), ("quanta_exposure", "mean", "variance")
+    return replace(result, **{name: getattr(result, name).reshape(shape) for name in names})
 
 
 class _Batch:
@@ -288,28 +267,23 @@ class _Batch:
 
     def refine(self, plain: FitResult, laws: Sequence[SampleLaw] | None) -> FitResult:
         """Fit again with the cells what the law or the settings ask for, from a fit with the density."""
-        fitted = (plain.fit_status & int(FAILED)) == 0
-        if laws is not None or (self.given.mask == SET_ASIDE).any():
-            laws = laws or self.neutral()
-            pixels = np.flatnonzero(
-                fitted | (self._at_limits(laws) & ((plain.fit_status & int(_NO_FIT)) == 0))
-            )
-        elif self.settings.likelihood == "exact":
-            pixels = np.flatnonzero((plain.fit_status & int(_NO_FIT)) == 0)
+        words, possible = plain.fit_status, (plain.fit_status & int(_NO_FIT)) == 0
+        scan = laws is None and not (self.given.mask == SET_ASIDE).any()
+        chosen = laws or self.neutral()
+        if not scan:
+            wanted = ((words & int(FAILED)) == 0) | (self._at_limits(chosen) & possible)
         elif self.settings.likelihood == "auto":
-            cut = self._at_limits(self.neutral()) & ((plain.fit_status & int(_NO_FIT)) == 0)
-            pixels = np.flatnonzero(self._coarse(plain) | cut)
+            wanted = self._coarse(plain) | (self._at_limits(chosen) & possible)
         else:
-            pixels = np.empty(0, np.intp)
+            wanted = possible & (self.settings.likelihood == "exact")
+        pixels = np.flatnonzero(wanted)
         if pixels.size == 0:
             return plain
         self.by_cells[pixels] = True
-        chosen = laws or self.neutral()
-        near, gaps = plain.columns, plain.likelihood_gap
-        part = self.fit_cells(chosen, near, gaps=gaps, pixels=pixels, scan=laws is None)
+        part = self.fit_cells(chosen, plain.columns, gaps=plain.likelihood_gap, pixels=pixels, scan=scan)
         part = replace(
             part,
-            fit_status=part.fit_status | (plain.fit_status[pixels] & np.uint16(int(_OF_DATA))),
+            fit_status=part.fit_status | (words[pixels] & np.uint16(int(_OF_DATA))),
             n_iterations=part.n_iterations + plain.n_iterations[pixels],
         )
         return plain.with_pixels(pixels, part)
@@ -330,7 +304,7 @@ class _Batch:
         gap = np.full(some.size, np.inf) if gaps is None else gaps[some]
         for each in own:  # the plain fit of an exposure that is not one may be an electron off
             mixed = ((each.added_weights > 0.0) & (each.added_exposure > 0.0)).any(axis=1)
-            gap = np.where(mixed, np.minimum(gap, 0.999 * _CLEAR_GAP), gap)
+            gap = np.where(mixed, np.minimum(gap, 0.999 * search_numba.CLEAR_GAP), gap)
         starts = Starts(
             np.ascontiguousarray(near[some], np.float64),
             np.ascontiguousarray(gap, np.float64),
@@ -351,32 +325,26 @@ class _Batch:
         return Histograms(counts[some], places, origin[some], dark, mask[some])
 
     def _fit(self, given: Histograms, laws: Sequence[SampleLaw], starts: Starts, limits: Limits) -> Answers:
-        n = given.counts.shape[0]
-        answers = self._answers(n)
+        n, size, cells = given.counts.shape[0], self.n_samples + 3, limits.cells
+        answers = Answers(
+            np.full((n, size), np.nan),
+            np.full((n, size, size), np.nan),
+            np.full((n, self.n_samples, 2), np.nan),
+            np.full((n, search_numba.N_OUT), np.nan),
+            np.zeros((n, tile_numba.N_WORDS), np.int64),
+        )
         packed = pack(laws, n)
-        cells = limits.cells
-        evaluate = engine.likelihood(cells)
         plain = self.n_samples == 1 and not limits.sandwich
         fit_tile = tile_numba.fit_plain_tile if plain else tile_numba.fit_tile
         search = engine.cells_search(starts.amplitudes.size > 0) if cells else engine.density_search()
+        tools = engine.likelihood(cells), engine.climb(), search, engine.regression_basis()
 
         def fit(pixels: NDArray[np.intp], quick: bool) -> None:
             answers.parameters[pixels] = np.nan
             answers.covariance[pixels] = np.nan
             # a few at a time: a signal is heard between kernels only
             for some in np.array_split(pixels, pixels.size // 1024 + 1):
-                fit_tile(
-                    given,
-                    some,
-                    packed,
-                    starts,
-                    limits._replace(quick=quick),
-                    evaluate,
-                    engine.climb(),
-                    search,
-                    engine.regression_basis(),
-                    answers,
-                )
+                fit_tile(given, some, packed, starts, limits._replace(quick=quick), *tools, answers)
 
         def expect(pixels: NDArray[np.intp], gone: FloatArray) -> FloatArray:
             satellites = answers.out[pixels][:, [search_numba.AMPLITUDE, search_numba.SATELLITE_WEIGHT]]
@@ -385,17 +353,6 @@ class _Batch:
 
         fit_guarded(fit, expect, given, limits, answers)
         return answers
-
-    def _answers(self, n: int) -> Answers:
-        """Return room for the answers of so many pixels."""
-        size = self.n_samples + 3
-        return Answers(
-            np.full((n, size), np.nan),
-            np.full((n, size, size), np.nan),
-            np.full((n, self.n_samples, 2), np.nan),
-            np.full((n, search_numba.N_OUT), np.nan),
-            np.zeros((n, tile_numba.N_WORDS), np.int64),
-        )
 
     def moments(
         self,
@@ -420,7 +377,7 @@ class _Batch:
             bound=float(np.log(settings.minimum_quanta_exposure)),
             tolerance=settings.tolerance,
             most=settings.em_max_iterations if em else settings.max_iterations,
-            warm_up=0 if self.n_samples == 1 else WARM_UP,
+            warm_up=0 if self.n_samples == 1 else _WARM_UP,
             only_em=em,
             cells=laws is not None,
             gap=settings.gap_threshold,
@@ -488,9 +445,8 @@ class _Batch:
     def _aliased(self, plain: FitResult) -> BoolArray:
         """Return in which pixels the comb of frequency ``1 - g`` may be the right one.
 
-        Between 1.2 and 6 DN per electron there is such a comb. With the same variance V its skewness is at
-        most ``1 / (sqrt(V) (1 - g))``; where that of the fit, ``H / (g^3 V^1.5)``, is higher by five of its
-        standard errors, ``sqrt(6 / N)`` and more of a skewed sample, it is not.
+        With the same variance V its skewness is at most ``1 / (sqrt(V) (1 - g))``: it is ruled out where that
+        of the fit, ``H / (g^3 V^1.5)``, is five standard errors higher, ``sqrt(6 / N)`` each and more.
         """
         if self.n_samples > 1:
             return np.zeros(self.n, np.bool_)
@@ -562,8 +518,7 @@ class _Batch:
     ) -> FloatArray:
         """Return the degrees of freedom of chi-square, those that merged bins leave to it included.
 
-        The estimates know every DN, the test only the groups: of the four parameters it loses as many as the
-        groups determine (Chernoff and Lehmann 1954). Many frames leave few DN merged, and that is all four.
+        It loses as many of the four parameters as its groups determine (Chernoff and Lehmann 1954).
         """
         freedom = words[:, tile_numba.FREEDOM].astype(np.float64)
         few = np.flatnonzero((freedom > 0) & (freedom < _FEW_GROUPS) & (frames < _FEW_FRAMES))
@@ -588,10 +543,8 @@ class _Batch:
     def intervals(self, found: FitResult, laws: Sequence[SampleLaw] | None) -> FloatArray:
         """Return the ends of profile-likelihood intervals, (n, J + 4, 2); NaN where there are none.
 
-        At an end the profile likelihood has fallen by ``z^2 / 2`` nats, all other parameters being at their
-        best for each value of the one (Venzon and Moolgavkar 1988). Unlike ``estimate -+ z stderr`` the ends
-        need not be symmetric, and they follow a change of parameter. Pixels whose cells were integrated have
-        the profile of that likelihood.
+        At an end the profile likelihood has fallen by ``z^2 / 2`` nats (Venzon and Moolgavkar 1988). Pixels
+        whose cells were integrated have the profile of that likelihood.
         """
         ends = np.full((self.n, self.n_samples + 4, 2), np.nan)
         fitted = np.isfinite(found.bias)
