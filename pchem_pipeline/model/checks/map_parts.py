@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import bdtr, stdtr
 
 from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.model.arithmetic.robust import OF_MEDIAN_DEVIATION
 
 #: Chance of a false alarm for a map, all places that are looked at together.
 _ALARM = 1e-4
@@ -17,7 +18,6 @@ _FEWEST, _MOST = 4, 8
 _PIXELS, _VALUES = 512, 1 << 18
 #: Share of the pixels that a mode has at least.
 _SHARE = 0.05
-
 
 Box = tuple[int, int, int, int]
 
@@ -39,11 +39,8 @@ def map_parts(values: FloatArray) -> list[Parts]:
     """Find steps of a map along its columns and rows; without any, two modes of its values.
 
     A step is a jump of the medians of lines against a common slope, by at least the robust standard deviation
-    of the pixels within the parts: a smaller one hardly matters to a median over the sensor. The map is
-    divided at the most significant one, and each part likewise.
-
-    Args:
-        values: the map, NaN where it has no value, shape (ny, nx).
+    of the pixels within the parts. The map, NaN where it has no value, is divided at the most significant
+    one, and each part likewise.
     """
     # of each line, all of it and both halves are looked at
     boxes = _divided(values, (0, values.shape[0], 0, values.shape[1]), _ALARM / (3.0 * sum(values.shape)))
@@ -72,10 +69,7 @@ def _median(values: FloatArray) -> float:
 
 
 def _step(values: FloatArray) -> tuple[float, int]:
-    """Return the p-value of the most significant step along the columns, and its place.
-
-    Lines are looked at as a whole and in halves: where steps cross, those of the halves may cancel.
-    """
+    """Return p-value and place of the most significant step along the columns, whole or in halves."""
     middle = len(values) // 2
     return min(_step_of(part) for part in (values, values[:middle], values[middle:]))
 
@@ -85,12 +79,11 @@ def _step_of(values: FloatArray) -> tuple[float, int]:
         return 1.0, -1
     some = np.unique(np.linspace(0, len(values) - 1, min(len(values), _PIXELS)).astype(np.int64))
     chosen = values[some]
-    full = np.isfinite(chosen).sum(axis=0) >= _FEWEST
-    columns = np.flatnonzero(full)
+    columns = np.flatnonzero(np.isfinite(chosen).sum(axis=0) >= _FEWEST)
     if columns.size < 2 * _FEWEST:
         return 1.0, -1
-    lines = np.nanmedian(chosen[:, full], axis=0)
-    spread = 1.4826 * float(np.nanmedian(np.abs(chosen[:, full] - lines)))
+    lines = np.nanmedian(chosen[:, columns], axis=0)
+    spread = OF_MEDIAN_DEVIATION * float(np.nanmedian(np.abs(chosen[:, columns] - lines)))
     p, at = _best_step(lines, spread)
     return p, int(columns[at])
 
@@ -128,10 +121,9 @@ def _two_modes(values: FloatArray) -> list[Parts]:
     cut = ends[0] + int(np.argmax(share[ends[0] : ends[1] - 1])) + 1
     medians = float(np.median(known[:cut])), float(np.median(known[cut:]))
     quarter, middle = 0.125 * (medians[1] - medians[0]), 0.5 * (medians[0] + medians[1])
-    counts = [
-        int(np.diff(np.searchsorted(known, (c - quarter, c + quarter)))[0])
-        for c in (medians[0], middle, medians[1])
-    ]
-    fewest = min(counts[0], counts[2])
-    p = float(bdtr(counts[1], counts[1] + fewest, 0.5)) if fewest else 1.0
+    centres = np.array([medians[0], middle, medians[1]])
+    low, high = np.searchsorted(known, (centres - quarter, centres + quarter))
+    left, between, right = (high - low).tolist()
+    fewest = min(left, right)
+    p = float(bdtr(between, between + fewest, 0.5)) if fewest else 1.0
     return [Parts((), medians)] if n * p < _ALARM else []

@@ -18,11 +18,7 @@ def false_discovery(probability: NDArray[np.floating[Any]]) -> FloatArray:
     ``q_(i) = min_(j >= i) p_(j) n / j``. Among the pixels with q below a limit the expected share of those
     that agree with the model is at most that limit, for independent pixels.
 
-    Args:
-        probability: p-values, any shape; NaN where nothing was tested.
-
-    Returns:
-        q-values, same shape, NaN where nothing was tested.
+    Of p-values of any shape, NaN where nothing was tested.
 
     Example:
         >>> false_discovery(np.array([0.01, 0.04, 0.5])).round(2).tolist()
@@ -42,27 +38,14 @@ def false_discovery(probability: NDArray[np.floating[Any]]) -> FloatArray:
 def misfit(chi2: FloatArray, dof: FloatArray) -> FloatArray:
     """Return chi-square as a standard normal deviate (Wilson and Hilferty 1931), large for a poor fit.
 
-    Unlike a p-value it does not run out of digits.
-
-    Args:
-        chi2: any shape.
-        dof: degrees of freedom, same shape; 0 where nothing was tested.
-
-    Returns:
-        Deviates, same shape; NaN where nothing was tested.
+    Unlike a p-value it does not run out of digits; NaN where there are no degrees of freedom.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         return chi_square(chi2, np.where(dof > 0, dof, np.nan))
 
 
 def poorest(chi2: FloatArray, dof: FloatArray, n: int) -> list[tuple[int, int]]:
-    """Return (y, x) of the n pixels of the poorest fit, the poorest first.
-
-    Args:
-        chi2: map of chi-square, shape (y, x).
-        dof: map of its degrees of freedom.
-        n: how many; fewer where fewer were tested.
-    """
+    """Return (y, x) of the n pixels of the poorest fit, the poorest first; fewer where fewer were tested."""
     score = misfit(chi2, dof).ravel()
     order = np.argsort(-score, kind="stable")[:n]
     return [divmod(int(i), chi2.shape[1]) for i in order if np.isfinite(score[i])]

@@ -29,16 +29,10 @@ class ChiSquare:
 
 
 def central_window(counts: NDArray[np.integer[Any]]) -> slice:
-    """Find the bins that hold the central 99.9 % of the data.
+    """Return the bins that hold the central 99.9 % of the samples, which are not all zero.
 
     A few hot pixels stretch the axis over thousands of empty bins; an RMSE over all of them would shrink with
-    the length of the axis. This window does not.
-
-    Args:
-        counts: samples in each bin, shape (n,), not all zero.
-
-    Returns:
-        The bins as a slice.
+    the length of the axis.
     """
     cumulative = np.cumsum(counts)
     tail = 0.0005 * cumulative[-1]
@@ -48,43 +42,17 @@ def central_window(counts: NDArray[np.integer[Any]]) -> slice:
 
 
 def rmse(data: FloatArray, model: FloatArray, window: slice = slice(None)) -> float:
-    """Root mean square difference between two densities on the same bins.
-
-    Args:
-        data: density of the data, 1/unit, shape (n,).
-        model: predicted density, same unit and shape.
-        window: the bins to compare.
-
-    Returns:
-        RMSE in the unit of the densities.
-    """
+    """Return the root mean square difference between two densities on the same bins, in their unit."""
     return math.sqrt(float(np.mean((data[window] - model[window]) ** 2)))
 
 
 def noise_floor(variance: FloatArray, window: slice = slice(None)) -> float:
-    """Root of the expected mean square difference between data and their own true density.
-
-    Args:
-        variance: variance of the density of each bin, shape (n,).
-        window: the bins to compare.
-
-    Returns:
-        The RMSE that counting alone causes.
-    """
+    """Return the RMSE that counting alone causes, from the variance of the density of each bin."""
     return math.sqrt(float(np.mean(variance[window])))
 
 
 def normalised_residuals(data: FloatArray, model: FloatArray, variance: FloatArray) -> FloatArray:
-    """Differences in units of their standard deviation.
-
-    Args:
-        data: density of the data, shape (n,).
-        model: predicted density, shape (n,).
-        variance: variance of the data's density, shape (n,).
-
-    Returns:
-        ``(data - model) / sqrt(variance)``; NaN where the variance is zero.
-    """
+    """Return ``(data - model) / sqrt(variance)``; NaN where the variance is zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(variance > 0, (data - model) / np.sqrt(variance), np.nan)
 

@@ -173,26 +173,17 @@ def compare_maps(
         p = np.zeros(good.shape)
         p[odd] = confirm(*np.nonzero(odd))
         q = _q_values([np.fmax(a, p[place]) for a, place in zip(likely, places, strict=True)], tested)
-    return {
-        name: _with_changed(each, place, each_q, rate)
-        for (name, each), place, each_q in zip(found.items(), places, q, strict=True)
-    }
+    for name, place, each_q in zip(found, places, q, strict=True):
+        changed = np.zeros(good.shape, np.bool_)
+        changed[place] = each_q <= rate
+        smallest = float(np.min(each_q, initial=1.0))
+        found[name] = replace(found[name], changed=changed, n_changed=int(changed.sum()), p_value=smallest)
+    return found
 
 
 def _q_values(likely: Sequence[FloatArray], tested: int) -> list[FloatArray]:
-    """Return the q-values of the smallest p-values of each map, out of all that were tested.
-
-    Map by map: where one has changed throughout, no pixel of another is let through in its company.
-    """
+    """Return the q-values of the smallest p-values, map by map, out of all that were tested."""
     return [false_discovery(few * (tested / max(few.size, 1))) for few in likely]
-
-
-def _with_changed(found: MapDifference, place: Any, q: FloatArray, rate: float) -> MapDifference:
-    changed = np.zeros(found.z.shape, np.bool_)
-    changed[place] = q <= rate
-    return replace(
-        found, changed=changed, n_changed=int(changed.sum()), p_value=float(np.min(q, initial=1.0))
-    )
 
 
 def common_fit_p(
@@ -283,9 +274,6 @@ def reasons_of_change(found: MapDifference) -> Reasons:
     Where all values moved by just the limit, ``z`` less the limit is N(0, 1): its median has standard error
     ``sqrt(pi / 2 n)``, its robust standard deviation ``1.166 / sqrt(n)`` (Maronna et al., *Robust
     Statistics*, 2019, Sec. 2.5), to which a tenth is added since the standard errors are estimates.
-
-    Args:
-        found: of two runs on different frames.
     """
     n = found.n_counted
     if n < 2:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
-from pchem_pipeline.model.arithmetic.robust import OF_MEDIAN_DEVIATION
+from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.fit.settings import FitSettings
 
 #: Largest change of the logarithm of a pixel's information over one standard error of its read noise. Beyond,
@@ -46,7 +46,7 @@ class _Prior:
     @classmethod
     def of(cls, values: FloatArray, errors: FloatArray) -> _Prior:
         centre = float(np.median(values))
-        scatter = OF_MEDIAN_DEVIATION * float(np.median(np.abs(values - centre)))
+        scatter = robust_sd(values, centre)
         return cls(centre, max(0.0, scatter**2 - _CHANCE * float(np.median(errors)) ** 2))
 
     def shrunk(self, values: FloatArray, errors: FloatArray) -> FloatArray:
@@ -114,9 +114,7 @@ class NoisePool:
         if some.noise.size < _FEWEST:
             return None
         noise = _Prior.of(some.noise, some.stderr)
-        near = np.abs(some.noise - noise.centre) <= 3.0 * OF_MEDIAN_DEVIATION * np.median(
-            np.abs(some.noise - noise.centre)
-        )
+        near = np.abs(some.noise - noise.centre) <= 3.0 * robust_sd(some.noise, noise.centre)
         return cls(noise, _Prior.of(*some.looseness()), _slope(some.of(near), noise.centre))
 
     def weak(self, pixels: Judged, settings: FitSettings) -> BoolArray:
@@ -146,10 +144,9 @@ class NoisePool:
 
 
 def _slope(pixels: Judged, centre: float) -> float:
-    """Return the regression of the log gap on the read noise; between none and that of the peaks' contrast.
+    """Return the slope of the log gap over the read noise: between 0 and that of the peaks' contrast.
 
-    The neighbours of a bias are told apart by the contrast of the peaks, whose square goes as
-    ``exp(-4 pi^2 s_e^2)``, and with few electrons by the shape of the whole histogram.
+    The square of that contrast goes as ``exp(-4 pi^2 s_e^2)``.
     """
     off = pixels.noise - pixels.noise.mean()
     square = float(off @ off)
@@ -166,15 +163,7 @@ def noise_of(
     sigma_stderr: FloatArray,
     correlation: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return s_e = g sigma and its standard error by the delta method, e-, shape (n,).
-
-    Args:
-        gain: g, e-/DN, shape (n,).
-        sigma: DN.
-        gain_stderr: standard error of g, e-/DN.
-        sigma_stderr: standard error of sigma, DN.
-        correlation: of the two estimates.
-    """
+    """Return s_e = g sigma and its standard error by the delta method, e-, shape (n,)."""
     by_gain, by_sigma = sigma * gain_stderr, gain * sigma_stderr
     with np.errstate(invalid="ignore"):
         variance = by_gain**2 + by_sigma**2 + 2.0 * correlation * by_gain * by_sigma

@@ -10,12 +10,7 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import callback, types_of
-from pchem_pipeline.model.fit import (
-    cells_search_numba,
-    climb_numba,
-    search_numba,
-    starts_numba,
-)
+from pchem_pipeline.model.fit import cells_search_numba, climb_numba, search_numba, starts_numba
 from pchem_pipeline.model.fit.climb_numba import Goal, Limits
 from pchem_pipeline.model.law.inputs import pack
 from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood, evaluation_arguments
@@ -25,7 +20,6 @@ _VECTOR = np.zeros(1)
 _OUTCOME = numba.types.Tuple((numba.types.int64, numba.types.float64, numba.types.int64))
 _FOUND = numba.types.UniTuple(numba.types.int64, 3)
 _LIMITS = Limits(0.0, 0.0, 0, 0, False, False, 0.0, 0.0, 0.0, 0.0, 0.0, False, False, False, False, False)
-_GOAL = Goal(False, 0.0, 0.0, 0.0, False)
 
 
 def _address(result: Any, arguments: tuple[Any, ...]) -> Any:
@@ -37,7 +31,7 @@ def _address(result: Any, arguments: tuple[Any, ...]) -> Any:
 def _climb_arguments() -> tuple[Any, ...]:
     pixel, _, _, scratch, _ = evaluation_arguments()
     evaluate = _address(numba.types.float64, evaluation_arguments())
-    return pixel, evaluate, _LIMITS, _GOAL, _VECTOR, _VECTOR, scratch
+    return pixel, evaluate, _LIMITS, Goal(False, 0.0, 0.0, 0.0, False), _VECTOR, _VECTOR, scratch
 
 
 @functools.cache

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.model.arithmetic.robust import chi_square
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.fit import guard_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
@@ -52,7 +53,7 @@ def expected_counts(
 
     Args:
         given: histograms.
-        pixels: m of them.
+        pixels: m places.
         laws: of the samples, the cells integrated; None: the density of the PCD.
         parameters: (H_1 ... H_J, g, mu, sigma) of these, shape (m, J + 3).
         satellites: amplitude (e-) and weight of their free satellites, shape (m, 2).
@@ -79,12 +80,9 @@ def expected_counts(
 
 
 def leave_out(given: Histograms, pixels: Pixels, outside: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """Leave out the samples in some bins, and count all others but those set aside.
+    """Leave out the samples of m pixels in the bins ``outside``, (m, all bins), and count all others.
 
-    Args:
-        given: histograms; their mask is updated.
-        pixels: m of them.
-        outside: bins, shape (m, all bins).
+    The mask of the histograms is updated; what is set aside stays so.
 
     Returns:
         How many samples are left out, and whether these are others than before, shape (m,) each.
@@ -106,10 +104,9 @@ def fit_guarded(
     """Fit all pixels, those that may hold outliers again and again.
 
     A good fit of all samples says itself which it does not expect. Otherwise both ends of the histograms are
-    left out first, as much of them as may be outliers; where that says nothing, the samples that a gap cuts
-    off. What these parameters expect then comes back, until the samples left out stay the same. Where that
-    fails, or where they are too many to be a few outliers, it is the fit of all samples, which is not fitted
-    twice. What is left after a cut only has to say what it expects, and is fitted quickly.
+    left out first, as much of them as may be outliers; where that fails, the samples that a gap cuts off.
+    What these parameters expect then comes back, until the samples left out stay the same. Where that fails,
+    or where they are too many to be a few outliers, the fit of all samples is kept.
 
     Args:
         fit: fits some pixels; quickly (True): the first maximum that tells the gain will do.
@@ -147,28 +144,19 @@ def fit_guarded(
 
 @dataclass
 class _Guard:
-    """What the tail guard knows of n pixels, and works with.
-
-    Attributes:
-        fit, expect, given, limits, answers: see :func:`fit_guarded`.
-        ends: of the bins that no gap cuts off, shape (n, J, 2).
-        whole: answers for some pixels, all their samples counted.
-        gone: samples left out.
-        attempt, passes: the attempt, and fits of it.
-        place: in ``whole``; -1: not there.
-    """
+    """What the tail guard knows of n pixels, and works with; see :func:`fit_guarded`."""
 
     fit: Callable[[Pixels, bool], None]
     expect: Callable[[Pixels, FloatArray], FloatArray]
     given: Histograms
     limits: Limits
-    ends: IntArray
+    ends: IntArray  # of the bins that no gap cuts off, shape (n, J, 2)
     answers: Answers
-    whole: Answers
-    gone: FloatArray
+    whole: Answers  # for some pixels, all their samples counted
+    gone: FloatArray  # samples left out
     attempt: IntArray
-    passes: IntArray
-    place: IntArray
+    passes: IntArray  # fits of the attempt
+    place: IntArray  # in ``whole``; -1: not there
 
     def keep(self, pixels: Pixels) -> None:
         """Keep the answers of pixels of which all samples were fitted."""
@@ -271,7 +259,5 @@ class _Guard:
 
 def _scores(answers: Answers) -> FloatArray:
     """Return the goodness of fit of all pixels as standard normal deviates; 0 without freedom."""
-    freedom = np.maximum(answers.words[:, FREEDOM], 1)
-    spread = 2.0 / (9.0 * freedom)
-    deviate = (np.cbrt(answers.out[:, CHI2] / freedom) - (1.0 - spread)) / np.sqrt(spread)
-    return np.where(answers.words[:, FREEDOM] > 0, deviate, 0.0)
+    freedom = answers.words[:, FREEDOM]
+    return np.where(freedom > 0, chi_square(answers.out[:, CHI2], np.maximum(freedom, 1)), 0.0)

@@ -69,8 +69,8 @@ class Profile:
         Args:
             given: histograms; codes left out by the tail guard do not count.
             law: of the samples.
-            limits: bounds and limits.
-            parameters: (H_1 ... H_J, g, mu, sigma) at the maximum, shape (n, J + 3); NaN where there is none.
+            limits: of the search.
+            parameters: (H_1 ... H_J, g, mu, sigma) of the fit, shape (n, J + 3); NaN where there is none.
             satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n, 2).
         """
         self._given, self._law, self._limits = given, law, limits
@@ -137,12 +137,7 @@ class Profile:
         return found
 
     def ends(self, root: float) -> FloatArray:
-        """Return where the profile of each parameter has fallen by ``root^2 / 2``.
-
-        The signed root of twice the drop is nearly linear, so a secant on it ends after a few values.
-
-        Args:
-            root: as standard normal quantile.
+        """Return where the profile of each parameter has fallen by ``root^2 / 2``, by a secant on the root.
 
         Returns:
             Lower and upper ends of (H_1 ... H_J, g, mu, sigma, sigma g), shape (n, J + 4, 2), NaN where the
@@ -190,10 +185,7 @@ class Profile:
         return ends
 
     def along_bias(self, reach: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Walk along the profile of the bias: find the best other parameters at biases on both sides.
-
-        Args:
-            reach: distance that is walked in any case, e-, shape (n,).
+        """Find the best other parameters at biases on both sides, ``reach`` e- in any case, shape (n,).
 
         Returns:
             (H_1 ... H_J, g, mu, sigma), those of the maximum in the middle, shape (n, 2 m + 1, J + 3); the

@@ -17,8 +17,6 @@ from pchem_pipeline.model.law.parameters import PixelParameters
 
 #: What has an interval, in the order of the axis ``quantity``.
 INTERVAL_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
-
-
 #: Fits that a notebook shows.
 _SHOWN = 10
 
@@ -53,21 +51,16 @@ class FitResult(PixelParameters):
         likelihood_gap: nats between the likelihood kept and the runner-up, shape (n,). Runners-up are the
             maxima reached from the neighbours (all H -+ 1, mu +- 1/g; of several samples also another gain
             that gives the brightest an electron less or more), the other maxima found, and Gaussians of one
-            width, one at the mean of each sample (g to infinity). A gap below 30 is exact: the runner-up was
-            climbed to its maximum. A larger one says that the neighbour was given up when, by the quadratic
-            through it, twice its expected rise would have left it more than 30 below; its height is then
-            taken from that quadratic. Where the fit of one sample is good, 1/g above 5 DN, and the neighbour
-            expected to be more than 80 below (four gap thresholds if that is more), it is not visited: its
-            height is the one expected. Negative only with a reason in ``fit_status``: one Gaussian, or a
-            climb that did not converge, stands higher. A fit that starts from another has the gap of that
-            one unless that was below 30.
+            width, one at the mean of each sample (g to infinity). A gap below 30 is exact; a larger one is
+            the height that a quadratic expects of a neighbour that was given up, or not visited. Negative
+            only with a reason in ``fit_status``: one Gaussian, or a climb that did not converge, is higher.
+            A fit that starts from another has the gap of that one unless that was below 30.
         fit_status: bits of :class:`~pchem_pipeline.model.fit.status.FitStatus`, uint16, shape (n,). Of
             several samples, ``NOT_INFORMATIVE`` says that the standard error of g is above 10 %.
         n_iterations: evaluations of the likelihood, all starts and neighbours together, int32, shape (n,).
         goodness_chi2: Pearson chi-square, adjacent DN merged until 5 counts are expected, shape (n,).
         goodness_dof: its degrees of freedom, groups - 5 for one sample, shape (n,); 0 if there are none.
-            With few frames more, up to groups - 1: as far as the groups do not determine the four fitted
-            parameters (Chernoff and Lehmann 1954).
+            With few frames up to groups - 1 (Chernoff and Lehmann 1954).
         goodness_p: probability of a larger chi-square, shape (n,); NaN without degrees of freedom.
         outlier_share: share of the samples that the tail guard left out of the likelihood, shape (n,).
         satellite_amplitude_e: amplitude of the free satellite peaks found in the pixel, e-, shape (n,); NaN

@@ -102,14 +102,9 @@ class Samples:
         return np.concatenate([exposures, by_sample[:, 0, 1:]], axis=1)
 
     def by_pixel(self, information: FloatArray, score: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return information and score in own and shared parameters of each pixel.
+        """Return information and score in own and shared parameters: (n, P + d, P + d) and (n, P + d).
 
-        Args:
-            information: of the rows, own parameters first, shape (n J, 4 + d, 4 + d).
-            score: likewise, shape (n J, 4 + d).
-
-        Returns:
-            Shapes (n, P + d, P + d) and (n, P + d).
+        Those given are of the rows, own parameters first, shapes (n J, 4 + d, 4 + d) and (n J, 4 + d).
         """
         more = score.shape[1] - 4
         slopes = np.zeros((self.n, 4 + more, self.n_exposures + 3 + more))
@@ -158,11 +153,7 @@ class SharedProblem:
         return np.where(self.kept, np.log(np.maximum(mass, LEAST_SEEN) / inside), 0.0)
 
     def slopes(self, theta: FloatArray, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the log masses, (n, B), and their derivatives, own four parameters first, (n, 4 + d, B).
-
-        Raises:
-            ValueError: fields of the law do not go together.
-        """
+        """Return the log masses, (n, B), and their derivatives, own four parameters first, (n, 4 + d, B)."""
         base, own = self.log_masses(theta, shared), to_parameters(self.samples.rows(theta))
         n, width = base.shape
         slopes = np.zeros((n, 4 + shared.size, width))
@@ -191,7 +182,7 @@ class SharedProblem:
 
 @dataclass(frozen=True)
 class SharedFit:
-    """Estimates.
+    """Estimates of own and shared parameters.
 
     Attributes:
         theta: own parameters of the pixels (see :class:`Samples`), shape (n, P).
@@ -402,11 +393,10 @@ class Ascent:
         return ~((low & (self._shared_score < 0)) | (high & (self._shared_score > 0)))
 
     def _reduced(self, damping: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Eliminate the own parameters from the information, which has the shape of an arrow.
+        """Eliminate the own parameters from the information, whose shape is an arrow.
 
-        Returns:
-            The inverse of the own block, what the own parameters answer to the free shared ones, and the
-            information that is left of these: shapes (n, P, P), (n, P, d') and (d', d').
+        Returns the inverse of the own block, what the own parameters answer to the free shared ones, and the
+        information that is left of these: shapes (n, P, P), (n, P, d') and (d', d').
         """
         p, information = self.theta.shape[1], self.expansion.information
         inverse = np.asarray(np.linalg.inv(_damped(information[:, :p, :p], damping)), np.float64)
@@ -424,10 +414,7 @@ def _damped(information: FloatArray, damping: FloatArray) -> FloatArray:
 
 
 def _limits(theta: FloatArray, n_exposures: int) -> tuple[FloatArray, FloatArray]:
-    """Return how far the own parameters may go from a start: not to another electron number, (n, P) each.
-
-    Beyond, the law would need ever more electron numbers, and each step ever more time.
-    """
+    """Return how far the own parameters may go from a start: not to another electron number, (n, P) each."""
     m = n_exposures
     step = np.exp(theta[:, m])
     reach = np.full((step.size, m + 2), _REACH_EXPOSURE)

@@ -11,7 +11,6 @@ from pchem_pipeline.model.law.inputs import kernel_counts, pack
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _CENTRAL_LOBE = 0.6  # 1/sd: the central lobe of any sample has fallen by then
-_PADDING = 8  # frequencies for each bin
 
 
 def starting_points(counts: NDArray[np.integer], origin: NDArray[np.integer]) -> FloatArray:
@@ -51,7 +50,7 @@ def _highest_lobe(counts: FloatArray, origin: NDArray[np.integer]) -> FloatArray
     bins = np.arange(counts.shape[1])
     mean = shares @ bins
     variance = shares @ bins**2 - mean**2
-    size = _PADDING * counts.shape[1]
+    size = 8 * counts.shape[1]  # frequencies
     phi, frequency = np.fft.rfft(shares, size), np.fft.rfftfreq(size)
     modulus = np.abs(phi)
     modulus[frequency < _CENTRAL_LOBE / np.sqrt(variance)[:, None]] = 0.0

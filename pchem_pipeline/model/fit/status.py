@@ -54,31 +54,22 @@ AMBIGUOUS = FitStatus.BIAS_AMBIGUOUS | FitStatus.GAIN_AMBIGUOUS
 FLAGGED = AMBIGUOUS | FitStatus.BIAS_UNSURE | FitStatus.NOT_INFORMATIVE | FitStatus.WEAKLY_IDENTIFIED
 
 #: What a bias that is an electron off concerns; the distance of the peaks and their width stay.
-COUNTS_ELECTRONS = ("quanta_exposure", "bias", "spurious_charge", *CHARGE_RATES)
+_COUNTS_ELECTRONS = ("quanta_exposure", "bias", "spurious_charge", *CHARGE_RATES)
 
 _LARGEST_GAIN_CHANGE = 0.03  # relative; a rival that differs by less has the same gain
 
 
 def flags_of(name: str) -> FitStatus:
-    """Return the bits of pixels that medians and tables of a quantity leave out.
-
-    Args:
-        name: of the map, without ``_stderr``.
-    """
+    """Return the bits of pixels that medians and tables of a map leave out; its name without ``_stderr``."""
     of_bias = FitStatus.BIAS_AMBIGUOUS | FitStatus.BIAS_UNSURE
-    return FLAGGED if name in COUNTS_ELECTRONS else FLAGGED & ~of_bias
+    return FLAGGED if name in _COUNTS_ELECTRONS else FLAGGED & ~of_bias
 
 
 def with_rivals_named(words: IntArray, *, dark: bool, several: bool = False) -> IntArray:
     """Return status words that say of ambiguous pixels whether their rival differs in bias, gain or both.
 
-    The search says so of one sample. Where bias frames hold the bias, the rival differs in gain alone.
-    Several samples have a gain of small error, and a rival's differs by many of these.
-
-    Args:
-        words: of the fit, shape (n,).
-        dark: whether bias frames are among the samples.
-        several: whether there are several.
+    The search says so of one sample. Where bias frames hold the bias (``dark``), the rival differs in gain
+    alone. ``several`` samples have a gain of small error, and a rival's differs by many of these.
     """
     ambiguous = (words & FitStatus.BIAS_AMBIGUOUS) != 0
     named = words | AMBIGUOUS if dark or several else words
@@ -128,17 +119,13 @@ MEANINGS: dict[FitStatus, str] = {
 def describe(word: int) -> str:
     """Return the sentences of all bits set in a status word, joined by ``"; "``; ``"good fit"`` for 0.
 
-    Args:
-        word: status word, as stored in ``fit/fit_status``.
-
     Example:
         >>> describe(0)
         'good fit'
         >>> describe(32)
         'bias may be off by one electron (1/g in DN) or more, and H by as many'
     """
-    sentences = [meaning for bit, meaning in MEANINGS.items() if word & bit]
-    return "; ".join(sentences) if sentences else "good fit"
+    return "; ".join(meaning for bit, meaning in MEANINGS.items() if word & bit) or "good fit"
 
 
 def words_of(flags: IntFlag) -> str:

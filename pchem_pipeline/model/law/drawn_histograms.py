@@ -49,8 +49,7 @@ def draw_histograms(
     origin = np.floor(offset - 9 * noise / gain).astype(np.int64) - 1
     width = np.ceil((exposure + 11 * np.sqrt(exposure) + 12 * (exposure > 0) + 18 * noise) / gain) + 3
     x = origin[:, None] + np.arange(int(width.max()))
-    mass = sample_mass(SampleLaw(), [exposure, gain, offset, noise / gain], x, smallest=1e-50)
+    truth = [exposure, gain, offset, noise / gain]
+    mass = sample_mass(SampleLaw(), truth, x, smallest=1e-50)
     counts = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True))
-    return DrawnHistograms(
-        counts.astype(np.uint32), origin, np.stack([exposure, gain, offset, noise / gain], axis=1)
-    )
+    return DrawnHistograms(counts.astype(np.uint32), origin, np.stack(truth, axis=1))

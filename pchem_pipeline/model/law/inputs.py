@@ -22,7 +22,6 @@ _LAWS: dict[CountLaw, int] = {
     "lost": electron_laws_numba.LOST,
 }
 _NO_LIMIT = 2**40  # DN
-_PEAK_FIELDS = ("weights", "shift_e", "shift_dn", "shift_sigma", "width")
 
 
 @runtime_checkable
@@ -39,11 +38,7 @@ class HasSatellites(Protocol):
 
 
 def pack(models: Sequence[SampleLaw], n: int) -> Law:
-    """Return the laws of the samples of n pixels as the loops take them.
-
-    Args:
-        models: the law of each sample.
-        n: number of pixels.
+    """Return the law of each sample of n pixels as the loops take them.
 
     Raises:
         ValueError: if an array has neither 1 nor n rows, or the weights of a mixture do not sum to 1.
@@ -80,7 +75,8 @@ def _pack_one(model: SampleLaw, n: int) -> _Part:
                 raise ValueError(f"{name} has {rows.shape[0]} rows for {n} pixels")
         return np.stack(np.broadcast_arrays(*values), axis=1)
 
-    peaks = per_pixel(*(f"satellite_{name}" for name in _PEAK_FIELDS))
+    shifts = ("satellite_shift_e", "satellite_shift_dn", "satellite_shift_sigma")
+    peaks = per_pixel("satellite_weights", *shifts, "satellite_width")
     added = per_pixel("added_weights", "added_exposure")
     mixture = np.broadcast_arrays(*np.atleast_2d(model.exposure_weights, model.exposure_factors))
     exposures = np.stack(mixture, axis=1)
@@ -113,8 +109,7 @@ def _limit(value: float | FloatArray | None, none: float) -> FloatArray | float:
 
 def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
     """Return arrays of the samples in one, as large as the largest, 0 in columns beyond."""
-    rank = parts[0].ndim
-    most = tuple(max(part.shape[axis] for part in parts) for axis in range(rank))
+    most = np.max([part.shape for part in parts], axis=0)
     found = np.zeros((len(parts), *most))
     for own, part in zip(found, parts, strict=True):
         own[..., : part.shape[-1]] = part  # one row is of all pixels

@@ -29,10 +29,7 @@ def code_ranges(
 ) -> tuple[IntArray, IntArray]:
     """Return the first and last code that pixels show, DN, shape (n,); 0 and -1 without usable parameters.
 
-    Args:
-        model: the law.
-        maps: (H, g, mu, sigma) of n pixels.
-        satellites: as of :func:`sample_mass`.
+    Arguments as of :func:`sample_mass`.
     """
     columns = columns_of(maps)
     n = columns.shape[0]

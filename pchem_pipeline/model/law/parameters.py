@@ -102,14 +102,7 @@ class UsablePixels(PixelParameters):
 
     @classmethod
     def from_maps(cls, maps: Sequence[NDArray[np.floating]]) -> tuple[UsablePixels, BoolArray]:
-        """Select the usable pixels of four maps.
-
-        Args:
-            maps: (H, g, mu, sigma), each of the same shape.
-
-        Returns:
-            The parameters of the usable pixels in C order, and the mask of them in the shape of the maps.
-        """
+        """Return the usable pixels of the maps (H, g, mu, sigma) in C order, and their mask."""
         full = [np.asarray(values, dtype=np.float64) for values in maps]
         mask = usable_pixels(*full)
         chosen = [np.ascontiguousarray(values[mask]) for values in full]

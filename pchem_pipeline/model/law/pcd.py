@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike
 
 from pchem_pipeline.base.arrays import FloatArray
 
-_Array = FloatArray
-
 
 class PosteriorMeans(NamedTuple):
     """Means given a value x, with the residual ``e = x - mu - k/g``, and the density at it.
@@ -28,12 +26,12 @@ class PosteriorMeans(NamedTuple):
         log_density: log f_X(x), nats of 1/DN.
     """
 
-    k: _Array
-    kk: _Array
-    e: _Array
-    ke: _Array
-    ee: _Array
-    log_density: _Array
+    k: FloatArray
+    kk: FloatArray
+    e: FloatArray
+    ke: FloatArray
+    ee: FloatArray
+    log_density: FloatArray
 
 
 def pcd_posterior(
@@ -65,7 +63,7 @@ def log_pcd(
     conversion_gain: ArrayLike,
     bias: ArrayLike,
     read_noise_dn: ArrayLike,
-) -> _Array:
+) -> FloatArray:
     """Return the log density of the PCD, eq. (X_density), with as many components as matter.
 
     Args:
@@ -87,7 +85,7 @@ def pcd(
     conversion_gain: ArrayLike,
     bias: ArrayLike,
     read_noise_dn: ArrayLike,
-) -> _Array:
+) -> FloatArray:
     """Return the density of the PCD, eq. (X_density), in 1/DN; arguments as in :func:`log_pcd`.
 
     Example:
@@ -98,12 +96,12 @@ def pcd(
 
 
 def thresholds(
-    quanta_exposure: _Array | float,
-    conversion_gain: _Array | float,
-    bias: _Array | float,
-    read_noise_dn: _Array | float,
+    quanta_exposure: FloatArray | float,
+    conversion_gain: FloatArray | float,
+    bias: FloatArray | float,
+    read_noise_dn: FloatArray | float,
     n_thresholds: int,
-) -> _Array:
+) -> FloatArray:
     """Return where the largest membership goes from k to k + 1 (Hendrickson et al. 2023, eq. demarg_K_eqn).
 
     ``t_k = mu + (k + 1/2)/g + g sigma^2 ln((k + 1)/H)``, of the density; they increase with k.

@@ -62,14 +62,9 @@ class ReplacedSamples:
         return ReplacedSamples(self.stays[pixels], self.comes[pixels], self.excess[pixels])
 
     def mass_and_slopes(self, mass: FloatArray, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the mass of the codes that come out, and its slopes.
+        """Return the mass of the codes that come out, (n, c), and its slopes, (n, a, c).
 
-        Args:
-            mass: of the samples, shape (n, at least c + the largest excess), DN by DN.
-            slopes: of it in a parameters, shape (n, a, as many).
-
-        Returns:
-            Shapes (n, c) and (n, a, c).
+        Those given are of the samples, DN by DN, at least c + the largest excess of them.
         """
         width = self.stays.shape[1]
         values = np.concatenate([mass[:, None], slopes], axis=1)

@@ -23,14 +23,6 @@ CountLaw = Literal["poisson", "negative_binomial", "borel", "trapped", "lost"]
 Number = float | FloatArray
 
 
-def _one() -> FloatArray:
-    return np.ones(1)
-
-
-def _zero() -> FloatArray:
-    return np.zeros(1)
-
-
 @dataclass(frozen=True)
 class SampleLaw:
     """The mass of code x given (H, g, mu, sigma) of a pixel.
@@ -80,17 +72,17 @@ class SampleLaw:
 
     law: CountLaw | NDArray[np.str_] = "poisson"
     dispersion: Number = 0.0
-    exposure_weights: FloatArray = field(default_factory=_one)
-    exposure_factors: FloatArray = field(default_factory=_one)
+    exposure_weights: FloatArray = field(default_factory=lambda: np.ones(1))
+    exposure_factors: FloatArray = field(default_factory=lambda: np.ones(1))
     added_exposure: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
     added_weights: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
-    level_scale: FloatArray = field(default_factory=_one)
-    level_shift_e: FloatArray = field(default_factory=_zero)
+    level_scale: FloatArray = field(default_factory=lambda: np.ones(1))
+    level_shift_e: FloatArray = field(default_factory=lambda: np.zeros(1))
     curvature: Number = 0.0
     variance_per_electron: Number = 0.0
     variance_per_electron2: Number = 0.0
-    extra_variance_e2: FloatArray = field(default_factory=_zero)
-    extra_variance_dn2: FloatArray = field(default_factory=_zero)
+    extra_variance_e2: FloatArray = field(default_factory=lambda: np.zeros(1))
+    extra_variance_dn2: FloatArray = field(default_factory=lambda: np.zeros(1))
     satellite_weights: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
     satellite_shift_e: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
     satellite_shift_dn: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
@@ -118,8 +110,9 @@ class SampleLaw:
     @property
     def neutral(self) -> bool:
         """Whether this is the PCD itself, cells integrated exactly."""
-        mine, plain = _values(self), _values(SampleLaw())
-        return all(np.array_equal(mine[name], plain[name]) for name in plain)
+        plain = SampleLaw()
+        names = [each.name for each in fields(self)]
+        return all(np.array_equal(getattr(self, name), getattr(plain, name)) for name in names)
 
     def of(self, pixels: NDArray[np.intp] | BoolArray | slice) -> SampleLaw:
         """Return the law of some of the pixels (an index, a mask or a slice along n)."""
@@ -133,11 +126,7 @@ class SampleLaw:
 
     @classmethod
     def joined(cls, parts: Sequence[tuple[NDArray[np.intp], SampleLaw]], n: int) -> SampleLaw:
-        """Return the law of n pixels of which groups have laws of their own.
-
-        Args:
-            parts: the pixels of a group, and their law; each pixel is in one group.
-            n: number of pixels.
+        """Return the law of n pixels from the pixels and the law of each group; a pixel is in one group.
 
         Raises:
             ValueError: groups look for different free satellites.
@@ -179,7 +168,8 @@ class SampleLaw:
         for name in _MEANS:
             found[name] = (1.0 - share) * getattr(self, name) + share * getattr(other, name)
         found |= _mixed_edges(self, other, share)
-        mine, theirs = _satellites(self), _satellites(other)
+        names = [name for name in _PER_PIXEL if name.startswith("satellite")]
+        mine, theirs = ({name: getattr(law, name) for name in names} for law in (self, other))
         if (np.abs(more) > _NARROW * noise_dn2).any():
             width = np.sqrt(np.maximum(1.0 + more / np.maximum(noise_dn2, 1e-9), 0.0))
             theirs["satellite_width"] = theirs["satellite_width"] * width[:, None]
@@ -187,12 +177,12 @@ class SampleLaw:
             found["extra_variance_e2"] = self.extra_variance_e2
         if any(not np.array_equal(mine[name], theirs[name]) for name in mine):
             found |= _united(mine, theirs, share, "satellite_weights")
-        mine, theirs = _exposures(self), _exposures(other)
+        mine, theirs = ({name: getattr(law, name) for name in _TABLES} for law in (self, other))
         if any(not np.array_equal(mine[name], theirs[name]) for name in mine):
             found |= _united(mine, theirs, share, "exposure_weights")
         free = other if other.free_satellites else self
-        names = ("free_satellites", "free_satellite_pattern", "free_satellite_alarm", "may_have_satellites")
-        return replace(self, **found, **{name: getattr(free, name) for name in names})
+        found |= {name: getattr(free, name) for name in (*_SEARCHED, "may_have_satellites")}
+        return replace(self, **found)
 
     def with_counts(self, law: CountLaw, dispersion: Number) -> SampleLaw:
         """Return a copy with another law of the electron number."""
@@ -210,12 +200,10 @@ class SampleLaw:
     def with_added_exposure(self, exposure_e: ArrayLike, weights: ArrayLike) -> SampleLaw:
         """Return a copy whose pixels also get one of several exposures, (n, j) e- each (all sums)."""
         d, u = (np.atleast_2d(np.asarray(values, np.float64)) for values in (exposure_e, weights))
-        sums = self.added_exposure[:, :, None] + d[:, None, :]
-        products = self.added_weights[:, :, None] * u[:, None, :]
         return replace(
             self,
-            added_exposure=np.ascontiguousarray(sums.reshape(sums.shape[0], -1)),
-            added_weights=np.ascontiguousarray(products.reshape(products.shape[0], -1)),
+            added_exposure=_of_pairs(np.add, self.added_exposure, d),
+            added_weights=_of_pairs(np.multiply, self.added_weights, u),
         )
 
     def with_noise(
@@ -233,17 +221,13 @@ class SampleLaw:
         def like(values: ArrayLike) -> FloatArray:
             return np.broadcast_to(np.asarray(values, np.float64), w.shape)
 
-        def outer(mine: FloatArray, theirs: FloatArray, *, product: bool) -> FloatArray:
-            both = mine[:, :, None] * theirs[:, None, :] if product else mine[:, :, None] + theirs[:, None, :]
-            return np.ascontiguousarray(both.reshape(both.shape[0], -1))
-
         return replace(
             self,
-            satellite_weights=outer(self.satellite_weights, w, product=True),
-            satellite_shift_e=outer(self.satellite_shift_e, like(shift_e), product=False),
-            satellite_shift_dn=outer(self.satellite_shift_dn, like(shift_dn), product=False),
-            satellite_shift_sigma=outer(self.satellite_shift_sigma, like(shift_sigma), product=False),
-            satellite_width=outer(self.satellite_width, like(width), product=True),
+            satellite_weights=_of_pairs(np.multiply, self.satellite_weights, w),
+            satellite_shift_e=_of_pairs(np.add, self.satellite_shift_e, like(shift_e)),
+            satellite_shift_dn=_of_pairs(np.add, self.satellite_shift_dn, like(shift_dn)),
+            satellite_shift_sigma=_of_pairs(np.add, self.satellite_shift_sigma, like(shift_sigma)),
+            satellite_width=_of_pairs(np.multiply, self.satellite_width, like(width)),
         )
 
     def with_variance(
@@ -254,14 +238,7 @@ class SampleLaw:
         per_electron: Number = 0.0,
         per_electron2: Number = 0.0,
     ) -> SampleLaw:
-        """Return a copy with more variance.
-
-        Args:
-            dn2: DN^2, scalar or (n,).
-            e2: e-^2, scalar or (n,).
-            per_electron: e-^2 per electron, scalar or (n,).
-            per_electron2: e-^2 per electron squared, scalar or (n,).
-        """
+        """Return a copy with more variance, scalar or (n,): DN^2, e-^2, e-^2 per electron and its square."""
         return replace(
             self,
             variance_per_electron=self.variance_per_electron + per_electron,
@@ -273,12 +250,9 @@ class SampleLaw:
     def with_levels(
         self, *, scale: ArrayLike = 1.0, shift_e: ArrayLike = 0.0, curvature: float = 0.0
     ) -> SampleLaw:
-        """Return a copy with a comb stretched by ``scale``, moved by ``shift_e`` e- and bent.
+        """Return a copy with a comb stretched by ``scale``, moved by ``shift_e`` e-, and bent.
 
-        Args:
-            scale: factor, scalar or (n,).
-            shift_e: e-, scalar or (n,).
-            curvature: relative change of the step per electron, added to what there is.
+        The first two are scalar or (n,); ``curvature``, the relative change of the step per electron, adds up.
         """
         return replace(
             self,
@@ -288,12 +262,7 @@ class SampleLaw:
         )
 
     def with_edges(self, first: int, shift: ArrayLike) -> SampleLaw:
-        """Return a copy whose lower code edges are shifted, on top of what there is.
-
-        Args:
-            first: code of the first shift.
-            shift: DN, shape (m,).
-        """
+        """Return a copy whose lower code edges from ``first`` on are shifted further, by DN, shape (m,)."""
         more = np.asarray(shift, np.float64)
         if self.edge_shift.size == 0:
             return replace(self, edge_first=first, edge_shift=more)
@@ -308,11 +277,7 @@ class SampleLaw:
         """Return a copy with codes cut to ``low`` .. ``high``, and to the limits that there are."""
         lows = [c for c in (low, self.clip_low) if c is not None]
         highs = [c for c in (high, self.clip_high) if c is not None]
-        return replace(
-            self,
-            clip_low=max(lows) if lows else None,
-            clip_high=min(highs) if highs else None,
-        )
+        return replace(self, clip_low=max(lows, default=None), clip_high=min(highs, default=None))
 
     def between(self, low: int | FloatArray | None, high: int | FloatArray | None) -> SampleLaw:
         """Return a copy with limits of the codes where it has none of its own."""
@@ -354,8 +319,6 @@ _PER_PIXEL = (
     "satellite_width",
     "may_have_satellites",
 )
-
-
 #: Fields that have one number for all pixels, unless laws were joined.
 _NUMBERS = (
     "law",
@@ -370,6 +333,8 @@ _NUMBERS = (
 )
 #: Fields that have one row for all pixels, and no axis for them, unless laws were joined.
 _TABLES = ("exposure_weights", "exposure_factors")
+#: Fields of the satellites that a fit looks for.
+_SEARCHED = ("free_satellites", "free_satellite_pattern", "free_satellite_alarm")
 #: What rows are filled up with where one pixel has fewer components than another.
 _FILL = {"satellite_width": 1.0, "exposure_factors": 1.0}
 #: Numbers of which the mean over the frames is taken where these differ.
@@ -389,6 +354,12 @@ _MEANS = (
 _NARROW = 0.02
 
 
+def _of_pairs(operation: np.ufunc, mine: FloatArray, theirs: FloatArray) -> FloatArray:
+    """Return sums or products of all pairs of columns of two tables, row by row."""
+    both = operation(mine[:, :, None], theirs[:, None, :])
+    return np.ascontiguousarray(both.reshape(both.shape[0], -1))
+
+
 def _same(one: NDArray[Any], other: NDArray[Any]) -> bool:
     """Return whether arrays are equal; no limit is the same as no limit."""
     return one.dtype.kind == other.dtype.kind and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
@@ -403,7 +374,7 @@ def _rows(name: str, parts: Sequence[tuple[NDArray[np.intp], NDArray[Any]]], n: 
     """Return a row for each of n pixels from those of groups, as long as the longest."""
     values = [each[None] if name in _TABLES and each.ndim == 1 else each for _, each in parts]
     most = max((each.shape[1] for each in values if each.ndim == 2), default=None)
-    found = np.full((n,) if most is None else (n, most), _FILL.get(name, 0.0), np.float64)
+    found: NDArray[Any] = np.full((n,) if most is None else (n, most), _FILL.get(name, 0.0))
     if name == "law":
         found = np.full(n, "negative_binomial")
     for (pixels, _), each in zip(parts, values, strict=True):
@@ -437,19 +408,13 @@ def _joined_satellites(
     looking = [law for law in laws if law.free_satellites]
     if not looking:
         return {}
-    first = looking[0]
-    kinds = {(law.free_satellites, law.free_satellite_pattern) for law in looking}
-    if len(kinds) > 1:
+    if len({(law.free_satellites, law.free_satellite_pattern) for law in looking}) > 1:
         raise ValueError("two kinds of free satellites in one model; keep one of the effects")
     where = np.zeros(n, np.bool_)
     for law, some in zip(laws, pixels, strict=True):
         where[some] = bool(law.free_satellites)
-    return {
-        "free_satellites": first.free_satellites,
-        "free_satellite_pattern": first.free_satellite_pattern,
-        "free_satellite_alarm": first.free_satellite_alarm,
-        "may_have_satellites": where,
-    }
+    found = {name: getattr(looking[0], name) for name in _SEARCHED}
+    return found | {"may_have_satellites": where}
 
 
 def _mixed_edges(one: SampleLaw, other: SampleLaw, share: float) -> dict[str, Any]:
@@ -457,14 +422,6 @@ def _mixed_edges(one: SampleLaw, other: SampleLaw, share: float) -> dict[str, An
     mine = replace(SampleLaw(), edge_first=one.edge_first, edge_shift=(1.0 - share) * one.edge_shift)
     both = mine.with_edges(other.edge_first, share * other.edge_shift) if other.edge_shift.size else mine
     return {"edge_first": both.edge_first, "edge_shift": both.edge_shift}
-
-
-def _satellites(law: SampleLaw) -> dict[str, FloatArray]:
-    return {name: getattr(law, name) for name in _PER_PIXEL if name.startswith("satellite")}
-
-
-def _exposures(law: SampleLaw) -> dict[str, FloatArray]:
-    return {name: getattr(law, name) for name in _TABLES}
 
 
 def _united(
@@ -481,7 +438,3 @@ def _united(
             own, other = (np.broadcast_to(each, (rows, each.shape[1])) for each in (own, other))
         found[name] = np.concatenate([own, other], axis=-1)
     return found
-
-
-def _values(model: SampleLaw) -> dict[str, Any]:
-    return {f.name: getattr(model, f.name) for f in fields(model)}

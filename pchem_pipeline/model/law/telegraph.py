@@ -78,8 +78,7 @@ class _Series:
         """Return the relative probability of each code at each exposure, (codes, exposures)."""
         poisson = np.exp(self.electrons[:, None] * np.log(exposures) - exposures - self.factorial[:, None])
         # a code that the comb forbids tells nothing of the state
-        found: FloatArray = np.maximum(self.comb @ poisson, 1e-30)
-        return found
+        return np.asarray(np.maximum(self.comb @ poisson, 1e-30))
 
     def height(self, theta: FloatArray, states: bool = False) -> tuple[float, FloatArray]:
         """Return the log-likelihood, and the probability of each state in each frame if asked for."""
@@ -92,12 +91,11 @@ class _Series:
 
     def climbed(self, theta: FloatArray) -> tuple[float, FloatArray]:
         """Return the highest log-likelihood from a start, and where it is."""
-        longest = np.log(max(self.run, 4.0 * _SHORTEST))
         logit = np.log(1.0 / _LEAST_SHARE - 1.0)
         process = [
             (np.log(LEAST_EXPOSURE), np.log(_LARGEST_STEP)),
             (-logit, logit),
-            (np.log(_SHORTEST), longest),
+            (np.log(_SHORTEST), np.log(max(self.run, 4.0 * _SHORTEST))),
         ]
         bounds = [(np.log(LEAST_EXPOSURE), None), *process * (theta.size // 3)]
         found = minimize(lambda t: -self.height(t)[0], theta, method="L-BFGS-B", bounds=bounds)

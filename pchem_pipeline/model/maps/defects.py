@@ -94,11 +94,7 @@ class Defects:
 def needs_moments(status: NDArray[Any], conversion_gain: FloatArray) -> BoolArray:
     """Return which pixels :class:`Moments` are needed of: gain not known, or samples at a limit of the ADC.
 
-    Pixels without samples have none.
-
-    Args:
-        status: words of the fit, any shape.
-        conversion_gain: g, same shape; NaN where there is no value.
+    Status words and g, NaN where there is no value, may have any shape. Pixels without samples have none.
     """
     left_out = _has(status, FitStatus.EXCLUDED | FitStatus.NOT_FITTED | FitStatus.NO_DATA)
     return (_gain_unknown(status, conversion_gain) | _has(status, FitStatus.ADC_LIMIT)) & ~left_out
@@ -181,7 +177,7 @@ class _Usual(NamedTuple):
     spread: float
 
     def far_below(self, sigmas: float) -> _Test:
-        """Return the test whether a value is above by so many standard deviations, and own errors."""
+        """Return the test whether a value is above by so many standard deviations, and its own errors."""
         return lambda value, error: value > self.median + sigmas * np.fmax(self.spread, error)
 
 

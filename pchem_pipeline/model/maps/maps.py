@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.fit.status import FAILED, FitStatus
+from pchem_pipeline.model.fit.status import FAILED, FitStatus, words_of
 from pchem_pipeline.model.maps.ordered import Ordered
 
 GOOD, CAUTION, NO_VALUE = 0, 1, 2
@@ -89,12 +89,8 @@ def derived_maps(
 
 def _delta(by_gain: FloatArray, by_sigma: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the standard error of a function of g and sigma from its two derivatives."""
-    variance = (
-        by_gain**2 * covariance[..., 1, 1]
-        + 2.0 * by_gain * by_sigma * covariance[..., 1, 3]
-        + by_sigma**2 * covariance[..., 3, 3]
-    )
-    return _root(variance)
+    variance = by_gain**2 * covariance[..., 1, 1] + 2.0 * by_gain * by_sigma * covariance[..., 1, 3]
+    return _root(variance + by_sigma**2 * covariance[..., 3, 3])
 
 
 def _root(variance: FloatArray) -> FloatArray:
@@ -107,10 +103,9 @@ def electron_shifts(
 ) -> tuple[IntArray, FloatArray]:
     """Return numbers of electrons m, and how probable it is that H, and the bias, is off by as many.
 
-    The peaks say nothing of which of them is that of no electron; the width of the law of the electron number
-    does, to a standard error of ``s = H sqrt(2 / N)``. The likelihood of being m electrons off is
-    ``exp(-(m - d)^2 / (2 s^2))``, and ``(1 - 2 d) / (2 s^2)`` is the likelihood gap, whence d. The gap does
-    not say to which side: m may have either sign.
+    The peaks do not say which of them is that of no electron; the width of the law of the electron number
+    does, to a standard error of ``s = H sqrt(2 / N)``. The likelihood of being m electrons off, to either
+    side, is ``exp(-(m - d)^2 / (2 s^2))``, and ``(1 - 2 d) / (2 s^2)`` is the likelihood gap, whence d.
 
     Args:
         quanta_exposure: H of one sample, e-, shape (n,).
@@ -133,34 +128,16 @@ def electron_shifts(
 
 
 def quality_map(fit_status: NDArray[np.integer[Any]], conversion_gain: FloatArray) -> NDArray[np.uint8]:
-    """Grade the pixels: ``GOOD``, ``CAUTION`` (any word in the status) or ``NO_VALUE`` (parameters are NaN).
-
-    Args:
-        fit_status: status words, any shape.
-        conversion_gain: g, same shape; NaN where the fit failed.
-
-    Returns:
-        Quality, same shape.
-    """
+    """Grade the pixels: ``GOOD``, ``CAUTION`` (any bit in the status) or ``NO_VALUE`` (NaN)."""
     quality = np.where(fit_status == 0, GOOD, CAUTION).astype(np.uint8)
     quality[((fit_status & int(FAILED)) != 0) | ~np.isfinite(conversion_gain)] = NO_VALUE
     return quality
 
 
 def status_counts(fit_status: NDArray[np.integer[Any]]) -> dict[str, int]:
-    """Count the pixels that bear each reason; one pixel may bear several.
-
-    Args:
-        fit_status: status words, any shape.
-
-    Returns:
-        Name of the reason, in lower case, to number of pixels; ``"ok"`` first.
-    """
-    counts = {"ok": int(np.count_nonzero(fit_status == 0))}
-    for bit in FitStatus:
-        if bit:
-            counts[str(bit.name).lower()] = int(np.count_nonzero(fit_status & int(bit)))
-    return counts
+    """Count the pixels with each reason, by its name in lower case, ``"ok"`` first; some have several."""
+    counts = {words_of(bit): int(np.count_nonzero(fit_status & int(bit))) for bit in FitStatus if bit}
+    return {"ok": int(np.count_nonzero(fit_status == 0))} | counts
 
 
 def summarise(
@@ -185,22 +162,19 @@ def summarise(
         The summary; NaN throughout where no pixel has a value.
     """
     ordered = Ordered.of(values, left_out)
-    n, missing, without = ordered.size, ordered.n_missing, ordered.n_left_out
+    n, missing, without, nan = ordered.size, ordered.n_missing, ordered.n_left_out, float("nan")
     if n == 0:
-        nan = float("nan")
         return MapSummary(0, missing, without, nan, nan, nan, dict.fromkeys(percentiles, nan), nan, nan, 0, 0)
     median, robust_sd = ordered.median, ordered.robust_sd
     middle, half = 0.5 * (n - 1), 0.5 * np.sqrt(n)
-    limit = outlier_sigmas * robust_sd
-    found = ordered.quantiles(np.asarray(percentiles) / 100.0)
+    limit, found = outlier_sigmas * robust_sd, ordered.quantiles(np.asarray(percentiles) / 100.0)
+    error = 0.5 * (ordered.at_rank(middle + half) - ordered.at_rank(middle - half))
     return MapSummary(
         n_valid=n,
         n_missing=missing,
         n_left_out=without,
         median=median,
-        median_stderr=0.5 * (ordered.at_rank(middle + half) - ordered.at_rank(middle - half))
-        if n > 1
-        else float("nan"),
+        median_stderr=error if n > 1 else nan,
         robust_sd=robust_sd,
         percentiles=dict(zip(percentiles, found.tolist(), strict=True)),
         minimum=float(ordered.values[0]),
@@ -217,12 +191,7 @@ def display_edges(ordered: Ordered, levels: ArrayLike) -> FloatArray:
     distribution function F~ and the quantile function of Beta(2,2), ``F(q) = 3 q^2 - 2 q^3``. Equal values
     share the middle of their ranks, so that ties stay ties and a change of sign turns the display round.
 
-    Args:
-        ordered: all values of the map, at least one.
-        levels: between 0 and 1.
-
-    Returns:
-        The values, of the shape of the levels; infinite where no pixel is as high.
+    The map has a value at least; the levels lie between 0 and 1. Infinite where no pixel is as high.
     """
     level = np.asarray(levels, dtype=np.float64)
     rank = ordered.size * level**2 * (3.0 - 2.0 * level)

@@ -28,12 +28,7 @@ class Ordered:
 
     @classmethod
     def of(cls, values: NDArray[Any] | Ordered, left_out: BoolArray | None = None) -> Ordered:
-        """Sort a map; what is sorted already is returned as it is.
-
-        Args:
-            values: the map, NaN where there is no value.
-            left_out: pixels whose values do not count, same shape; None: none.
-        """
+        """Sort a map, NaN where it has no value, without some pixels; what is sorted stays as it is."""
         if isinstance(values, Ordered):
             return values
         ordered = np.array(values, np.float64, order="C").ravel()
@@ -76,10 +71,7 @@ class Ordered:
         return 1.4826 * float(np.mean([self._deviation(rank) for rank in sorted(middle)]))
 
     def _deviation(self, rank: int) -> float:
-        """Return the deviation from the median that so many values do not exceed.
-
-        These values follow each other: sought is the window of so many whose larger end is the smallest.
-        """
+        """Return the deviation from the median that so many successive values do not exceed."""
         centre = self.median
         first, last = 0, self.size - rank
         while first < last:
@@ -122,12 +114,7 @@ class Ordered:
 
 
 def median_of(values: NDArray[Any], left_out: BoolArray | None = None) -> float:
-    """Return the median of a map, as :attr:`Ordered.median` in a third of the time; NaN of nothing.
-
-    Args:
-        values: the map, NaN where there is no value.
-        left_out: pixels whose values do not count, same shape; None: none.
-    """
+    """Return :attr:`Ordered.median` of a map in a third of the time."""
     some = np.array(values, np.float64, order="C").ravel()
     if left_out is not None:
         some[left_out.ravel()] = np.nan
