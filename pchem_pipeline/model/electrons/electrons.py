@@ -67,9 +67,7 @@ class KnownPixels:
     ) -> tuple[IntArray, IntArray]:
         """Return the first and last code that pixels show, DN, shape (n,); none without parameters.
 
-        Args:
-            counts: histograms whose samples are among the codes, too, shape (n, n_bins); None: no samples.
-            origin: DN of their bin 0, shape (n,).
+        Those of samples are among them, too, if histograms (n, n_bins) and the DN of bin 0 (n,) are given.
         """
         low, high = code_ranges(self.law, self.parameters, self.satellites)
         if counts is None or origin is None:
@@ -159,20 +157,15 @@ class NumberTables:
         out = SampleNumbers(number, probability, mean)
         electrons_numba.convert_frames(frames.reshape(n_frames, n), lifted, self.missing, out)
         shape = (n_frames, *self.shape)
-        return Numbers(
-            number.reshape(shape),
-            *(each.reshape(shape) if each.size else each for each in (probability, mean)),
-        )
+        details = (each.reshape(shape) if each.size else each for each in (probability, mean))
+        return Numbers(number.reshape(shape), *details)
 
     def tally(
         self, counts: NDArray[np.integer[Any]], origin: NDArray[np.integer[Any]], n_k: int
     ) -> tuple[IntArray, int]:
-        """Return the samples of each electron number, shape (n_k,), and how many have a larger one.
+        """Return the samples of each electron number k < n_k, and how many have a larger one.
 
-        Args:
-            counts: samples per bin, shape (n, n_bins).
-            origin: DN of bin 0, shape (n,).
-            n_k: number of electron numbers, k = 0 .. n_k - 1.
+        The histograms have the shape (n, n_bins), the DN of bin 0 the shape (n,).
         """
         out = np.zeros(n_k + 1, np.int64)
         first = np.asarray(origin, np.int64)
@@ -180,11 +173,7 @@ class NumberTables:
         return out[:-1], int(out[-1])
 
     def outcomes(self, n_k: int) -> Outcomes:
-        """Return the probability of each estimated number and of an error; of tables with all details.
-
-        Args:
-            n_k: number of electron numbers in the result.
-        """
+        """Return the probability of each estimated number k < n_k and of an error; of detailed tables."""
         pixel = np.repeat(np.arange(self.first.size), np.diff(self.start))
         right = np.bincount(pixel, self.right, self.first.size)
         estimated = np.bincount(self.number, self.mass, n_k)[:n_k]
@@ -207,9 +196,8 @@ class ErrorTally:
 
     def __add__(self, other: ErrorTally) -> ErrorTally:
         """Return the tally of both sets of samples."""
-        return ErrorTally(
-            self.n_samples + other.n_samples, self.by_size + other.by_size, self.signed + other.signed
-        )
+        n, signed = self.n_samples + other.n_samples, self.signed + other.signed
+        return ErrorTally(n, self.by_size + other.by_size, signed)
 
 
 def number_type(largest: float) -> np.dtype[Any]:
@@ -229,13 +217,12 @@ def number_tables(
 ) -> NumberTables:
     """Return the electron number of each code that pixels have shown.
 
-    That the most probable k is right has the probability of its share in the sum over all k. Without a prior
-    all k are alike beforehand.
+    That it is right has the probability of its share in the sum over all k.
 
     Args:
         minimum: smallest code of each pixel, of the shape of the pixels.
         maximum: largest code, likewise.
-        prior: exposure of each pixel, e-, likewise; NaN: no numbers for the pixel; None: no prior.
+        prior: exposure of each pixel, e-, likewise; NaN: no numbers for the pixel; None: all k are alike.
         pixels: what is known of them.
         dtype: of the numbers; its largest value means none.
         parts: codes in a DN.
@@ -258,16 +245,7 @@ def number_tables(
 def compare_electron_numbers(
     estimated: NDArray[np.uint16], true: NDArray[np.uint16], n_sizes: int = 8
 ) -> ErrorTally:
-    """Compare estimated with true electron numbers; samples without an estimate are left out.
-
-    Args:
-        estimated: k~, any shape.
-        true: K, same shape.
-        n_sizes: number of error sizes told apart.
-
-    Returns:
-        The tally.
-    """
+    """Compare estimated with true electron numbers, by so many sizes of error, where there is an estimate."""
     known = estimated != NO_NUMBER
     off = estimated[known].astype(np.int64) - true[known]
     sizes = np.bincount(np.minimum(np.abs(off), n_sizes - 1), minlength=n_sizes)

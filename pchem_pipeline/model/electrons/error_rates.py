@@ -22,9 +22,8 @@ _AT_ONCE = 4096  # pixels
 def error_rates(totals: EnsembleTotals, pixels: UsablePixels, true: UsablePixels | None) -> dict[str, Any]:
     """Return how often the electron numbers are wrong, where the true ones are known.
 
-    What one should expect follows from the fitted parameters alone (``expected_error_rate``) or, better, from
-    data of the true parameters decided with the fitted ones; the least possible rate is that of numbers
-    decided with the true ones. Frames that the fit has seen err slightly less than new ones.
+    The expected rate is that of data of the true parameters decided with the fitted ones; the least possible
+    one that of numbers decided with the true ones. Frames that the fit has seen err slightly less.
 
     Args:
         totals: the sums over all tiles.
@@ -57,14 +56,10 @@ def error_rates(totals: EnsembleTotals, pixels: UsablePixels, true: UsablePixels
 
 
 def errors_of_numbers(deciding: UsablePixels, data: UsablePixels) -> FloatArray:
-    """Return how often numbers that some parameters decide are wrong in samples of others, shape (n,).
+    """Return how often numbers that n pixels decide are wrong in data of other parameters, shape (n,).
 
     The number of a code is right with the probability ``P(k; H) [Phi((x + 1/2 - m_k) / s) - Phi((x - 1/2 -
     m_k) / s)]`` of that code and number, ``m_k = mu + k / g``, s the read noise before rounding.
-
-    Args:
-        deciding: n pixels.
-        data: what their samples follow.
     """
     errors = np.empty(len(deciding))
     for part in np.array_split(np.arange(errors.size), errors.size // _AT_ONCE + 1):

@@ -13,15 +13,8 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 def nearest_pcd(parameters: Parameters, model: SampleLaw) -> tuple[FloatArray, ...]:
     """Return (H, g, mu, sigma) of the PCD whose peaks lie and widen as the extended law's do near k = H.
 
-    It has the levels and the whole width of the peaks, that of the named effects included, which the fitted
-    read noise leaves out. Free satellites are levels beside the peaks, not part of their width.
-
-    Args:
-        parameters: fitted (H, g, mu, sigma) of the n pixels of the law, NaN where there are none.
-        model: the law.
-
-    Returns:
-        The four, each (n,): DN and e- as given.
+    Unlike the fitted read noise it has the whole width of the peaks, that of the named effects included. Free
+    satellites are levels beside the peaks, not part of their width. Each of the four is of shape (n,).
     """
     exposure, gain, bias, sigma = columns_of(parameters).T
     exposure = exposure + (model.added_weights * model.added_exposure).sum(axis=1)

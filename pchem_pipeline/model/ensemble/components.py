@@ -78,11 +78,7 @@ def bias_weight(likelihood_gap: FloatArray) -> FloatArray:
     right with the probability ``(1 - w) / 2``, and then the bias is off by one electron, 1/g: this adds
     ``(1 - w^2) / (4 g^2)`` to its variance, which is taken off.
 
-    Args:
-        likelihood_gap: nats to the runner-up, shape (n,); NaN where there is none.
-
-    Returns:
-        Shape (n,), 0..1; 1 throughout where no pixel has a weight.
+    The gap is NaN where there is no runner-up. Weights are 1 throughout where no pixel has any.
     """
     weight = np.tanh(0.5 * np.nan_to_num(likelihood_gap, nan=np.inf))
     return np.asarray(weight if weight.any() else np.ones_like(weight))
@@ -99,9 +95,6 @@ def predicted_moments(pixels: UsablePixels, weight: FloatArray | None = None) ->
         pixels: the pixels.
         weight: of each in Var(mu), shape (n,), see :func:`bias_weight`; None: all the same. The other moments
             need none: where the bias is an electron off, H is, too.
-
-    Returns:
-        The moments and their terms.
     """
     exposure, gain, bias, sigma = pixels.maps
     signal = exposure / gain
@@ -154,16 +147,12 @@ def component_widths(pixels: UsablePixels, n_k: int, weight: FloatArray | None =
 
     Under the weights ``e^{-H} H^k`` (eq. EPCD_alt_form), ``Var(E|K_e=k) = E(sigma^2) + Var(mu) + 2 k
     Cov(mu, 1/g) + k^2 Var(1/g)``. Holding g, mu or sigma^2 at the mean of its map removes its terms
-    (sigma^2 leaves its mean); holding H makes the weights equal. So two sets of weighted moments a k
-    serve all cases.
+    (sigma^2 leaves its mean); holding H makes the weights equal.
 
     Args:
         pixels: the pixels; where all have H = 0 there is no component k > 0, and its moments are NaN.
         n_k: number of components, k = 0 .. n_k - 1.
         weight: of each pixel, shape (n,), see :func:`bias_weight`; None: all the same.
-
-    Returns:
-        Means, variances and NUCed variances.
     """
     exposure, gain, bias, sigma = pixels.maps
     step = 1.0 / gain
@@ -194,12 +183,10 @@ def _weighted_moments(exposure: FloatArray, table: FloatArray, weight: FloatArra
     for k in np.flatnonzero(sums[:, 0] < _FEW_ELECTRONS):  # the ratios of the weights are left
         log_weight = (k * log_exposure if k else 0.0) - exposure
         largest = log_weight[weight > 0.0].max(initial=-np.inf)
-        if not np.isfinite(largest):
-            found[k] = np.nan
-            continue
-        # pixels without a weight may lie above
-        of_k = np.exp(np.minimum(log_weight - largest, 0.0))
-        found[k] = of_k @ columns[:, 1:] / (of_k @ weight)
+        found[k] = np.nan
+        if np.isfinite(largest):  # pixels without a weight may lie above
+            of_k = np.exp(np.minimum(log_weight - largest, 0.0))
+            found[k] = of_k @ columns[:, 1:] / (of_k @ weight)
     return found
 
 

@@ -139,13 +139,7 @@ def electron_numbers(
 ) -> tuple[Arrays, dict[str, Any]]:
     """Return the electron numbers, observed and predicted, and how often they should be wrong.
 
-    Args:
-        totals: the sums over all tiles.
-        pixels: all pixels with a value.
-        settings: the section ``ensemble``.
-
-    Returns:
-        Arrays of the group ``ensemble``, and numbers for its attributes.
+    Arguments and results as of :func:`curves`.
     """
     n_k = totals.axes.n_k
     arrays: Arrays = {
@@ -170,15 +164,9 @@ def electron_numbers(
 
 
 def components(pixels: UsablePixels, mass: FloatArray, weight: FloatArray) -> Arrays:
-    """Return means and widths of the components that matter (Appendix B).
+    """Return means and widths of the components (Appendix B) whose electron numbers have enough mass, (n_k,).
 
-    Args:
-        pixels: all pixels with a value.
-        mass: mass of each electron number, shape (n_k,).
-        weight: of each pixel, see :func:`bias_weight`.
-
-    Returns:
-        Arrays of the group ``ensemble``.
+    The pixels are all with a value, weighted as :func:`bias_weight` says.
     """
     shown = max(2, int(np.flatnonzero(mass >= _SMALLEST_COMPONENT)[-1]) + 1)
     widths = component_widths(pixels, min(shown, mass.size), weight)

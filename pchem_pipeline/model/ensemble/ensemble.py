@@ -88,17 +88,14 @@ def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None) 
     """Choose the bins of the NUCed histogram.
 
     A pixel's NUCed values lie on a lattice of pitch g. A bin of width w holds ``floor(w/g)`` or one more
-    of its points, and their jitter from pixel to pixel is noise on the histogram that no number of frames
-    removes. It is smallest where w is a whole multiple of the typical g, hence the default.
+    of its points: a noise on the histogram that no number of frames removes, smallest where w is a whole
+    multiple of the typical g.
 
     Args:
         pixels: the pixels.
-        dn: axis of the raw data; the NUCed axis reaches no further than it does for the median pixel's
-            neighbours (1st to 99th percentile of g and mu), so that one strange gain cannot stretch it.
+        dn: axis of the raw data; the NUCed axis reaches no further than it does for the 1st to 99th
+            percentile of g and mu, so that one strange gain cannot stretch it.
         width: bin width, e-; None: the median g.
-
-    Returns:
-        The axis.
     """
     gain, bias = pixels.conversion_gain, pixels.bias
     bin_width = float(np.median(gain)) if width is None else width
@@ -151,16 +148,7 @@ def _on_axes(
 
 
 def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatArray:
-    """Compute the sum over pixels of a share times the mass of each code under the PCD.
-
-    Args:
-        pixels: n pixels.
-        dn: the codes.
-        share: of each pixel, shape (n,).
-
-    Returns:
-        ``sum_i share_i P_i(x)``, shape (n_dn,).
-    """
+    """Return ``sum_i share_i P_i(x)``, shape (n_dn,), with the mass of each code under the PCD of a pixel."""
     out = np.zeros(dn.size)
     law = SampleLaw()
     for some, first, n_codes in parts_of_similar_width(law, pixels, (dn.start, dn.start + dn.size - 1)):
@@ -186,8 +174,7 @@ def curve_errors(
         nuced: axis of the NUCed prediction.
 
     Returns:
-        Sums of the variances of the mass of a whole DN, shape (n_dn,), and of the mass of a NUCed bin,
-        shape (n_bins,).
+        Sums for a whole DN, shape (n_dn,), and for a NUCed bin, shape (n_bins,).
     """
     raw, bins = np.zeros(dn.size), np.zeros(nuced.size)
     known = np.where(np.isfinite(covariance), covariance, 0.0)
@@ -229,24 +216,19 @@ def tally(
     Returns:
         The samples, whole numbers; no squares.
     """
-    rows = kernel_counts(counts)
+    rows, no_squares = kernel_counts(counts), np.zeros((1, 1, 1))
     begin = np.arange(len(rows)) * rows.shape[1]
     codes = np.asarray(origin, np.int64), begin, begin + rows.shape[1]
-    return _on_axes(
-        rows.reshape(-1, 1), codes, np.zeros((1, 1, 1)), pixels, dn, nuced or NucedAxis(1.0, 0, 0)
-    )
+    return _on_axes(rows.reshape(-1, 1), codes, no_squares, pixels, dn, nuced or NucedAxis(1.0, 0, 0))
 
 
 def electron_pmf(quanta_exposure: FloatArray, n_k: int, share: FloatArray | None = None) -> FloatArray:
-    """Probability mass of the ensemble electron number (Hendrickson et al. 2023, eq. K_ensemble_pmf).
+    """Return the mass of the ensemble electron number (Hendrickson et al. 2023, eq. K_ensemble_pmf), (n_k,).
 
     Args:
         quanta_exposure: H of each pixel, or of each bin of the map's histogram, e-, shape (n,).
         n_k: number of masses, for k = 0 .. n_k - 1.
         share: part of the pixels that each H stands for, shape (n,), adding up to 1; None: equal parts.
-
-    Returns:
-        p_Ke(k), shape (n_k,).
     """
     exposure = np.asarray(quanta_exposure, np.float64)
     weights = np.full(exposure.size, 1.0 / exposure.size) if share is None else share
@@ -254,16 +236,7 @@ def electron_pmf(quanta_exposure: FloatArray, n_k: int, share: FloatArray | None
 
 
 def poisson_sums(exposure: FloatArray, columns: FloatArray, n_k: int) -> FloatArray:
-    """Compute the sums over pixels ``sum_i P(K = k; H_i) c_i`` of the columns c of a table.
-
-    Args:
-        exposure: H, e-, shape (n,).
-        columns: of the table, shape (n, m).
-        n_k: number of sums, k = 0 .. n_k - 1.
-
-    Returns:
-        Shape (n_k, m).
-    """
+    """Return the sums over pixels ``sum_i P(K = k; H_i) c_i`` of columns c, (n, m), for k < n_k: (n_k, m)."""
     order = np.argsort(exposure)
     sorted_h, table = exposure[order], columns[order]
     log_h, reach = np.log(np.maximum(sorted_h, SMALLEST_MASS)), 12.0 * np.sqrt(sorted_h) + 40.0

@@ -51,15 +51,7 @@ class Cells:
 
 
 def joint_cells(columns: Sequence[FloatArray], bins: int) -> Cells:
-    """Histogram pixels in d dimensions and keep the occupied cells only.
-
-    Args:
-        columns: d parameters, each of shape (n,).
-        bins: of each parameter.
-
-    Returns:
-        At most n cells.
-    """
+    """Histogram d parameters of n pixels, so many bins each, and keep the occupied cells only."""
     index: IntArray = np.zeros(columns[0].size, dtype=np.int64)
     edges = [_edges(column, bins) for column in columns]
     for column, edge in zip(columns, edges, strict=True):
@@ -85,27 +77,19 @@ def _occupied(index: IntArray, n_cells: int) -> IntArray:
 
 def _edges(column: FloatArray, bins: int) -> FloatArray:
     """Return the edges of equal bins: the 1st to 99th percentile, and half of that on either side."""
-    low, high = float(column.min()), float(column.max())
     first, last = np.percentile(column, [1.0, 99.0])
     beyond = 0.5 * (last - first)
-    low, high = max(low, float(first - beyond)), min(high, float(last + beyond))
+    low = max(float(column.min()), float(first - beyond))
+    high = min(float(column.max()), float(last + beyond))
     if not high > low:  # a constant map: one bin that holds it
         return np.array([low, np.nextafter(low, np.inf)])
     return np.linspace(low, high, bins + 1)
 
 
 def epcd_dependent(pixels: UsablePixels, dn: DnAxis, bins: int) -> FloatArray:
-    """Ensemble PCD with the joint density of (H, g, mu, sigma^2) from a 4-D histogram.
+    """Return the ensemble PCD, 1/DN, with the joint density of (H, g, mu, sigma^2) from a 4-D histogram.
 
     Hendrickson et al. 2023, eq. full_ensemble_dist with integrals replaced by sums, dependent parameters.
-
-    Args:
-        pixels: the pixels.
-        dn: where to evaluate it.
-        bins: of each parameter.
-
-    Returns:
-        f_E, 1/DN, shape (n_dn,).
     """
     *first, sigma = pixels.maps
     cells = joint_cells((*first, sigma**2), bins)
@@ -114,21 +98,13 @@ def epcd_dependent(pixels: UsablePixels, dn: DnAxis, bins: int) -> FloatArray:
 
 
 def epcd_independent(pixels: UsablePixels, dn: DnAxis, bins: int) -> FloatArray:
-    """Ensemble PCD with the joint density as the product of four histograms.
+    """Return the ensemble PCD, 1/DN, with the joint density as the product of four histograms.
 
     The product of B bins each has B^4 cells, too many to visit. Its characteristic function factors
     instead: ``E_{g,H} exp(H (e^{it/g} - 1)) * E_mu e^{it mu} * E_sigma exp(-sigma^2 t^2 / 2)``
     (Hendrickson et al. 2023, eqs. EPCD_RV_definition and full_ensemble_dist, independent parameters). It
-    falls off as a Gaussian, so the trapezoidal rule inverts it to rounding error.
-
-    Args:
-        pixels: the pixels.
-        dn: where to evaluate it.
-        bins: of each parameter.
-
-    Returns:
-        f_E, 1/DN, shape (n_dn,); correct to about 1e-15 absolute unless it is so wide that narrow noise is
-        widened.
+    falls off as a Gaussian, so the trapezoidal rule inverts it to rounding error, about 1e-15, unless it is
+    so wide that narrow noise is widened.
     """
     exposures, gains, biases, variances = (
         joint_cells((column,), bins) for column in (*pixels.maps[:3], pixels.read_noise_dn**2)
@@ -196,13 +172,10 @@ def within_limits(
 
     Args:
         curve: of an unlimited ADC, :func:`epcd_dependent` or :func:`epcd_independent`.
-        pixels: the pixels.
-        dn: where to evaluate it.
-        bins: of each parameter.
+        pixels: as of the curve.
+        dn: likewise.
+        bins: likewise.
         limits: first and last code, DN; those at an end of ``dn`` count. None: no limits.
-
-    Returns:
-        f_E, 1/DN, shape (n_dn,).
     """
     low, high = (False, False) if limits is None else (dn.start <= limits[0], dn.start + dn.size > limits[1])
     below = 0
@@ -218,35 +191,19 @@ def within_limits(
 
 
 def nuced_dependent(pixels: UsablePixels, axis: NucedAxis, bins: int) -> FloatArray:
-    """NUCed ensemble PCD with the joint density of (H, sigma_e-^2) from a 2-D histogram.
+    """Return the NUCed ensemble PCD, 1/e-, with the joint density of (H, sigma_e-^2) from a 2-D histogram.
 
     Hendrickson et al. 2023, eq. partial_ensemble_dist, dependent parameters; each value is the mean of the
     density over its bin, as in the data.
-
-    Args:
-        pixels: the pixels.
-        axis: bins of the NUCed value.
-        bins: of each parameter.
-
-    Returns:
-        f_E', 1/e-, shape (n_bins,).
     """
     cells = joint_cells((pixels.quanta_exposure, pixels.read_noise_e**2), bins)
     return _in_bins(cells.values[0], np.zeros(cells.share.size), cells.values[1], axis, cells.share)
 
 
 def nuced_independent(pixels: UsablePixels, axis: NucedAxis, bins: int) -> FloatArray:
-    """NUCed ensemble PCD with the joint density as the product of two histograms.
+    """Return the NUCed ensemble PCD, 1/e-, with the joint density as the product of two histograms.
 
     Hendrickson et al. 2023, eq. partial_ensemble_dist, independent parameters, averaged over each bin.
-
-    Args:
-        pixels: the pixels.
-        axis: bins of the NUCed value.
-        bins: of each parameter.
-
-    Returns:
-        f_E', 1/e-, shape (n_bins,).
     """
     mass = electron_pmf_binned(pixels.quanta_exposure, _enough_k(pixels.quanta_exposure), bins)
     noise = joint_cells((pixels.read_noise_e**2,), bins)
@@ -266,17 +223,9 @@ def _in_bins(
 
 
 def electron_pmf_binned(quanta_exposure: FloatArray, n_k: int, bins: int) -> FloatArray:
-    """Mass of the ensemble electron number with the density of H from a histogram of its map.
+    """Return the mass of the ensemble electron number, with the density of H from a histogram, for k < n_k.
 
     Hendrickson et al. 2023, eq. K_ensemble_pmf with the integral replaced by a sum.
-
-    Args:
-        quanta_exposure: H of each pixel, e-, shape (n,).
-        n_k: number of masses, for k = 0 .. n_k - 1.
-        bins: of each parameter.
-
-    Returns:
-        p_Ke(k), shape (n_k,).
     """
     cells = joint_cells((quanta_exposure,), bins)
     return electron_pmf(cells.values[0], n_k, cells.share)

@@ -48,14 +48,9 @@ class PixelErrors:
         return PixelErrors(self.stderr[pixels], self.correlation[pixels], self.place[pixels], self.share)
 
     def sampled(self, pixels: UsablePixels, samples: NDArray[np.integer]) -> tuple[BoolArray, FloatArray]:
-        """Take some pixels.
+        """Return which pixels are taken, (n,), and their covariances, each times the pixels it stands for.
 
-        Args:
-            pixels: their parameters.
-            samples: number of samples behind each, shape (n,).
-
-        Returns:
-            Which are taken, shape (n,), and their covariances, each as many times as it stands for pixels.
+        The parameters of the pixels are given, and the number of samples behind each, shape (n,).
         """
         chance = np.clip(self.share * self._badness(pixels, samples), self.share, 1.0)
         some = self.place * _GOLDEN % 1.0 < chance

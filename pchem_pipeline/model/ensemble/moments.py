@@ -37,8 +37,8 @@ def moment_rows(
 ) -> list[dict[str, Any]]:
     """Return the moments of Appendix A, from the maps and from the data.
 
-    Under an extended model, or where samples lie at the limits of the codes, mean and variance are those of
-    its masses, and what effects and limits add to the variance of the parameters is a term of its own.
+    Where extended, mean and variance are those of the model's masses, and what effects and limits add to the
+    variance of the parameters is a term of its own.
 
     Args:
         totals: the sums.

@@ -72,16 +72,7 @@ def _range(quanta_exposure: float, noise_e: float) -> tuple[float, float]:
 
 
 def _of_cells(quanta_exposure: float, read_noise_e: float, gain: float) -> FloatArray:
-    """Return the information of one rounded frame for each of some places of the bias between two DN.
-
-    Args:
-        quanta_exposure: H, e-; 0: of one Gaussian.
-        read_noise_e: s_e, quantisation included, e-.
-        gain: g, e-/DN.
-
-    Returns:
-        Shape (8, 4, 4).
-    """
+    """Return the information of one rounded frame for 8 places of the bias between two DN, (8, 4, 4)."""
     variance = (read_noise_e / gain) ** 2
     analog = max(variance - QUANTISATION_VARIANCE, 1e-6 * variance)
     low, high = _range(quanta_exposure, read_noise_e)
@@ -102,16 +93,8 @@ def shared_information(
 ) -> FloatArray:
     """Return what one frame of a sample, its exposure unknown, tells of the other coordinates.
 
-    A sample without electrons (H = 0, bias frames) is one Gaussian: it tells bias and read noise, not the
-    gain.
-
-    Args:
-        quanta_exposure: H >= 0, e-; 0 for bias frames, of which H is known.
-        read_noise_e: s_e, e-.
-        conversion_gain: as of :func:`expected_information`.
-
-    Returns:
-        Matrix, shape (3, 3).
+    A sample without electrons (bias frames, H = 0 is known) is one Gaussian: it tells bias and read noise,
+    not the gain. Arguments as of :func:`expected_information`; the matrix is of shape (3, 3).
 
     Raises:
         ValueError: H is negative or the read noise not positive.
@@ -125,11 +108,7 @@ def shared_information(
 
 
 def inverse_information(information: ArrayLike) -> FloatArray:
-    """Return the smallest covariance, the inverse of an information matrix; NaN where it is singular.
-
-    Args:
-        information: shape (..., n, n), of one frame or of a sum over frames.
-    """
+    """Return the smallest covariance, the inverse of information, (..., n, n); NaN where it is singular."""
     matrix = np.asarray(information, np.float64)
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     known = np.asarray(np.isfinite(matrix).all(axis=(-2, -1)) & (diagonal > 0).all(axis=-1))

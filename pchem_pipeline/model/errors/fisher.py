@@ -18,13 +18,8 @@ CORRELATION_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 def expected_scores(parameters: Parameters) -> tuple[FloatArray, FloatArray]:
     """Return mean and mean outer product of the density's score, the samples being rounded to whole DN.
 
-    The latter is the expected information of one frame; the former is 0 but for what rounding does.
-
-    Args:
-        parameters: (H, g, mu, sigma) of n pixels.
-
-    Returns:
-        In (H, g, mu, sigma), shape (n, 4) and (n, 4, 4); NaN without usable parameters.
+    The latter is the expected information of one frame; the former is 0 but for what rounding does. In (H, g,
+    mu, sigma) of n pixels, shape (n, 4) and (n, 4, 4); NaN without usable parameters.
     """
     columns = columns_of(parameters)
     n = columns.shape[0]
@@ -50,15 +45,9 @@ def expected_scores(parameters: Parameters) -> tuple[FloatArray, FloatArray]:
 
 
 def correlations(covariance: FloatArray) -> FloatArray:
-    """Return the six correlations of (H, g, mu, sigma), see :data:`CORRELATION_PAIRS`.
+    """Return the correlations of :data:`CORRELATION_PAIRS`, (..., 6), from a covariance, (..., 4, 4).
 
-    With the four standard errors they are the covariance, each number once.
-
-    Args:
-        covariance: shape (..., 4, 4).
-
-    Returns:
-        Correlations, shape (..., 6); NaN where a parameter has no standard error.
+    NaN where a parameter has no standard error.
     """
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     pairs = [
@@ -68,15 +57,7 @@ def correlations(covariance: FloatArray) -> FloatArray:
 
 
 def covariance_from(stderr: FloatArray, correlation: FloatArray) -> FloatArray:
-    """Put the covariance of (H, g, mu, sigma) together again; the opposite of :func:`correlations`.
-
-    Args:
-        stderr: standard errors, shape (..., 4).
-        correlation: shape (..., 6).
-
-    Returns:
-        Covariance, shape (..., 4, 4).
-    """
+    """Return the covariance, (..., 4, 4), of standard errors, (..., 4), and :func:`correlations`, (..., 6)."""
     covariance = stderr[..., :, None] * stderr[..., None, :]
     for place, (i, j) in enumerate(CORRELATION_PAIRS):
         covariance[..., i, j] *= correlation[..., place]

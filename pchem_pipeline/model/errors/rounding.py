@@ -30,23 +30,15 @@ def rounding_bias(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic
     """Return the bias that rounding to whole DN gives to estimates from the density, in standard errors.
 
     To first order, ``I^-1 E[s]``: the mean score of the density under the exact masses, through the inverse
-    of its information, at the parameters given.
-
-    Args:
-        parameters: (H, g, mu, sigma), each of shape (n,).
-        n_frames: frames of each pixel, shape (n,).
-
-    Returns:
-        Bias of (H, g, mu, sigma) over their standard errors, shape (n, 4);
-        infinite where there is no answer.
+    of its information. Of (H, g, mu, sigma) of n pixels, shape (n, 4); infinite where there is no answer.
     """
     columns, frames = columns_of(parameters), np.asarray(n_frames, np.float64)
     out = np.full(columns.shape, np.inf)
-    told = (columns[:, 0] > 0.0) & (columns[:, 3] ** 2 > QUANTISATION_VARIANCE)
-    score, information = expected_scores(list(columns[told].T))
+    usable = (columns[:, 0] > 0.0) & (columns[:, 3] ** 2 > QUANTISATION_VARIANCE)
+    score, information = expected_scores(list(columns[usable].T))
     bound = inverse_information(information)
-    errors = np.sqrt(np.diagonal(bound, axis1=1, axis2=2) / frames[told, None])
-    out[told] = np.nan_to_num(np.einsum("nij,nj->ni", bound, score) / errors, nan=np.inf)
+    errors = np.sqrt(np.diagonal(bound, axis1=1, axis2=2) / frames[usable, None])
+    out[usable] = np.nan_to_num(np.einsum("nij,nj->ni", bound, score) / errors, nan=np.inf)
     return out
 
 
@@ -59,9 +51,7 @@ def rounding_may_matter(variance: FloatArray, n_frames: NDArray[np.generic]) -> 
 def biased_by_rounding(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic]) -> BoolArray:
     """Return in which pixels rounding biases the density's estimates by more than :data:`LARGEST_BIAS`.
 
-    Args:
-        parameters: (H, g, mu, sigma) estimated with the density, each (n,); NaN: not fitted, not counted.
-        n_frames: frames of each pixel, shape (n,).
+    Arguments as of :func:`rounding_bias`; a pixel without parameters is not biased.
     """
     sigma, frames = np.asarray(parameters[3], np.float64), np.asarray(n_frames, np.float64)
     suspects = np.flatnonzero(np.isfinite(sigma) & rounding_may_matter(sigma**2, frames))

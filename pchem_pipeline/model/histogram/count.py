@@ -71,13 +71,7 @@ class HistogramAccumulator:
     """Histograms of the pixels of some rows, while the frames come in."""
 
     def __init__(self, shape: tuple[int, int], bins: int, n_frames: int) -> None:
-        """Begin with no frames.
-
-        Args:
-            shape: rows and columns.
-            bins: number of bins of every pixel, see `choose_bins`.
-            n_frames: number of frames to come, at most; it decides the type of the counts.
-        """
+        """Begin with no frames of some rows and columns; at most ``n_frames`` may come."""
         self._counts = np.zeros((*shape, bins), counts_dtype(n_frames))
         self._origin = np.zeros(shape, np.int32)
         self._under = np.zeros(shape, np.uint32)
@@ -89,12 +83,7 @@ class HistogramAccumulator:
 
     @classmethod
     def resumed(cls, held: RowHistograms, n_frames: int) -> HistogramAccumulator:
-        """Go on after the frames of finished histograms, as if it had never stopped.
-
-        Args:
-            held: what `finish` returned.
-            n_frames: number of frames in the end, those of ``held`` included.
-        """
+        """Go on after what `finish` returned; ``n_frames`` in the end, those included."""
         self = cls(held.counts.shape[:2], held.counts.shape[2], n_frames)
         for name, values in vars(held).items():
             getattr(self, f"_{name}")[...] = values
@@ -112,7 +101,7 @@ class HistogramAccumulator:
         Raises:
             InputError: a DN has more than 24 bits.
         """
-        if frames.shape[0] == 0:
+        if not len(frames):
             return
         low, high = frames[0].copy(), frames[0].copy()
         update_range(frames, low, high)
@@ -121,17 +110,8 @@ class HistogramAccumulator:
                 f"the frames have DN of {int(high.max())}, more than 24 bits; correct input.dtype, "
                 "input.byte_order or input.bit_shift"
             )
-        place_windows(
-            frames,
-            low,
-            high,
-            self._minimum,
-            self._maximum,
-            self._counts,
-            self._origin,
-            self._fixed,
-            self._first,
-        )
+        seen = low, high, self._minimum, self._maximum
+        place_windows(frames, *seen, self._counts, self._origin, self._fixed, self._first)
         self._first = False
         count_frames(frames, self._origin, self._counts, self._under, self._over)
 
@@ -149,17 +129,10 @@ def most_bins(max_bins: int, dtype: np.dtype[Any]) -> int:
 
 
 def pixels_by_range(frames: _Frames, max_bins: int) -> IntArray:
-    """Return how many pixels have which range of DN in the first frames of a stack, glitches left out.
+    """Return the number of pixels by their range of DN in the first frames, (max_bins + 2,).
 
-    Of each pixel the most extreme samples are left out, the more the more frames there are. The sum over all
-    rows of the sensor goes to `choose_bins`.
-
-    Args:
-        frames: the first frames, (frame, y, x).
-        max_bins: upper limit of the bins.
-
-    Returns:
-        Number of pixels by range in DN, (max_bins + 2,); the last element is for all above ``max_bins``.
+    Of each pixel the most extreme samples are left out, the more the more frames there are. The last number
+    is of all pixels above ``max_bins``.
     """
     depth = 1 + min(_TRIM, frames.shape[0] // _FRAMES_PER_TRIM)
     low = np.full((depth, *frames.shape[1:]), np.iinfo(frames.dtype).max, frames.dtype)
@@ -170,18 +143,11 @@ def pixels_by_range(frames: _Frames, max_bins: int) -> IntArray:
 
 
 def choose_bins(pixels: IntArray, max_bins: int) -> int:
-    """Return the number of bins that suits a sensor: the typical pixels, and the hot ones within reason.
+    """Return the number of bins that suits a sensor, a multiple of 16 from 32 on.
 
-    A pixel of range r in the first frames needs ``2 r + 16`` bins: of the range of some hundred frames, its
-    extremes left out, the range of a million frames is less than twice as much. The widest need counts, but
-    not the wild ones: above ``max_bins``, or above both 512 and four times the need of the median pixel.
-
-    Args:
-        pixels: number of pixels by range in DN, (max_bins + 2,), see `pixels_by_range`.
-        max_bins: upper limit.
-
-    Returns:
-        A multiple of 16, from 32 to ``max_bins``.
+    A pixel of range r in the first frames (see `pixels_by_range`) needs ``2 r + 16`` bins: of the range of
+    some hundred frames, its extremes left out, the range of a million frames is less than twice as much. The
+    widest need counts, but not above ``max_bins``, or above both 512 and four times that of the median pixel.
     """
     needs = [_needed(width) for width in range(pixels.size)]
     median = int(np.searchsorted(np.cumsum(pixels), 0.5 * pixels.sum()))

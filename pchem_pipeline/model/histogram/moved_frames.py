@@ -18,8 +18,6 @@ from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.histogram.odd_frames import FAR, FEWEST_FRAMES
 from pchem_pipeline.model.histogram.spectrum import MOST_SAMPLES
 
-_FloatArray = FloatArray
-
 #: Standard deviations beyond which a difference or a deviation of a single pixel does not count any more.
 _CLIP = 3.0
 #: Rows and columns by which a frame may have moved, and the kinds of two of them each.
@@ -38,7 +36,7 @@ class MovedFrames:
         self._n, self._known = n_frames, False
         self.found = {kind: list((found or {}).get(kind, ())) for kind in _KINDS}
 
-    def learn(self, mean: _FloatArray, sd: _FloatArray, n_frames: int) -> None:
+    def learn(self, mean: FloatArray, sd: FloatArray, n_frames: int) -> None:
         """Take mean and standard deviation of each pixel over some frames, (y, x), DN, as the pattern."""
         if n_frames < FEWEST_FRAMES:
             return

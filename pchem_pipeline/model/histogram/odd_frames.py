@@ -9,6 +9,7 @@ from scipy import ndimage, special, stats
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.wording import short
+from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 
 KINDS = ("empty", "copied", "far", "moved_x", "moved_y")
@@ -67,7 +68,7 @@ def _far(level: FloatArray, least: float) -> tuple[BoolArray, float]:
     away, size = levels_apart(level), _around(level)
     # around a frame the levels spread by a drift, too, which the median at an end of the run does not follow
     low, high = (ndimage.percentile_filter(level, share, size) for share in (25, 75))
-    floor = max(1.4826 * float(np.median(np.abs(away))), least)
+    floor = max(robust_sd(away, 0.0), least)
     return np.abs(away) > FAR * np.maximum((high - low) / 1.349, floor), floor
 
 

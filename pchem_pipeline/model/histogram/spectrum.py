@@ -103,9 +103,8 @@ class FrameSpectrum:
     def _of_lines(self) -> dict[str, float]:
         """Return the frequency along rows, or columns, that stands out most if each line has its own phase.
 
-        A mean over frames is compared with its standard error (Student's test). Noise that all pixels of the
-        other lines share raises all frequencies alike, and a correlation of neighbours with the cosine of a
-        frequency: neither is looked for here.
+        A mean over frames is compared with its standard error (Student's test); what raises all frequencies
+        alike, or with their cosine (neighbours that are correlated), is taken off.
         """
         looks = float(sum(lines.shape[1] for lines in self._lines))
         best = {"line_p": math.inf}

@@ -83,14 +83,9 @@ class OpenSums:
 
 
 def line_sums(frames: _Frames) -> LineSums:
-    """Return the sums along rows and columns of each frame.
-
-    Args:
-        frames: (frame, y, x), whole groups of rows from the top (the last one of the sensor may be smaller).
-    """
+    """Return the sums along rows and columns of frames (frame, y, x), whole groups of rows from the top."""
     n_frames, ny, nx = frames.shape
-    row_sum = np.empty((n_frames, ny), np.int64)
-    row_sum_square = np.empty((n_frames, ny), np.int64)
+    row_sum, row_sum_square = np.empty((2, n_frames, ny), np.int64)
     column_sum = np.zeros((n_frames, -(-ny // ROW_GROUP), nx), np.int32)
     sum_lines(frames, ROW_GROUP, row_sum, row_sum_square, column_sum)
     return LineSums(row_sum, row_sum_square, column_sum)
@@ -104,15 +99,9 @@ def block_starts(n_frames: int, block_frames: int) -> IntArray:
 def frame_statistics(
     row_sum: IntArray, row_sum_square: IntArray, columns: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean and variance over the pixels of each frame, from its sums along rows.
+    """Return mean, DN, and variance, DN^2, over the pixels of each frame, (frame,) each.
 
-    Args:
-        row_sum: DN, (frame, y), all rows of the sensor.
-        row_sum_square: DN^2, (frame, y).
-        columns: pixels in a row.
-
-    Returns:
-        Mean, DN, and variance (divided by the number of pixels), DN^2; both (frame,).
+    The sums along all rows of the sensor, of so many columns, are of shape (frame, y).
     """
     row_mean = row_sum / columns
     mean = row_mean.mean(axis=1)
@@ -126,12 +115,7 @@ class SummaryAccumulator:
     """Block sums and covariances of the pixels of some rows, while the frames come in."""
 
     def __init__(self, shape: tuple[int, int], block_frames: int) -> None:
-        """Begin with no frames.
-
-        Args:
-            shape: rows (from the top of a group) and columns.
-            block_frames: frames in a time block.
-        """
+        """Begin with no frames of some rows (from the top of a group) and columns."""
         self._block_frames = block_frames
         self._in_block = 0
         self._reference = np.zeros(shape, np.int32)
@@ -142,13 +126,7 @@ class SummaryAccumulator:
 
     @classmethod
     def resumed(cls, state: OpenSums, n_frames: int, block_frames: int) -> SummaryAccumulator:
-        """Go on after ``n_frames`` frames, as if it had never stopped.
-
-        Args:
-            state: what `open_sums` returned after these frames.
-            n_frames: number of frames so far.
-            block_frames: frames in a time block.
-        """
+        """Go on after ``n_frames`` frames with what `open_sums` returned then."""
         self = cls(state.sums.shape[1:], block_frames)
         closed, self._in_block = divmod(n_frames, block_frames)
         self._freedom = closed * (block_frames - 1)
@@ -166,13 +144,11 @@ class SummaryAccumulator:
     def add(self, frames: _Frames) -> list[BlockSums]:
         """Take frames (frame, y, x), any number of them, and return the blocks that they complete."""
         done = []
-        start = 0
-        while start < frames.shape[0]:
-            end = min(frames.shape[0], start + self._block_frames - self._in_block)
-            self._add_part(frames[start:end])
+        while len(frames):
+            part, frames = np.split(frames, [self._block_frames - self._in_block])
+            self._add_part(part)
             if self._in_block == self._block_frames:
                 done.append(self._close_block())
-            start = end
         return done
 
     def finish(self) -> tuple[list[BlockSums], CovarianceMaps]:
@@ -180,8 +156,7 @@ class SummaryAccumulator:
         done = [self._close_block()] if self._in_block else []
         lag, right, down = self._covariances / self._freedom if self._freedom else self._covariances * np.nan
         right[:, -1] = np.nan
-        down[ROW_GROUP - 1 :: ROW_GROUP] = np.nan
-        down[-1] = np.nan
+        down[ROW_GROUP - 1 :: ROW_GROUP] = down[-1] = np.nan
         return done, CovarianceMaps(lag, right, down)
 
     def exchange(self, pieces: Iterable[_Frames], kept: BoolArray) -> BlockSums:
@@ -205,25 +180,22 @@ class SummaryAccumulator:
     def _add_part(self, frames: _Frames) -> None:
         """Add frames that all belong to the open block."""
         if self._in_block == 0:
-            self._reference[:] = frames[0]
-            self._before[:] = frames[0]
+            self._reference[:] = self._before[:] = frames[0]
         narrow = self._is_narrow(frames)
-        columns = frames.shape[2]
         for chosen, dtype in ((narrow, np.int32), (~narrow, np.int64)):
             if chosen.any():
-                work = np.zeros((7, columns + 1), dtype)
+                work = np.zeros((7, frames.shape[2] + 1), dtype)
                 add_products(frames, self._before, self._reference, ROW_GROUP, chosen, work, self._sums)
         self._before[:] = frames[-1]
         self._in_block += frames.shape[0]
 
     def _is_narrow(self, frames: _Frames) -> BoolArray:
-        """Tell for each row whether sums of products over the frames fit into 32 bits, (y,)."""
+        """Return for each row whether sums of products over the frames fit into 32 bits, (y,)."""
         low, high = self._before.astype(frames.dtype), self._before.astype(frames.dtype)
         update_range(frames, low, high)
         reach = np.maximum(high - self._reference, self._reference - low).max(axis=1).astype(np.float64)
         largest = np.maximum(reach, np.append(reach[1:], 0))
-        narrow: BoolArray = frames.shape[0] * reach * largest < np.iinfo(np.int32).max
-        return narrow
+        return np.asarray(frames.shape[0] * reach * largest < np.iinfo(np.int32).max)
 
     def _close_block(self) -> BlockSums:
         """Turn the sums of the open block into block sums and covariances, and begin the next."""
@@ -240,6 +212,5 @@ class SummaryAccumulator:
         reference = self._reference.astype(np.int64)
         total = self._sums[0] + n * reference
         squares = self._sums[1] + 2 * reference * self._sums[0] + n * reference**2
-        self._sums[:] = 0
-        self._in_block = 0
+        self._sums[:], self._in_block = 0, 0
         return BlockSums(total, squares)

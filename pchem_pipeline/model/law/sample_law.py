@@ -252,7 +252,7 @@ class SampleLaw:
     ) -> SampleLaw:
         """Return a copy with a comb stretched by ``scale``, moved by ``shift_e`` e-, and bent.
 
-        The first two are scalar or (n,); ``curvature``, the relative change of the step per electron, adds up.
+        The first two are scalar or (n,); ``curvature`` is a relative change of the step per electron.
         """
         return replace(
             self,

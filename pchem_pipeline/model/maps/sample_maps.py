@@ -1,26 +1,106 @@
-"""What several exposures of the same pixels tell together: the line of H over time or light."""
+"""The line through the exposures of a pixel over time or light: charge rate, spurious charge, linearity."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtrc
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.model.maps.exposure_series import exposure_line
 
 #: Slope and offset of the exposures over the light level.
 LEVEL_MAPS = ("charge_per_level", "dark_signal")
+_REWEIGHTINGS = 2
+_MOST_RESCALED = 100.0  # no variance is trusted to change by more
+
+
+@dataclass(frozen=True)
+class ExposureLine:
+    """``H_j = slope x_j + offset`` in n pixels; NaN where a pixel has no exposures.
+
+    Attributes:
+        slope: e- per unit of x: the charge rate, e-/px/s, where x is the integration time; shape (n,).
+        offset: e-: charge that does not grow with x (spurious charge; dark signal over light), shape (n,).
+        covariance: of slope and offset, shape (n, 2, 2).
+        residual: H_j minus the line, e-, shape (n, J).
+        residual_stderr: standard error of the residual, e-, shape (n, J); 0 where the line leaves no freedom.
+        chi2: squared residuals over the covariance of the exposures, shape (n,).
+        dof: its degrees of freedom, J - 2.
+        p: probability of a larger one, shape (n,); NaN without degrees of freedom.
+    """
+
+    slope: FloatArray
+    offset: FloatArray
+    covariance: FloatArray
+    residual: FloatArray
+    residual_stderr: FloatArray
+    chi2: FloatArray
+    dof: int
+    p: FloatArray
+
+
+def exposure_line(
+    quanta_exposure: FloatArray, covariance: FloatArray, own_variance: FloatArray, x: ArrayLike
+) -> ExposureLine:
+    """Fit a line to the exposures of every pixel by generalised least squares.
+
+    The exposures of a pixel share g, mu and sigma, so their errors are correlated. The variance of each
+    alone grows with H; it is taken at the line, since small estimates would else claim too much weight.
+
+    Args:
+        quanta_exposure: H_j, e-, shape (n, J).
+        covariance: of H_1 ... H_J, e-^2, shape (n, J, J).
+        own_variance: the variance of H_j at known g, mu and sigma, e-^2, shape (n, J).
+        x: integration times (s) or light levels of the samples, shape (J,), not all equal.
+
+    Raises:
+        ValueError: if there are fewer than two different x.
+    """
+    places = np.asarray(x, np.float64)
+    if np.unique(places).size < 2:
+        raise ValueError("a line needs two different integration times or light levels")
+    n, n_samples = quanta_exposure.shape
+    design = np.stack([places, np.ones(n_samples)], axis=1)
+    line, spread = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
+    residual, sd, chi2 = np.full((n, n_samples), np.nan), np.full((n, n_samples), np.nan), np.full(n, np.nan)
+    good = np.flatnonzero(np.isfinite(quanta_exposure).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
+    if good.size:
+        exposure, own = quanta_exposure[good], covariance[good]
+        fitted = exposure
+        for _ in range(1 + _REWEIGHTINGS):
+            errors = own.copy()
+            change = (_rescaling(exposure, fitted) - 1.0) * own_variance[good]
+            errors[:, np.arange(n_samples), np.arange(n_samples)] += change
+            inverse = np.linalg.inv(errors)
+            weighted = np.einsum("jp,njk->npk", design, inverse)
+            bend = np.linalg.inv(weighted @ design)
+            solution = np.einsum("npq,nqk,nk->np", bend, weighted, exposure)
+            fitted = solution @ design.T
+        rest = exposure - fitted
+        line[good], spread[good], residual[good] = solution, bend, rest
+        left = np.diagonal(errors, axis1=1, axis2=2) - np.einsum("jp,npq,jq->nj", design, bend, design)
+        sd[good] = np.sqrt(np.maximum(left, 0.0)) if n_samples > 2 else 0.0
+        chi2[good] = np.einsum("nj,njk,nk->n", rest, inverse, rest)
+    dof = n_samples - 2
+    p = np.asarray(chdtrc(dof, chi2)) if dof > 0 else np.full(n, np.nan)
+    return ExposureLine(line[:, 0].copy(), line[:, 1].copy(), spread, residual, sd, chi2, dof, p)
+
+
+def _rescaling(exposure: FloatArray, fitted: FloatArray) -> FloatArray:
+    """Return the factor from the variance at the estimates to that at the line."""
+    least = np.maximum(1e-6, 1e-3 * exposure.max(axis=1, keepdims=True))
+    ratio = np.maximum(fitted, least) / np.maximum(exposure, least)
+    return np.asarray(np.clip(ratio, 1.0 / _MOST_RESCALED, _MOST_RESCALED))
 
 
 def line_map_names(against: str, rate: str) -> tuple[str, ...]:
-    """Return the names of slope and offset of the exposures against what they are drawn over.
+    """Return the names of slope and offset of the exposures against integration_time, light_level or none.
 
-    Args:
-        against: integration_time, light_level or none.
-        rate: name of the slope over time: ``charge_rate``, in the dark ``dark_current``.
+    The slope over time is the ``rate``: ``charge_rate``, in the dark ``dark_current``.
     """
     if against == "none":
         return ()
@@ -28,13 +108,9 @@ def line_map_names(against: str, rate: str) -> tuple[str, ...]:
 
 
 def own_variance(covariance: FloatArray) -> FloatArray:
-    """Return the variance of each H_j at known g, mu and sigma, e-^2.
+    """Return the variance of each H_j at known g, mu and sigma, e-^2, (n, J); NaN without a covariance.
 
-    Args:
-        covariance: of (H_1 ... H_J, g, mu, sigma), shape (n, J + 3, J + 3); sigma at its bound is NaN.
-
-    Returns:
-        Shape (n, J); NaN where a pixel has no covariance.
+    That is of (H_1 ... H_J, g, mu, sigma), shape (n, J + 3, J + 3); sigma at its bound is NaN.
     """
     n, size = covariance.shape[:2]
     j = size - 3
@@ -75,7 +151,7 @@ def line_maps(
     line = exposure_line(exposure[:, use], covariance[:, use][:, :, use], own, x[use])
     maps: dict[str, NDArray[Any]] = {}
     for i, (name, values) in enumerate(zip(names, (line.slope, line.offset), strict=True)):
-        maps[name], maps[f"{name}_stderr"] = values, np.sqrt(line.covariance[:, i, i])
+        maps |= {name: values, f"{name}_stderr": np.sqrt(line.covariance[:, i, i])}
     left: dict[str, NDArray[Any]] = {"linearity_chi2": line.chi2, "linearity_p": line.p}
     residuals = {"linearity_residual": line.residual, "linearity_residual_stderr": line.residual_stderr}
     for name, part in residuals.items():

@@ -7,7 +7,6 @@ from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
-from pchem_pipeline.model.maps.exposure_series import exposure_line
 from pchem_pipeline.model.maps.maps import (
     CAUTION,
     GOOD,
@@ -19,6 +18,7 @@ from pchem_pipeline.model.maps.maps import (
     summarise,
 )
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
+from pchem_pipeline.model.maps.sample_maps import exposure_line
 from pchem_pipeline.stages.maps import maps_tile
 
 PARAMETERS = {
