@@ -47,11 +47,8 @@ class SampleMoments(NamedTuple):
 def sample_moments(counts: NDArray[np.integer], origin: NDArray[np.integer]) -> SampleMoments:
     """Return the unbiased estimates of the first four cumulants (k-statistics, Fisher 1929).
 
-    Values are centred on the mean first, so that a large bias costs no digits.
-
-    Args:
-        counts: histograms, shape (n, B).
-        origin: DN of bin 0, shape (n,).
+    Of histograms, shape (n, B), with the DN of bin 0, shape (n,). Values are centred on the mean first, so
+    that a large bias costs no digits.
     """
     weights = np.asarray(counts, np.float64)
     bins = np.arange(weights.shape[1], dtype=np.float64)
@@ -59,8 +56,7 @@ def sample_moments(counts: NDArray[np.integer], origin: NDArray[np.integer]) -> 
     with np.errstate(divide="ignore", invalid="ignore"):
         centre = weights @ bins / n
         residual = bins - centre[:, None]
-        powers = [np.einsum("ij,ij->i", weights, residual**power) for power in (2, 3, 4)]
-        second, third, fourth = powers
+        second, third, fourth = (np.einsum("ij,ij->i", weights, residual**power) for power in (2, 3, 4))
         variance = np.where(n > 1, second / (n - 1), np.nan)
         skew = np.where(n > 2, n * third / ((n - 1) * (n - 2)), np.nan)
         top = n * (n + 1) * fourth - 3 * (n - 1) * second**2
@@ -85,13 +81,9 @@ class Sample:
         return sample_moments(self.counts, self.origin)
 
     def likeliest(self, candidates: FloatArray) -> FloatArray:
-        """Return for every pixel the candidate of largest likelihood, NaN where there is none.
+        """Return for every pixel the likeliest (H, g, mu, sigma), shape (n, 4), NaN where there is none.
 
-        Args:
-            candidates: (H, g, mu, sigma), shape (n, m, 4); NaN for those that do not count.
-
-        Returns:
-            Shape (n, 4).
+        The candidates are of shape (n, m, 4); NaN for those that do not count.
         """
         pixel, bins = np.nonzero(self.counts)
         x, weights = self.origin[pixel] + bins, self.counts[pixel, bins]
@@ -123,10 +115,9 @@ class PixelSamples:
 
     def by_brightness(self) -> list[int]:
         """Return the samples' numbers from the darkest to the brightest, by the median pixel."""
-        means = [sample.moments().mean for sample in self.samples]
-        level = [
-            float(np.median(mean[np.isfinite(mean)])) if np.isfinite(mean).any() else 0.0 for mean in means
-        ]
+        means = (sample.moments().mean for sample in self.samples)
+        known = [mean[np.isfinite(mean)] for mean in means]
+        level = [float(np.median(mean)) if mean.size else 0.0 for mean in known]
         return [int(number) for number in np.argsort(level, kind="stable")]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.methods.base import Method, PixelSamples, Sample, methods
 from pchem_pipeline.methods.settings import MethodsSettings
+from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,
@@ -20,8 +21,6 @@ from pchem_pipeline.model.errors.expected_information import (
 
 #: What is compared: (H, g, read noise) relative, the bias in electrons.
 COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
-
-
 #: Errors of a parameter over the pixels, JSON data.
 Errors = dict[str, float | None]
 
@@ -107,9 +106,7 @@ def _medians(parameters: FloatArray) -> dict[str, float | None]:
 def errors_of(parameters: FloatArray, reference: FloatArray) -> dict[str, FloatArray]:
     """Return the errors of each pixel by parameter of :data:`COMPARED`; relative, that of the bias in e-.
 
-    Args:
-        parameters: (H, g, mu, sigma) estimated, shape (n, 4).
-        reference: the same, held for true.
+    Both are (H, g, mu, sigma), shape (n, 4); the reference is held for true.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         noise = parameters[:, 1] * parameters[:, 3]
@@ -138,31 +135,23 @@ def summarise_errors(errors: FloatArray, bounds: FloatArray) -> Errors:
     n, bound = int(values.size), bound[np.isfinite(bound)]
     if n == 0:
         return {"n": 0} | dict.fromkeys(("bias", "bias_stderr", "rmse", "median", "robust_sd", "bound"))
-    median = float(np.median(values))
     return {
         "n": n,
         "bias": float(values.mean()),
         "bias_stderr": float(values.std(ddof=1) / np.sqrt(n)) if n > 1 else None,
         "rmse": float(np.sqrt(np.mean(values**2))),
-        "median": median,
-        "robust_sd": float(1.4826 * np.median(np.abs(values - median))),
+        "median": float(np.median(values)),
+        "robust_sd": robust_sd(values),
         "bound": float(np.sqrt(np.mean(bound**2))) if bound.size else None,
     }
 
 
 def pixel_bounds(samples: Sequence[Sample], reference: FloatArray) -> FloatArray:
-    """Return the Cramer-Rao bound of each pixel for :data:`COMPARED`, in the units of the errors.
+    """Return the Cramer-Rao bound of each pixel for :data:`COMPARED`, in the units of the errors, (n, 4).
 
-    The exposure of the first sample is that of the reference; those of others follow from their means. A
-    sample whose mean lies within five standard errors of the bias is taken for bias frames, of which H = 0 is
-    known.
-
-    Args:
-        samples: used together, the characterised one first.
-        reference: (H, g, mu, sigma), shape (n, 4).
-
-    Returns:
-        Standard deviations, shape (n, 4); NaN where nothing is known or the samples do not tell.
+    The exposure of the first sample is that of the reference, (H, g, mu, sigma), shape (n, 4); those of the
+    others follow from their means. A sample whose mean lies within five standard errors of the bias is taken
+    for bias frames, of which H = 0 is known. NaN where nothing is known or the samples do not tell.
     """
     exposures, frames = [reference[:, 0]], [samples[0].counts.sum(axis=1)]
     for sample in samples[1:]:
@@ -181,9 +170,8 @@ def pixel_bounds(samples: Sequence[Sample], reference: FloatArray) -> FloatArray
 @functools.lru_cache(maxsize=1 << 16)
 def bounds(exposures: tuple[float, ...], noise: float, gain: float, frames: tuple[float, ...]) -> FloatArray:
     """Return the bound of (H of the first sample, g, mu, s_e), relative, the bias in e-."""
-    if not (
-        np.isfinite([*exposures, noise]).all() and exposures[0] > 0 and noise > 0 and min(exposures) >= 0
-    ):
+    known = np.isfinite([*exposures, noise]).all() and min(exposures[0], noise) > 0 and min(exposures) >= 0
+    if not known:
         return np.full(4, np.nan)
     first = expected_information(exposures[0], noise, gain) * frames[0]
     for exposure, n in zip(exposures[1:], frames[1:], strict=True):

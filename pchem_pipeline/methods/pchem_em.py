@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from pchem_pipeline.methods.base import Estimates, Method, PixelSamples
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.fit.api import fit_histograms
@@ -52,6 +50,4 @@ class JointPchEm(Method):
             [sample.origin for sample in pixels.samples],
             dark=[number == darkest for number in range(len(pixels.samples))],
         )
-        exposure = result.quanta_exposure[:, 0]
-        parameters = np.stack([exposure, result.conversion_gain, result.bias, result.read_noise_dn], axis=1)
-        return Estimates.of_fit(parameters, result.fit_status)
+        return Estimates.of_fit(result.columns[:, [0, -3, -2, -1]], result.fit_status)

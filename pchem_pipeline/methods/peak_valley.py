@@ -39,7 +39,7 @@ class PeakValley(Method):
         spacing = 1.0 / closed_form_start(sample)[:, 1]
         spacing[~(spacing < 0.5 * sample.counts.shape[1])] = np.nan
         width = np.maximum(0.12 * spacing, 0.3)  # of the smoothing, a share of the distance of two peaks
-        found = np.full((pixels.n_pixels, 4), np.nan)
+        found = no_estimates(pixels.n_pixels)
         for pixel in np.flatnonzero(np.isfinite(spacing)):
             found[pixel] = comb(sample.counts[pixel], spacing[pixel], width[pixel])
         step, first, exposure, valley = found.T
@@ -60,11 +60,7 @@ def comb(counts: NDArray[np.integer], spacing: float, width: float) -> tuple[flo
     """Return distance and first place of the peaks, bins, H, and the height of a valley over its peaks.
 
     A peak counts where it is above the valley beside it by three times the scatter of the smoothed counts.
-
-    Args:
-        counts: histogram, shape (B,).
-        spacing: first guess of the distance, bins.
-        width: standard deviation of the smoothing, bins.
+    The first guess of the distance, and the standard deviation of the smoothing, are in bins.
     """
     values = gaussian_filter1d(counts.astype(np.float64), width, mode="constant")
     tops, facts = find_peaks(values, prominence=0.0, distance=max(1.0, 0.6 * spacing))

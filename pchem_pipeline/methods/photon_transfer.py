@@ -128,9 +128,8 @@ def _line(x: FloatArray, y: FloatArray, weights: FloatArray) -> tuple[FloatArray
     with np.errstate(divide="ignore", invalid="ignore"):
         total = weights.sum(axis=0)
         mean_x, mean_y = (weights * x).sum(axis=0) / total, (weights * y).sum(axis=0) / total
-        slope = (weights * (x - mean_x) * (y - mean_y)).sum(axis=0) / (weights * (x - mean_x) ** 2).sum(
-            axis=0
-        )
+        square = (weights * (x - mean_x) ** 2).sum(axis=0)
+        slope = (weights * (x - mean_x) * (y - mean_y)).sum(axis=0) / square
         return mean_y - slope * mean_x, slope
 
 
@@ -141,13 +140,6 @@ def gain_variance(
 
     ``[var(xbar_b) + var(xbar_d) + var(s2_b) + var(s2_d) - 2 cov_b - 2 cov_d] / (H_b - H_d)^2`` in electrons,
     with ``var(s2) = (m4 - s2^2)/n``, ``m4 = H + 3 (H + s_e^2)^2`` and ``cov(xbar, s2) = H/n``.
-
-    Args:
-        bright_exposure: H_b, e-.
-        dark_exposure: H_d, e-.
-        read_noise_e: s_e, e-.
-        n_bright: frames of the bright sample.
-        n_dark: frames of the dark sample.
     """
     total = 0.0
     for exposure, frames in ((bright_exposure, n_bright), (dark_exposure, n_dark)):

@@ -49,13 +49,7 @@ def closed_form_start(sample: Sample) -> FloatArray:
 def run_em(
     sample: Sample, start: FloatArray, only_light: bool, settings: MethodsSettings
 ) -> tuple[FloatArray, IntArray]:
-    """Run EM from given points.
-
-    Args:
-        sample: histograms of n pixels.
-        start: (H, g, mu, sigma), shape (n, 4), NaN where there is none.
-        only_light: bias and read noise are known, H and g are looked for.
-        settings: when to stop.
+    """Run EM from (H, g, mu, sigma), shape (n, 4), NaN where there is no start; ``only_light``: for H and g.
 
     Returns:
         (H, g, mu, sigma), NaN without a result, and the steps taken (negative: out of range; 0: no start).
@@ -90,12 +84,7 @@ def _em_step(
 ) -> FloatArray:
     """Return (H, g, mu, sigma) after one EM step, eqs. (update_eqns); NaN where it is not defined.
 
-    Args:
-        pixel: number of the pixel of each occupied code.
-        x: the code, DN.
-        share: part of the pixel's samples at it.
-        theta: (H, g, mu, sigma) before, shape (n, 4).
-        only_light: H and g only.
+    Each occupied code x, DN, has a share of the samples of its pixel.
     """
 
     def mean_of(values: FloatArray) -> FloatArray:

@@ -57,7 +57,7 @@ def correlations(covariance: FloatArray) -> FloatArray:
 
 
 def covariance_from(stderr: FloatArray, correlation: FloatArray) -> FloatArray:
-    """Return the covariance, (..., 4, 4), of standard errors, (..., 4), and :func:`correlations`, (..., 6)."""
+    """Return the covariance, (..., 4, 4), from standard errors, (..., 4), and correlations, (..., 6)."""
     covariance = stderr[..., :, None] * stderr[..., None, :]
     for place, (i, j) in enumerate(CORRELATION_PAIRS):
         covariance[..., i, j] *= correlation[..., place]

@@ -82,18 +82,11 @@ def _around(level: FloatArray) -> int:
 
 
 def frame_scores(row_sum: IntArray, row_sum_square: IntArray, columns: int) -> FloatArray:
-    """Compute normal scores of the levels and spreads of frames, of all rows and of parts of a frame.
+    """Return normal scores, (k, frame): the spread of all rows, then level and spread of parts of a frame.
 
-    The level and the variance of a row are ranked among the frames (van der Waerden 1952). Of independent
-    rows the sum of m scores over root m is N(0, 1), whatever the distribution of the samples.
-
-    Args:
-        row_sum: DN, (frame, y).
-        row_sum_square: DN^2, (frame, y).
-        columns: pixels in a row.
-
-    Returns:
-        Standard deviations, (k, frame): spread of all rows, then level and spread of each part.
+    The level and the variance of a row, of so many columns, are ranked among the frames (van der Waerden
+    1952) by the sums along rows, (frame, y). Of independent rows the sum of m scores over root m is N(0, 1),
+    whatever the distribution of the samples.
     """
     some = np.s_[:, :: -(-row_sum.shape[1] // (_PARTS * ROW_GROUP))]
     sums, squares = row_sum[some], row_sum_square[some]
@@ -112,11 +105,9 @@ def _normal_scores(values: FloatArray) -> FloatArray:
 
 
 def chance_of_copies(row_variance: FloatArray, n_frames: int) -> float:
-    """Return how many pairs of frames have equal rows by chance: sums of rows have a density of differences.
+    """Return how many pairs of frames have equal rows by chance.
 
-    Args:
-        row_variance: sum of the variances of the pixels of each row, along time, DN^2, (y,).
-        n_frames: number of frames.
+    Of each row the sum of the variances of its pixels along time is given, DN^2, (y,).
     """
     alike = float(np.log(np.minimum(1.0, 0.5 / np.sqrt(np.pi * np.maximum(row_variance, 0.1)))).sum())
     return float(np.exp(max(alike + 2.0 * np.log(n_frames), -700.0)))
@@ -146,13 +137,7 @@ def _runs(frames: IntArray) -> list[str]:
 
 
 def odd_words(odd: dict[str, IntArray], mean: FloatArray, variance: FloatArray) -> str:
-    """Return which frames are odd and why.
-
-    Args:
-        odd: frames by kind.
-        mean: of all frames over their pixels, DN, (n,).
-        variance: likewise, DN^2, (n,).
-    """
+    """Return which frames are odd, by kind, and why, with mean and variance of all frames, (n,)."""
     away, excess = levels_apart(mean), levels_apart(variance)
     added, nothing = np.sqrt(np.abs(excess)), np.zeros(0, np.int64)
     far = odd.get("far", nothing)

@@ -212,5 +212,6 @@ class SummaryAccumulator:
         reference = self._reference.astype(np.int64)
         total = self._sums[0] + n * reference
         squares = self._sums[1] + 2 * reference * self._sums[0] + n * reference**2
-        self._sums[:], self._in_block = 0, 0
+        self._sums[:] = 0
+        self._in_block = 0
         return BlockSums(total, squares)
