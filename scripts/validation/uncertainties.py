@@ -62,7 +62,7 @@ def judge_together(fit: FitResult) -> FitResult:
     pool = NoisePool.of(pixels)
     if pool is None:
         return fit
-    word = np.where(pool.weak(pixels, FitSettings()), int(FitStatus.WEAKLY_IDENTIFIED), 0)
+    word = np.where(np.logical_or(*pool.reasons(pixels, FitSettings())), int(FitStatus.WEAKLY_IDENTIFIED), 0)
     return replace(fit, fit_status=fit.fit_status | word.astype(np.uint16))
 
 

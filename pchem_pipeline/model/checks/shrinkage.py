@@ -117,10 +117,6 @@ class NoisePool:
         near = np.abs(some.noise - noise.centre) <= 3.0 * robust_sd(some.noise, noise.centre)
         return cls(noise, _Prior.of(*some.looseness()), _slope(some.of(near), noise.centre))
 
-    def weak(self, pixels: Judged, settings: FitSettings) -> BoolArray:
-        """Return which pixels are weakly identified for either of the :meth:`reasons`, shape (n,)."""
-        return np.logical_or(*self.reasons(pixels, settings))
-
     def reasons(self, pixels: Judged, settings: FitSettings) -> tuple[BoolArray, BoolArray]:
         """Return which pixels have rough errors or too much noise, and which too small a gap, (n,) each.
 

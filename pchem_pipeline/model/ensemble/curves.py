@@ -79,7 +79,7 @@ def curves(
     if any(each.any() for each in errors):
         arrays["epcd_stderr"], arrays["nuced_stderr"] = errors[0], errors[1] / width
     for prefix, noise in (("", variance), ("nuced_", nuced_variance)):
-        exact = arrays["nuced_exact" if prefix else "epcd_exact"]
+        exact = arrays[f"{prefix or 'epcd_'}exact"]
         arrays[f"{prefix}residual"] = normalised_residuals(arrays[f"{prefix}density"], exact, noise)
     facts = _agreement(arrays, variance, nuced_variance, totals)
     facts |= {
@@ -98,37 +98,27 @@ def _agreement(
     totals: EnsembleTotals,
 ) -> dict[str, Any]:
     """Return RMSEs, their noise floors, chi-square, and the windows they were taken over."""
-    window = central_window(arrays["counts"])
-    nuced_window = central_window(arrays["nuced_counts"])
-    found = {f"epcd_{way}": rmse(arrays["density"], arrays[f"epcd_{way}"], window) for way in _WAYS}
-    found["noise_floor"] = noise_floor(variance, window)
-    for way in _WAYS:
-        found[f"nuced_{way}"] = rmse(arrays["nuced_density"], arrays[f"nuced_{way}"], nuced_window)
-    found["nuced_noise_floor"] = noise_floor(nuced_variance, nuced_window)
-    found_all = {f"epcd_{way}": rmse(arrays["density_all"], arrays[f"epcd_{way}"], window) for way in _WAYS}
-    n, n_all = totals.samples
+    found: dict[str, float] = {}
+    model_error: dict[str, float] = {}
+    fits: dict[str, Any] = {}
+    windows = [central_window(arrays[name]) for name in ("counts", "nuced_counts")]
+    for prefix, noise, window in zip(("", "nuced_"), (variance, nuced_variance), windows, strict=True):
+        curve, data = prefix or "epcd_", arrays[f"{prefix}density"]
+        found |= {f"{curve}{way}": rmse(data, arrays[f"{curve}{way}"], window) for way in _WAYS}
+        found[f"{prefix}noise_floor"] = noise_floor(noise, window)
+        if f"{curve}stderr" in arrays:
+            model_error[curve.rstrip("_")] = noise_floor(arrays[f"{curve}stderr"] ** 2, window)
+        fit = chi_square(data, arrays[f"{curve}exact"], noise, arrays[f"{prefix}counts"])
+        fits[f"{prefix}chi_square"] = asdict(fit)
+    (n, n_all), all_data = totals.samples, arrays["density_all"]
+    found_all = {f"epcd_{way}": rmse(all_data, arrays[f"epcd_{way}"], windows[0]) for way in _WAYS}
     found_all["noise_floor"] = found["noise_floor"] * math.sqrt(n / n_all)
-    model_error = {
-        prefix: noise_floor(arrays[f"{prefix}_stderr"] ** 2, place)
-        for prefix, place in (("epcd", window), ("nuced", nuced_window))
-        if f"{prefix}_stderr" in arrays
-    }
-    ends = [window.start, window.stop - 1], [nuced_window.start, nuced_window.stop - 1]
+    ends = [[window.start, window.stop - 1] for window in windows]
     return {
         "rmse": found,
         "rmse_all_frames": found_all,
         "model_error": model_error,
-        **{
-            f"{prefix}chi_square": asdict(
-                chi_square(
-                    arrays[f"{prefix}density"],
-                    arrays["nuced_exact" if prefix else "epcd_exact"],
-                    noise,
-                    arrays[f"{prefix}counts"],
-                )
-            )
-            for prefix, noise in (("", variance), ("nuced_", nuced_variance))
-        },
+        **fits,
         "rmse_window_dn": [int(arrays["dn"][i]) for i in ends[0]],
         "rmse_window_electrons": [float(arrays["electrons"][i]) for i in ends[1]],
     }

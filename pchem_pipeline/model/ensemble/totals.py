@@ -59,13 +59,9 @@ class EnsembleAxes:
     @cached_property
     def floats(self) -> dict[str, slice]:
         """Place of each sum in the row of floats."""
-        lengths: dict[str, int] = {}
-        for name in ("pcd", "pcd_variance", "share", "share_all"):
-            lengths[name] = self.dn.size
-        for name in ("nuced", "nuced_variance", "nuced_share"):
-            lengths[name] = self.nuced.size
-        for name in ("electron_share", "electron_expected"):
-            lengths[name] = self.n_k
+        lengths = dict.fromkeys(("pcd", "pcd_variance", "share", "share_all"), self.dn.size)
+        lengths |= dict.fromkeys(("nuced", "nuced_variance", "nuced_share"), self.nuced.size)
+        lengths |= dict.fromkeys(("electron_share", "electron_expected"), self.n_k)
         lengths |= dict(zip(MODEL_ERRORS, (self.dn.size, self.nuced.size), strict=True))
         return _places(lengths | dict.fromkeys(_FLOATS, 1))
 

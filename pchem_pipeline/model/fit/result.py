@@ -15,8 +15,6 @@ from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.law.parameters import PixelParameters
 
-#: What has an interval, in the order of the axis ``quantity``.
-INTERVAL_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 #: Fits that a notebook shows.
 _SHOWN = 10
 

@@ -32,6 +32,8 @@ MINIMUM_BINS = 32
 _GENEROUS_BINS = 512
 #: ... and up to this many times the window that half of the pixels need.
 _HOT_FACTOR = 4
+#: Largest number of bins of frames in memory.
+_MOST_BINS = 1024
 #: Samples left out at either end of a pixel's range where there are enough frames: glitches.
 _TRIM = 3
 _FRAMES_PER_TRIM = 64
@@ -161,25 +163,18 @@ def _needed(width: int) -> int:
     return max(MINIMUM_BINS, -(-(2 * width + 16) // 16) * 16)
 
 
-def histogram_frames(
-    frames: _Frames, *, bins: int | None = None, max_bins: int = 1024, window_frames: int = 256
-) -> RowHistograms:
-    """Return the histograms of a stack of frames that is in memory.
+def histogram_frames(frames: _Frames, *, bins: int | None = None, window_frames: int = 256) -> RowHistograms:
+    """Return the histograms of a stack of frames in memory, (frame, y, x) of an unsigned type.
 
-    Args:
-        frames: (frame, y, x) of an unsigned type.
-        bins: number of bins; by default what `choose_bins` finds in the first frames.
-        max_bins: upper limit of it.
-        window_frames: number of first frames that decide the windows.
+    The first ``window_frames`` decide the windows, and the number of bins where it is not given.
 
     Raises:
         InputError: a DN has more than 24 bits.
     """
-    n_frames, *shape = frames.shape
-    head = frames[:window_frames]
+    n_frames, ny, nx = frames.shape
     if bins is None:
-        bins = choose_bins(pixels_by_range(head, max_bins), max_bins)
-    histograms = HistogramAccumulator((shape[0], shape[1]), bins, n_frames)
+        bins = choose_bins(pixels_by_range(frames[:window_frames], _MOST_BINS), _MOST_BINS)
+    histograms = HistogramAccumulator((ny, nx), bins, n_frames)
     for t in range(0, n_frames, window_frames):
         histograms.add(frames[t : t + window_frames])
     return histograms.finish()

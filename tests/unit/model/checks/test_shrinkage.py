@@ -18,7 +18,7 @@ def pixels(noise, spread, error, gap, n=4000, seed=1):
 
 
 def weak(sensor):
-    return NoisePool.of(sensor).weak(sensor, SETTINGS)
+    return np.logical_or(*NoisePool.of(sensor).reasons(sensor, SETTINGS))
 
 
 ROUGH = LOOSEST / (8 * np.pi**2 * 0.4)
