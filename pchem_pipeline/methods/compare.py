@@ -122,13 +122,8 @@ def errors_of(parameters: FloatArray, reference: FloatArray) -> dict[str, FloatA
 def summarise_errors(errors: FloatArray, bounds: FloatArray) -> Errors:
     """Return what the errors of one parameter come to; relative, or in e- for the bias.
 
-    Args:
-        errors: of each pixel; NaN without an answer or a reference.
-        bounds: Cramer-Rao bound of each pixel, from the samples that the method was given.
-
-    Returns:
-        ``n`` pixels with an error, its mean ``bias`` with ``bias_stderr``, ``rmse``, ``median``,
-        ``robust_sd`` (1.4826 times the median absolute deviation), and ``bound``, the rms of the bounds.
+    Errors and Cramer-Rao bounds are of each pixel. Of ``n`` pixels with an error: the mean ``bias`` with
+    ``bias_stderr``, ``rmse``, ``median``, ``robust_sd``, and ``bound``, the rms of the bounds.
     """
     known = np.isfinite(errors)
     values, bound = errors[known], bounds[known]

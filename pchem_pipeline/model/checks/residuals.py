@@ -60,19 +60,10 @@ def normalised_residuals(data: FloatArray, model: FloatArray, variance: FloatArr
 def chi_square(
     data: FloatArray, model: FloatArray, variance: FloatArray, counts: NDArray[np.integer[Any]]
 ) -> ChiSquare:
-    """Pearson's chi-square of an ensemble histogram with the binomial variance of its pixels.
+    """Return Pearson's chi-square of an ensemble histogram with the binomial variance of its pixels.
 
-    Bins are taken where there are at least 10 samples. The bins of one pixel are slightly
-    anticorrelated, so the sum is not exactly chi-square; with many bins the difference is small.
-
-    Args:
-        data: density of the data, shape (n,).
-        model: predicted density, shape (n,).
-        variance: variance of the data's density, shape (n,).
-        counts: samples in each bin, shape (n,).
-
-    Returns:
-        Chi-square, the number of bins and the p-value.
+    Over the bins with at least 10 samples. The bins of one pixel are slightly anticorrelated, so the sum is
+    not exactly chi-square; with many bins the difference is small.
     """
     use = (counts >= 10) & (variance > 0)
     value, dof = float(np.sum((data[use] - model[use]) ** 2 / variance[use])), int(use.sum())

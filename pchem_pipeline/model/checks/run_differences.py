@@ -60,14 +60,10 @@ class BlockDifference:
 def compare_blocks(
     one: NDArray[np.generic], other: NDArray[np.generic], *, scale: float, tolerance: float
 ) -> BlockDifference:
-    """Compare two blocks value by value.
+    """Compare two blocks of integers or floats, of one shape, value by value.
 
-    Args:
-        one: integers or floats.
-        other: the same of the other run, of the same shape.
-        scale: largest absolute value of the whole array: rounding is relative to it, since many values are
-            differences of large ones.
-        tolerance: relative difference that counts as rounding; 0 for integers.
+    A difference of ``tolerance`` counts as rounding, relative to the largest absolute value of the whole
+    array, ``scale``, since many values are differences of large ones; between integers none does.
     """
     if one.dtype.kind not in "fc" and other.dtype.kind not in "fc":
         apart = np.abs(one.astype(np.float64) - other.astype(np.float64))
@@ -189,18 +185,11 @@ def _q_values(likely: Sequence[FloatArray], tested: int) -> list[FloatArray]:
 def common_fit_p(
     limits: tuple[int, int] | None, counts: Sequence[NDArray[Any]], origins: Sequence[NDArray[Any]]
 ) -> FloatArray:
-    """Compute the p-values of one (H, g, mu, sigma) for both histograms of each pixel, against one for each.
+    """Return the p-values of one (H, g, mu, sigma) for both histograms of each pixel, against one for each.
 
     Twice the gain in log-likelihood by separate fits is chi-square with 4 degrees of freedom (Wilks 1938),
-    also where the likelihood is not quadratic.
-
-    Args:
-        limits: first and last code of the ADC, DN; None: not known.
-        counts: of either run, shape (n, B).
-        origins: DN of bin 0 in either, shape (n,).
-
-    Returns:
-        Shape (n,); NaN where a fit failed.
+    also where the likelihood is not quadratic. The histograms of either run are of shape (n, B), with the DN
+    of bin 0 (n,), between the limits of the ADC, DN, if known. NaN where a fit failed.
     """
     origin = np.minimum(*origins)
     places = [(own - origin)[:, None] + np.arange(n.shape[1]) for n, own in zip(counts, origins, strict=True)]

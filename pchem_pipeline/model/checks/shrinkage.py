@@ -120,11 +120,7 @@ class NoisePool:
     def reasons(self, pixels: Judged, settings: FitSettings) -> tuple[BoolArray, BoolArray]:
         """Return which pixels have rough errors or too much noise, and which too small a gap, (n,) each.
 
-        False for those without a value.
-
-        Args:
-            pixels: to be judged.
-            settings: their ``gap_threshold`` and ``read_noise_limit`` are the limits.
+        False for those without a value; ``gap_threshold`` and ``read_noise_limit`` are the limits.
         """
         weak, ambiguous = np.zeros((2, pixels.noise.size), np.bool_)
         known = pixels.known

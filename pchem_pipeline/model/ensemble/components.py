@@ -91,10 +91,8 @@ def predicted_moments(pixels: UsablePixels, weight: FloatArray | None = None) ->
     E(sigma^2) + E(H/g^2) + 2 Cov(mu, H/g)``; for the NUCed ensemble ``E(H)`` and ``Var(H) + E(H) +
     E(sigma_e-^2)``.
 
-    Args:
-        pixels: the pixels.
-        weight: of each in Var(mu), shape (n,), see :func:`bias_weight`; None: all the same. The other moments
-            need none: where the bias is an electron off, H is, too.
+    Var(mu) has a weight for each pixel, see :func:`bias_weight`; None: all the same. The other moments need
+    none: where the bias is an electron off, H is, too.
     """
     exposure, gain, bias, sigma = pixels.maps
     signal = exposure / gain
@@ -124,12 +122,8 @@ def moment_errors(pixels: UsablePixels, n_frames: int | NDArray[np.integer[Any]]
     About the ensemble mean, from which the pixel lies off by d, ``Var((X - m)^2) = 3 v^2 + H/g^4 - v^2 +
     4 d H/g^3 + 4 d^2 v``. Frames are independent, so both add over samples.
 
-    Args:
-        pixels: the pixels.
-        n_frames: frames of each pixel: a number, or shape (n,) where pixels differ and each counts the same.
-
-    Returns:
-        Standard errors of ``mean`` (DN), ``variance`` (DN^2), ``nuced_mean`` (e-), ``nuced_variance`` (e-^2).
+    Each pixel counts the same, whatever its frames. Those of ``mean`` (DN), ``variance`` (DN^2),
+    ``nuced_mean`` (e-) and ``nuced_variance`` (e-^2).
     """
     exposure, gain, bias, sigma = pixels.maps
     errors: list[float] = []

@@ -161,20 +161,13 @@ def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatA
 def curve_errors(
     law: SampleLaw, pixels: UsablePixels, covariance: FloatArray, dn: DnAxis, nuced: NucedAxis
 ) -> tuple[FloatArray, FloatArray]:
-    """Sum the pixels' variances of the two predicted masses that the errors of their parameters cause.
+    """Return the sums of the variances of the predicted masses by the errors of the pixels' parameters.
 
     By the delta method, pixels being independent: ``D' C D`` with the slopes D of the mass of a code, or of a
     NUCed bin, in (H, g, mu, sigma). The standard error of a mean over n pixels is ``sqrt(sum) / n``.
 
-    Args:
-        law: of the samples of n pixels, without their free satellites.
-        pixels: the pixels.
-        covariance: of (H, g, mu, sigma), shape (n, 4, 4); entries that are not known count as 0.
-        dn: axis of the raw prediction.
-        nuced: axis of the NUCed prediction.
-
-    Returns:
-        Sums for a whole DN, shape (n_dn,), and for a NUCed bin, shape (n_bins,).
+    The law is that without free satellites; entries of the covariance, (n, 4, 4), that are not known count as
+    0. For each whole DN, shape (n_dn,), and each NUCed bin, shape (n_bins,).
     """
     raw, bins = np.zeros(dn.size), np.zeros(nuced.size)
     known = np.where(np.isfinite(covariance), covariance, 0.0)
@@ -204,17 +197,10 @@ def tally(
     dn: DnAxis,
     nuced: NucedAxis | None = None,
 ) -> AxisSums:
-    """Sort the histograms of pixels onto the axes of the ensemble.
+    """Sort the histograms of n pixels onto the axes of the ensemble; without squares.
 
-    Args:
-        counts: samples per bin, shape (n, n_bins), integer.
-        origin: DN of bin 0, shape (n,).
-        pixels: parameters of the same n pixels, which give the two-point NUC ``(x - mu) g``.
-        dn: axis of the raw histogram.
-        nuced: axis of the NUCed histogram, or None for none.
-
-    Returns:
-        The samples, whole numbers; no squares.
+    The counts are of shape (n, n_bins), the DN of bin 0 of shape (n,); the parameters of the pixels give the
+    two-point NUC ``(x - mu) g``.
     """
     rows, no_squares = kernel_counts(counts), np.zeros((1, 1, 1))
     begin = np.arange(len(rows)) * rows.shape[1]

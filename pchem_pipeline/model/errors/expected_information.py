@@ -33,16 +33,13 @@ _LEAST_EXPOSURE = 1e-12  # below it a sample holds no electrons
 def expected_information(
     quanta_exposure: float, read_noise_e: float, conversion_gain: float = 0.0
 ) -> FloatArray:
-    """Return the expected Fisher information of one frame in ``(H, ln g, g mu, ln sigma)``.
+    """Return the expected Fisher information of one frame in ``(H, ln g, g mu, ln sigma)``, shape (4, 4).
 
     Args:
         quanta_exposure: H > 0, e-.
         read_noise_e: s_e > 0, quantisation included, e-.
         conversion_gain: g, e-/DN, of samples in whole DN, whose bias may be anywhere between two: the inverse
             is the mean covariance; 0: as fine as can be.
-
-    Returns:
-        Symmetric matrix, shape (4, 4); units 1/e-^2, 1/e- and 1 after those of the coordinates.
 
     Raises:
         ValueError: an argument is not a positive number.

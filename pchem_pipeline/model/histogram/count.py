@@ -95,10 +95,7 @@ class HistogramAccumulator:
         return self
 
     def add(self, frames: _Frames) -> None:
-        """Count a block of frames, (frame, y, x).
-
-        The first block of a stack places the windows of pixels that do not fit: let it always have the same
-        number of frames.
+        """Count a block of frames, (frame, y, x); the first one places the windows of pixels that do not fit.
 
         Raises:
             InputError: a DN has more than 24 bits.

@@ -42,7 +42,7 @@ def odd_frames(
         pixels: of a frame; of few pixels chance makes all of these.
         scores: of :func:`frame_scores`, (k, n).
         copies: whether equal frames are copies; see :func:`chance_of_copies`.
-        moved: those that look moved, see `MovedFrames`; here without those that are odd anyway.
+        moved: those that look moved, see `MovedFrames`.
     """
     found = {kind: np.zeros(0, np.int64) for kind in KINDS}
     if level.size < FEWEST_FRAMES or pixels < _FEWEST_PIXELS:

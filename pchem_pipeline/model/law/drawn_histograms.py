@@ -31,13 +31,7 @@ def draw_histograms(
 ) -> DrawnHistograms:
     """Draw a histogram of every pixel from the exact mass of eq. (PCD_RV_definition), rounding included.
 
-    Args:
-        rng: source of random numbers.
-        quanta_exposure: H >= 0, e-, scalar or shape (n,); the parameters broadcast.
-        conversion_gain: g, e-/DN.
-        bias: mu, DN.
-        read_noise_e: s_e with quantisation, e-; at least that of the rounding, g / sqrt(12).
-        n_frames: frames per pixel.
+    The parameters are H >= 0, e-, g, e-/DN, mu, DN, and s_e with quantisation, e-, scalars or of shape (n,).
 
     Raises:
         ValueError: the read noise is below that of the rounding.

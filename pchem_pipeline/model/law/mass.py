@@ -44,10 +44,7 @@ def parts_of_similar_width(
 ) -> Iterator[tuple[NDArray[np.intp], IntArray, int]]:
     """Give pixels in parts whose codes take little memory: those with as many codes come together.
 
-    Args:
-        model: the law.
-        maps: (H, g, mu, sigma) of n pixels; those without usable parameters are in no part.
-        limits: first and last code that are wanted, DN; None: all.
+    Of all codes, or those between limits, DN. Pixels without usable parameters are in no part.
 
     Yields:
         Places of the pixels, the first code of each, DN, and how many codes the widest has.
@@ -107,16 +104,10 @@ def sample_mass(
 def sample_slopes(
     model: SampleLaw, maps: Parameters, first: NDArray[np.integer], n_codes: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the probability of successive codes down to 1e-50, and its slopes.
+    """Return the probability of successive codes down to 1e-50, (n, n_codes), and its slopes.
 
-    Args:
-        model: the law.
-        maps: (H, g, mu, sigma) of n pixels.
-        first: first code of each pixel, DN, shape (n,).
-        n_codes: number of codes.
-
-    Returns:
-        P(x), shape (n, n_codes), and its derivatives in log H, 1/g, mu and log sigma_R^2, (n, 4, n_codes).
+    From the first code of each pixel on, DN, shape (n,); the slopes are in log H, 1/g, mu and log sigma_R^2,
+    shape (n, 4, n_codes). Other arguments as of :func:`sample_mass`.
     """
     columns = columns_of(maps)
     n = columns.shape[0]
@@ -167,13 +158,8 @@ def score_and_information(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the slopes of the log-likelihood of histograms, and Fisher's information of as many samples.
 
-    Args:
-        log_slopes: of the logarithm of the mass in a parameters, shape (n, a, B).
-        mass: of each code, shape (n, B).
-        counts: histograms, shape (n, B).
-
-    Returns:
-        Shapes (n, a) and (n, a, a).
+    From the slopes of the logarithm of the mass in a parameters, shape (n, a, B), the mass and the counts,
+    (n, B); shapes (n, a) and (n, a, a).
     """
     expected = mass * counts.sum(axis=1, keepdims=True)
     score = np.einsum("nab,nb->na", log_slopes, counts)

@@ -16,15 +16,8 @@ def usable_pixels(
 ) -> BoolArray:
     """Return which pixels have parameters that define a density (Hendrickson et al. 2023, eq. X_density).
 
-    Args:
-        quanta_exposure: H, e-, any shape; the others have the same shape.
-        conversion_gain: g, e-/DN.
-        bias: mu, DN.
-        read_noise_dn: sigma, DN.
-
-    Returns:
-        True where all four are finite, H >= 0, g > 0 and sigma > 0, and where they are of a size that a pixel
-        can have: H up to 1e6 e-, 1e-6..1e3 e-/DN, |mu| up to 1e8 DN, read noise up to 1e3 e-.
+    All four, of any one shape, are finite, H >= 0, g > 0, sigma > 0, and of a size that a pixel can have: H
+    up to 1e6 e-, 1e-6..1e3 e-/DN, |mu| up to 1e8 DN, read noise up to 1e3 e-.
     """
     with np.errstate(invalid="ignore", over="ignore"):  # comparisons with NaN are False
         usable = (quanta_exposure >= 0) & (quanta_exposure <= 1e6)

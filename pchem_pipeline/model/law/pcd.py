@@ -104,17 +104,8 @@ def thresholds(
 ) -> FloatArray:
     """Return where the largest membership goes from k to k + 1 (Hendrickson et al. 2023, eq. demarg_K_eqn).
 
-    ``t_k = mu + (k + 1/2)/g + g sigma^2 ln((k + 1)/H)``, of the density; they increase with k.
-
-    Args:
-        quanta_exposure: H, e-, any shape; the others broadcast with it.
-        conversion_gain: g, e-/DN.
-        bias: mu, DN.
-        read_noise_dn: sigma, DN.
-        n_thresholds: number of boundaries.
-
-    Returns:
-        t_k, DN, boundary between k and k + 1, k on the last axis; infinite where H = 0.
+    ``t_k = mu + (k + 1/2)/g + g sigma^2 ln((k + 1)/H)``, DN, of the density, with k on the last axis, k <
+    ``n_thresholds``; infinite where H = 0. Parameters as of :func:`log_pcd`.
     """
     exposure, gain, offset, sigma = (
         np.asarray(v, dtype=np.float64)[..., None]

@@ -119,13 +119,8 @@ def transitions(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the probabilities of the states, (s,), and from each to each over gaps, (g, s, s).
 
-    Over a gap each process keeps its state with its correlation, or takes one by chance; the first is the
-    lowest bit of a state's number.
-
-    Args:
-        share: of the time that each process is up, shape (d,).
-        tau: its correlation time, frames, shape (d,).
-        gaps: frames from one to the next, shape (g,).
+    Over a gap, frames, each process keeps its state with its correlation, of time tau, frames, or takes one
+    by chance, up for a share; the first process is the lowest bit of a state's number.
     """
     start, moves = np.ones(1), np.ones((gaps.size, 1, 1))
     for s, t in zip(share, tau, strict=True):

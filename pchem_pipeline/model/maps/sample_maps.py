@@ -136,15 +136,9 @@ def line_maps(
 ) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
     """Return the line through the exposures of each pixel, and what is left of them.
 
-    Args:
-        exposure: H of n pixels in J samples, e-, shape (n, J).
-        covariance: of (H_1 ... H_J, g, mu, sigma), shape (n, J + 3, J + 3).
-        x: integration times (s) or light levels of the samples, NaN for those without electrons, shape (J,).
-        names: of slope and offset, as of :func:`line_map_names`.
-
-    Returns:
-        Slope and offset with standard errors, (n,), by name; and the residuals (n, J) with theirs, chi-square
-        and its probability (n,).
+    Slope and offset with standard errors, (n,), by their names of :func:`line_map_names`; and the residuals
+    (n, J) with theirs, chi-square and its probability (n,). The covariance is that of (H_1 ... H_J, g, mu,
+    sigma); x, times (s) or light levels of the samples, is NaN for those without electrons.
     """
     use = np.flatnonzero(np.isfinite(x))
     own = own_variance(covariance)[:, use]
