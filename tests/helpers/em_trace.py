@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.fit.climb_numba import Limits, em_step
-from pchem_pipeline.model.law.likelihood import density_likelihood
+from pchem_pipeline.model.fit.engine import likelihood
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     DERIVATIVES,
@@ -57,7 +57,7 @@ def em_trace(counts: NDArray[np.integer], origin: int, start: ArrayLike, n_itera
     theta = np.array([np.log(h), 1 / g, mu - middle, 2 * np.log(sigma), 0.0])
     path, logliks = np.empty((n_iterations + 1, 4)), np.empty(n_iterations + 1)
     for row in range(n_iterations + 1):
-        logliks[row] = evaluated(pixel, theta, DERIVATIVES, density_likelihood(), scratch)
+        logliks[row] = evaluated(pixel, theta, DERIVATIVES, likelihood(False), scratch)
         path[row] = np.exp(theta[0]), 1 / theta[1], middle + theta[2], np.exp(theta[3] / 2)
         following = np.empty(5)
         if em_step(pixel, theta, scratch.evaluations[AT], LIMITS, following):

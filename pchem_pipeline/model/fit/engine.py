@@ -1,4 +1,4 @@
-"""The parts of the fit that are compiled by themselves: climb and searches, called by their addresses."""
+"""The parts of the fit that are compiled by themselves and called by their addresses."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import callback, types_of
 from pchem_pipeline.model.fit import cells_search_numba, climb_numba, search_numba, starts_numba
 from pchem_pipeline.model.fit.climb_numba import Goal, Limits
+from pchem_pipeline.model.law import cells_numba, density_numba
 from pchem_pipeline.model.law.inputs import pack
-from pchem_pipeline.model.law.likelihood import cells_likelihood, density_likelihood, evaluation_arguments
+from pchem_pipeline.model.law.pixel_numba import Pixel, Scratch
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 _VECTOR = np.zeros(1)
@@ -28,16 +29,25 @@ def _address(result: Any, arguments: tuple[Any, ...]) -> Any:
 
 
 @functools.cache
+def _evaluation_arguments() -> tuple[Any, ...]:
+    """Return an example of each argument of a likelihood."""
+    rows, stack = np.zeros((1, 1)), np.zeros((1, 1, 1))
+    pixel = Pixel(stack, rows, stack, stack, 0, 0.0)
+    flags, evaluations = np.zeros((2, 1), np.bool_), np.zeros((1, 1, 1, 1))
+    return pixel, _VECTOR, 0, Scratch(rows, rows, rows, rows, stack, rows, rows, flags, evaluations), stack
+
+
+@functools.cache
 def _climb_arguments() -> tuple[Any, ...]:
-    pixel, _, _, scratch, _ = evaluation_arguments()
-    evaluate = _address(numba.types.float64, evaluation_arguments())
+    pixel, _, _, scratch, _ = _evaluation_arguments()
+    evaluate = _address(numba.types.float64, _evaluation_arguments())
     return pixel, evaluate, _LIMITS, Goal(False, 0.0, 0.0, 0.0, False), _VECTOR, _VECTOR, scratch
 
 
 @functools.cache
 def _search_arguments() -> tuple[Any, ...]:
-    pixel, _, _, scratch, _ = evaluation_arguments()
-    evaluate = _address(numba.types.float64, evaluation_arguments())
+    pixel, _, _, scratch, _ = _evaluation_arguments()
+    evaluate = _address(numba.types.float64, _evaluation_arguments())
     climb_on = _address(_OUTCOME, _climb_arguments())
     tools = numba.types.NamedTuple(
         types_of((_LIMITS, evaluate, climb_on, np.zeros((1, 1)), scratch)), search_numba.Tools
@@ -52,9 +62,14 @@ def climb() -> Any:
     return callback(climb_numba.climb, _OUTCOME, _climb_arguments(), borrows=True)
 
 
+@functools.cache
+def _likelihood(evaluate: Any) -> Any:
+    return callback(evaluate, numba.types.float64, _evaluation_arguments(), borrows=True)
+
+
 def likelihood(cells: bool) -> Any:
     """Return the likelihood of the cells, integrated, or of the density at whole DN."""
-    return cells_likelihood() if cells else density_likelihood()
+    return _likelihood(cells_numba.evaluate_cells if cells else density_numba.evaluate_density)
 
 
 @functools.cache

@@ -12,8 +12,8 @@ from scipy.special import logsumexp
 from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.fit import climb_numba
+from pchem_pipeline.model.fit.engine import likelihood
 from pchem_pipeline.model.law import pixel_numba
-from pchem_pipeline.model.law.likelihood import density_likelihood
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     DERIVATIVES,
@@ -79,7 +79,7 @@ def internal(theta, centre):
 
 
 def run(sample, theta):
-    return evaluated(sample.pixel, theta, DERIVATIVES, density_likelihood(), sample.scratch)
+    return evaluated(sample.pixel, theta, DERIVATIVES, likelihood(False), sample.scratch)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -88,7 +88,7 @@ def test_score_is_the_gradient_and_information_minus_its_jacobian(case):
     point = internal(theta, centre)
     assert run(histogram, point) == pytest.approx(log_likelihood(x, theta), rel=1e-11)
     score, information = histogram.at[SCORE, :4].copy(), histogram.information
-    alone = evaluated(histogram.pixel, point, LOGLIK_ALONE, density_likelihood(), histogram.scratch)
+    alone = evaluated(histogram.pixel, point, LOGLIK_ALONE, likelihood(False), histogram.scratch)
     assert alone == pytest.approx(log_likelihood(x, theta), rel=1e-6)  # without components further down
     size = np.sqrt(np.abs(np.diag(information)))
     step = 1e-3 / size
@@ -126,13 +126,13 @@ def test_large_electron_numbers_and_a_comb_finer_than_any():
     x = np.repeat(np.arange(-centre, 9.0 - centre), [0, 3, 40, 180, 300, 180, 40, 3, 0])
     for h in (40.0, 5000.0):  # with a table of factorials, and beyond it
         theta = Theta(h, 1 / 0.6, -0.6 * h, 0.7)
-        loglik = evaluated(pixel, internal(theta, 0.0), DERIVATIVES, density_likelihood(), scratch)
+        loglik = evaluated(pixel, internal(theta, 0.0), DERIVATIVES, likelihood(False), scratch)
         k = np.arange(int(h) - 60, int(h) + 60)
         log_weight = poisson.logpmf(k, h)
         terms = log_weight + norm.logpdf(x[:, None], theta.bias + 0.6 * k, theta.sigma)
         assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)
     finest = Theta(2.0, 1 / 0.01, 0.0, 0.3)
-    assert evaluated(pixel, internal(finest, 0.0), DERIVATIVES, density_likelihood(), scratch) == -np.inf
+    assert evaluated(pixel, internal(finest, 0.0), DERIVATIVES, likelihood(False), scratch) == -np.inf
 
 
 def test_far_values_have_the_density_of_the_nearest_component():
@@ -142,7 +142,7 @@ def test_far_values_have_the_density_of_the_nearest_component():
     x = np.repeat(np.arange(400.0) - centre, counts)
     for sigma in (0.6, 3.0):  # e-: 0.055 and 0.27
         theta = Theta(1.0, 1 / 11.0, 200.3 - centre, sigma)
-        loglik = evaluated(pixel, internal(theta, 0.0), DERIVATIVES, density_likelihood(), scratch)
+        loglik = evaluated(pixel, internal(theta, 0.0), DERIVATIVES, likelihood(False), scratch)
         k = np.arange(60)
         terms = poisson.logpmf(k, 1.0) + norm.logpdf(x[:, None], theta.bias + 11.0 * k, sigma)
         assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)

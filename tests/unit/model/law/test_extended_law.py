@@ -8,10 +8,10 @@ from helpers.plain_law import pcd_mass
 from scipy.stats import binom, norm, poisson
 
 from pchem_pipeline.model.fit.api import satellite_threshold
+from pchem_pipeline.model.fit.engine import likelihood
 from pchem_pipeline.model.law import cells_numba, pixel_numba
 from pchem_pipeline.model.law.electron_laws_numba import LOST, _one_law, electron_number
 from pchem_pipeline.model.law.inputs import pack
-from pchem_pipeline.model.law.likelihood import cells_likelihood
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas, sample_slopes
 from pchem_pipeline.model.law.pcd import log_pcd, pcd
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -118,13 +118,13 @@ def test_score_and_information_are_the_derivatives(law, satellite, aside):
     at = scratch.evaluations[pixel_numba.AT]
 
     def evaluate(point):
-        value = evaluated(pixel, point, pixel_numba.DERIVATIVES, cells_likelihood(), scratch)
+        value = evaluated(pixel, point, pixel_numba.DERIVATIVES, likelihood(True), scratch)
         lower = np.tril(at[0, pixel_numba.INFORMATION : pixel_numba.DAMPING])
         return value, at[0, pixel_numba.SCORE].copy(), lower + np.tril(lower, -1).T
 
     here = np.array([np.log(1.7), 12.0, 99.7 - centre, np.log(10.0), 0.2 if satellite else 0.0])
     value, score, information = evaluate(here)
-    alone = evaluated(pixel, here, pixel_numba.LOGLIK_ALONE, cells_likelihood(), scratch)
+    alone = evaluated(pixel, here, pixel_numba.LOGLIK_ALONE, likelihood(True), scratch)
     assert alone == pytest.approx(value, rel=1e-12)
     for i in range(5 if satellite else 4):
         step = np.zeros(5)
