@@ -52,10 +52,6 @@ def study_point(point: StudyPoint, settings: MethodsSettings) -> dict[str, Any]:
     """Return errors of all methods at one read noise, and the bounds there, as plain data.
 
     Methods that give one gain to the whole sensor are left out: they average over pixels.
-
-    Args:
-        point: what to simulate.
-        settings: of the iterative methods.
     """
     found: dict[str, dict[str, Any]] = {}
     for number, (needs, exposures) in enumerate(SHARES.items()):

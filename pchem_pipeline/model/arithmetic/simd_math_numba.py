@@ -54,10 +54,7 @@ PER_ROOT_2PI = 1.0 / math.sqrt(2.0 * math.pi)
 
 @kernel(borrows=True)
 def simd_log(x: Simd) -> Simd:
-    """Return log(x) of positive normal numbers.
-
-    From the exponent and ``2 artanh((f - 1)/(f + 1))`` of the fraction f in [sqrt(1/2), sqrt(2)).
-    """
+    """Return log(x) of positive normal numbers, by ``2 artanh((f - 1)/(f + 1))`` of the fraction f."""
     top, rest = _ARTANH
     exponent = exponent_of(x * ROOT2)
     fraction = scaled(x, 0.0 - exponent)

@@ -36,8 +36,6 @@ Value: TypeAlias = Simd | float
 _WIDTH = 8  # doubles in the widest vector register
 _DOUBLES = ir.VectorType(ir.DoubleType(), _WIDTH)
 _WORDS = ir.VectorType(ir.IntType(64), _WIDTH)
-_MANTISSA = 0x000FFFFFFFFFFFFF
-_ONE = 0x3FF0000000000000
 _MANTISSA_BITS = 52
 _EXPONENT_BIAS = 1023
 
@@ -155,15 +153,6 @@ def _exponent_of(_typing: Any, _x: Any) -> Any:
 
 
 @intrinsic
-def _fraction_of(_typing: Any, _x: Any) -> Any:
-    def emit(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        words = builder.and_(builder.bitcast(arguments[0], _WORDS), _constant(_WORDS, _MANTISSA))
-        return builder.bitcast(builder.or_(words, _constant(_WORDS, _ONE)), _DOUBLES)
-
-    return signature(_SIMD, _SIMD), emit
-
-
-@intrinsic
 def _scaled(_typing: Any, _x: Any, _power: Any) -> Any:
     def emit(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         power = builder.shl(builder.fptosi(arguments[1], _WORDS), _constant(_WORDS, _MANTISSA_BITS))
@@ -264,11 +253,6 @@ def exponent_of(x: Simd) -> Simd:
     return np.asarray(np.frexp(x)[1] - 1.0)
 
 
-def fraction_of(x: Simd) -> Simd:
-    """Return x over its largest power of two, in [1, 2), of positive normal numbers."""
-    return np.asarray(2.0 * np.frexp(x)[0])
-
-
 def scaled(x: Simd, power: Simd) -> Simd:
     """Return ``x 2^power`` for whole powers that leave it a normal number."""
     return np.asarray(np.ldexp(x, np.asarray(power).astype(int)))
@@ -311,7 +295,6 @@ _VECTOR: dict[Callable[..., Any], _Choice] = {
     least: lambda x, y: lambda x, y: _smaller(x, y),
     most: lambda x, y: lambda x, y: _larger(x, y),
     exponent_of: lambda x: lambda x: _exponent_of(x),
-    fraction_of: lambda x: lambda x: _fraction_of(x),
     scaled: lambda x, power: lambda x, power: _scaled(x, power),
     counting: lambda: lambda: _counting(),
     spliced: lambda n, x, y: lambda n, x, y: _spliced(n, x, y),
@@ -320,14 +303,12 @@ _VECTOR: dict[Callable[..., Any], _Choice] = {
     simd_sum: lambda x: lambda x: _sum(x),
 }
 
-
 _SCALAR: dict[Callable[..., Any], _Choice] = {
     fused: lambda x, y, z: lambda x, y, z: x * y + z,
     nearest: lambda x: lambda x: np.rint(x),
     least: lambda x, y: lambda x, y: min(float(x), float(y)),
     most: lambda x, y: lambda x, y: max(float(x), float(y)),
     exponent_of: lambda x: lambda x: math.frexp(x)[1] - 1.0,
-    fraction_of: lambda x: lambda x: 2.0 * math.frexp(x)[0],
     scaled: lambda x, power: lambda x, power: math.ldexp(x, int(power)),
     counting: lambda: lambda: 0.0,
     spliced: lambda n, x, y: lambda n, x, y: float(x) if n > 0 else float(y),
@@ -340,10 +321,7 @@ _SCALAR: dict[Callable[..., Any], _Choice] = {
 
 
 def _named(function: Callable[..., Any], choose: _Choice) -> _Choice:
-    """Return what chooses the implementation of a function; it bears the function's name in machine code.
-
-    Of two codes with one name only the first that is loaded is run; all lambdas have one.
-    """
+    """Return what chooses the implementation of a function, which bears its name: all lambdas have one."""
 
     @functools.wraps(choose)
     def chosen(*kinds: Any) -> Callable[..., Any]:

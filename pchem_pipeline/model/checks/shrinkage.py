@@ -1,16 +1,13 @@
 """What the pixels of a sensor, taken together, say about each one's read noise, and so about its fit.
 
-Whether a fit can be trusted depends on the true read noise: the peaks fade as ``exp(-2 pi^2 s_e^2)``, and
-with them go what tells the bias from its neighbours and the sharpness of the standard errors. A pixel knows
-its read noise only to a standard error, though. Where most pixels of a sensor are ambiguous, those that come
-out quiet by chance look clear, and they are the very ones whose estimates are off: no rule that looks at one
-pixel alone can tell, because a really quiet pixel may hold the same histogram.
+Whether a fit can be trusted depends on the true read noise: the peaks fade as ``exp(-2 pi^2 s_e^2)``. Where
+most pixels of a sensor are ambiguous, those that come out quiet by chance look clear, and they are the very
+ones whose estimates are off, which no look at one pixel alone can tell.
 
-All pixels together can. Their scatter beyond their standard errors says how much the true read noises differ,
-and an estimate is drawn towards the middle by as much as it is likely to be chance (James and Stein 1961;
-Efron and Morris 1973). A pixel is :attr:`~pchem_pipeline.model.fit.status.FitStatus.WEAKLY_IDENTIFIED` if,
-with the read noise found so, its likelihood gap would be too small, its read noise too high, or its standard
-errors rough. On a sensor whose pixels differ more than their errors this changes nothing.
+The scatter of all pixels beyond their standard errors says how much the true read noises differ, and an
+estimate is drawn towards the middle by as much as it is likely to be chance (James and Stein 1961; Efron and
+Morris 1973). A pixel is :attr:`~pchem_pipeline.model.fit.status.FitStatus.WEAKLY_IDENTIFIED` if, with the
+read noise found so, its likelihood gap is too small, its read noise too high, or its standard errors rough.
 """
 
 from __future__ import annotations
@@ -86,8 +83,8 @@ class Judged:
     def looseness(self) -> tuple[FloatArray, FloatArray]:
         """Return the logarithm of ``8 pi^2 s_e stderr(s_e)``, and its standard error.
 
-        The information goes as ``exp(-4 pi^2 s_e^2)``, so this is how much its logarithm changes over one
-        standard error; which grows itself as ``exp(2 pi^2 s_e^2)``.
+        That is the change over one standard error of the logarithm of the information, which goes as
+        ``exp(-4 pi^2 s_e^2)``; the standard error goes as ``exp(2 pi^2 s_e^2)``.
         """
         slope = 2.0 / self.noise + 4.0 * np.pi**2 * self.noise
         return np.log(8.0 * np.pi**2 * self.noise * self.stderr), slope * self.stderr

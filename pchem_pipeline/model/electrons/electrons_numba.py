@@ -134,14 +134,7 @@ def fill_tables(
 
 @kernel
 def convert_frames(frames: NDArray[Any], tables: CodeTables, missing: int, out: SampleNumbers) -> None:
-    """Look every sample up in the table of its pixel.
-
-    Args:
-        frames: codes, shape (frame, n).
-        tables: of the pixels.
-        missing: number of a code that is not in the table.
-        out: out.
-    """
+    """Look every code, shape (frame, n), up in the table of its pixel; one that is not there is missing."""
     first, start, number, mass, right, expected = tables
     with_probability, with_expected = out.probability.size > 0, out.expected.size > 0
     for t in range(frames.shape[0]):
@@ -162,12 +155,8 @@ def count_numbers(
 ) -> None:
     """Count the samples of histograms by their electron number; those without one are left out.
 
-    Args:
-        counts: samples per bin, shape (n, n_bins).
-        origin: DN of bin 0, shape (n,).
-        tables: of the pixels.
-        missing: what stands for no number.
-        out: in and out, samples of each number; in the last place those of it and of larger ones.
+    The counts are of shape (n, n_bins), the DN of bin 0 (n,). They are added to ``out``, in whose last place
+    are the samples of that number and of larger ones.
     """
     start, number = tables.start, tables.number
     for p in range(origin.size):

@@ -35,7 +35,7 @@ def moment_rows(
     *,
     extended: bool = False,
 ) -> list[dict[str, Any]]:
-    """Return the moments of Appendix A, from the maps and from the data.
+    """Return the moments of Appendix A, from the maps and from the data; terms have nothing to be observed.
 
     Where extended, mean and variance are those of the model's masses, and what effects and limits add to the
     variance of the parameters is a term of its own.
@@ -46,9 +46,6 @@ def moment_rows(
         per_pixel: samples of each pixel.
         weight: of each pixel in Var(mu), see :func:`bias_weight`.
         extended: whether the model holds effects, or samples lie at the limits of the codes.
-
-    Returns:
-        Rows ``{name, quantity, unit, predicted, observed, stderr}``; terms have nothing to be observed.
     """
     plain_ones, errors = predicted_moments(pixels, weight), moment_errors(pixels, per_pixel)
     expected = _extended_moments(totals, plain_ones) if extended else plain_ones

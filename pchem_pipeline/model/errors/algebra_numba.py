@@ -39,15 +39,10 @@ _SMALLEST = 1e-10  # of the damping matrix: less is lost in rounding
 def cholesky(
     matrix: FloatArray, start: int, end: int, least: float, held: BoolArray, lower: FloatArray
 ) -> bool:
-    """Factor the rows start ... end - 1 of a matrix; False unless positive definite.
+    """Factor the rows start ... end - 1 of a matrix, a lower triangle; False unless positive definite.
 
-    Args:
-        matrix: its lower triangle.
-        start: first row.
-        end: of the rows.
-        least: share of a diagonal element that must be left of it.
-        held: which rows stay, the first row first: they are taken for those of a unit matrix.
-        lower: out.
+    The rows that are held are taken for those of a unit matrix; of the diagonal elements of the others a
+    share must be left.
     """
     for row in range(start, end):
         for column in range(start, row + 1):
@@ -85,10 +80,7 @@ def back_substitute(lower: FloatArray, start: int, end: int, vector: FloatArray)
 
 @kernel(inline=True, borrows=True)
 def _solve_without_satellites(at: FloatArray, share: float, scratch: Scratch, step: FloatArray) -> float:
-    """Do as :func:`solve_arrow` where there are no satellites: by L D L', five times faster.
-
-    The shared parameters are 1/g, mu and v.
-    """
+    """Do as :func:`solve_arrow` where there are no satellites: by L D L', five times faster."""
     n, held = at.shape[0], scratch.flags[HELD]
     squared = right1 = right2 = right3 = 0.0
     a11 = a21 = a22 = a31 = a32 = a33 = 0.0
@@ -148,16 +140,9 @@ def _solve_without_satellites(at: FloatArray, share: float, scratch: Scratch, st
 
 @kernel(borrows=True)
 def solve_arrow(at: FloatArray, share: float, scratch: Scratch, step: FloatArray) -> float:
-    """Solve for the step with the information and a share of the damping matrix.
+    """Fill the step with the information and a share of the damping matrix, 0 for what stays (flags `HELD`).
 
-    Args:
-        at: evaluation.
-        share: of the damping matrix.
-        scratch: with the parameters that stay in its flags `HELD`.
-        step: out, shape (J + N_SHARED,); 0 for what stays.
-
-    Returns:
-        The squared decrement, NaN unless the matrix is positive definite.
+    Return the squared decrement, NaN unless the matrix is positive definite.
     """
     n, held, small = at.shape[0], scratch.flags[HELD], scratch.small
     if held[n + SATELLITE]:
@@ -213,16 +198,8 @@ def invert_arrow(at: FloatArray, theta: FloatArray, held: BoolArray, covariance:
     """Fill the inverse of the observed information of (H_1 ... H_J, 1/g, mu, v, q).
 
     In H itself, ``-d2 L / dH2 = (I + s) / H^2`` with information I and score s in log H: it stays finite
-    where the exposure is at its lower bound.
-
-    Args:
-        at: evaluation at the maximum.
-        theta: there.
-        held: parameters that stay, shape (J + N_SHARED,).
-        covariance: out, shape (J + N_SHARED, J + N_SHARED); zeros for what stays.
-
-    Returns:
-        Whether the information is positive definite.
+    where the exposure is at its lower bound. Zeros for what stays; return whether the information is positive
+    definite.
     """
     n = at.shape[0]
     factors, own = np.zeros((n, N_BLOCK)), np.zeros(n)
@@ -277,10 +254,7 @@ def invert_arrow(at: FloatArray, theta: FloatArray, held: BoolArray, covariance:
 def enclose(at: FloatArray, theta: FloatArray, covariance: FloatArray) -> None:
     """Replace the inverse information C by the sandwich ``C (sum of squared scores) C`` (White 1982).
 
-    Args:
-        at: evaluation at the maximum, the samples' squared scores in the place of the damping matrix.
-        theta: there.
-        covariance: as of `invert_arrow`; out.
+    The evaluation at the maximum has the squared scores in the place of the damping matrix.
     """
     n, size = at.shape[0], theta.size
     middle, half = np.zeros((size, size)), np.zeros((size, size))

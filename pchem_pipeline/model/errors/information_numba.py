@@ -30,10 +30,7 @@ from pchem_pipeline.model.law.pixel_numba import (
 def fill_squared_scores(pixel: Pixel, theta: FloatArray, at: FloatArray) -> None:
     """Fill the sums of outer products of the samples' scores, the middle of the sandwich, of the density.
 
-    Args:
-        pixel: its samples.
-        theta: parameters, shape (J + N_SHARED,).
-        at: out, an evaluation, in the place of its damping matrix; lower triangles.
+    Lower triangles, in the place of the damping matrix of an evaluation.
     """
     n = pixel.facts.shape[0]
     means, score = np.empty(N_MEANS), np.empty(4)
@@ -71,15 +68,10 @@ def grouped_trace(
 
     The trace of the groups' Fisher information times the covariance of the estimates: 4 where grouping
     loses nothing, 0 where the groups say nothing. Groups are those of
-    :func:`~pchem_pipeline.model.fit.search_numba.pearson`.
+    :func:`~pchem_pipeline.model.fit.search_numba.pearson`, from the first occupied DN to the last, (n,).
 
-    Args:
-        first: first occupied DN, shape (n,).
-        last: last occupied DN, shape (n,).
-        frames: samples fitted, shape (n,).
-        parameters: (H, g, mu, sigma), shape (n, 4); NaN where there is none.
-        covariance: of the estimates, shape (n, 4, 4); NaN for what a bound holds.
-        out: out, shape (n,); NaN without parameters.
+    The parameters (H, g, mu, sigma), (n, 4), are NaN where there are none, and so is ``out``; the covariance,
+    (n, 4, 4), for what a bound holds.
     """
     means, score, held, rest = np.empty(N_MEANS), np.empty(4), np.empty(4), np.empty(4)
     for p in range(first.size):

@@ -82,12 +82,10 @@ from pchem_pipeline.model.law.pixel_numba import (
 )
 
 _LEAST_VARIANCE = 0.01  # DN^2, of the analog read noise at a start
-_LEAST_SHARE = (
-    0.1  # of the variance and the exposure of the density's fit, left to the pixel itself at the start
-)
+# of the variance and the exposure of the density's fit, left to the pixel itself at the start
+_LEAST_SHARE = 0.1
 _POOR = float(-special.ndtri(SIGNIFICANCE))  # standard normal: a pixel at a limit is started anew
-# what calls for other starts of free satellites: a bad fit (standard normal), or one without resolved peaks,
-# e-
+# what calls for other starts of free satellites: a bad fit (standard normal), or unresolved peaks, e-
 _SUSPICIOUS = 2.3
 _UNRESOLVED = 0.45
 _CUT_SHARE = 0.005  # of a sample at a limit, beyond which the starts of the whole sample mislead
@@ -100,9 +98,7 @@ _STEPS, _AROUND = 3, 3  # biases per electron, and to either side
 def _from_density(pixel: Pixel, warm: bool, near: FloatArray, theta: FloatArray) -> None:
     """Fill ``theta`` from parameters with the whole variance of the read noise.
 
-    Unless ``warm``, exposures and read noise are those of a fit with the density, which hold the mean
-    exposure and all
-    that widens the peaks: what the law adds is taken off, but for a tenth.
+    Unless ``warm``, what the law adds to exposures and read noise is taken off, but for a tenth.
     """
     n = pixel.facts.shape[0]
     copy(near, theta)
@@ -149,9 +145,8 @@ def _share_at_limits(pixel: Pixel) -> float:
 def _scan_cut(pixel: Pixel, tools: Tools) -> int:
     """Put the likeliest combs of a cut sample among the starts; return the evaluations.
 
-    Mean and variance of a cut histogram say little, and its characteristic function has a phase of its own;
-    but its median is where it was, as long as less than half is cut. So steps from the range of the sample
-    down, exposures, and biases around the one that has the median right are all tried.
+    Of a cut histogram the median stays. So steps from the range of the sample down, exposures, and biases
+    around the one that has the median right are all tried.
     """
     trial, place, used = tools.scratch.small[HERE], 0, 0
     facts, cumulative = pixel.facts[0], pixel.bins[0, CUMULATIVE]
@@ -200,10 +195,7 @@ def _climb_known(pixel: Pixel, tools: Tools, near: FloatArray, best: FloatArray)
 
 @kernel
 def _flat_at_two(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -> bool:
-    """Return whether the log-likelihood of a single sample is flat towards 2 DN per electron.
-
-    Whole numbers do not tell 1/a from 1 - 1/a: it has no slope at 2 DN, and near it no standard error.
-    """
+    """Return whether the log-likelihood of a single sample is flat towards 2 DN per electron."""
     if abs(1.0 / best[1 + STEP] - 0.5) > NEAR_TWO:
         return False
     combs_of_step(pixel, tools.evaluate, 2.0, tools.scratch)
@@ -225,9 +217,8 @@ def _start_anew(
 ) -> Found:
     """Climb from other starts in pixels that the density may have led astray.
 
-    These are pixels at the limits of the codes, those of few DN per electron, and those whose climb did not
-    arrive. Of other pixels the density has scanned all combs, unless their law is another: then those with a
-    near rival are started anew, too.
+    These are at the limits of the codes, have few DN per electron, or a climb that did not arrive; under
+    another law also those with a near rival.
     """
     n, limits = pixel.facts.shape[0], tools.limits
     place = n + STEP
@@ -281,17 +272,8 @@ def search_with(satellites: bool) -> Callable[..., tuple[int, int, int]]:
 
         From a fit with the density, or with nearly this law; its neighbours are tried where that fit does not
         exclude them, or where its law was too different to do so. Pixels that the density may have led astray
-        are also started anew. Where the law has free satellites, each amplitude is tried.
-
-        Args:
-            pixel: its samples and its law.
-            tools: of the search, with the cells; out: score and information at the maximum in ``at_best``.
-            task: the law, and the fit to start from.
-            best: out, theta at the maximum; its step is 0 where there is none.
-            out: out, a row of results.
-
-        Returns:
-            Status word, evaluations, degrees of freedom of the goodness of fit.
+        are also started anew. Where the law has free satellites, each amplitude is tried. Arguments and
+        results as of :func:`.search_numba.search_density`.
         """
         n, limits, null = pixel.facts.shape[0], tools.limits, loglik_without_gain(pixel)
         known = task.near[n + STEP] > 0.0

@@ -55,22 +55,19 @@ DEGENERATE = 2  # ran towards one Gaussian: g to infinity, or an empty second pe
 FAR_BELOW = 3  # given up: too far below the likelihood to beat
 _GOING, _AT_KNOWN = 4, 5  # within a climb: not there yet; heading for the maximum that is known
 
-
 MIN_LOG_VARIANCE = math.log(QUANTISATION_VARIANCE)
 MIN_ELECTRON_NOISE = 0.03  # of the density: below it the polynomials of the E-step overflow
 MAX_ELECTRON_NOISE = 3.0  # above it there is one Gaussian to all intents
-ALIASED_STEP = (
-    6.0  # DN per electron: whole numbers do not tell 1/a from 1 - 1/a, and MIN_STEP is the alias of 6
-)
+# DN per electron: whole numbers do not tell 1/a from 1 - 1/a, and MIN_STEP is the alias of 6
+ALIASED_STEP = 6.0
 MIN_STEP = 1.2  # DN per electron, of the density: a comb with a tooth at each DN would fit any whole numbers
 LEAST_STEP, LEAST_NOISE_DN, LEAST_NOISE_E = 0.6, 0.05, 0.02  # of the cells
 MAX_LOG_EXPOSURE = math.log(1e5)
 MOST_SATELLITE = 0.95
 _LEAST_SHARE = 1e-5  # of the damping matrix in a damped step
 _REFUSED, _REFUSED_CELLS = 3e-5, 1e-2  # after a step that was refused
-_INDEFINITE_CELLS = (
-    1.0  # where the information is not positive definite: most of the step is the damping matrix's
-)
+# where the information is not positive definite: most of the step is the damping matrix's
+_INDEFINITE_CELLS = 1.0
 _SURELY_LOWER = 1e-4  # nats still to rise, where that much cannot reach the likelihood that is known
 _LARGEST_SHARE = 3.0  # beyond it an EM step is taken, where there is one
 _MOST_SHARE = 1e9
@@ -212,8 +209,7 @@ def find_held(theta: FloatArray, at: FloatArray, fixed: BoolArray, limits: Limit
 def em_step(pixel: Pixel, theta: FloatArray, at: FloatArray, limits: Limits, out: FloatArray) -> bool:
     """One EM update, eq. (update_eqns), from an evaluation of the density; False where it is not defined.
 
-    Written in the residuals e = x - mu - k/g of the present parameters, which is the same update without
-    cancellation; ``1/g``, ``mu`` and ``sigma^2`` from the sums over all samples, ``H_j = A_j``.
+    Written in the residuals e = x - mu - k/g of the present parameters, without cancellation.
     """
     samples = at.shape[0]
     n = sum_k = sum_kk = sum_ke = sum_e = sum_ee = 0.0
@@ -251,8 +247,7 @@ def newton_step(
 
     Returns:
         Half the squared Newton decrement, the expected rise of the log-likelihood (NaN without a step), and
-        the share of the damping matrix that it took. Only with a share of 0 does the former say how far the
-        maximum is.
+        the share of the damping matrix that it took.
     """
     squared = solve_arrow(at, share, scratch, step)
     while not squared >= 0.0:
@@ -430,16 +425,8 @@ def climb(
 ) -> tuple[int, float, int]:
     """Climb to the maximum near ``theta``, which is updated in place.
 
-    Args:
-        pixel: histograms and law.
-        evaluate: the likelihood.
-        limits: bounds and limits.
-        goal: what the climb is for.
-        known: a maximum known already.
-        theta: start; out: the maximum.
-        scratch: room to work in; parameters that stay in its flags `FIXED`: without electrons, without
-            satellites, held for a profile; out: in its evaluation `AT` that at the last theta that was
-            evaluated.
+    The parameters that stay are in the flags `FIXED` of the scratch; the evaluation at the last theta that
+    was evaluated is left in `AT`. ``known`` is a maximum known already.
 
     Returns:
         Outcome, log-likelihood at the last theta (the rise expected from one more Newton step included, once

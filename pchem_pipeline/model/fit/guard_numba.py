@@ -15,13 +15,7 @@ _FEW_DN = 4.0
 def find_cores(given: Histograms, ends: IntArray, far: BoolArray) -> None:
     """Find the bins that no gap cuts off from the core of a histogram, which holds 96 % of the frames.
 
-    The model has no say here: far samples would otherwise lead the search for its parameters astray, where
-    peaks hundreds of DN apart explain them.
-
-    Args:
-        given: histograms.
-        ends: out, first bin and the one after the last of each sample, shape (n, J, 2).
-        far: out, whether there are samples beyond, shape (n,).
+    Fill first bin and the one after the last of each sample, (n, J, 2), and whether samples are beyond, (n,).
     """
     for index in range(far.size):
         far[index] = False

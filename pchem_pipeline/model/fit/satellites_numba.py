@@ -75,10 +75,7 @@ def _climb(pixel: Pixel, tools: Tools, to_beat: float, theta: FloatArray) -> tup
 
 @kernel(borrows=True)
 def _evaluate_weight(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch, out: FloatArray) -> float:
-    """Evaluate the rise of the log-likelihood with the weight of the free satellites, the rest held.
-
-    The masses are linear in it; those without satellites, and their slopes, are in the scratch.
-    """
+    """Evaluate the rise of the log-likelihood with the weight of the satellites: the mass is linear in it."""
     rise, weight, place = 0.0, theta[theta.size - 1], 1 + SATELLITE
     for j in range(pixel.facts.shape[0]):
         weights, room, slope, bend = pixel.bins[j, WEIGHT], scratch.cells[j], 0.0, 0.0
@@ -99,8 +96,7 @@ def _evaluate_weight(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratc
 def _with_weight(pixel: Pixel, tools: Tools, theta: FloatArray) -> tuple[float, float, float]:
     """Set the likeliest weight of the free satellites.
 
-    Returns:
-        The log-likelihood without them, its rise by the weight, and that expected of all parameters.
+    Returns the log-likelihood without them, its rise by the weight, and that expected of all parameters.
     """
     scratch, limits, last = tools.scratch, tools.limits, theta.size - 1
     at, fixed = scratch.evaluations[AT], scratch.flags[FIXED]
@@ -128,11 +124,7 @@ def _from_fit(pixel: Pixel, tools: Tools, theta: FloatArray) -> bool:
 
 @kernel(borrows=True)
 def _beside(direction: float, pixel: Pixel, tools: Tools, theta: FloatArray) -> float:
-    """Move ``theta`` by one electron (H + direction, mu - direction/g); return the log-likelihood there.
-
-    A satellite below the peak of no electron is taken for that peak by a fit without satellites. -inf where
-    H would end.
-    """
+    """Move ``theta`` by one electron; return the log-likelihood there, -inf where H would end."""
     n = pixel.facts.shape[0]
     for j in range(n):
         exposure = math.exp(theta[j]) + direction
@@ -153,17 +145,10 @@ def _with_cumulants(
     moments: tuple[float, float, float],
     theta: FloatArray,
 ) -> bool:
-    """Fill ``theta`` of a single sample from the cumulants of its histogram, given the step.
+    """Fill ``theta`` of a single sample from the cumulants of its histogram, given the step, DN.
 
-    Args:
-        a: DN per electron.
-        third: third cumulant, DN^3.
-        histogram: of the sample.
-        moments: first three moments of the levels beside the quiet one, e-.
-        theta: out.
-
-    Returns:
-        Whether such satellites can have these cumulants, chance aside.
+    The moments are the first three of the levels beside the quiet one, e-. Return whether such satellites can
+    have these cumulants, chance aside.
     """
     m1, m2, m3 = moments
     weight, exposure, spread = 0.1, 0.0, 0.0
@@ -187,11 +172,7 @@ def _with_cumulants(
 def _from_cumulants(
     pixel: Pixel, law: Law, amplitude: float, tools: Tools, theta: FloatArray
 ) -> tuple[bool, int]:
-    """Fill ``theta`` of a single sample with the likeliest comb of the histogram's first three cumulants.
-
-    Returns:
-        Whether there is one, and evaluations.
-    """
+    """Fill ``theta`` with the likeliest comb of a histogram's cumulants; return whether and evaluations."""
     scratch, histogram, used = tools.scratch, histogram_of(pixel, 0), 0
     third = m1 = m2 = m3 = 0.0
     for i in range(histogram.n_bins):
@@ -217,11 +198,7 @@ def _from_cumulants(
 def _refine(
     amplitude: float, theta: FloatArray, highest: float, pixel: Pixel, law: Law, index: int, tools: Tools
 ) -> tuple[float, float, int]:
-    """Climb in the amplitude too; ``theta`` is updated.
-
-    Returns:
-        Amplitude, e-, log-likelihood there, evaluations.
-    """
+    """Climb in the amplitude, too; update ``theta``, return amplitude, e-, log-likelihood and evaluations."""
     trial = tools.scratch.small[HERE]
     heights = np.empty(2)
     used, step, target = 0, _FINER, 0.0
@@ -267,16 +244,8 @@ def search_satellites(
 ) -> tuple[float, int]:
     """Try free satellites of each amplitude; keep the best in ``theta`` where the likelihood rises by enough.
 
-    Args:
-        theta: the fit without satellites; out: that with them.
-        loglik: its log-likelihood.
-        pixel: its samples; the levels of the noise are overwritten.
-        law: of all pixels.
-        index: the pixel's place in it.
-        amplitudes: e-.
-        unsure: a start with one electron more is tried too; one with one less always is.
-        thorough: both are however unlikely, and starts on other combs.
-        tools: of the search.
+    ``unsure``: a start with one electron more is tried, too; one with one less always is. ``thorough``: both
+    are however unlikely, and starts on other combs.
 
     Returns:
         The amplitude kept, e-, 0 without one; evaluations.

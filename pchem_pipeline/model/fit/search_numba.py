@@ -95,13 +95,9 @@ FITTED_PARAMETERS = len(PARAMETERS)  # of one sample
 
 
 class Tools(NamedTuple):
-    """What the search works with.
+    """What the search works with; likelihood and climb are called by their addresses.
 
-    Attributes:
-        limits: bounds and limits.
-        evaluate, climb: the likelihood, and the climb on it, called by their addresses.
-        basis: of the regression on the characteristic function.
-        scratch: room to work in.
+    The basis is that of the regression on the characteristic function.
     """
 
     limits: Limits
@@ -193,8 +189,7 @@ def _most_electrons(pixel: Pixel, theta: FloatArray) -> float:
 def _count_neighbours(pixel: Pixel, cells: bool, theta: FloatArray) -> int:
     """Return how many neighbours a maximum has: of its bias two, the others differ in their gains.
 
-    One sample tells neighbouring gains apart but for few DN per electron. Of several, the variance leaves
-    ``sqrt(2 / N)`` of the gain open, which is so many electrons of the brightest; three times that is tried.
+    The variance of several samples leaves ``sqrt(2 / N)`` of the gain open; three times that is tried.
     """
     n = pixel.facts.shape[0]
     if n == 1:
@@ -210,8 +205,8 @@ def _count_neighbours(pixel: Pixel, cells: bool, theta: FloatArray) -> int:
 def _neighbour(which: int, pixel: Pixel, theta: FloatArray, out: FloatArray) -> bool:
     """Fill ``out`` with a neighbour of ``theta``: electrons more or (odd ``which``) fewer.
 
-    The first two move the bias: all H_j +- 1, mu -+ 1/g. The others keep it and move the gain, so that the
-    brightest sample alone has 1, 2, ... electrons more or less: the combs agree at the bias and there.
+    The first two move the bias: all H_j +- 1, mu -+ 1/g. The others move the gain, so that the brightest
+    sample has 1, 2, ... electrons more or less.
     """
     n, most = pixel.facts.shape[0], _most_electrons(pixel, theta)
     change = max(float(which // 2), 1.0) * (-1.0 if which % 2 else 1.0)
@@ -234,13 +229,7 @@ def _neighbour(which: int, pixel: Pixel, theta: FloatArray, out: FloatArray) -> 
 def climb_neighbours(
     pixel: Pixel, tools: Tools, best: FloatArray, best_loglik: float
 ) -> tuple[float, float, int]:
-    """Move to a neighbour while one is more likely.
-
-    Args:
-        pixel: its samples.
-        tools: of the search.
-        best: a maximum; out: the likeliest of its neighbours.
-        best_loglik: its log-likelihood.
+    """Move ``best`` to a neighbour while one is more likely.
 
     Returns:
         Log-likelihood of the best, that of the best other one (-inf without one), evaluations.
@@ -334,14 +323,7 @@ def settled(
 
     They do not where the fit is good and far above one Gaussian, nor where it is poor and the side lobe all
     the same far out of the noise, which a misfit raises by sqrt(chi2 / freedom): then the model is wrong, and
-    not the start.
-
-    Args:
-        pixel: its samples.
-        theta: the maximum.
-        clear: a side lobe of one of several samples stands clear of the noise.
-        above_null: nats above the likelihood without a gain.
-        out: with the goodness of fit.
+    not the start. ``clear``: a side lobe of one of several samples stands clear of the noise.
     """
     n, lobe = pixel.facts.shape[0], side_lobe(pixel, theta)
     good = score_of(out) < SUSPICIOUS and ((n > 1 and not clear) or lobe > _CLEAR_LOBE)
@@ -439,11 +421,7 @@ def outlying(pixel: Pixel, floor: float) -> float:
 
 @kernel(borrows=True)
 def examine(pixel: Pixel, tools: Tools, theta: FloatArray, out: FloatArray) -> float:
-    """Evaluate at a maximum; return the log-likelihood.
-
-    The goodness of fit and the number of samples that are not expected go to ``out``; the evaluation to
-    `AT_BEST`.
-    """
+    """Evaluate at a maximum, into `AT_BEST`; fill goodness of fit and outliers; return the log-likelihood."""
     scratch = tools.scratch
     loglik: float = tools.evaluate(pixel, theta, EXPECTATIONS, scratch, scratch.evaluations[AT_BEST])
     out[OUTLYING] = outlying(pixel, tools.limits.floor)
@@ -471,15 +449,9 @@ def judge(
 ) -> int:
     """Return the status word of a converged pixel.
 
-    Args:
-        pixel: its samples.
-        limits: bounds and limits.
-        best: the maximum.
-        above_null: nats above the likelihood without a gain.
-        above_blurred: nats above the likelihood without peaks. Twice the smallest gap is asked of both: combs
-            of many steps had the chance to come out higher.
-        gap: nats above the runner-up, that likelihood aside.
-        of_gain: a runner-up that is near has another gain.
+    The maximum is so many nats above the likelihoods without a gain and without peaks, of which twice the
+    smallest gap is asked: combs of many steps had the chance to come out higher. ``gap`` is that to the
+    runner-up; ``of_gain``: one that is near has another gain.
     """
     n, status = pixel.facts.shape[0], 0
     sigma, a = math.exp(0.5 * best[n + LOG_VARIANCE]), best[n + STEP]
@@ -553,16 +525,8 @@ def fall_and_parabola(
 ) -> tuple[float, float]:
     """Return by how many nats the log-likelihood falls to other values of a parameter, and by its error.
 
-    Args:
-        pixel: its samples.
-        tools: of the search; its scratch holds starts, of which the two highest are climbed from, and the
-            evaluation at the maximum.
-        best: the maximum.
-        loglik: its log-likelihood.
-        which: place of the parameter in theta that stays where the starts have it.
-
-    Returns:
-        The fall, infinite where nothing is to be known; what the standard error would have it be.
+    The scratch holds the evaluation at the maximum, and starts, of which the two highest are climbed from
+    with the parameter fixed. The fall is infinite where nothing is to be known.
     """
     scratch, top, covariance = tools.scratch, -math.inf, np.empty((best.size, best.size))
     at, held, trial, change = scratch.evaluations[AT_BEST], scratch.flags[HELD], scratch.small[HERE], 0.0
@@ -612,11 +576,7 @@ def above_blurred(pixel: Pixel, tools: Tools, best: FloatArray, loglik: float) -
 
 @kernel(borrows=True)
 def _weigh(pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray) -> Found:
-    """Examine a new best maximum and its neighbours; the likeliest of them is kept.
-
-    No neighbour is climbed to where the fit is good and much better than any neighbour of such a pixel: were
-    a neighbour the right one, the fit could not be good.
-    """
+    """Examine a new best maximum and, unless the fit rules them out, its neighbours; keep the likeliest."""
     n, loglik, runner_up, used = pixel.facts.shape[0], found.loglik, found.runner_up, found.used + 1
     at_best = examine(pixel, tools, best, out)
     if n == 1 and not tools.limits.cells:
@@ -678,16 +638,7 @@ def plus(found: Found, count: int) -> Found:
 def climb_starts(
     pixel: Pixel, tools: Tools, clear: bool, found: Found, best: FloatArray, out: FloatArray
 ) -> Found:
-    """Climb from the starts, the highest first; a higher maximum takes the place of ``best``.
-
-    Args:
-        pixel: its samples.
-        tools: of the search.
-        clear: a side lobe of one of several samples stands clear of the noise.
-        found: how far the search has come.
-        best: best maximum so far; its step is 0 where there is none.
-        out: out, what `examine` says of it.
-    """
+    """Climb from the starts, the highest first; a higher maximum takes the place of ``best``."""
     trial = tools.scratch.small[HERE]
     while next_start(tools.scratch, trial):
         found = _climb_start(pixel, tools, clear, found, trial, best, out)
@@ -698,7 +649,7 @@ def climb_starts(
 def _stay_near(
     pixel: Pixel, tools: Tools, task: Task, trial: FloatArray, out: FloatArray
 ) -> tuple[bool, float, int]:
-    """Climb from what is known; tell whether that fits well, with the log-likelihood and evaluations."""
+    """Climb from what is known; return whether that fits well, log-likelihood and evaluations."""
     copy(task.near, trial)
     outcome, loglik, used = climb_on(pixel, tools, from_start(), trial, trial)
     if outcome != CONVERGED:
@@ -716,12 +667,8 @@ def search_density(
     the first start is climbed from; where the goodness of fit or a side lobe in the noise raises suspicion,
     the other starts follow; the likeliest maximum is kept.
 
-    Args:
-        pixel: its samples.
-        tools: of the search, with the density; out: score and information at the maximum in `AT_BEST`.
-        task: what is known.
-        best: out, theta at the maximum; its step is 0 where there is none.
-        out: out, a row of results; the columns are named at the top of this module.
+    ``best`` becomes theta at the maximum, its step 0 where there is none, ``out`` a row of results, see
+    `LOG_LIKELIHOOD`; score and information at the maximum are in `AT_BEST`.
 
     Returns:
         Status word, evaluations, degrees of freedom of the goodness of fit.

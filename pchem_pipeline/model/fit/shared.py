@@ -238,15 +238,10 @@ def fit_shared(
     max_steps: int = 60,
     tolerance: float = 1e-3,
 ) -> SharedFit:
-    """Climb the likelihood from a start.
+    """Climb the likelihood from a start until a step promises a rise, nats, below the tolerance.
 
-    Args:
-        problem: histograms and law.
-        parameters: start of (H, g, mu, sigma) of the rows, shape (n J, 4), finite; g, mu and sigma are taken
-            from the first sample of a pixel.
-        shared: start of the shared parameters, shape (d,).
-        max_steps: scoring steps at most.
-        tolerance: converged where a step promises a smaller rise of all pixels together, nats.
+    The start is (H, g, mu, sigma) of the rows, shape (n J, 4), finite, with g, mu and sigma of the first
+    sample of a pixel, and the shared parameters, shape (d,).
     """
     theta = problem.samples.theta(parameters)
     shared = np.clip(np.asarray(shared, np.float64), problem.bounds[:, 0], problem.bounds[:, 1])
@@ -321,15 +316,10 @@ class Ascent:
         max_steps: int,
         tolerance: float,
     ) -> bool:
-        """Go up, and return whether the rise that a further step promises is below the tolerance.
+        """Go up, and return whether the rise of all pixels that a further step promises is small enough.
 
-        Args:
-            expand: the expansion of some pixels at a point (theta, shared); the point is refused where it
-                raises ValueError.
-            limits: lowest and highest own parameters, shapes (n, P).
-            longest: longest step of the own parameters, shape (n, P); a longer one is shortened as a whole.
-            max_steps: steps at most.
-            tolerance: of the sum over all pixels.
+        A point (theta, shared) whose expansion raises ValueError is refused. The limits are the lowest and
+        highest own parameters, (n, P); a step that is longer than the longest, (n, P), is shortened.
         """
         n, together = len(self.theta), self.shared.size > 0
         damping, promised = np.full(n, _FIRST_DAMPING), np.full(n, np.inf)

@@ -14,19 +14,13 @@ _CENTRAL_LOBE = 0.6  # 1/sd: the central lobe of any sample has fallen by then
 
 
 def starting_points(counts: NDArray[np.integer], origin: NDArray[np.integer]) -> FloatArray:
-    """Compute the starting points of every pixel.
+    """Return two starting points (H, g, mu, sigma) of every pixel, shape (n, 2, 4); NaN where there is none.
 
     The empirical characteristic function of a PCD, ``phi(f) = mean exp(2 pi i f x)``, has
     ``log|phi| = -2 pi^2 f^2 sigma^2 - H (1 - cos 2 pi f / g)``, which is fitted by weighted least squares for
     a grid of gains (good for H < 15). The second start has g where ``|phi|`` is largest beyond its central
     lobe; ``phi(g) = exp(-2 pi^2 sigma^2 g^2 + 2 pi i mu g)`` then gives sigma and mu, the mean H.
-
-    Args:
-        counts: histograms, shape (n, B).
-        origin: DN of bin 0, shape (n,).
-
-    Returns:
-        (H, g, mu, sigma) of both, shape (n, 2, 4); NaN where there is none.
+    Of histograms, shape (n, B), with the DN of bin 0, shape (n,).
     """
     counts = kernel_counts(counts)
     n, n_bins = counts.shape

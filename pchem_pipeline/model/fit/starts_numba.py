@@ -61,7 +61,6 @@ N_LOBES = 90
 _SIDE_BY_SIDE = 3  # vectors of frequencies at a time
 _HIGHEST_FREQUENCY = 0.5  # cycles/DN: whole numbers cannot tell f from 1 - f
 
-
 N_ATTEMPTS = 2  # the first start, then all steps of the comb; at several samples some starts, then all
 #: Frequencies of the scan over the step of the comb: the first is 1 over the range of the sample, each is
 #: larger than the one before by a share of itself, half the width of a narrow peak, or by a third of the
@@ -91,8 +90,7 @@ def regression_basis() -> FloatArray:
 def _clenshaw(histogram: Histogram, first: int, end: int, work: FloatArray) -> None:
     """Leave b_0 and b_1 of Clenshaw's recurrence in ``work[2:4]``, from 2 cos(angle) in ``work[1]``.
 
-    ``b_i = c_i + 2 cos(angle) b_{i+1} - b_{i+2}``, two DN at a time and all frequencies side by side; then
-    ``sum c_i exp(i angle) = b_0 - b_1 exp(-i angle)``. Columns ``first ... end - 1``, and some beyond.
+    ``b_i = c_i + 2 cos(angle) b_{i+1} - b_{i+2}``; then ``sum c_i exp(i angle) = b_0 - b_1 exp(-i angle)``.
     """
     weights, n_bins = histogram.weights, histogram.n_bins
     for m in range(first, end, _SIDE_BY_SIDE * SIMD_WIDTH):
@@ -167,14 +165,8 @@ def _regress(
 ) -> tuple[float, float]:
     """Return (satellite frequency in 1/sd, H) of the best weighted regression over all trial steps.
 
-    The sums of all trial steps grow side by side, frequency by frequency: that needs no other order of the
-    additions to run in vector registers.
-
-    Args:
-        basis: from `regression_basis`.
-        power: squared modulus of the ECF; its frequencies are those of the basis.
-        floor: power below which a frequency does not count.
-        sums: scratch, three rows of at least `N_LOBES`.
+    The power is the squared modulus of the ECF at the frequencies of `regression_basis`; those below the
+    floor do not count. ``sums`` is room to work in, three rows.
     """
     bb, bq, by = sums[0, :N_LOBES], sums[1, :N_LOBES], sums[2, :N_LOBES]
     for p in range(N_LOBES):
@@ -231,11 +223,7 @@ def assemble(
     exposure: float,
     theta: FloatArray,
 ) -> tuple[bool, bool]:
-    """Turn a step and a rough H into a start: noise from the satellite's height, bias from its phase.
-
-    Returns:
-        Whether there is a start, and whether the satellite stands clear of the noise.
-    """
+    """Turn a step and a rough H into a start; return whether there is one, and whether its lobe is clear."""
     if not (a > 0.0 and math.isfinite(a) and exposure > 0.0 and math.isfinite(exposure)):
         return False, False
     clear: bool = _on_lobe(histogram, a, exposure, ecf_at(histogram, 1.0 / a), theta)
@@ -250,7 +238,7 @@ def _on_lobe(
     lobe: tuple[float, float],
     theta: FloatArray,
 ) -> bool:
-    """Fill a start from modulus (unnormalised) and phase of the ECF at 1/a; tell whether it stands clear."""
+    """Fill a start from modulus (unnormalised) and phase of the ECF at 1/a; return whether it is clear."""
     _, _, _, _, n, mean, variance = histogram
     modulus, phase = lobe[0] / n, lobe[1]
     least = _CLEAR / math.sqrt(n)
@@ -286,11 +274,7 @@ def start_regression(
     work: FloatArray,
     theta: FloatArray,
 ) -> tuple[bool, bool]:
-    """Start from the regression on log|phi|; ``work`` has seven rows.
-
-    Returns:
-        Whether there is a start, and whether the side lobe at its frequency stands clear of the noise.
-    """
+    """Start from the regression on log|phi|, see `assemble`; ``work`` has seven rows."""
     n, variance = histogram.n, histogram.variance
     sd = math.sqrt(variance)
     n_used = min(N_FREQUENCIES, int(_HIGHEST_FREQUENCY * sd / FREQUENCY_STEP))
@@ -306,8 +290,7 @@ def start_regression(
 def _keep_noises(pixel: Pixel, evaluate: Any, a: float, around: int, scratch: Scratch) -> int:
     """Put combs of a step, a few DN, among the starts of a single sample; return the evaluations.
 
-    Aliases of the lobe at 1/a hide modulus and phase, so some read noises are tried, and exposures, so many
-    to either side of the one that has the variance right.
+    Some read noises are tried, and exposures, so many to either side of the one that has the variance right.
     """
     histogram, trial, used = histogram_of(pixel, 0), scratch.small[HERE], 0
     trial[1 + STEP], trial[1 + SATELLITE] = a, 0.0
@@ -326,10 +309,9 @@ def _keep_noises(pixel: Pixel, evaluate: Any, a: float, around: int, scratch: Sc
 def _keep_lobe(
     pixel: Pixel, evaluate: Any, cells: bool, a: float, lobe: tuple[float, float], scratch: Scratch
 ) -> int:
-    """Put the comb of a step among the starts, see `_on_lobe` and `keep_start`; return the evaluations.
+    """Put the comb of a step among the starts; return the evaluations.
 
-    Of few DN per electron, what is left of other frequencies adds to the lobe where H is low; there mean and
-    variance alone give bias and H, for some read noises.
+    Of few DN per electron and a low H other frequencies add to the lobe; there some read noises are tried.
     """
     histogram, trial = histogram_of(pixel, 0), scratch.small[HERE]
     trial[1 + SATELLITE] = 0.0
@@ -405,11 +387,7 @@ def _keep_rescaled(
 
 @kernel(borrows=True)
 def alias_of_step(pixel: Pixel, evaluate: Any, best: FloatArray, scratch: Scratch) -> int:
-    """Put the comb of frequency ``1 - 1/a``, which whole numbers show at 1/a, among the starts.
-
-    Returns:
-        Evaluations.
-    """
+    """Put the comb of frequency ``1 - 1/a``, which whole numbers show at 1/a, among the starts; count."""
     no_starts(scratch.small[HEIGHTS])
     n, cells = pixel.facts.shape[0], True
     a = 1.0 / (1.0 - 1.0 / best[n + STEP])
@@ -431,11 +409,7 @@ def combs_of_step(pixel: Pixel, evaluate: Any, a: float, scratch: Scratch) -> in
 
 @kernel(borrows=True)
 def _holds_one(histogram: Histogram, theta: FloatArray) -> bool:
-    """Return whether the peak of one electron is there: a comb of half the step has none.
-
-    Within a fourth of a step of it are more than 0.4 of its ``N H exp(-H)`` samples, the tail of the bias
-    peak taken off.
-    """
+    """Return whether more than 0.4 of the samples expected in the peak of one electron are near it."""
     exposure, a, noise = math.exp(theta[0]), theta[1], math.exp(0.5 * theta[3])
     empty = histogram.n * math.exp(-exposure)
     middle = theta[2] + a - histogram.first
@@ -452,10 +426,9 @@ def longer_steps(
 ) -> int:
     """Put combs of longer steps than a maximum's among the starts; return the evaluations.
 
-    Where H and read noise are low, the sample is one peak and some electrons apart, and the comb of half the
-    step fits them with no sample at each second peak; none are needed where the peak of one electron is
-    there. Several samples that fit poorly may have such a comb at any exposure. Starts below ``least`` are
-    left out.
+    Where H and read noise are low, the comb of half the step fits them with no sample at each second peak,
+    unless the peak of one electron is there. Several samples that fit poorly may have such a comb at any
+    exposure. Starts below ``least`` are left out.
     """
     cells = False
     histogram, heights, used = histogram_of(pixel, 0), scratch.small[HEIGHTS], 0
@@ -481,18 +454,9 @@ def longer_steps(
 
 @kernel(borrows=True)
 def fill_theta(pixel: Pixel, a: float, bias: float, noise2: float, cells: bool, theta: FloatArray) -> bool:
-    """Fill ``theta`` for a step, a bias and a read noise: exposures from the means.
+    """Fill ``theta`` for a step, DN, a bias less the centre, DN, and sigma^2, DN^2: exposures from the means.
 
-    Args:
-        pixel: its samples.
-        a: 1/g, DN.
-        bias: mu less the centre, DN.
-        noise2: sigma^2, DN^2; negative: what the variances leave.
-        cells: bounds of the cells.
-        theta: out.
-
-    Returns:
-        Whether that makes sense.
+    A negative sigma^2 is what the variances leave. Return whether that makes sense.
     """
     if not (a > 0.0 and math.isfinite(a) and math.isfinite(bias)):
         return False
@@ -574,11 +538,7 @@ def _line_start(
 def _regression_start(
     j: int, pixel: Pixel, basis: FloatArray, scratch: Scratch, theta: FloatArray
 ) -> tuple[bool, bool]:
-    """Fill ``theta`` with the start from the regression of sample j.
-
-    Returns:
-        Whether there is one, and whether its side lobe stands clear of the noise.
-    """
+    """Fill ``theta`` with the start from the regression of sample j, see `assemble`."""
     facts = pixel.facts
     if facts[j, DARK] > 0.0 or facts[j, OCCUPIED] < 3:
         return False, False
@@ -630,15 +590,9 @@ def fill_starts(
     evaluate: Any,
     scratch: Scratch,
 ) -> tuple[bool, int]:
-    """Fill the starts of an attempt, and their heights: -inf where there are fewer.
+    """Fill the starts of an attempt from `KEPT_STARTS` on, and their `HEIGHTS`: -inf where there are fewer.
 
-    Args:
-        attempt: 0 ... N_ATTEMPTS - 1.
-        quick: the first start of a single sample is taken although its side lobe is in the noise.
-        pixel: its samples.
-        basis: from `regression_basis`.
-        evaluate: the density.
-        scratch: room to work in; out: in its ``small`` the starts from `KEPT_STARTS` on, and `HEIGHTS`.
+    ``quick``: the first start of a single sample is taken although its side lobe is in the noise.
 
     Returns:
         Whether a side lobe of one of several samples stands clear of the noise; evaluations.

@@ -81,12 +81,8 @@ def moves_gain(exposure: FloatArray, noise: FloatArray) -> BoolArray:
     """Return where a bias that is an electron off has a gain of its own, too, off by more than 3 %.
 
     With one electron more or less, mean and variance of the sample ask for a gain changed by ``1 / (2 H)``;
-    the peaks hold the gain with ``4 pi^2 H exp(-4 pi^2 s_e^2)`` times that information. Little is left of the
-    change where they are resolved.
-
-    Args:
-        exposure: H, e-.
-        noise: read noise s_e, e-, same shape.
+    the peaks hold the gain with ``4 pi^2 H exp(-4 pi^2 s_e^2)`` times that information. H and the read noise
+    s_e, e-, have one shape.
     """
     square = 4.0 * np.pi**2
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):

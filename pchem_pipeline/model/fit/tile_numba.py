@@ -180,8 +180,7 @@ def _expect_information(
 ) -> None:
     """Put the expected information in `AT_BEST`: the squared scores of the counts that are expected.
 
-    The observed information also holds what looks like peaks by chance, which makes it several times larger
-    where peaks are not resolved. Single samples have a flag for that.
+    The observed one is several times larger where peaks are not resolved, by what looks like peaks by chance.
     """
     at = scratch.evaluations[AT_BEST]
     for j in range(pixel.facts.shape[0]):
@@ -237,7 +236,7 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
         parameters: FloatArray,
         covariance: FloatArray,
     ) -> bool:
-        """Fill parameters and covariance at a maximum; tell whether the information is positive definite."""
+        """Fill parameters and covariance at a maximum; return whether the information is regular."""
         n, at, fixed = pixel.facts.shape[0], scratch.evaluations[AT_BEST], scratch.flags[FIXED]
         held = fixed.copy()
         floor = min_log_variance(theta[n + STEP], limits.cells)
@@ -271,20 +270,7 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
         basis: FloatArray,
         answers: Answers,
     ) -> None:
-        """Fit pixels; they do not influence each other.
-
-        Args:
-            given: histograms; codes left out by the tail guard do not count.
-            chosen: pixels to fit.
-            law: of the samples.
-            starts: what is known.
-            limits: bounds and limits.
-            evaluate: the likelihood.
-            climb: the climb on it.
-            search: the search for its maximum.
-            basis: of the regression on the characteristic function.
-            answers: out.
-        """
+        """Fit the chosen pixels with likelihood, climb and search; codes left out do not count."""
         n = given.dark.size
         room = make_room(given, law)
         scratch = make_scratch(n, room.bins.shape[2] - 1, limits.cells)

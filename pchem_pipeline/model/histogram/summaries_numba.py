@@ -20,15 +20,7 @@ _Array = NDArray[Any]
 def sum_lines(
     frames: _Array, group: int, row_sum: _Array, row_sum_square: _Array, column_sum: _Array
 ) -> None:
-    """Sum each frame along its rows, and along its columns by groups of rows.
-
-    Args:
-        frames: (frame, y, x).
-        group: rows in a group.
-        row_sum: result, (frame, y).
-        row_sum_square: result, (frame, y).
-        column_sum: zeros; result, (frame, row_group, x).
-    """
+    """Sum each frame along its rows, (frame, y), and its columns by groups of rows, (frame, row_group, x)."""
     n_frames, ny, nx = frames.shape
     for t in range(n_frames):
         for y in range(ny):

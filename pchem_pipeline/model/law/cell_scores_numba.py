@@ -112,16 +112,9 @@ def fill_law(
     last: int,
     law: FloatArray,
 ) -> None:
-    """Fill ``law`` (code, column) of one pixel.
+    """Fill ``law`` (code, column) of one pixel, of electron numbers from first to last.
 
-    Args:
-        exposure: H, e-.
-        step: 1/g, DN.
-        offset: mu minus the DN of row 0, DN.
-        width: analog read noise, DN.
-        first: smallest electron number.
-        last: largest electron number.
-        law: to fill; its first dimension is the number of codes.
+    The step is 1/g, the offset mu minus the DN of row 0, the width the analog read noise, all in DN.
     """
     for i in range(law.shape[0]):  # a slice takes numba ten times as long to compile
         for j in range(law.shape[1]):

@@ -233,11 +233,7 @@ def set_peaks(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
 def resolve(law: Law, index: int, amplitude: float, pixel: Pixel) -> None:
     """Fill what the law says of a pixel: facts, mixtures, edges of the cells, levels of the noise.
 
-    Args:
-        law: of all pixels.
-        index: the pixel's place in it.
-        amplitude: of free satellites, e-; 0: none.
-        pixel: its histograms; out: the rest.
+    The amplitude is that of free satellites, e-; 0: none.
     """
     for j in range(pixel.facts.shape[0]):
         facts, edges = pixel.facts[j], pixel.bins[j, EDGE]
@@ -466,14 +462,8 @@ def fill_masses(
 ) -> int:
     """Fill mass and slopes of all cells; return how many electron numbers there are.
 
-    Args:
-        theta: the sample's own parameters.
-        cells: of the sample.
-        stage: how far the tails go, see `CORE`.
-        what: `LOGLIK_ALONE`: the masses alone.
-        numbers: out, electron numbers in use.
-        edges: out, of the components, see :class:`.pixel_numba.Scratch`.
-        room: rows of the sample in a scratch's ``cells``; out: masses and slopes.
+    The stage says how far the tails go, see `CORE`; with `LOGLIK_ALONE` there are masses alone. They go to
+    the ``room``, rows of a scratch's ``cells``; electron numbers in use and edges are left, too.
     """
     reach, cut = _REACH[stage], _CUT[stage]
     for row in range(1 if what == LOGLIK_ALONE else N_BLOCK + 1):
@@ -509,8 +499,7 @@ def fill_far_enough(
 ) -> tuple[int, float]:
     """Fill mass and slopes of the cells, exact also where an occupied one lies far out.
 
-    Returns:
-        Number of electron numbers in use, and how many standard deviations a component reaches.
+    Return how many electron numbers are in use, and how many standard deviations a component reaches.
     """
     count = 0
     for stage in range(len(_REACH)):  # the last one is taken whatever the masses are, NaN too
@@ -540,10 +529,7 @@ def _log_mass(cells: Cells, room: FloatArray) -> float:
 
 @kernel(inline=True, borrows=True)
 def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
-    """Return the log-likelihood of the masses in the room; add score and squared scores, fill ratios.
-
-    Given that a sample is in a code that is not set aside, its score is less by that of their whole mass.
-    """
+    """Return the log-likelihood of the masses in the room; add score and squared scores, fill ratios."""
     total = counting() * 0.0
     for i in range(0, cells.n_bins, SIMD_WIDTH):
         weight, own = simd_load(cells.bins, WEIGHT, i), most(simd_load(room, MASS, i), SMALLEST_MASS)
@@ -580,8 +566,7 @@ def _sum_up(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray)
 def _condition(cells: Cells, room: FloatArray, change: FloatArray, out: FloatArray) -> float:
     """Take off what all kept codes together give; return the change of the log-likelihood.
 
-    With their mass M the log-likelihood is less by ``n log M``; the squared scores are about their mean,
-    which is that of the law at the maximum.
+    With their mass M the log-likelihood is less by ``n log M``; the squared scores are about their mean.
     """
     mass, slopes, ratios = room[MASS], room[SLOPES:], room[RATIO]
     n, rest = cells.frames, 1.0 - cells.outlier_share
@@ -700,15 +685,8 @@ def _expect(pixel: Pixel, j: int, cells: Cells, room: FloatArray) -> None:
 def evaluate_cells(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratch, out: FloatArray) -> float:
     """Evaluate log-likelihood, score, squared scores and observed information of all samples of a pixel.
 
-    Args:
-        pixel: histograms and law.
-        theta: parameters, shape (J + N_SHARED,); with fewer exposures, the last is that of the other samples.
-        what: `LOGLIK_ALONE`, `DERIVATIVES`, or `EXPECTATIONS`, left of each DN in the pixel's ``bins``.
-        scratch: room to work in; its ``cells`` keep the masses and their slopes.
-        out: out, the evaluation; lower triangles of the matrices.
-
-    Returns:
-        The log-likelihood, nats.
+    See :func:`.density_numba.evaluate_density`; of fewer exposures in theta than samples, the last is that of
+    all others. The ``cells`` of the scratch keep the masses and their slopes.
     """
     own, n, loglik = scratch.small[OWN], theta.size - N_BLOCK + 1, 0.0
     own[_STEP], own[_VARIANCE] = theta[n + STEP], theta[n + LOG_VARIANCE]

@@ -88,26 +88,16 @@ LOG_2PI = math.log(2.0 * math.pi)
 
 
 class _Comb(NamedTuple):
-    """The components of a sample, and the blocks of bins.
+    """The components of a sample, and the blocks of bins."""
 
-    Attributes:
-        a: 1/g, DN.
-        inverse: 1/sigma^2.
-        zero: where component 0 lies, bins after the first.
-        first, last: components nearest to the first and the last bin.
-        half: components that matter on either side of the nearest one.
-        n_bins: number of bins.
-        stride: bins of a block: no more than lie next to two components.
-    """
-
-    a: float
-    inverse: float
-    zero: float
-    first: int
-    last: int
-    half: int
+    a: float  # 1/g, DN
+    inverse: float  # 1/sigma^2
+    zero: float  # where component 0 lies, bins after the first
+    first: int  # component nearest to the first bin
+    last: int  # component nearest to the last bin
+    half: int  # components that matter on either side of the nearest one
     n_bins: int
-    stride: int
+    stride: int  # bins of a block: no more than lie next to two components
 
 
 @kernel(inline=True, borrows=True)
@@ -142,10 +132,7 @@ def _fill_levels(
 
 @kernel(inline=True, borrows=True)
 def _fill_coefficients(coefficients: FloatArray, rows: FloatArray, comb: _Comb) -> None:
-    """Fill the coefficients of the polynomials, a row for each nearest component j.
-
-    From one j to the one before they change by ``(j + l) / j``, which is 0 where there is no such component.
-    """
+    """Fill the coefficients of the polynomials: from component j to the one before a factor (j + l) / j."""
     half, n = comb.half, comb.last - comb.first
     power = -0.5 * comb.a * comb.a * comb.inverse
     for place in range(0, 2 * half + 1, SIMD_WIDTH):
@@ -162,12 +149,11 @@ def _fill_coefficients(coefficients: FloatArray, rows: FloatArray, comb: _Comb) 
 
 @kernel(inline=True, borrows=True)
 def _fill_blocks(rows: FloatArray, comb: _Comb, n_blocks: int) -> None:
-    """Fill what the loops need of the blocks.
+    """Fill the rows `_CELL` to `_CUT` of the blocks.
 
-    Which component is nearest to the first bin, after the first one, and to how many bins; the first bin's
-    distance from the lowest component that matters, and ``exp(d a / sigma^2)`` there, for the nearest
-    component and for the next. Far to the left of all components its logarithm ends; what is cut off, times
-    the components below, goes to `_CUT`.
+    Which component is nearest to the first bin, and to how many bins; for it and the next one the distance
+    of the first bin from the lowest component that matters, and ``exp(d a / sigma^2)`` there, whose logarithm
+    ends far to the left: what is cut off goes to `_CUT`.
     """
     a, half, scale = comb.a, comb.half, comb.a * comb.inverse
     longest = _LONGEST / half
@@ -204,11 +190,7 @@ def _lanes(
 
 @kernel(inline=True, borrows=True)
 def _weighted_logs(bins: FloatArray, rows: FloatArray, n_bins: int) -> Simd:
-    """Sum up counts times the logarithms of `_DENSITY`.
-
-    In a loop of its own, so short that the processor has several logarithms under way at a time: each is a
-    long chain of operations that wait for each other.
-    """
+    """Sum up counts times the logarithms of `_DENSITY`, in a loop so short that several are under way."""
     total = counting() * 0.0
     for i in range(0, n_bins, SIMD_WIDTH):
         total = fused(simd_load(bins, WEIGHT, i), simd_log(simd_load(rows, _DENSITY, i)), total)
@@ -227,14 +209,8 @@ def _add_moments(
 ) -> Any:
     """Add a block to the sums that follow the log-likelihood in `_TOTALS`.
 
-    Args:
-        a: 1/g, DN.
-        square: of it.
-        d: distances of the bins from the lowest component that matters, DN.
-        y: bins less mu, DN.
-        c: counts.
-        moments: density over its Gaussian factor, and its first four moments in components above the lowest.
-        sums: so far.
+    The moments are the density over its Gaussian factor, and its first four in components above the lowest
+    one that matters, from which the bins are so far away, d; y are bins less mu, c counts.
     """
     p0, s1, s2, s3, s4 = moments
     sum_e, sum_ee, sum_ye, v11, v11y, v11yy, v12, v12y, v22 = sums
@@ -365,8 +341,7 @@ def _finish(
 ) -> None:
     """Turn the totals into a sample's block of an evaluation.
 
-    The complete-data score is ``(k - H, k e/s2, e/s2, e^2/2 s2 - 1/2)`` with ``k = (y - e)/a``: its
-    conditional covariance is made of the sums of var(e), cov(e, e^2) and var(e^2) times powers of y.
+    The complete-data score is ``(k - H, k e/s2, e/s2, e^2/2 s2 - 1/2)`` with ``k = (y - e)/a``.
     """
     n = facts[N_FRAMES]
     score, sums = out[SCORE], out[SUMS]
@@ -491,14 +466,11 @@ def evaluate_density(pixel: Pixel, theta: FloatArray, what: int, scratch: Scratc
     """Evaluate log-likelihood, score, observed information and E-step sums of all samples of a pixel.
 
     Args:
-        pixel: histograms; their moments take part, too.
+        pixel: histograms, with their moments.
         theta: parameters, shape (J + N_SHARED,).
         what: `LOGLIK_ALONE`, `DERIVATIVES`, or `EXPECTATIONS`, left of each DN in the pixel's ``bins``.
         scratch: room to work in.
         out: out, the evaluation; lower triangles of the matrices.
-
-    Returns:
-        The log-likelihood, nats.
     """
     n = pixel.facts.shape[0]
     a, bias, log_variance = theta[n + STEP], theta[n + BIAS], theta[n + LOG_VARIANCE]

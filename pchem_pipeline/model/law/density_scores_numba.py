@@ -26,15 +26,7 @@ def posterior(x: float, exposure: float, step: float, bias: float, sigma: float,
     """Fill the posterior means of a value and return its log density.
 
     The terms are summed from the largest on, each from the one before: the ratio of neighbours changes by the
-    same factor at every electron. So the answer is exact however far out the value lies.
-
-    Args:
-        x: DN.
-        exposure: H, e-.
-        step: 1/g, DN.
-        bias: mu, DN.
-        sigma: DN, quantisation included.
-        means: out, see `K`, shape (5,).
+    same factor at every electron. So the answer is exact however far out the value lies. The step is 1/g, DN.
     """
     along = step / (sigma * sigma)
     fall = math.exp(-step * along)

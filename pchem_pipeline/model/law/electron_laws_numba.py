@@ -29,10 +29,7 @@ def _log_rising(dispersion: float, k: float) -> float:
 
 @kernel(borrows=True)
 def _trapped(chance: float, k: float, exposure: float) -> tuple[float, float, float]:
-    """Return P(k) over that of Poisson electrons, and its first two derivatives in log exposure.
-
-    A trap takes one electron from a sample that has any, and gives one to any sample, as often.
-    """
+    """Return P(k) over that of Poisson electrons, and its first two derivatives in log exposure."""
     some, none = -math.expm1(-exposure), exposure * math.exp(-exposure)
     given, left = k / exposure, exposure / (k + 1.0)
     taken = 1.0 if k > 0.0 else 0.0
@@ -44,10 +41,7 @@ def _trapped(chance: float, k: float, exposure: float) -> tuple[float, float, fl
 
 @kernel(borrows=True)
 def _lost(chance: float, k: float, exposure: float) -> tuple[float, float, float]:
-    """Return log P(k) where each electron is lost with a chance for every other one, and its derivatives.
-
-    Of n electrons so many are left that the others are a binomial number: a sum over n.
-    """
+    """Return log P(k) where each electron is lost with a chance for every other one, and its derivatives."""
     log_exposure, largest = math.log(exposure), 0.0
     mass = slope = bend = 0.0
     outer = -exposure - math.lgamma(k + 1.0)

@@ -177,14 +177,8 @@ def fill_level(
 ) -> tuple[int, int]:
     """Fill P(code | k) of the codes that an electron number reaches; return these, the end excluded.
 
-    Args:
-        k: electron number.
-        likely: its probability; an unlikely one is given fewer codes.
-        theta: parameters of the sample.
-        cells: of the sample.
-        codes: of the pixel.
-        share: out, the first row from the first of these codes on; the second one is worked in; see
-            :func:`share_scratch`.
+    One of little probability (``likely``) is given fewer codes. They go to the first row of the ``share``,
+    see :func:`share_scratch`; the second one is worked in.
     """
     low, high, _ = _span(k, theta, cells, codes, reach_of(math.log(likely)))
     for i in range(high - low):

@@ -10,12 +10,7 @@ from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
-from pchem_pipeline.model.law.cells_numba import (
-    Law,
-    cells_of,
-    fill_masses,
-    resolve,
-)
+from pchem_pipeline.model.law.cells_numba import Law, cells_of, fill_masses, resolve
 from pchem_pipeline.model.law.levels_numba import place_codes, reach_of_law
 from pchem_pipeline.model.law.pixel_numba import (
     DERIVATIVES,

@@ -200,14 +200,7 @@ def make_scratch(n_samples: int, n_bins: int, cells: bool) -> Scratch:
 
 @kernel
 def make_pixel(dark: BoolArray, n_bins: int, n_peaks: int, n_exposures: int) -> Pixel:
-    """Return room for the histograms of a pixel.
-
-    Args:
-        dark: which samples hold no electrons.
-        n_bins: bins at most.
-        n_peaks: levels of the noise at most.
-        n_exposures: exposures at most that H is a mixture of.
-    """
+    """Return room for histograms, levels of the noise and a mixture of exposures, of so many at most."""
     n = dark.size
     facts = np.zeros((n, N_FACTS))
     for j in range(n):
@@ -240,16 +233,9 @@ def copy_evaluation(source: FloatArray, target: FloatArray) -> None:
 
 @kernel(borrows=True)
 def load(counts: NDArray[np.generic], mask: NDArray[np.uint8], bins: FloatArray, facts: FloatArray) -> int:
-    """Fill the histogram of one sample without its empty ends, and sum it up.
+    """Fill the histogram of one sample without its empty ends, and its facts but for ``CENTRE``; return that.
 
-    Args:
-        counts: of all bins.
-        mask: of all bins, see `COUNTED`.
-        bins: out, rows of a pixel's ``bins``.
-        facts: out, of that sample; but for ``CENTRE``.
-
-    Returns:
-        The centre, bins after bin 0.
+    The mask is that of :data:`COUNTED`; the centre is counted in bins after bin 0.
     """
     low, high = 0, counts.size
     worst = np.uint8(COUNTED)

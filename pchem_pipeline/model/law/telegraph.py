@@ -134,10 +134,7 @@ def transitions(
 def find_telegraph(samples: NDArray[np.integer], frames: IntArray, pixel: FloatArray) -> Telegraph | None:
     """Return how a pixel's exposure blinks, or None where a constant one explains the samples as well.
 
-    Args:
-        samples: DN, shape (n,).
-        frames: their frame numbers, increasing, shape (n,).
-        pixel: plain (H, g, mu, sigma); H is the mean exposure.
+    The samples, DN, have increasing frame numbers; the pixel is (H, g, mu, sigma), H the mean exposure.
     """
     series = _Series(samples, frames, pixel)
     theta = np.log([series.mean])

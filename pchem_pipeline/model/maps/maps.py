@@ -107,13 +107,7 @@ def electron_shifts(
     does, to a standard error of ``s = H sqrt(2 / N)``. The likelihood of being m electrons off, to either
     side, is ``exp(-(m - d)^2 / (2 s^2))``, and ``(1 - 2 d) / (2 s^2)`` is the likelihood gap, whence d.
 
-    Args:
-        quanta_exposure: H of one sample, e-, shape (n,).
-        likelihood_gap: nats, shape (n,).
-        n_frames: N.
-
-    Returns:
-        m, shape (k,), and probabilities, shape (n, k); m = 0 for certain where a pixel has no value.
+    m has the shape (k,), the probabilities (n, k); m = 0 for certain where a pixel has no value.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         square = np.minimum(2.0 * quanta_exposure**2 / n_frames, 0.5 / likelihood_gap)

@@ -26,7 +26,7 @@ import pchem_pipeline.model.arithmetic.simd_numba
 hooks.register_model = register
 from pchem_pipeline.model.arithmetic import simd_math_numba as functions, simd_numba as simd
 from pchem_pipeline.model.arithmetic.simd_numba import (
-    counting, exponent_of, fraction_of, fused, least, simd_load, most, nearest, scaled, simd_store,
+    counting, exponent_of, fused, least, simd_load, most, nearest, scaled, simd_store,
     simd_sum, spliced
 )
 SIMD_WIDTH = simd.SIMD_WIDTH
@@ -41,7 +41,7 @@ def fill(table):
         simd_store(table, 3, i, most(least(x, 1.0), -2.0))
         simd_store(table, 4, i, fused(x, 2.0, 1.0) / 2 - nearest(x))
         y = exp(x)
-        simd_store(table, 5, i, scaled(fraction_of(y), exponent_of(y)) - y)
+        simd_store(table, 5, i, scaled(scaled(y, 0.0 - exponent_of(y)), exponent_of(y)) - y)
         simd_store(table, 6, i, counting() + float(i))
         tail, density, by_z = functions.simd_tail(simd_load(table, 7, i))
         simd_store(table, 8, i, tail)
