@@ -36,12 +36,12 @@ class EffortSpentError(Exception):
 
 @dataclass
 class Effort:
-    """Work of a search.
+    """Work of a search, CPU seconds by count.
 
     Attributes:
-        share: times what a search may cost by default; None: no limit.
-        spent: CPU seconds by count.
-        most: the same at which nothing more is begun; infinite until the null distribution is there.
+        share: factor on the default budget; None: no limit.
+        spent: so far.
+        most: nothing more is begun beyond it; infinite until the null distribution is drawn.
         kept: for what no effect explains.
         for_choice: for the choice among the sets that were tried.
         for_fits: the least that is left for fits of candidates once they are compared.
@@ -84,18 +84,11 @@ class Effort:
 
     def simulate(self, samples: int, pixels: int, fits: int) -> None:
         """Count a simulated stack, whose pixels are fitted so many times."""
-        self.spent += _SAMPLE * samples + _FIT * self._hard * pixels * fits
+        self.spent += _SAMPLE * samples + _FIT * self._difficulty * pixels * fits
 
     def refit(self, pixels: int, components: int, evaluations: float, tags: Iterable[str]) -> None:
-        """Count a fit of all pixels with effects.
-
-        Args:
-            pixels: that were fitted.
-            components: of their law.
-            evaluations: of the likelihood of a pixel, on average.
-            tags: of the effects.
-        """
-        self.spent += self._hard * pixels * components * (_REFIT + _REFIT_BY * evaluations)
+        """Count a fit of pixels with effects, ``evaluations`` of the likelihood of each on average."""
+        self.spent += self._difficulty * pixels * components * (_REFIT + _REFIT_BY * evaluations)
         self.tried |= set(tags)
 
     def learn(self, pixels: int, components: int) -> None:
@@ -127,6 +120,6 @@ class Effort:
         return f"the search used its budget before {spent}" + (f"; not tried: {untried}" if untried else "")
 
     @property
-    def _hard(self) -> float:
+    def _difficulty(self) -> float:
         """How many times as long a fit takes as where all peaks are resolved."""
         return 1.0 + _AMBIGUOUS * self.ambiguous

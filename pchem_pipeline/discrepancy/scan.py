@@ -30,7 +30,6 @@ from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 _FRAME_PERIODS = range(2, 33)
 _SWEEPS = 3  # of the ends of a range over the frames
 _RIDGE = 1e-3  # of a covariance of series that may all but coincide
-_LEAST = math.log(SMALLEST_MASS)  # of the smallest probability that is written
 _LITTLE = 0.25  # of the mean inside a place, that outside
 _MOST_SINGLE = 1000  # frames that are listed
 _MOST_EVENTS = 500  # frames with an event that are looked at: so many drawn of them tell a range as well
@@ -58,7 +57,7 @@ class Cluster:
     @property
     def p(self) -> float:
         """Probability of such a deviation by chance, at least 1e-300."""
-        return math.exp(max(self.log_p, _LEAST))
+        return math.exp(max(self.log_p, math.log(SMALLEST_MASS)))
 
     @property
     def log_places(self) -> float:
@@ -99,7 +98,7 @@ def scan_map(
     Args:
         values: N(0, 1) where nothing is wrong, (y, x).
         usable: pixels that count, (y, x).
-        significance: largest probability of a chance.
+        significance: largest p-value.
         most: places at most.
         single: look for single pixels, too; not where far tails are heavier than normal.
         next_along: axis along which each value is of a pixel and the next one: places reach one further.
@@ -138,7 +137,7 @@ def scan_series(
     Args:
         values: N(0, 1) and independent where nothing is wrong, (n,).
         numbers: frame numbers, increasing, (n,).
-        significance: largest probability of a chance.
+        significance: largest p-value.
         most: stretches at most.
         shortest: frames that a range or a phase of a period must have.
     """
@@ -202,10 +201,9 @@ def _significant(
     *,
     either_side: bool = False,
 ) -> families.Place | None:
-    """Return a place with its deviation in terms of the scatter inside and outside (Welch), if significant.
+    """Return a place with its deviation over the scatter inside and outside (Welch's t), if significant.
 
-    Where values scatter more, a mean that is off says less. ``either_side``: the place, or all outside of it
-    where that is what deviates from 0.
+    ``either_side``: the place, or all outside of it where that is what deviates from 0.
     """
     if place is None:
         return None
@@ -228,10 +226,7 @@ def affected_share(z: FloatArray, inside: BoolArray) -> float:
     test bounds the number of true deviations of all sets at once, so that the place may have been chosen
     after looking: ``max_u (1 - u + #{i inside: m p_i <= u a})`` with all m values (Hommel's smaller
     number would do, and give a little more). Any of these bounds is too large with the probability a = SURE.
-
-    Args:
-        z: one-sided deviations of all values, N(0, 1) by chance, (m,).
-        inside: the place, (m,).
+    The deviations z of all values, (m,), are one-sided, N(0, 1) by chance.
     """
     n = int(inside.sum())
     if n == 0:
@@ -269,20 +264,20 @@ def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> 
     def nats(a: IntArray, b: IntArray) -> FloatArray:
         inside, whole = (total[b] - total[a], square[b] - square[a]), (total[-1], square[-1])
         outside = whole[0] - inside[0], whole[1] - inside[1]
-        likely = _normal(b - a, *inside) + _normal(n - b + a, *outside)
-        return np.where(np.minimum(b - a, n - b + a) >= shortest, likely, -np.inf)
+        likelihood = _log_likelihood(b - a, *inside) + _log_likelihood(n - b + a, *outside)
+        return np.where(np.minimum(b - a, n - b + a) >= shortest, likelihood, -np.inf)
 
     every, given = np.arange(n + 1), (first, last)
     for _ in range(_SWEEPS):
         first = int(np.argmax(nats(every[:last], np.full(last, last))))
         last = first + 1 + int(np.argmax(nats(np.full(n - first, first), every[first + 1 :])))
     with_range = nats(np.array([first]), np.array([last]))
-    gain = float((with_range - _normal(np.array([n]), total[-1:], square[-1:]))[0])
+    gain = float((with_range - _log_likelihood(np.array([n]), total[-1:], square[-1:]))[0])
     price = len(series) * (len(series) + 3) / 2 + math.log(n**2 / 2)
     return (first, last) if gain > price else given
 
 
-def _normal(count: IntArray, sums: FloatArray, squares: FloatArray) -> FloatArray:
+def _log_likelihood(count: IntArray, sums: FloatArray, squares: FloatArray) -> FloatArray:
     """Return the largest log likelihood of normal vectors, given their number, sums and sums of squares."""
     m = np.maximum(count, 1)[:, None]
     mean = sums / m
@@ -301,15 +296,14 @@ def scan_event_map(
 ) -> list[Suspect]:
     """Return the places with more events than their share, the most significant first.
 
+    Their ``inside`` and ``outside`` are events beyond those expected per pixel.
+
     Args:
         seen: pixels with an event, (y, x).
         expected: number of events in each, in proportion, (y, x).
         usable: pixels that count, (y, x).
-        significance: largest probability of a chance.
+        significance: largest p-value.
         most: places at most.
-
-    Returns:
-        Places; ``inside`` and ``outside`` are events beyond those expected per pixel.
     """
 
     def best(left: BoolArray) -> families.Place | None:
@@ -344,17 +338,15 @@ def scan_event_frames(
 
     Of n events in random order, those that follow the i-th by k in a share w of the frames are at least k of
     the others with the probability of a binomial law, which is uniform whatever i and k: the union bound has
-    as many terms as there are pairs of events.
+    as many terms as there are pairs of events. ``inside`` and ``outside`` of the range are events beyond those
+    expected per frame.
 
     Args:
         positions: of the frames with an event, increasing, none twice, (m,).
         numbers: of all frames in the run, increasing, (n,).
         expected: number of events in all frames.
-        significance: largest probability of a chance.
+        significance: largest p-value.
         shortest: frames that a range must have.
-
-    Returns:
-        The range; ``inside`` and ``outside`` are events beyond those expected per frame.
     """
     if positions.size > _MOST_EVENTS:
         expected *= _MOST_EVENTS / positions.size

@@ -78,10 +78,7 @@ class _Guess(NamedTuple):
 def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: int = 2) -> list[Shared]:
     """Return the places whose pixels share noise, the most significant first, each without those before it.
 
-    Args:
-        samples: standardised frames.
-        significance: largest probability of a chance in any place, mode and channel.
-        most: places at most.
+    The significance is that of any place, mode and channel; there are ``most`` places at most.
     """
     found: list[Shared] = []
     while len(found) < most and samples.usable.sum() > 2 * FEWEST_PIXELS:
@@ -94,12 +91,7 @@ def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: in
 
 
 def shared_elsewhere(samples: Samples, place: Shared) -> Region | None:
-    """Return all pixels outside a place if they share noise among themselves as those inside do; else None.
-
-    Args:
-        samples: standardised frames.
-        place: found among them.
-    """
+    """Return all pixels outside a place if they share noise among themselves as those inside do; else None."""
     rest = samples.without(place.region.mask(samples.usable.shape))
     if rest.usable.sum() <= 2 * FEWEST_PIXELS:
         return None
@@ -260,9 +252,7 @@ class PairContrast(families.Contrast):
 def pairs_of(samples: Samples, edges: families.Edges | None = None) -> list[dict[str, PairContrast]]:
     """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share.
 
-    Args:
-        samples: standardised frames.
-        edges: of the cells of rows and of columns, pixels; None: cells of equal size.
+    ``edges`` are those of the cells of rows and of columns, pixels; None: cells of equal size.
     """
     if edges is None:
         rows, columns = (families.cell_edges(n, _CELLS) for n in samples.usable.shape)
@@ -277,22 +267,21 @@ def pairs_of(samples: Samples, edges: families.Edges | None = None) -> list[dict
         mode: (families.cumulative(n * table), n * rest) for mode, (table, rest) in counted.tables().items()
     }
     area = families.cumulative(samples.usable.astype(np.float64))
-    found: list[dict[str, PairContrast]] = []
-    for each in gathered:
-        found.append({})
-        for mode, (table, by_number) in each.tables().items():
-            cells, (number, number_by) = each.edges(mode), counts[mode]
-            found[-1][mode] = PairContrast(
-                edges=cells,
-                sums=families.cumulative(table),
-                counts=number,
-                # that pairs are counted twice doubles the variance of a sum
-                null=families.normal(float(table.sum()), float(number.flat[-1]), 2.0, 1.0, one_sided=True),
-                axes=MODES[mode],
-                area=area[np.ix_(*cells)],
-                by_number=(by_number, number_by),
-            )
-    return found
+
+    def contrast(mode: str, table: FloatArray, by_number: FloatArray) -> PairContrast:
+        cells, (number, number_by) = counted.edges(mode), counts[mode]
+        return PairContrast(
+            edges=cells,
+            sums=families.cumulative(table),
+            counts=number,
+            # that pairs are counted twice doubles the variance of a sum
+            null=families.normal(float(table.sum()), float(number.flat[-1]), 2.0, 1.0, one_sided=True),
+            axes=MODES[mode],
+            area=area[np.ix_(*cells)],
+            by_number=(by_number, number_by),
+        )
+
+    return [{mode: contrast(mode, *each) for mode, each in g.tables().items()} for g in gathered]
 
 
 def pairs_bytes(shape: tuple[int, int]) -> int:
@@ -314,7 +303,6 @@ class _Gathered:
     """
 
     def __init__(self, cells: families.Edges) -> None:
-        """Begin with nothing, for cells of rows and columns with these edges."""
         self.cells = cells
         y, x = (each.size - 1 for each in cells)
         self.stride = [2 if n > _CELLS // 2 else 1 for n in (y, x)]
@@ -356,12 +344,10 @@ class _Gathered:
             sums += folded.T @ folded - np.diag(_folded(each))
 
     def tables(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return the sums of each mode by cells, (y, x, x), (y, y, x) or (y, y, x, x), and by numbers.
-
-        Of frames those of pixels in different rows and columns.
-        """
+        """Return the sums of each mode by cells, (y, x, x), (y, y, x) or (y, y, x, x), and by numbers."""
         by, bx = (np.arange(0, len(each), n) for each, n in zip(self.lines, self.stride, strict=True))
         i, j = np.arange(by.size), np.arange(bx.size)
+        # of frames those of pixels in different rows and columns
         frames = self.frames.reshape(*2 * self.squares.shape).transpose(0, 2, 1, 3).copy()
         frames[i, i] -= _summed(self.lines[0], (by, bx, bx))
         frames[:, :, j, j] -= _summed(self.lines[1], (bx, by, by)).transpose(1, 2, 0)
