@@ -77,7 +77,7 @@ class Place:
 def successive(
     best: Callable[[BoolArray], Place | None], some: BoolArray, most: int
 ) -> Iterator[tuple[Place, BoolArray]]:
-    """Yield the most significant place (``best``) of pixels, (y, x), with these, then that of the rest, ..."""
+    """Yield the most significant place (``best``) of some pixels and these, then that of the rest, ..."""
     for _ in range(most):
         if some.sum() <= 2 * FEWEST or (place := best(some)) is None:
             return

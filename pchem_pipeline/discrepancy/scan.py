@@ -338,8 +338,8 @@ def scan_event_frames(
 
     Of n events in random order, those that follow the i-th by k in a share w of the frames are at least k of
     the others with the probability of a binomial law, which is uniform whatever i and k: the union bound has
-    as many terms as there are pairs of events. ``inside`` and ``outside`` of the range are events beyond those
-    expected per frame.
+    as many terms as there are pairs of events. ``inside`` and ``outside`` are events beyond those expected
+    per frame.
 
     Args:
         positions: of the frames with an event, increasing, none twice, (m,).

@@ -91,7 +91,7 @@ def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: in
 
 
 def shared_elsewhere(samples: Samples, place: Shared) -> Region | None:
-    """Return all pixels outside a place if they share noise among themselves as those inside do; else None."""
+    """Return all pixels outside a place if they share noise among themselves, as those inside do."""
     rest = samples.without(place.region.mask(samples.usable.shape))
     if rest.usable.sum() <= 2 * FEWEST_PIXELS:
         return None
