@@ -52,6 +52,8 @@ class Follows:
     def of(self, source: Source) -> tuple[FloatArray, FloatArray]:
         """Return the products and pairs of single samples, or of all of a row, column or frame."""
         axes = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}[source]
+        if not axes:
+            return self.products, self.pairs
         return self.products.sum(axis=axes, keepdims=True), self.pairs.sum(axis=axes, keepdims=True)
 
     def z(self, source: Source) -> FloatArray:

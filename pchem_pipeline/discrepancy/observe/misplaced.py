@@ -44,9 +44,8 @@ def misplaced_lines(
         usable: pixels that count, (y, x).
 
     Returns:
-        By ``space.misplaced.rows`` and ``.columns`` how many standard deviations lines are likelier elsewhere
-        than chance makes them; by "rows" and "columns", where these stand out, the likeliest share of lines
-        from each of :data:`~.evidence.PLACES`, the share by chance taken off, shape (6,).
+        ``space.misplaced.rows`` and ``.columns``; by "rows" and "columns", where these stand out, the
+        likeliest share of lines from each of :data:`~.evidence.PLACES`, less the share by chance, shape (6,).
     """
     z: dict[str, float] = {}
     shares: dict[str, FloatArray] = {}
@@ -70,12 +69,7 @@ def misplaced_lines(
 def own_lines(frames: CodeArray, usable: BoolArray, effects: Iterable[Effect]) -> CodeArray:
     """Return frames in which lines that effects likely misplaced are those of other frames, drawn at random.
 
-    Each sample in a pixel's histogram is then its own, as many as there were.
-
-    Args:
-        frames: codes (frame, y, x), DN.
-        usable: pixels that count, (y, x).
-        effects: of the model.
+    Each sample in a pixel's histogram is then of that pixel, and their number stays.
     """
     found = frames
     for effect in effects:

@@ -57,10 +57,9 @@ class SensorWindow:
         found = []
         for effect in (each.to_window(self.rows, self.columns, self.shape) for each in effects):
             mask = self.mask(effect.region)
-            if effect.region is None or mask.all():
-                found.append(effect.at_place(None, effect.when))
-            elif mask.any():
-                found.append(effect.at_place(Region.of_mask(mask), effect.when))
+            if effect.region is None or mask.any():
+                region = None if effect.region is None or mask.all() else Region.of_mask(mask)
+                found.append(effect.at_place(region, effect.when))
         return tuple(found)
 
     def found(self, effect: Effect, part: Part | None = None) -> Effect:
@@ -120,12 +119,7 @@ def _beyond(found: tuple[Span, ...], window: Span, known: tuple[Span, ...]) -> t
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the sensor, of the run, or of both.
-
-    Attributes:
-        region: its pixels; None: all.
-        when: its frames; None: all.
-    """
+    """A part of the sensor (None: all pixels), of the run (None: all frames), or of both."""
 
     region: Region | None = None
     when: When | None = None
@@ -151,7 +145,7 @@ def part_evidence(
     window: SensorWindow | None = None,
     fitted: bool = True,
 ) -> Evidence:
-    """Return the evidence of a part alone, a sensor that ends with it: row 0 is its first.
+    """Return the evidence of a part alone, as of a sensor that ends with it: row 0 is its first.
 
     Args:
         frames: codes (n, y, x), DN.

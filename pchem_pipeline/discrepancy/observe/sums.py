@@ -125,12 +125,12 @@ class FrameBlocks:
 
     @classmethod
     def of(cls, frames: CodeArray, chosen: IntArray | None = None, together: int = 1) -> FrameBlocks:
-        """Take frames in memory.
+        """Take frames in memory, codes (n, y, x).
 
         Args:
-            frames: codes (n, y, x), DN.
-            chosen: positions of those that are meant; None: all.
-            together: successive ones of these that come in the same block.
+            frames: all of them.
+            chosen: positions of those that are taken; None: all.
+            together: number of successive ones that come in the same block.
         """
         n_frames = frames.shape[0] if chosen is None else chosen.size
 
@@ -179,15 +179,10 @@ class Samples:
     ) -> Samples:
         """Prepare frames by the laws of their pixels, made of all samples of the frames or of more.
 
-        Args:
-            frames: codes.
-            laws: of the pixels' samples.
-            maps: parameters of the pixels.
-            standardised: False: k (e-) and r (DN) as they are.
+        If not ``standardised``, k (e-) and r (DN) stay as they are.
         """
         pixels = pixel_statistics(laws, maps)
-        usable = pixels.usable
-        tables = laws.tables
+        usable, tables = pixels.usable, laws.tables
         if standardised:
             length = np.where(laws.good, laws.support[:, 1], 0)
             deviation = np.sqrt(np.where(usable, pixels.variance, 1.0)).reshape(2, -1).astype(np.float32)
@@ -198,7 +193,7 @@ class Samples:
         # of pixels that do not count the row 0, of zeros
         first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T
         ranges = np.stack([first, first + length - 1, start]).reshape(3, *usable.shape).astype(np.int32)
-        return cls(frames, ranges[0], ranges[1], ranges[2], tables, usable)
+        return cls(frames, *ranges, tables, usable)
 
     @property
     def n_frames(self) -> int:
@@ -206,7 +201,7 @@ class Samples:
         return self.frames.n_frames
 
     def without(self, pixels: BoolArray) -> Samples:
-        """Return it without some pixels, (y, x)."""
+        """Return the samples without some pixels, (y, x)."""
         return replace(self, usable=self.usable & ~pixels)
 
     def chunks(
