@@ -188,12 +188,8 @@ class Contrast:
 def normal(total: float, number: float, variance: float, fewest: float, one_sided: bool = False) -> Null:
     """Return the null of normal sums with a mean and a variance in proportion to their count.
 
-    Args:
-        total: sum of all.
-        number: count of all.
-        variance: of a sum, by its count.
-        fewest: smallest count of a place, and of all outside of it.
-        one_sided: only sums that are too large count.
+    ``total`` and ``number`` are sum and count of all, ``variance`` is by count, ``fewest`` the smallest count
+    inside and outside of a place; if ``one_sided``, only sums that are too large count.
     """
 
     def deviations(sums: FloatArray, counts: FloatArray) -> FloatArray:
@@ -226,13 +222,9 @@ def events(total: float) -> Null:
 def contrast_of_map(
     values: FloatArray, some: BoolArray, fewest: int = FEWEST, frames: IntArray | None = None
 ) -> Contrast:
-    """Return the contrast of values that are N(0, 1) by chance, far ones clipped.
+    """Return the contrast of values that are N(0, 1) by chance, of a map (y, x) or a series (1, n) of frames.
 
-    Args:
-        values: of a map (y, x), or of a series (1, n) of ``frames``.
-        some: which of them count.
-        fewest: values inside and outside of a place.
-        frames: their numbers.
+    ``some`` of them count, ``fewest`` of these inside and outside of a place. Far ones are clipped.
     """
     values = np.clip(np.where(some, values, 0.0), -FAR, FAR)
     # what stands out widens the spread of the whole: take it from the middle

@@ -34,7 +34,7 @@ class Gap:
     """A gap, nats per sample.
 
     Attributes:
-        value: the gap; negative by sampling noise only.
+        value: negative by sampling noise only.
         floor: 95 % quantile under the model.
         interval: 95 % interval.
         families: contribution of each family of statistics.
@@ -58,15 +58,9 @@ class Gap:
         families: Mapping[str, float] | None = None,
         standing_out: tuple[str, ...] = (),
     ) -> Gap:
-        """Compute gap, floor and interval from a distance of so many samples.
+        """Compute gap, floor and interval from a distance, nats, and those of replicates (b,), by chance.
 
-        Args:
-            distance: distance of the data from the model, nats.
-            chance: distances of replicates of the model, nats, shape (b,).
-            n_samples: number of samples.
-            variance: additional variance of the distance, nats^2.
-            families: contributions, nats per sample; None: all of family "shape".
-            standing_out: significant families.
+        The variance is what the distance has in addition, nats^2. The families are by default "shape" alone.
         """
         expected = float(chance.mean())
         reach = _INTERVAL * float(np.sqrt(chance.var(ddof=1) + variance))

@@ -149,14 +149,10 @@ class NullModel:
         *,
         effects: bool = False,
     ) -> NullModel:
-        """Estimate the null distribution from replicates.
+        """Estimate the null distribution from replicates, shape (b, m).
 
-        Args:
-            names: names of the statistics.
-            vectors: the replicates, shape (b, m).
-            before: null of the model to which effects were added; standard deviations of statistics that they
-                neither shift nor widen are pooled with it.
-            effects: whether the model has effects, as one with a model before it has.
+        Standard deviations of statistics that added effects neither shift nor widen are pooled with those of
+        the model before. ``effects``: whether the model has any, as one with a model before it has.
         """
         vectors = without_strays(vectors, STRAY if effects or before is not None else _STRAY_ALONE)
         mean, std, covariance = moments(vectors)
@@ -171,12 +167,9 @@ class NullModel:
         return cls(names, mean, std, covariance, vectors, skewness, tests)
 
     def moved_by(self, vectors: FloatArray) -> BoolArray:
-        """Test which statistics effects shift (t-test) or widen (F-test), shape (m,).
+        """Test which statistics effects, in replicates (b, m), shift (t-test) or widen (F-test), shape (m,).
 
         A common mode widens trends and correlations in time without shifting them.
-
-        Args:
-            vectors: replicates with the effects, shape (b, m).
         """
         n = len(vectors)
         moved = np.abs(vectors.mean(axis=0) - self.mean) > CERTAIN * self.std / np.sqrt(n)
@@ -263,12 +256,7 @@ def as_matrix(
     """Arrange statistics as a matrix (vector, m) in the order of the names.
 
     A missing value (too few usable pixels or pairs) is replaced by the mean of the other vectors, or by
-    ``usual`` if all lack it.
-
-    Args:
-        names: names of the statistics, shape (m,).
-        vectors: statistics by name.
-        usual: default of each, shape (m,); None: at least one vector has it.
+    ``usual``, shape (m,), if all lack it.
 
     Raises:
         KeyError: no vector has a statistic, and there is no default.

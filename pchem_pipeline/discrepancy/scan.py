@@ -241,18 +241,11 @@ def affected_share(z: FloatArray, inside: BoolArray) -> float:
 def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> tuple[int, int]:
     """Return the range of frames, its end excluded, with which all series together are most probable.
 
-    Inside and outside, all series are normal with a mean and a covariance of their own (a change point of
-    either, Hinkley 1970; its error goes as the inverse of what a frame tells, and not with the root of their
-    number); of each only the inverse hyperbolic sine counts, so that single frames far off decide nothing.
-    Where the series are not more probable with a range than without by as many nats as it has parameters
-    (Akaike 1974) and as choosing one of all ranges gains, they do not tell its ends: those that are given
-    stay.
-
-    Args:
-        series: N(0, 1) where nothing is wrong, (s, n), finite.
-        first: of a range near it.
-        last: its end, excluded.
-        shortest: frames inside, and outside, at least.
+    Inside and outside, all series, (s, n), are normal with different means and covariances (a change point of
+    either, Hinkley 1970); of each only the inverse hyperbolic sine counts, so that single frames far off
+    decide nothing. The given ends (the last one excluded) stay where a range does not raise the probability by
+    as many nats as it has parameters (Akaike 1974) and as choosing one of all ranges gains. There are at least
+    ``shortest`` frames inside and outside.
     """
     x = np.arcsinh(series - np.median(series, axis=1, keepdims=True)).T
     total, square = (

@@ -94,15 +94,9 @@ class FollowingSamples:
         inside: BoolArray | None = None,
         most: int | None = None,
     ) -> FollowingSamples | None:
-        """Prepare frames; None where they are too few.
+        """Prepare frames, codes (frame, y, x), in blocks at ``edges``, (b + 1,); None where they are too few.
 
-        Args:
-            frames: codes (frame, y, x), DN.
-            edges: positions of the blocks, (b + 1,).
-            laws: of the pixels' samples.
-            maps: parameters of the pixels.
-            inside: pixels whose residuals count, (y, x); None: all.
-            most: samples that are looked at, in frames evenly spread; None: all.
+        Residuals count of pixels ``inside``, (y, x); ``most`` samples are looked at, in frames evenly spread.
         """
         first = groups_of(edges, maps.usable.size, frames.size if most is None else most)
         if not first.size:
@@ -118,7 +112,8 @@ class FollowingSamples:
         scale = np.where(resolved, 1.0 / np.sqrt(np.where(resolved, left, 1.0)), 0.0)
         mean = np.where(usable, maps.quanta_exposure, 0.0)
         spread = np.sqrt(np.where(usable, pixels.variance[0], 0.0))
-        return cls(samples, inside, *(each.astype(np.float32) for each in (correlation, scale, mean, spread)))
+        single = [each.astype(np.float32) for each in (correlation, scale, mean, spread)]
+        return cls(samples, inside, single[0], single[1], single[2], single[3])
 
     @property
     def groups(self) -> int:

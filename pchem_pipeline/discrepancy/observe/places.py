@@ -147,15 +147,8 @@ def part_evidence(
 ) -> Evidence:
     """Return the evidence of a part alone, as of a sensor that ends with it: row 0 is its first.
 
-    Args:
-        frames: codes (n, y, x), DN.
-        numbers: of the frames in the run, shape (n,).
-        maps: fit of all these frames.
-        part: what to look at.
-        n_run: frames of the whole run.
-        block_frames: frames of a block; shorter ones where the part has few.
-        window: of the sensor that the frames are; None: all of it.
-        fitted: fit its pixels in its frames; False: take the maps as they are.
+    The maps are the fit of all these frames, of a window of the sensor (None: all of it); the other arguments
+    are those of :func:`.observe`. Blocks are shorter where the part has few frames.
 
     Raises:
         PchEmError: it holds too few frames, or no usable pixel.

@@ -125,12 +125,9 @@ class FrameBlocks:
 
     @classmethod
     def of(cls, frames: CodeArray, chosen: IntArray | None = None, together: int = 1) -> FrameBlocks:
-        """Take frames in memory, codes (n, y, x).
+        """Take frames in memory, codes (n, y, x): those at chosen positions (None: all).
 
-        Args:
-            frames: all of them.
-            chosen: positions of those that are taken; None: all.
-            together: number of successive ones that come in the same block.
+        So many successive ones come ``together`` in the same block.
         """
         n_frames = frames.shape[0] if chosen is None else chosen.size
 
@@ -193,7 +190,7 @@ class Samples:
         # of pixels that do not count the row 0, of zeros
         first, length, start = np.where(usable.reshape(-1, 1), laws.support, [0, 1, 0]).T
         ranges = np.stack([first, first + length - 1, start]).reshape(3, *usable.shape).astype(np.int32)
-        return cls(frames, *ranges, tables, usable)
+        return cls(frames, ranges[0], ranges[1], ranges[2], tables, usable)
 
     @property
     def n_frames(self) -> int:

@@ -65,13 +65,9 @@ class CodeSums(NamedTuple):
 
 @kernel
 def supports(parameters: FloatArray, log_negligible: float, electrons: IntArray, codes: IntArray) -> None:
-    """Fill the ranges of electron numbers and of codes (n, 2) that the law of each pixel covers.
+    """Fill the ranges of electron numbers and of codes, (n, 2), that the law of each pixel covers.
 
-    Args:
-        parameters: H, 1/g, mu, analog read noise in DN, (n, 4).
-        log_negligible: logarithm of the probability of electron numbers that are left out.
-        electrons: to fill.
-        codes: to fill.
+    Parameters as of :class:`Fits`; electron numbers of negligible probability (its logarithm) are left out.
     """
     for p in range(parameters.shape[0]):
         exposure, step, bias, width = parameters[p]

@@ -43,11 +43,8 @@ def pixel_forms(
 ) -> dict[str, float]:
     """Return the statistics of standardised deviations of pixels, (n,): their mean, their squares, outliers.
 
-    Args:
-        z: of mean 0 and variance 1.
-        normal: the same as normal quantiles; None: they are.
-        kurtosis: excess of each.
-        two_sided: whether far below counts as far above.
+    ``normal`` are the same as normal quantiles (None: they are), ``kurtosis`` is the excess of each; outliers
+    are on both sides, or above only.
     """
     quantiles = z if normal is None else normal
     count = int(np.sum((np.abs(quantiles) if two_sided else quantiles) > OUTLYING))
@@ -82,12 +79,12 @@ def sample_statistics(pixels: PixelLaws, exposure: FloatArray, residuals: CodeRe
     for side in ("low", "high"):
         near, far = moments[side], moments[f"far_{side}"]
         found[f"tail.{side}.count"] = _beyond(near.sum(axis=0), far.sum(axis=0))
-        some = [(np.count_nonzero(seen), -np.expm1(-mean).sum()) for seen, mean in (near.T, far.T)]
+        some = [np.array([np.count_nonzero(n), -np.expm1(-mean).sum()]) for n, mean in (near.T, far.T)]
         found[f"tail.{side}.pixels"] = _beyond(*some)
     return found | _code_statistics(pixels.codes, residuals)
 
 
-def _beyond(near: FloatArray | tuple[int, float], far: FloatArray | tuple[int, float]) -> float:
+def _beyond(near: FloatArray, far: FloatArray) -> float:
     """Return the statistic of samples (seen, expected) beyond the support and far beyond it."""
     # few samples of heavy tails are far out, where none is expected; many of a satellite are near
     z = laws.poisson(int(near[0]), float(near[1]))

@@ -101,15 +101,7 @@ class FrameView:
     def of(
         cls, frames: NDArray[Any], numbers: IntArray, block_frames: int, laws: PixelLaws, maps: PixelMaps
     ) -> FrameView:
-        """Sum over frames.
-
-        Args:
-            frames: codes (n, y, x), DN.
-            numbers: their frame numbers in the run, increasing, (n,).
-            block_frames: frames in a block; no block spans a gap.
-            laws: of the pixels' samples.
-            maps: parameters of the pixels.
-        """
+        """Sum over frames, codes (n, y, x), whose numbers in the run are increasing; no block spans a gap."""
         (n, ny, nx), edges = frames.shape, sums.blocks_of(numbers, block_frames)
         pixels = sums.pixel_statistics(laws, maps)
         samples = sums.Samples.by_laws(sums.FrameBlocks.of(frames), laws, maps, standardised=False)
@@ -211,7 +203,7 @@ class FrameView:
         return Correlation(of_pixels, average, _count(self.edges, lag))
 
     def _shared(self, a: int, b: int, one: _Slices, two: _Slices) -> FloatArray:
-        """Return what removing the common modes adds to covariances of channel a of pixels and b of others."""
+        """Return what removing the common modes adds to covariances of channels a and b of two pixels."""
         # with a' = a - s sum(a) and b' = b - t sum(b), s and t the shares of the pixels in the modes
         pixels = self.pixels
         covariance = (pixels.variance[0], pixels.cross, pixels.variance[1])[a + b]

@@ -113,13 +113,9 @@ def _memory(series: FloatArray) -> Check:
 def levels_check(
     mean: FloatArray, variance: FloatArray, gain: float, empty: IntArray | tuple[()] = ()
 ) -> Check:
-    """Test whether the frames are of several exposures.
+    """Test whether the frames are of several exposures, from mean and variance of each over its pixels, DN.
 
-    Args:
-        mean: mean of each frame over its pixels, DN, (n,).
-        variance: variance of each frame over its pixels, DN^2, (n,).
-        gain: median gain, e-/DN.
-        empty: frames without samples of the sensor, which are no exposure.
+    Frames without samples of the sensor (``empty``) are no exposure. The gain is the median, e-/DN.
     """
     parts, p = _parted(mean, variance, gain, np.setdiff1d(np.arange(mean.size), empty))
     levels = sorted(((float(mean[part].mean()), part) for part in parts), key=lambda level: level[0])

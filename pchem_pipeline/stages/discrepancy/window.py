@@ -152,14 +152,9 @@ def within_memory(
     codes: float,
     limit: int,
 ) -> DiscrepancySettings:
-    """Return the settings with as many samples and pixels as the memory allows.
+    """Return the settings with as many samples and pixels as a search may have within ``limit`` bytes.
 
-    Args:
-        settings: as configured.
-        shape: frames, rows, columns of the stack.
-        roi: rows and columns that the user asked for.
-        codes: of the law of a pixel.
-        limit: bytes that the search may take.
+    Shape and roi as of :func:`choose_window`; ``codes`` is the number of codes of the law of a pixel.
 
     Raises:
         ConfigError: it is not enough for the smallest window.
