@@ -243,9 +243,9 @@ def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> 
 
     Inside and outside, all series, (s, n), are normal with different means and covariances (a change point of
     either, Hinkley 1970); of each only the inverse hyperbolic sine counts, so that single frames far off
-    decide nothing. The given ends (the last one excluded) stay where a range does not raise the probability by
-    as many nats as it has parameters (Akaike 1974) and as choosing one of all ranges gains. There are at least
-    ``shortest`` frames inside and outside.
+    decide nothing. The given ends (the last one excluded) stay where a range does not raise the likelihood by
+    as many nats as it has parameters (Akaike 1974) and as choosing one of all ranges gains. At least
+    ``shortest`` frames are inside and outside.
     """
     x = np.arcsinh(series - np.median(series, axis=1, keepdims=True)).T
     total, square = (
