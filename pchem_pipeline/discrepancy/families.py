@@ -1,10 +1,10 @@
 """Families of places on a sensor or in a series, and the place of each that stands out most.
 
-What is seen in a place is a sum over it: of the values of a map, of events, or of the products of all pairs
-of its pixels. A :class:`Contrast` says how far such a sum is from the share of the whole that its count asks
-for (pixels, events by chance, pairs). Sums over bands and rectangles come from cumulative tables, in which
-pairs have an axis twice; these boxes are of cells, and around the ends of the best one the scan goes on with
-finer cells, down to single lines. The probability of a place is the union bound over all of its family.
+The statistic of a place is a sum over it: of the values of a map, of events, or of products of all pairs of
+its pixels. A :class:`Contrast` compares the sum with the share of the whole that its count asks for (pixels,
+events by chance, pairs). Sums over bands and rectangles come from cumulative tables, in which pairs have an
+axis twice; these boxes are of cells, and around the ends of the best one the scan goes on with finer cells,
+down to single lines. The p-value of a place is the union bound over its family.
 """
 
 from __future__ import annotations

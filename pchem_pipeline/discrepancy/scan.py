@@ -2,15 +2,13 @@
 
 Each value is about N(0, 1) and independent of the others where nothing is wrong. Of every place of some
 family (:mod:`.families`: bands of rows or columns, rectangles, discs, lines at a period, single pixels) the
-mean inside is compared with the mean outside, so that something everywhere alike has no place. A series is a
-map of one row: its bands are ranges of frames, its pixels single frames. The probability is that of the
-largest deviation among all places of the family (the union bound), of all families: it counts every place
-that was looked at.
+mean inside is compared with the mean outside, so that a uniform deviation has no place. A series is a map of
+one row: its bands are ranges of frames, its pixels single frames. The p-value is corrected for all places of
+all families (the union bound).
 
-Samples beyond all that the PCD allows are few, and maps of their numbers nothing like normal: they are
-events. Given how many there are in all, each lies by chance in a place with the share of it that the laws of
-the pixels give, and in a range of frames with the share of its frames. Probabilities are those of binomial
-laws, and only more than chance makes has a place. How many are expected in all does not matter.
+Samples beyond the support of the PCD are rare events. Given their total number, each lies by chance in a
+place with the probability that the laws of the pixels give, and in a range of frames with the share of its
+frames. So their number in a place is binomial; only an excess counts.
 """
 
 from __future__ import annotations

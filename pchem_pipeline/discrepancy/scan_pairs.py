@@ -2,13 +2,11 @@
 
 Of every band of lines, every band across them, every rectangle, every n-th line, and the lines that stand out
 each by itself the mean covariance of the pairs inside is compared with that of all other pairs, so that noise
-which all pixels share has no place. What pixels share adds to the covariance of all their pairs, not only to
-that of neighbours: a row of w pixels has w (w - 1) / 2 pairs, and w - 1 neighbours. Given the histograms,
-frames without an effect are in random order: then products of different standardised pixels have mean 0,
-variance 1, and are uncorrelated, whatever the pixels' law. So the standard error of a mean of N pairs is
-``1 / sqrt(N)``, or what the frames' scatter gives where that is more; the sum of squares behind it is skewed,
-which Wilson and Hilferty's root takes away. The probability is the union bound over the places of the family,
-the families, modes and channels.
+which all pixels share has no place. Given the histograms, frames without an effect are in random order: then
+products of different standardised pixels have mean 0, variance 1, and are uncorrelated, whatever the pixels'
+law. So the standard error of a mean of N pairs is ``1 / sqrt(N)``, or what the frames' scatter gives where
+that is more; the skewness of the sum of squares behind it is removed (Wilson and Hilferty 1931). The p-value
+is the union bound over the places of the family, the families, modes and channels.
 
 Boxes are of cells, each of several rows or columns of a large sensor; each round of finer cells
 (:func:`.families.with_sharp_ends`) is another pass over the frames.
@@ -142,7 +140,7 @@ def _measured(samples: Samples, guess: _Guess) -> Shared:
     # partners of each pixel: squares of sums over w of them have this many degrees of freedom
     partners = 2.0 * own / max(int(parts[0].sum()), 1)
     freedom = 2.0 * n * own / max(partners - 1.0, 1e-9) ** 2
-    z = float(chi_square(max(freedom + z * math.sqrt(2.0 * freedom), 0.0), freedom))
+    z = float(chi_square(freedom + z * math.sqrt(2.0 * freedom), freedom))
     return Shared(
         family=place.family,
         z=z,

@@ -7,6 +7,8 @@ nearer to the one before than to those of other frames; and whether they follow 
 before. Lines that repeat those before them, of the same frame or of the frame before, never come by chance in
 analog data unless they are a few pixels long. Squares of equal samples are made by compression with losses,
 binning that is undone and repeated pixels; nothing analog does.
+
+Frames are codes (frame, y, x), DN, usable pixels are (y, x), and edges are positions of the blocks, (b + 1,).
 """
 
 from __future__ import annotations
@@ -54,13 +56,7 @@ def groups_of(edges: IntArray, samples_of_a_frame: int, most_samples: int = MOST
 
 
 def predicted_samples(frames: CodeArray, edges: IntArray, usable: BoolArray) -> dict[str, PredictedSamples]:
-    """Return how samples compare with their predictions, by kind; none where frames or pixels are too few.
-
-    Args:
-        frames: codes (frame, y, x), DN.
-        edges: positions of the blocks, (b + 1,).
-        usable: pixels that count, (y, x).
-    """
+    """Return how samples compare with their predictions, by kind; none where frames or pixels are too few."""
     first, inside = groups_of(edges, usable.size), usable[1:-1, 1:-1]
     if min(usable.shape) < 3 or not inside.any() or not first.size:
         return {}

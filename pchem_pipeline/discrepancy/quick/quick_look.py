@@ -5,10 +5,7 @@ histograms, samples without any effect are in random order and independent of ot
 expectation and variance of all sums of products of different samples (permutation argument), so that a poor
 fit, a hot pixel or a heavy tail gives no false alarm. Noise common to a frame, row, column or to neighbours
 adds to the mean covariance of the pairs that share it; its components are separated as in an analysis of
-variance.
-
-A quick look gives a size, not a cause: for that, ``pchem discrepancy`` compares many more statistics with
-simulations.
+variance. The cause is found by ``pchem discrepancy``.
 """
 
 from __future__ import annotations
@@ -139,7 +136,7 @@ _NOTHING = _Estimate(0.0, math.inf, 1.0)
 
 def _normal(z: FloatArray, freedom: float) -> FloatArray:
     """Return normal quantiles of standardised sums of squares of so many degrees of freedom."""
-    return chi_square(np.maximum(freedom + z * math.sqrt(2.0 * freedom), 0.0), freedom)
+    return chi_square(freedom + z * math.sqrt(2.0 * freedom), freedom)
 
 
 def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:

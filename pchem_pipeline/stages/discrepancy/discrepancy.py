@@ -74,7 +74,8 @@ def _run_frames(
 ) -> None:
     source = open_source(context)
     block_length(source.shape[0], context.config.discrepancy.block_frames)
-    model = (*before, *_limits(context, before))
+    limits = _limits(context, before)
+    model = (*before, *limits)
     settings, seen, whole = _surveyed(context, source, model, roi, progress)
     search = _Search(context, source, model, roi, seen, progress)
     window, found = search.found(settings, "")
@@ -86,11 +87,14 @@ def _run_frames(
         )
         window, found = search.found(whole, "whole-")
         elsewhere = search.elsewhere(whole, "whole-elsewhere-", window, found)
-    verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)
+    rows, columns = window.rows, window.columns
+    verdict = found.verdict.on_sensor(
+        source.shape[1:], rows, columns, lambda y, x: (y + rows[0], x + columns[0])
+    )
     verdict = seen.told(verdict, window.share(source.shape)).costing(search.work)
     found = replace(found, verdict=verdict if elsewhere is None else verdict.checked(elsewhere))
-    _write(context, found, before)
-    write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
+    _write(context, found, limits)
+    write_added_exposure(context.store, _STAGE, found.added, found.model, rows, columns)
 
 
 @dataclass
@@ -233,11 +237,11 @@ def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...
 def _run_histograms(context: StageContext, before: Sequence[Effect], progress: Callable[[str], None]) -> None:
     """Do the same with ready-made histograms, or with those of several samples together, in one unit."""
     samples = _samples(context) if context.sensor.samples else [_histograms(context.store)]
-    model = (*before, *_limits(context, before))
+    limits, settings = _limits(context, before), context.config.discrepancy
     found = find_in_histograms(
-        samples, context.config.discrepancy, width=context.sensor.nx, model=model, progress=progress
+        samples, settings, width=context.sensor.nx, model=(*before, *limits), progress=progress
     )
-    _write(context, found, before)
+    _write(context, found, limits)
     context.run_units([WHOLE])
 
 
@@ -307,7 +311,8 @@ def _simulate(unit: Named[Replicate], store: RunStore) -> dict[str, float]:
     return unit.content()
 
 
-def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) -> None:
+def _write(context: StageContext, found: Discrepancy, limits: Sequence[Effect]) -> None:
+    """Write the arrays, and the verdict with its model but for the limits of the ADC."""
     context.begin()
     names, z_before, z_after = found.statistics
     arrays = evidence_arrays(
@@ -321,7 +326,6 @@ def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) 
     )
     for name, array in arrays.items():
         context.store.write_array(f"{_STAGE}/{name}", array)
-    limits = _limits(context, before)
     kept = tuple(each.model_dump(mode="json") for each in found.model if each not in limits)
     verdict = found.verdict.model_copy(update={"model_effects": kept})
     context.store.write_file(VERDICT_FILE, verdict.to_json().encode())

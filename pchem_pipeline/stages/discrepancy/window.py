@@ -59,10 +59,6 @@ class Window:
         """Frame numbers without the copies, which took no time."""
         return self.numbers - np.searchsorted(self.copied, self.numbers)
 
-    def pixel(self, y: int, x: int) -> tuple[int, int]:
-        """Return the place on the sensor of a pixel of the window."""
-        return y + self.rows[0], x + self.columns[0]
-
     @property
     def pixels(self) -> int:
         """Number of its pixels."""
