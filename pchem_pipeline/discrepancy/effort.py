@@ -63,12 +63,12 @@ class Effort:
     def begin(self) -> None:
         """Set the limit, now that the null distribution has been paid; no candidate was fitted for that."""
         self.tried.clear()
-        limit = math.inf if self.share is None else self.share * max(_LEAST, _OF_NULL * self.spent)
+        share = math.inf if self.share is None else self.share
+        limit = share * max(_LEAST, _OF_NULL * self.spent)
         self.kept, self.for_choice = _KEPT * limit, _FOR_CHOICE * limit
         self.most = self.spent + (1.0 - _KEPT) * limit
-        # one that was asked to be short is as short as that
-        short = self.share is not None and self.share < 1.0
-        self.for_fits = 0.0 if short else _FOR_FITS * limit
+        # a search that is asked to be short is so
+        self.for_fits = _FOR_FITS * limit if share >= 1.0 else 0.0
 
     def leave_for_fits(self) -> None:
         """Let something be left for fits: a search that asks all candidates and fits none is in vain."""

@@ -93,13 +93,9 @@ def scan_map(
 ) -> list[Suspect]:
     """Return the places that stand out of a map, the most significant first, each without those before it.
 
-    Args:
-        values: N(0, 1) where nothing is wrong, (y, x).
-        usable: pixels that count, (y, x).
-        significance: largest p-value.
-        most: places at most.
-        single: look for single pixels, too; not where far tails are heavier than normal.
-        next_along: axis along which each value is of a pixel and the next one: places reach one further.
+    Values are N(0, 1) where nothing is wrong, (y, x). ``single`` pixels are looked for, too, but not where
+    far tails are heavier than normal. If values are of pixels and those ``next_along`` an axis, places reach
+    one further.
     """
     some = usable & np.isfinite(values)
 
@@ -130,14 +126,10 @@ def scan_series(
     most: int = 2,
     shortest: int = families.FEWEST,
 ) -> list[Stretch]:
-    """Return the frames that stand out of a series, the most significant first.
+    """Return the frames that stand out of a series, the most significant first, ``most`` stretches.
 
-    Args:
-        values: N(0, 1) and independent where nothing is wrong, (n,).
-        numbers: frame numbers, increasing, (n,).
-        significance: largest p-value.
-        most: stretches at most.
-        shortest: frames that a range or a phase of a period must have.
+    Values are N(0, 1) and independent where nothing is wrong, (n,), of frames with increasing numbers. A
+    range or a phase of a period has ``shortest`` frames at least.
     """
     row = values[None]
 
@@ -287,14 +279,8 @@ def scan_event_map(
 ) -> list[Suspect]:
     """Return the places with more events than their share, the most significant first.
 
-    Their ``inside`` and ``outside`` are events beyond those expected per pixel.
-
-    Args:
-        seen: pixels with an event, (y, x).
-        expected: number of events in each, in proportion, (y, x).
-        usable: pixels that count, (y, x).
-        significance: largest p-value.
-        most: places at most.
+    Given are the pixels with an event, (y, x), and the number expected in each, but for a factor. ``inside``
+    and ``outside`` of a place are events beyond those expected per pixel.
     """
 
     def best(left: BoolArray) -> families.Place | None:

@@ -1,9 +1,8 @@
 """Locations of a disagreement: deviating statistics with their pixels, DN and frames.
 
-Samples that chance hardly makes are listed of either tail: those beyond the support of their pixel, and rarer
-ones. Of a thousand pixels up to ten have one beyond their support by chance. Those hide a dozen of a few
-pixels or frames with heavy tails, which lie farther out: so the samples are also looked at by themselves of
-which chance makes one in the whole stack.
+Rare samples are listed of either tail: those beyond the support of their pixel, which up to ten of a thousand
+pixels have by chance, and those of which chance makes one in the whole stack: a few pixels or frames with
+heavy tails have samples that lie farther out.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """Rows and columns of single frames whose samples belong to other pixels.
 
-Lines that change places, come a sample early or late, or lose one on the way: every sample is then one of
-another pixel, by whose histogram it is likely and by its own less so. A line's likelihood at another place
-over that at its own tells, for every place, and the sum of what a small share of such lines gains is the
-statistic. Lines put together of samples of different frames show what chance makes of it, whatever the
-histograms are.
+Lines change places, come a sample early or late, or lose one on the way: every sample is then one of another
+pixel. The statistic is the gain of log likelihood by a small share of lines at other places, less that of
+lines put together from samples of different frames, whatever the histograms are.
 """
 
 from __future__ import annotations

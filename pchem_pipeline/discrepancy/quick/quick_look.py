@@ -267,9 +267,9 @@ def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
 
 
 def _frame_means(sums: StackSums) -> FloatArray:
-    """Return the mean of each frame over the quiet rows; where sums are not at hand, over all rows."""
+    """Return the mean of each frame over the quiet rows; where sums of blocks are missing, over all rows."""
     quiet = _quiet(sums)
-    if not sums.whole or not quiet.any():
+    if sums.lengths.size != sums.n_blocks or not quiet.any():
         return sums.frame_mean if quiet.any() else np.zeros(0)
     return np.asarray(sums.row_sum[:, quiet].sum(axis=1) / sums.n_varying(quiet))
 

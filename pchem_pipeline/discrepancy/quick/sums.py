@@ -137,11 +137,6 @@ class StackSums:
         return self.block_sum.shape[1], self.block_sum.shape[2]
 
     @property
-    def whole(self) -> bool:
-        """Whether the sums of all blocks are at hand."""
-        return self.lengths.size == self.n_blocks
-
-    @property
     def starts(self) -> IntArray:
         """First frame of each block among those at hand, (b,)."""
         return np.asarray(np.cumsum(self.lengths) - self.lengths)
@@ -271,10 +266,6 @@ class CellMap:
         for total, part in ((self.sums, kept), (self.counts, some.astype(np.float64))):
             np.add.at(total, at, np.add.reduceat(part, self.columns[:-1], axis=1))
 
-    def mask(self, cells: BoolArray) -> BoolArray:
-        """Return the pixels of some cells, (y, x)."""
-        return np.repeat(np.repeat(cells, np.diff(self.rows), axis=0), np.diff(self.columns), axis=1)
-
 
 def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
     """Return maps of all pixels, all frames, each N(0, 1) where samples are independent, summed over cells.
@@ -323,5 +314,5 @@ def _place(name: str, cells: CellMap, significance: float) -> Suspect | None:
     if not (usable[inside].any() and usable[~inside].any()):
         return None
     means = [float(cells.sums[part].sum() / cells.counts[part].sum()) for part in (inside, ~inside)]
-    region = Region.of_mask(cells.mask(inside))
-    return replace(places[0], region=region, inside=means[0], outside=means[1])
+    pixels = np.repeat(np.repeat(inside, np.diff(cells.rows), axis=0), np.diff(cells.columns), axis=1)
+    return replace(places[0], region=Region.of_mask(pixels), inside=means[0], outside=means[1])

@@ -41,17 +41,10 @@ def evidence_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of group ``discrepancy``, by their names without the group.
 
-    Args:
-        evidence: what the frames show beyond the PCD.
-        before: the statistics standardised by replicates of the plain model; None for ``evidence.z``.
-        after: the same for the model with effects; None where nothing was added.
-        effects: the named effects; those whose path does not depend on chance are drawn over the frames.
-        integration_time: of the run, s.
-        bit_depth: of the ADC.
-        code_extended: samples expected at each code with the added effects; None where nothing was added.
-
-    Returns:
-        What the evidence lacks (everything along time for ready-made histograms) is absent.
+    The statistics ``before`` (None: those of the evidence) and ``after`` effects are added, with which
+    ``code_extended`` samples are expected at each code, are standardised by replicates. The paths of effects
+    that do not depend on chance are among the arrays. What the evidence lacks (everything along time for
+    ready-made histograms) is absent.
     """
     code = evidence.code
     found: dict[str, NDArray[Any]] = {

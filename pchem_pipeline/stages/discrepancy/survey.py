@@ -162,12 +162,8 @@ def places_of_bands(
 ) -> tuple[dict[str, Suspect], dict[str, float]]:
     """Return where histograms and pairs of pixels stand out, and the share of the samples looked at.
 
-    Args:
-        store: the run, with histograms and fit.
-        source: its frames.
-        plain: the pixels were fitted without effects, so that their histograms follow the plain law.
-        memory: bytes that this may take: lower bands; None: what the highest ones take.
-        left_out: frames that are not looked at.
+    The pixels are ``plain`` if they were fitted without effects, so that their histograms follow the plain
+    law. This takes ``memory`` bytes at most, by lower bands; None: what the highest ones take.
 
     Raises:
         ConfigError: it is not enough for the lowest ones.

@@ -82,13 +82,9 @@ def choose_window(
     The window lies where the sensor disagrees most, as much of it inside the place as outside: what is only
     there shows against its quiet neighbours. Without such a place it lies in the middle.
 
-    Args:
-        shape: frames, rows, columns of the stack.
-        settings: frames x pixels and pixels to look at, and frames in a block.
-        roi: rows and columns that the user asked for: y0, y1, x0, x1.
-        places: where the survey found that the sensor stands out.
-        left_out: odd frames, which are not looked at.
-        copied: those of them that are copies of earlier ones.
+    The shape of the stack is (frames, rows, columns), the ``roi`` (y0, y1, x0, x1) that the user asked for.
+    ``places`` are those where the sensor stands out, ``left_out`` odd frames, and ``copied`` those of them
+    that are copies of earlier ones.
     """
     kept = np.setdiff1d(np.arange(shape[0], dtype=np.int64), left_out)
     n_frames, ny, nx = kept.size, *shape[1:]
