@@ -355,8 +355,9 @@ def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> st
     state, data, added = found.state, found.samples, found.added
     titles = [_summary(each, sizes) for each in added.additions if each.named]
     if state == "consistent":
-        only = " (histograms of single pixels only; frames, rows, columns and neighbours were not tested)"
-        return f"No statistic tested disagrees with the model{only * (data == 'histograms')}{_nearly(found)}."
+        seen = " (histograms of single pixels only; frames, rows, columns and neighbours were not tested)"
+        seen = seen if data == "histograms" else ""
+        return f"No statistic tested disagrees with the model{seen}{_nearly(found)}."
     if state == "cannot_tell":
         return (
             "Frame order, neighbours and codes agree with the model; the shape of the histograms cannot be "

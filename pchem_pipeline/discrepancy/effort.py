@@ -67,7 +67,7 @@ class Effort:
         limit = share * max(_LEAST, _OF_NULL * self.spent)
         self.kept, self.for_choice = _KEPT * limit, _FOR_CHOICE * limit
         self.most = self.spent + (1.0 - _KEPT) * limit
-        # a search that is asked to be short is so
+        # a short search may end before any fit
         self.for_fits = _FOR_FITS * limit if share >= 1.0 else 0.0
 
     def leave_for_fits(self) -> None:

@@ -77,7 +77,7 @@ class Place:
 def successive(
     best: Callable[[BoolArray], Place | None], some: BoolArray, most: int
 ) -> Iterator[tuple[Place, BoolArray]]:
-    """Yield the most significant place (``best``) of some pixels and these, then that of the rest, ..."""
+    """Yield the most significant place of some pixels, with these, then that of the rest, and so on."""
     for _ in range(most):
         if some.sum() <= 2 * FEWEST or (place := best(some)) is None:
             return
@@ -296,7 +296,7 @@ def _ranges(edges: int, free: bool) -> IntArray:
 
 
 def with_sharp_ends(place: Place, at: Callable[[Edges], Contrast]) -> Place:
-    """Return a box with its ends among finer and finer cells, of all of which it counts; other places as is.
+    """Return a box with ends searched among finer and finer cells, all boxes counted; other places as is.
 
     ``at`` returns the contrast by cells of other edges.
     """

@@ -96,7 +96,7 @@ class FollowingSamples:
     ) -> FollowingSamples | None:
         """Prepare frames, codes (frame, y, x), in blocks at ``edges``, (b + 1,); None where they are too few.
 
-        Residuals count of pixels ``inside``, (y, x); ``most`` samples are looked at, in frames evenly spread.
+        Only residuals of pixels ``inside``, (y, x), count, of ``most`` samples, in frames evenly spread.
         """
         first = groups_of(edges, maps.usable.size, frames.size if most is None else most)
         if not first.size:

@@ -127,7 +127,7 @@ class FrameBlocks:
     def of(cls, frames: CodeArray, chosen: IntArray | None = None, together: int = 1) -> FrameBlocks:
         """Take frames in memory, codes (n, y, x): those at chosen positions (None: all).
 
-        So many successive ones come ``together`` in the same block.
+        Groups of ``together`` successive ones are never split between blocks.
         """
         n_frames = frames.shape[0] if chosen is None else chosen.size
 

@@ -226,7 +226,7 @@ class FrameView:
         """Return the statistic of slow variation of centred series of variance 1, from :meth:`block_sums`.
 
         The squares of the slowest 2, 4, 8 ... waves over the blocks are summed, and those of all; the most
-        significant sum counts (the adaptive test of Neyman, Fan 1996). So many of the series are independent.
+        significant sum counts (the adaptive test of Neyman, Fan 1996). ``freedom`` series are independent.
         """
         root = np.sqrt(np.diff(self.edges).astype(np.float64))
         middle = 0.5 * (self.edges[:-1] + self.edges[1:]) / self.n

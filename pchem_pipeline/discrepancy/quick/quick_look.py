@@ -336,8 +336,7 @@ def _resemblance(
 ) -> list[Check]:
     """Return whether pairs of samples are correlated, beyond what they share with others (and its error).
 
-    The covariance of each pair, NaN where there is none, is compared with its ``size`` if both were equal,
-    DN^2.
+    The covariance of each pair, NaN where there is none, is compared with that of equal samples, DN^2.
     """
     some = (size > 0) & np.isfinite(covariance)
     if not some.any():

@@ -253,15 +253,10 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
     usable &= np.isfinite(values).all(axis=0)
     usable &= counts.sum(axis=2) >= np.maximum(50, 100.0 * sum(outside))
     maps = PixelMaps(values[0], values[1], values[2], values[3], usable)
-    laws = pixel_laws(
-        PixelHistograms(
-            counts.reshape(-1, counts.shape[2]),
-            store.read("histogram/origin", part).ravel().astype(np.int64),
-            np.stack([each.ravel() for each in outside], axis=1).astype(np.float64),
-        ),
-        np.stack([each.ravel() for each in values], axis=1),
-        usable.ravel(),
-    )
+    origin = store.read("histogram/origin", part).ravel().astype(np.int64)
+    beyond = np.stack([each.ravel() for each in outside], axis=1).astype(np.float64)
+    seen = PixelHistograms(counts.reshape(-1, counts.shape[2]), origin, beyond)
+    laws = pixel_laws(seen, maps.columns, usable.ravel())
     return replace(maps, usable=laws.good.reshape(usable.shape)), laws
 
 
