@@ -191,7 +191,7 @@ def bit_statistics(found: PreviousBits | None) -> dict[str, float]:
         return {}
     scale = np.sqrt(np.maximum(np.diag(found.square), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(found.square / np.outer(scale, scale))
-    kept = (eigenvalues > _SMALLEST * eigenvalues.max()) if eigenvalues.size else np.zeros(0, np.bool_)
+    kept = eigenvalues > _SMALLEST * eigenvalues.max()
     if not kept.any():
         return {}
     projected = vectors.T[kept] @ (found.product / scale)

@@ -148,7 +148,7 @@ def part_evidence(
     """Return the evidence of a part alone, as of a sensor that ends with it: row 0 is its first.
 
     The maps are the fit of all these frames, of a window of the sensor (None: all of it); the other arguments
-    are those of :func:`.observe`. Blocks are shorter where the part has few frames.
+    are those of `observe`. Blocks are shorter where the part has few frames.
 
     Raises:
         PchEmError: it holds too few frames, or no usable pixel.
