@@ -364,9 +364,8 @@ def disagrees(null: NullModel, z: Measured, significance: float, tolerance: Floa
     """
     p = null.p_values(z.both, 2, tolerance)
     limit = 1.0 - (1.0 - significance) ** (1.0 / null.effective_tests)
-    pulls = [null.pulls(part, 1, tolerance) for part in (z.train, z.test)]
-    alone = [null.p_of(pull) < _REPLICATION for pull in pulls]
-    same = alone[0] & alone[1] & (pulls[0] * pulls[1] > 0)
+    train, test = (null.pulls(part, 1, tolerance) for part in (z.train, z.test))
+    same = (null.p_of(train) < _REPLICATION) & (null.p_of(test) < _REPLICATION) & (train * test > 0)
     same |= np.isin(null.names, list(EXACT))  # no false positives: one split is enough
     return bool(np.any(same & (p < limit)))
 

@@ -318,12 +318,9 @@ def scan_event_frames(
     as many terms as there are pairs of events. ``inside`` and ``outside`` are events beyond those expected
     per frame.
 
-    Args:
-        positions: of the frames with an event, increasing, none twice, (m,).
-        numbers: of all frames in the run, increasing, (n,).
-        expected: number of events in all frames.
-        significance: largest p-value.
-        shortest: frames that a range must have.
+    ``positions`` are those of the frames with an event, increasing, none twice, (m,); ``numbers`` are of all
+    frames in the run, (n,), in which ``expected`` events are by chance. A range has ``shortest`` frames or
+    more.
     """
     if positions.size > _MOST_EVENTS:
         expected *= _MOST_EVENTS / positions.size

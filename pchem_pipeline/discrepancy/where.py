@@ -226,7 +226,7 @@ def _pixels(name: str, evidence: Evidence, maps: Mapping[str, FloatArray]) -> tu
     allowed = _FALSE_DISCOVERY_RATE * np.arange(1, p.size + 1) / max(int(evidence.maps.usable.sum()), 1)
     passed = np.flatnonzero(p[order] <= allowed)
     count = min(int(passed[-1]) + 1, _MOST_LISTED) if passed.size else 0
-    return tuple((int(i) // values.shape[1], int(i) % values.shape[1]) for i in order[:count])
+    return tuple(divmod(int(i), values.shape[1]) for i in order[:count])
 
 
 def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:

@@ -35,15 +35,9 @@ def misplaced_lines(
 ) -> tuple[dict[str, float], dict[str, FloatArray]]:
     """Return the statistics of misplaced rows and columns, and their shares by place.
 
-    Args:
-        frames: codes (frame, y, x), DN.
-        counts: histograms of the pixels over all frames, (y * x, B).
-        origin: DN of their bin 0, (y * x,).
-        usable: pixels that count, (y, x).
-
-    Returns:
-        ``space.misplaced.rows`` and ``.columns``; by "rows" and "columns", where these stand out, the
-        likeliest share of lines from each of :data:`~.evidence.PLACES`, less the share by chance, shape (6,).
+    Frames are codes (frame, y, x), DN; histograms of their pixels are (y * x, B), with bin 0 at ``origin``.
+    The shares, by "rows" and "columns" where these stand out, are the likeliest ones of lines from each of
+    :data:`~.evidence.PLACES`, less those by chance, shape (6,).
     """
     z: dict[str, float] = {}
     shares: dict[str, FloatArray] = {}

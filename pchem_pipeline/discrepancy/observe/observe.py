@@ -119,13 +119,10 @@ def observe(
 def observe_histograms(
     counts: CodeArray, origin: IntArray, *, parameters: FloatArray | None = None
 ) -> Evidence:
-    """Return the evidence of ready-made histograms: maps of shape (1, n), and no time.
+    """Return the evidence of ready-made histograms (n, B) with bin 0 at ``origin``: maps (1, n), and no time.
 
-    Args:
-        counts: one histogram per pixel (and sample), (n, B).
-        origin: DN of bin 0, (n,).
-        parameters: (H, g, mu, sigma) of a fit of more than one histogram each, (n, 4), NaN where not usable;
-            None: each histogram is fitted by itself.
+    The parameters are (H, g, mu, sigma) of a fit of more than one histogram each, (n, 4), NaN where not
+    usable; None: each histogram is fitted by itself.
 
     Raises:
         PchEmError: no pixel is usable.

@@ -53,15 +53,10 @@ def quick_look(
     missing: dict[str, str] | None = None,
     command: str = "",
 ) -> QuickLook:
-    """Return the checks of a run.
+    """Return the checks of a run, of those of its sums and codes (histograms of some pixels) that there are.
 
-    Args:
-        sums: the summaries; None where there are none.
-        maps: the fitted parameters, (y, x).
-        codes: histograms of some pixels; None: codes are not looked at.
-        model: the effects that the pixels were fitted with.
-        missing: parts that are not looked at, and why.
-        command: for a full search.
+    The pixels were fitted with the effects of the model. ``missing``: parts that are not looked at, and why;
+    ``command``: for a full search.
     """
     checks: list[Check] = []
     usable = maps.usable
