@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 #: Largest share of a gap above its floor that may remain with effects that explain it.
 LARGEST_REST = 0.2
-#: Rivals of an effect that are fitted in its place and told.
+#: Largest number of rivals that are fitted in place of an effect and listed.
 MOST_RIVALS = 3
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
@@ -407,8 +407,8 @@ def _factor_words(factors: Mapping[str, tuple[str, ...]]) -> str:
     """State which factors of an effect are certain, and what the others may be."""
     words = ""
     for state, many in (("certain", False), ("open", True)):
-        told = [f"{schema.FACTORS[k]} ({' or '.join(v)})" for k, v in factors.items() if (len(v) > 1) is many]
-        words += f"; {state}: {_and(told)}" if told else ""
+        some = [f"{schema.FACTORS[k]} ({' or '.join(v)})" for k, v in factors.items() if (len(v) > 1) is many]
+        words += f"; {state}: {_and(some)}" if some else ""
     return words
 
 

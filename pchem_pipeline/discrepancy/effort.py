@@ -24,7 +24,7 @@ _ASKED = 2.0e-6
 _AMBIGUOUS = 4.0
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
 _LEAST, _OF_NULL = 170.0, 6.0
-#: Shares of that: kept for measuring what no effect explains, and besides for the choice among the sets.
+#: Shares of that: kept for measuring what no effect explains, and for the choice among the sets.
 _KEPT, _FOR_CHOICE = 0.25, 0.3
 #: The same that is left for fits, whatever it cost to find out what candidates would do.
 _FOR_FITS = 0.4

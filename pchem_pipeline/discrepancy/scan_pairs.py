@@ -37,11 +37,11 @@ from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 MODES = {"row": (1, 2), "column": (2, 1), "frame": (2, 2)}
 #: Pixels of a place, and its share of the sensor at most.
 FEWEST_PIXELS, LARGEST = 16, 0.6
-#: Lines are told apart by their number modulo this.
+#: Lines are distinguished by their number modulo this.
 PERIOD = 32
 #: Cells along an edge of the sensor, for lines; half as many for frames.
 _CELLS = 64
-#: Of each table of sums of products: two channels and the counts, as gathered and as told.
+#: Of each table of sums of products: two channels and the counts, as gathered and as returned.
 _COPIES = 9
 _CONTRAST = 0.4  # mean outside of a place over that inside, at most
 #: Guesses that are held against the scatter of the frames, the most significant first.

@@ -152,8 +152,8 @@ class FollowingSamples:
         number = (self.groups * (GROUP - np.arange(STEPS))).astype(np.float64)
         found = []
         for axes, total in zip(views, sums, strict=True):
-            told = np.flip(self.scale > 0.0, tuple(axis - 1 for axis in axes))
-            to, source = (fft.rfftn(mask.astype(np.float64), size) for mask in (self.inside, told))
+            counted = np.flip(self.scale > 0.0, tuple(axis - 1 for axis in axes))
+            to, source = (fft.rfftn(mask.astype(np.float64), size) for mask in (self.inside, counted))
             products = _centred(total, size, (ny, nx))
             pairs = np.rint(_centred((to.conj() * source)[None], size, (ny, nx))) * number[:, None, None]
             if not axes:

@@ -28,7 +28,7 @@ _LEADING = 2  # statistics of a signature that are looked at
 
 @dataclass(frozen=True)
 class SensorWindow:
-    """The rows and columns of a sensor that are looked at; regions are told on the sensor.
+    """The rows and columns of a sensor that are looked at; regions are in coordinates of the sensor.
 
     Attributes:
         rows, columns: first, and end.

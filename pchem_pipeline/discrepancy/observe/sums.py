@@ -38,7 +38,7 @@ class PixelStatistics:
             common to all pixels taken away.
         gain_variance: variance of that sum in one frame.
         noise: variance of r^2, in that of r squared: 2 for Gaussian residuals.
-        square: weights of r^2 by which a common relative change of the noise is told best.
+        square: weights of r^2 that measure a common relative change of the noise best.
     """
 
     usable: BoolArray
