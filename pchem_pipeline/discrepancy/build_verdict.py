@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 #: Largest share of a gap above its floor that may remain with effects that explain it.
 LARGEST_REST = 0.2
-#: Rivals of an effect that are fitted in its place and told.
+#: Largest number of rivals that are fitted in place of an effect and listed.
 MOST_RIVALS = 3
 _MOST_UNEXPLAINED = 8
 _MOST_RESIDUALS = 3
@@ -43,10 +43,9 @@ LEAVES_TOO_MUCH = "it leaves too much of the discrepancy"
 
 @dataclass(frozen=True)
 class Addition:
-    """An effect added to the model, or the likeliest of several.
+    """An effect added to the model with its fitted parameters, or the likeliest of several.
 
     Attributes:
-        effect: with its fitted parameters.
         alone: whether all others are excluded.
         against: reason of its rejection, starting with "it"; empty if it is accepted.
         stderr: standard errors of its parameters, of those that have one.
@@ -130,17 +129,12 @@ class Addition:
 
     def _separate(self) -> dict[str, str]:
         """Return, by effect, the measurement that would distinguish it from this one."""
-        known = dict(type(self.effect).separate)
-        if self.named:
-            return known
-        found = {}
-        for each in self.candidates:
-            other = effect_classes().get(each.effect)
-            back = {} if other is None else other.separate
-            if each.effect != self.effect.tag and not self.alone:
-                text = known.get(each.effect) or back.get(self.effect.tag) or _more_samples(each)
-                found[each.effect] = text
-        return found
+        known, tag, classes = dict(type(self.effect).separate), self.effect.tag, effect_classes()
+        if self.named or self.alone:
+            return known if self.named else {}
+        others = [each for each in self.candidates if each.effect != tag]
+        back = {c.effect: classes[c.effect].separate.get(tag) for c in others if c.effect in classes}
+        return {c.effect: known.get(c.effect) or back.get(c.effect) or _more_samples(c) for c in others}
 
 
 @dataclass(frozen=True)
@@ -183,12 +177,10 @@ class Findings:
 
     Attributes:
         samples: kind of data ("frames", "histograms").
-        z: statistics of the data.
         first, last: null distribution of the model before and after.
         before: gap on the final samples without new effects.
         places: disagreements of the data with the model before.
         still: whether the data disagree with the final model.
-        added: added effects, and the remaining discrepancy.
         doubt, limit: see :class:`~pchem_pipeline.discrepancy.verdict.Verdict`.
     """
 
@@ -238,13 +230,18 @@ class Findings:
         complete = self.added.after.at_floor and all(each.fits for each in self.added.additions)
         return () if complete else self.described
 
-    def model(self, present: Sequence[Effect], extended: Sequence[Effect]) -> tuple[Effect, ...]:
-        """Return the model with the named effects and complete descriptions.
+    @property
+    def pulls(self) -> tuple[FloatArray, FloatArray]:
+        """Pulls of the statistics under the model before and after, shape (m,) each."""
+        return self.first.pulls(self.z.both, splits=2), self.last.pulls(self.z.both, splits=2)
 
-        Args:
-            present: effects before the search.
-            extended: the same, and all that were added.
-        """
+    @property
+    def closed(self) -> float:
+        """The share of the gap that the added effects close."""
+        return schema.closed_share(self.before.value, self.added.after.value)
+
+    def model(self, present: Sequence[Effect], extended: Sequence[Effect]) -> tuple[Effect, ...]:
+        """Return the effects present before the search, the named ones and complete descriptions."""
         kept = self.named if self.proposed else (*self.named, *self.described)
         keys = {effect.key for effect in (*present, *kept)}
         return tuple(effect for effect in extended if effect.key in keys)
@@ -253,14 +250,7 @@ class Findings:
 def build_verdict(
     found: Findings, data: Prepared, model: tuple[Effect, ...], fitted: Fitted
 ) -> schema.Discrepancy:
-    """Build the verdict.
-
-    Args:
-        found: results of the search.
-        data: that were searched.
-        model: effects of the final model.
-        fitted: the pixels under it.
-    """
+    """Build the verdict on data from the results of a search, the final model, and the pixels under it."""
     additions, before, after = found.added.additions, found.before, found.added.after
     # unidentified gain and read noise give no size in e-
     sizes = {
@@ -270,7 +260,6 @@ def build_verdict(
         for each in additions
     }
     both = found.z.both
-    pulls = found.first.pulls(both, splits=2), found.last.pulls(both, splits=2)
     return schema.Discrepancy(
         verdict=schema.Verdict(
             verdict=found.state,
@@ -285,13 +274,13 @@ def build_verdict(
                 before=before.value,
                 after=after.value,
                 floor=after.floor,
-                closed_fraction=schema.closed_share(before.value, after.value) if additions else 0.0,
+                closed_fraction=found.closed if additions else 0.0,
                 interval_before=before.interval,
                 interval_after=after.interval,
                 standing_out=after.standing_out,
             ),
             where=tuple(found.places),
-            unexplained=(*found.added.residuals, *_still(found, pulls[1])),
+            unexplained=(*found.added.residuals, *_still(found, found.pulls[1])),
             set_aside=found.added.set_aside if found.named else (),
             untestable=dict(data.untestable),
             defects=dict(data.defects),
@@ -304,7 +293,7 @@ def build_verdict(
         model=model,
         maps=fitted.maps,
         evidence=data.evidence,
-        statistics=(found.first.names, *pulls),
+        statistics=(found.first.names, *found.pulls),
         code_extended=fitted.code_extended,
         added=fitted.added,
     )
@@ -354,7 +343,7 @@ def _nearly(found: Findings) -> str:
     p = found.first.global_p(found.z.both, 2)
     if p < FALSE_ALARM:
         least = int(np.argmin(found.first.p_values(found.z.both, 2)))
-        says = STATISTICS[found.first.names[least]].says(float(found.first.pulls(found.z.both, 2)[least]))
+        says = STATISTICS[found.first.names[least]].says(float(found.pulls[0][least]))
         words.append(f"{says} (p = {p:.1g}, corrected for the number of statistics)")
     if not found.before.at_floor:
         words.append("all statistics together exceed the 95 % limit of sampling noise")
@@ -375,10 +364,8 @@ def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> st
             f"tested: {found.doubt}."
         )
     if state == "unexplained":
-        first = found.places[0] if found.places else None
-        lead = f": {first.sentence or first.statistic}" if first is not None else ""
-        words = f"{lead}; {_none(found)} explains it{_left(added)}{_broken(found)}"
-        return f"Data and model disagree{words}."
+        lead = "".join(f": {place.sentence or place.statistic}" for place in found.places[:1])
+        return f"Data and model disagree{lead}; {_none(found)} explains it{_left(added)}{_broken(found)}."
     if state == "described":
         return _described(found, titles, sizes)
     if state == "ambiguous":
@@ -388,10 +375,9 @@ def _sentence(found: Findings, sizes: Mapping[Effect, schema.Size | None]) -> st
     if state == "named_in_part":
         words = f"{_rest(found)}{_shown(found)}{_left(added)}"
         return f"The data show {_and(titles)}{words}{_broken(found)}."
-    return (
-        f"The data show {_and(titles)}; with {'them' if len(titles) > 1 else 'it'} in the model, no "
-        f"statistic tested disagrees{_left(added)}."
-    )
+    them = "them" if len(titles) > 1 else "it"
+    lead = f"The data show {_and(titles)}; with {them} in the model"
+    return f"{lead}, no statistic tested disagrees{_left(added)}."
 
 
 def _none(found: Findings) -> str:
@@ -421,8 +407,8 @@ def _factor_words(factors: Mapping[str, tuple[str, ...]]) -> str:
     """State which factors of an effect are certain, and what the others may be."""
     words = ""
     for state, many in (("certain", False), ("open", True)):
-        told = [f"{schema.FACTORS[k]} ({' or '.join(v)})" for k, v in factors.items() if (len(v) > 1) is many]
-        words += f"; {state}: {_and(told)}" if told else ""
+        some = [f"{schema.FACTORS[k]} ({' or '.join(v)})" for k, v in factors.items() if (len(v) > 1) is many]
+        words += f"; {state}: {_and(some)}" if some else ""
     return words
 
 
@@ -445,8 +431,7 @@ def _described(found: Findings, titles: Sequence[str], sizes: Mapping[Effect, sc
     before, after = found.before, found.added.after
     closed = f"does not reduce the discrepancy in unseen {found.samples}"
     if not before.at_floor and after.value < before.value:
-        share = percent(schema.closed_share(before.value, after.value))
-        closed = f"explains {share} of the discrepancy in unseen {found.samples}"
+        closed = f"explains {percent(found.closed)} of the discrepancy in unseen {found.samples}"
     rest = "; single statistics still disagree" if found.still else ""
     if found.proposed:
         rest = "; more than sampling noise remains, so it is proposed, not added to the model"
@@ -467,8 +452,7 @@ def _rest(found: Findings) -> str:
         return ""
     if after.value <= after.floor:
         return f"; a significant discrepancy remains in {schema.families_words(after.standing_out)}"
-    left = 1.0 - schema.closed_share(found.before.value, after.value)
-    return f"; {percent(left)} of the discrepancy remains"
+    return f"; {percent(1.0 - found.closed)} of the discrepancy remains"
 
 
 def _broken(found: Findings) -> str:
@@ -486,10 +470,9 @@ def _shown(found: Findings) -> str:
     """Name the statistic that still deviates though the gap is at its floor."""
     if not found.still or not found.added.after.at_floor:
         return ""
-    pulls = found.last.pulls(found.z.both, splits=2)
+    pulls = found.pulls[1]
     worst = int(np.argmax(np.abs(pulls)))
-    name = found.last.names[worst]
-    says = STATISTICS[name].says(float(pulls[worst]))
+    says = STATISTICS[found.last.names[worst]].says(float(pulls[worst]))
     return f"; one statistic still disagrees: {says} ({schema.sigma_text(pulls[worst])})"
 
 

@@ -24,7 +24,7 @@ _ASKED = 2.0e-6
 _AMBIGUOUS = 4.0
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
 _LEAST, _OF_NULL = 170.0, 6.0
-#: Shares of that: kept for measuring what no effect explains, and besides for the choice among the sets.
+#: Shares of that: kept for measuring what no effect explains, and for the choice among the sets.
 _KEPT, _FOR_CHOICE = 0.25, 0.3
 #: The same that is left for fits, whatever it cost to find out what candidates would do.
 _FOR_FITS = 0.4
@@ -36,12 +36,12 @@ class EffortSpentError(Exception):
 
 @dataclass
 class Effort:
-    """Work of a search.
+    """Work of a search, CPU seconds by count.
 
     Attributes:
-        share: times what a search may cost by default; None: no limit.
-        spent: CPU seconds by count.
-        most: the same at which nothing more is begun; infinite until the null distribution is there.
+        share: factor on the default budget; None: no limit.
+        spent: so far.
+        most: nothing more is begun beyond it; infinite until the null distribution is drawn.
         kept: for what no effect explains.
         for_choice: for the choice among the sets that were tried.
         for_fits: the least that is left for fits of candidates once they are compared.
@@ -63,12 +63,12 @@ class Effort:
     def begin(self) -> None:
         """Set the limit, now that the null distribution has been paid; no candidate was fitted for that."""
         self.tried.clear()
-        limit = math.inf if self.share is None else self.share * max(_LEAST, _OF_NULL * self.spent)
+        share = math.inf if self.share is None else self.share
+        limit = share * max(_LEAST, _OF_NULL * self.spent)
         self.kept, self.for_choice = _KEPT * limit, _FOR_CHOICE * limit
         self.most = self.spent + (1.0 - _KEPT) * limit
-        # one that was asked to be short is as short as that
-        short = self.share is not None and self.share < 1.0
-        self.for_fits = 0.0 if short else _FOR_FITS * limit
+        # a short search may end before any fit
+        self.for_fits = _FOR_FITS * limit if share >= 1.0 else 0.0
 
     def leave_for_fits(self) -> None:
         """Let something be left for fits: a search that asks all candidates and fits none is in vain."""
@@ -84,18 +84,11 @@ class Effort:
 
     def simulate(self, samples: int, pixels: int, fits: int) -> None:
         """Count a simulated stack, whose pixels are fitted so many times."""
-        self.spent += _SAMPLE * samples + _FIT * self._hard * pixels * fits
+        self.spent += _SAMPLE * samples + _FIT * self._difficulty * pixels * fits
 
     def refit(self, pixels: int, components: int, evaluations: float, tags: Iterable[str]) -> None:
-        """Count a fit of all pixels with effects.
-
-        Args:
-            pixels: that were fitted.
-            components: of their law.
-            evaluations: of the likelihood of a pixel, on average.
-            tags: of the effects.
-        """
-        self.spent += self._hard * pixels * components * (_REFIT + _REFIT_BY * evaluations)
+        """Count a fit of pixels with effects, ``evaluations`` of the likelihood of each on average."""
+        self.spent += self._difficulty * pixels * components * (_REFIT + _REFIT_BY * evaluations)
         self.tried |= set(tags)
 
     def learn(self, pixels: int, components: int) -> None:
@@ -127,6 +120,6 @@ class Effort:
         return f"the search used its budget before {spent}" + (f"; not tried: {untried}" if untried else "")
 
     @property
-    def _hard(self) -> float:
+    def _difficulty(self) -> float:
         """How many times as long a fit takes as where all peaks are resolved."""
         return 1.0 + _AMBIGUOUS * self.ambiguous

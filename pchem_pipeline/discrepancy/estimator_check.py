@@ -26,7 +26,7 @@ _BLOCK = 50  # frames, as many as a search looks at in one piece
 
 @dataclass(frozen=True)
 class RecoveredStrength:
-    """What an estimator makes of several stacks.
+    """The strengths that an estimator finds in several stacks.
 
     Attributes:
         true: strength that the effect has in the stacks.
@@ -90,9 +90,8 @@ def recovered_strength(
         raise ConfigError(f"effect {effect.tag!r} has no strength; name the field that scales it")
     if unknown := [name for name in effect.signature if name not in STATISTICS]:
         raise ConfigError(
-            f"effect {effect.tag!r}: its signature names no statistics: "
-            f"{', '.join(unknown)}; they are listed "
-            "in pchem_pipeline/discrepancy/observe/catalogue.py"
+            f"effect {effect.tag!r}: its signature names no statistics: {', '.join(unknown)}; they are "
+            "listed in pchem_pipeline/discrepancy/observe/catalogue.py"
         )
     _check_reach(effect, shape, seed)
     found = np.full(stacks, np.nan)

@@ -1,10 +1,10 @@
 """Families of places on a sensor or in a series, and the place of each that stands out most.
 
-What is seen in a place is a sum over it: of the values of a map, of events, or of the products of all pairs
-of its pixels. A :class:`Contrast` says how far such a sum is from the share of the whole that its count asks
-for (pixels, events by chance, pairs). Sums over bands and rectangles come from cumulative tables, in which
-pairs have an axis twice; these boxes are of cells, and around the ends of the best one the scan goes on with
-finer cells, down to single lines. The probability of a place is the union bound over all of its family.
+The statistic of a place is a sum over it: of the values of a map, of events, or of products of all pairs of
+its pixels. A :class:`Contrast` compares the sum with the share of the whole that its count asks for (pixels,
+events by chance, pairs). Sums over bands and rectangles come from cumulative tables, in which pairs have an
+axis twice; these boxes are of cells, and around the ends of the best one the scan goes on with finer cells,
+down to single lines. The p-value of a place is the union bound over its family.
 """
 
 from __future__ import annotations
@@ -49,7 +49,6 @@ class Place:
     """The best place of a family.
 
     Attributes:
-        family: its name.
         mask: its pixels, (y, x).
         z: deviation of the mean inside from that outside, standard errors.
         log_places: logarithm of the number of places that were looked at.
@@ -78,13 +77,7 @@ class Place:
 def successive(
     best: Callable[[BoolArray], Place | None], some: BoolArray, most: int
 ) -> Iterator[tuple[Place, BoolArray]]:
-    """Yield what stands out most, then what does so without it, and so on, with the pixels it stands out of.
-
-    Args:
-        best: returns the most significant place among pixels that count; None without.
-        some: pixels that count, (y, x).
-        most: places at most.
-    """
+    """Yield the most significant place of some pixels, with these, then that of the rest, and so on."""
     for _ in range(most):
         if some.sum() <= 2 * FEWEST or (place := best(some)) is None:
             return
@@ -93,11 +86,9 @@ def successive(
 
 
 def best_place(families: Sequence[Place | None], better: float = PRICE) -> Place | None:
-    """Return the place of the smallest probability of all families, whose number it then counts as well.
+    """Return the place of the smallest probability of all families, corrected for their number.
 
-    Args:
-        families: the best place of each, the simpler ones first; None: it has none.
-        better: nats by which one of a later family must be less probable.
+    Simpler families come first; the place of a later one must be less probable by ``better``, nats.
     """
     best: Place | None = None
     for each in families:
@@ -110,7 +101,7 @@ def best_place(families: Sequence[Place | None], better: float = PRICE) -> Place
 
 
 def cell_edges(n: int, most: int) -> IntArray:
-    """Return the edges of cells of about as many of n lines each, ``most`` of them or one for each line."""
+    """Return the edges of cells of about equal size of n lines, ``most`` of them or one for each line."""
     return np.unique(np.linspace(0, n, min(n, most) + 1).astype(np.int64))
 
 
@@ -124,12 +115,8 @@ def cumulative(table: FloatArray) -> FloatArray:
 def box_sums(table: FloatArray, axes: tuple[int, int], rows: Ranges, columns: Ranges) -> FloatArray:
     """Return sums over all boxes of some ranges of rows and of columns, (ranges of rows, of columns).
 
-    Args:
-        table: cumulative, of pixels (y, x), of pairs of a row (y, x, x), of a column (y, y, x), of a frame
-            (y, y, x, x).
-        axes: of the table that are rows, and columns.
-        rows: first indices of ranges, and their ends.
-        columns: the same of columns.
+    The table is cumulative, of pixels (y, x), of pairs of a row (y, x, x), of a column (y, y, x), or of a
+    frame (y, y, x, x); ``axes``: how many of its axes are rows, and columns.
     """
     if axes[0] > axes[1]:  # less is left of an axis that is there twice
         turned = np.moveaxis(table, (0, 1), (-2, -1))
@@ -201,12 +188,8 @@ class Contrast:
 def normal(total: float, number: float, variance: float, fewest: float, one_sided: bool = False) -> Null:
     """Return the null of normal sums with a mean and a variance in proportion to their count.
 
-    Args:
-        total: sum of all.
-        number: their count.
-        variance: of a sum, by its count.
-        fewest: count of a place, and of all outside of it.
-        one_sided: only sums that are too large count.
+    ``total`` and ``number`` are sum and count of all, ``variance`` is by count, ``fewest`` the smallest count
+    inside and outside of a place; if ``one_sided``, only sums that are too large count.
     """
 
     def deviations(sums: FloatArray, counts: FloatArray) -> FloatArray:
@@ -239,13 +222,9 @@ def events(total: float) -> Null:
 def contrast_of_map(
     values: FloatArray, some: BoolArray, fewest: int = FEWEST, frames: IntArray | None = None
 ) -> Contrast:
-    """Return the contrast of values that are N(0, 1) by chance, far ones clipped.
+    """Return the contrast of values that are N(0, 1) by chance, of a map (y, x) or a series (1, n) of frames.
 
-    Args:
-        values: of a map (y, x), or of a series (1, n).
-        some: which of them count.
-        fewest: values inside and outside of a place.
-        frames: numbers of the frames of a series.
+    ``some`` of them count, ``fewest`` of these inside and outside of a place. Far ones are clipped.
     """
     values = np.clip(np.where(some, values, 0.0), -FAR, FAR)
     # what stands out widens the spread of the whole: take it from the middle
@@ -317,13 +296,9 @@ def _ranges(edges: int, free: bool) -> IntArray:
 
 
 def with_sharp_ends(place: Place, at: Callable[[Edges], Contrast]) -> Place:
-    """Return a box that ends with cells with ends among finer and finer ones around them, other places as is.
+    """Return a box with ends searched among finer and finer cells, all boxes counted; other places as is.
 
-    All boxes that were looked at are counted.
-
-    Args:
-        place: the best of its family.
-        at: returns the contrast by cells of other edges.
+    ``at`` returns the contrast by cells of other edges.
     """
     for _ in range(_ROUNDS):
         if place.edges is None:
@@ -351,12 +326,9 @@ def _finer(edges: IntArray, inside: IntArray) -> IntArray:
 
 
 def box_of_map(contrast: Contrast, family: str, shortest: int | None = None) -> Place | None:
-    """Return the best band of rows or columns, or rectangle, to a line; all of them are counted.
+    """Return the best box of a family of :data:`BOXES` to a line; all of them are counted.
 
-    Args:
-        contrast: of a map.
-        family: of :data:`BOXES`.
-        shortest: the columns are frames, and ranges of them have so many at least.
+    ``shortest``: the columns are frames, of which a range has so many at least.
     """
     most = _CELLS if family == "rectangle" else _RANGE_CELLS
     rows, columns = (
@@ -377,12 +349,8 @@ def every_nth(
 ) -> Place | None:
     """Return the best set of every n-th row (axis 0) or column (axis 1).
 
-    Args:
-        contrast: of all lines.
-        axis: 0 for rows, 1 for columns.
-        periods: that are tried, increasing.
-        cycles: of a period, at least, among the lines.
-        better: factor by which a longer period must deviate more.
+    Periods (increasing) with fewer cycles among the lines are not tried; a longer one must deviate more by
+    the factor ``better``.
     """
     number, z, lines = contrast.numbers(axis), 0.0, np.zeros(0, np.bool_)
     periods = [each for each in periods if cycles * each <= number.size]

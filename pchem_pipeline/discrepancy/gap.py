@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import special
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.null import STRAY, Covariance, NullModel, moments
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere, robust_sd
@@ -34,7 +34,7 @@ class Gap:
     """A gap, nats per sample.
 
     Attributes:
-        value: the gap; negative by sampling noise only.
+        value: negative by sampling noise only.
         floor: 95 % quantile under the model.
         interval: 95 % interval.
         families: contribution of each family of statistics.
@@ -58,21 +58,15 @@ class Gap:
         families: Mapping[str, float] | None = None,
         standing_out: tuple[str, ...] = (),
     ) -> Gap:
-        """Compute gap, floor and interval from a distance.
+        """Compute gap, floor and interval from a distance, nats, and those of replicates (b,), by chance.
 
-        Args:
-            distance: distance of the data from the model, nats.
-            chance: distances of replicates of the model, nats, shape (b,).
-            n_samples: number of samples of the distance.
-            variance: additional variance of the distance, nats^2.
-            families: contributions, nats per sample; None: all of family "shape".
-            standing_out: significant families.
+        The variance is what the distance has in addition, nats^2. The families are by default "shape" alone.
         """
         expected = float(chance.mean())
-        spread = float(np.sqrt(chance.var(ddof=1) + variance))
+        reach = _INTERVAL * float(np.sqrt(chance.var(ddof=1) + variance))
         total = distance - expected
         value = total / n_samples
-        ends = (total - _INTERVAL * spread) / n_samples, (total + _INTERVAL * spread) / n_samples
+        ends = (total - reach) / n_samples, (total + reach) / n_samples
         # unbiased for few replicates: one more exceeds it with probability 0.05
         floor = float(np.quantile(chance, _FLOOR_QUANTILE, method="weibull") - expected) / n_samples
         return cls(value, floor, ends, {"shape": value} if families is None else families, standing_out)
@@ -83,10 +77,7 @@ class Gap:
         return self.value <= self.floor and not self.standing_out
 
     def too_wide(self, closed: float) -> bool:
-        """Test whether the remaining gap is too large to name an effect that closed ``closed``.
-
-        The lower end of the interval counts, since few samples measure a small gap poorly.
-        """
+        """Test whether the rest (few samples measure it poorly) is too large to name what closed so much."""
         return max(self.interval[0], 0.0) >= _REST_OF_NAMED * closed
 
 
@@ -142,7 +133,7 @@ class StatisticsGap:
         )
 
     def _covariance(self, mean: FloatArray) -> Covariance:
-        """Compute the covariance for a model of expectation ``mean``."""
+        """Compute the covariance for a model of this expectation."""
         counts = self.null.events * np.maximum(mean - self.null.mean, 0.0)
         return self.null.covariance.plus(counts)
 
@@ -155,8 +146,7 @@ class StatisticsGap:
     def _own_distances(self, replicates: FloatArray, strengths: FloatArray | None) -> dict[str, FloatArray]:
         """Compute half the squared distances of the replicates, (b,) or (2 b,) for each family.
 
-        Each replicate is compared with mean and covariance of the others (leave-one-out), with random errors
-        of the strengths of either sign. Outliers are left out.
+        Leave-one-out, with random errors of the strengths of either sign, without outliers.
         """
         key = id(replicates), id(strengths)
         if key in self._known:
@@ -175,22 +165,14 @@ class StatisticsGap:
                 white = covariance.among(index).white(apart[:, index])
                 own[family].append(0.5 * np.sum(white**2, axis=1))
         found = {family: np.concatenate(values) for family, values in own.items()}
-        kept = among_themselves(np.sum(list(found.values()), axis=0), _APART if known else STRAY)
+        total = np.sum(list(found.values()), axis=0)
+        middle, apart = float(np.median(total)), _APART if known else STRAY
+        # each is half a chi-square, of which this is the least scatter
+        kept = total <= middle + apart * max(robust_sd(total), np.sqrt(max(middle, 0.5)))
         found = {family: values[kept] for family, values in found.items()}
         # the vectors are kept with it: an id is given again to what comes after them
         self._known[key] = replicates, strengths, found
         return found
-
-
-def among_themselves(distances: FloatArray, apart: float = _APART) -> BoolArray:
-    """Return which replicates are no outliers, (b,).
-
-    Args:
-        distances: half a chi-square each, nats, shape (b,).
-        apart: limit, robust standard deviations, at least those of a chi-square distribution.
-    """
-    middle = float(np.median(distances))
-    return np.asarray(distances <= middle + apart * max(robust_sd(distances), np.sqrt(max(middle, 0.5))))
 
 
 def _stands_out(distance: float, chance: FloatArray, families: int) -> bool:

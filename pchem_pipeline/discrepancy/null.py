@@ -68,27 +68,27 @@ class Covariance:
         return np.asarray(self.own + np.einsum("rm,rm->m", self.common, self.common))
 
     def times(self, factor: float) -> Covariance:
-        """Return so many times the covariance; the factor is not negative."""
+        """Return the covariance times a factor that is not negative."""
         return Covariance(self.own * factor, self.common * np.sqrt(factor))
 
     def scaled(self, ratio: FloatArray) -> Covariance:
-        """Return that of statistics so many times as large each, shape (m,)."""
+        """Return the covariance of statistics that are each multiplied by a ratio, shape (m,)."""
         return Covariance(self.own * ratio**2, self.common * ratio)
 
     def plus(self, variances: FloatArray) -> Covariance:
-        """Return it with independent scatter besides, shape (m,)."""
+        """Return the covariance with independent variances added, shape (m,)."""
         return replace(self, own=self.own + variances)
 
     def with_modes(self, modes: FloatArray) -> Covariance:
-        """Return it with further modes, each of which scatters with a deviation of 1, shape (k, m)."""
+        """Return the covariance with further common modes, shape (k, m)."""
         return replace(self, common=np.concatenate([self.common, modes]))
 
     def among(self, kept: BoolArray | list[int]) -> Covariance:
-        """Return that of some of the statistics."""
+        """Return the covariance of some of the statistics."""
         return Covariance(self.own[kept], self.common[:, kept])
 
     def white(self, rows: FloatArray) -> FloatArray:
-        """Return vectors, (..., m), in a basis in which they scatter independently with a deviation of 1."""
+        """Whiten vectors, (..., m): return them in a basis in which their covariance is the identity."""
         scale, modes, change, _ = self._whitening
         scaled = rows / scale
         return np.asarray(scaled + ((scaled @ modes.T) * change) @ modes)
@@ -100,9 +100,9 @@ class Covariance:
 
     @cached_property
     def _whitening(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """Own deviations, common modes as orthonormal rows, by how much each shrinks, the determinant.
+        """Own deviations, orthonormal common modes, the shrinkage of each, half the log determinant.
 
-        Of ``I + V.T V`` the symmetric root, from the eigenvectors of the smaller of ``V V.T`` and ``V.T V``.
+        From the eigenvectors of the smaller of ``V V.T`` and ``V.T V`` with V the scaled common modes.
         """
         scale = np.sqrt(self.own)
         common = self.common / scale
@@ -123,8 +123,7 @@ class NullModel:
 
     Attributes:
         names: names of the statistics, shape (m,).
-        mean: shape (m,).
-        std: standard deviations, shape (m,).
+        mean, std: mean and standard deviation of each, shape (m,).
         covariance: shrunk towards its diagonal.
         replicates: the vectors, shape (b, m).
         skewness: skewness of the statistics of one split, shape (m,).
@@ -150,14 +149,10 @@ class NullModel:
         *,
         effects: bool = False,
     ) -> NullModel:
-        """Estimate the null distribution from replicates.
+        """Estimate the null distribution from replicates, shape (b, m).
 
-        Args:
-            names: names of the statistics.
-            vectors: the replicates, shape (b, m).
-            before: null of the model to which effects were added; standard deviations of statistics that they
-                neither shift nor widen are pooled with it.
-            effects: whether the model has effects, as one with a model before it has.
+        Standard deviations of statistics that added effects neither shift nor widen are pooled with those of
+        the model before. ``effects``: whether the model has any, as one with a model before it has.
         """
         vectors = without_strays(vectors, STRAY if effects or before is not None else _STRAY_ALONE)
         mean, std, covariance = moments(vectors)
@@ -172,12 +167,9 @@ class NullModel:
         return cls(names, mean, std, covariance, vectors, skewness, tests)
 
     def moved_by(self, vectors: FloatArray) -> BoolArray:
-        """Test which statistics effects shift (t-test) or widen (F-test), shape (m,).
+        """Test which statistics effects, in replicates (b, m), shift (t-test) or widen (F-test), shape (m,).
 
         A common mode widens trends and correlations in time without shifting them.
-
-        Args:
-            vectors: replicates with the effects, shape (b, m).
         """
         n = len(vectors)
         moved = np.abs(vectors.mean(axis=0) - self.mean) > CERTAIN * self.std / np.sqrt(n)
@@ -185,7 +177,7 @@ class NullModel:
         return np.asarray(moved | (wider < _WIDER))
 
     def shifted(self, shift: FloatArray) -> NullModel:
-        """Return the null with all means shifted by ``shift``, shape (m,)."""
+        """Return the null with shifted means, shape (m,)."""
         return replace(self, mean=self.mean + shift, replicates=self.replicates + shift)
 
     @property
@@ -235,7 +227,7 @@ def moments(vectors: FloatArray) -> tuple[FloatArray, FloatArray, Covariance]:
     """Compute mean, standard deviation and shrunk covariance of replicates, shape (b, m)."""
     mean = vectors.mean(axis=0)
     off = vectors - mean
-    std, length = _std(off), np.linalg.norm(off, axis=0)
+    std, length = _std(np.sum(off**2, axis=0), len(off) - 1), np.linalg.norm(off, axis=0)
     # deviations of length 1, whose products are the correlations; a constant has none
     common = np.sqrt(1.0 - _SHRINKAGE) * off / np.where(length > 0.0, length, 1.0)
     own = np.where(length > 0.0, _SHRINKAGE, 1.0)
@@ -250,8 +242,7 @@ def two_sided(pulls: FloatArray, freedom: float) -> FloatArray:
 def without_strays(vectors: FloatArray, apart: float = STRAY) -> FloatArray:
     """Winsorise replicates, (b, m), at ``apart`` robust standard deviations from the median.
 
-    A single badly fitted pixel makes a sum of squares of one replicate thousands of times as large as in all
-    others, and would dominate mean and standard deviation.
+    A single badly fitted pixel would dominate mean and standard deviation of a sum of squares.
     """
     middle = np.median(vectors, axis=0)
     # statistics scatter by about 1 without effects
@@ -265,31 +256,22 @@ def as_matrix(
     """Arrange statistics as a matrix (vector, m) in the order of the names.
 
     A missing value (too few usable pixels or pairs) is replaced by the mean of the other vectors, or by
-    ``usual`` if all lack it.
-
-    Args:
-        names: names of the statistics, shape (m,).
-        vectors: statistics by name.
-        usual: default of each, shape (m,); None: at least one vector has it.
+    ``usual``, shape (m,), if all lack it.
 
     Raises:
         KeyError: no vector has a statistic, and there is no default.
     """
     found = np.array([[vector.get(name, np.nan) for name in names] for vector in vectors], np.float64)
-    lacking = np.array([[name not in vector for name in names] for vector in vectors], np.bool_)
-    for j in np.flatnonzero(lacking.any(axis=0)):
-        there = found[~lacking[:, j], j]
-        if not there.size and usual is None:
+    missing = np.array([[name not in vector for name in names] for vector in vectors], np.bool_)
+    for j in np.flatnonzero(missing.any(axis=0)):
+        known = found[~missing[:, j], j]
+        if not known.size and usual is None:
             raise KeyError(names[int(j)])
-        found[lacking[:, j], j] = there.mean() if there.size else np.asarray(usual)[j]
+        found[missing[:, j], j] = known.mean() if known.size else np.asarray(usual)[j]
     return found
 
 
-def _std(deviations: FloatArray) -> FloatArray:
-    return _std_of(np.sum(deviations**2, axis=0), deviations.shape[0] - 1)
-
-
-def _std_of(squares: FloatArray, freedom: float) -> FloatArray:
+def _std(squares: FloatArray, freedom: float) -> FloatArray:
     """Compute standard deviations from sums of squares with the prior 1, which only raises small ones."""
     own = np.maximum(squares, 0.0)
     variance = np.maximum((own + _PRIOR_WEIGHT) / (freedom + _PRIOR_WEIGHT), own / freedom)
@@ -312,7 +294,7 @@ def _skewness(names: Sequence[str], vectors: FloatArray) -> FloatArray:
     """
     n = vectors.shape[0]
     off = vectors - vectors.mean(axis=0)
-    own = np.mean(off**3, axis=0) / _std(off) ** 3
+    own = np.mean(off**3, axis=0) / _std(np.sum(off**2, axis=0), n - 1) ** 3
     chance = 6.0 / n
     kinds, found = np.array([_kind(name) for name in names]), np.zeros(own.size)
     for kind in np.unique(kinds):
@@ -337,13 +319,12 @@ def _straight(names: Sequence[str], pulls: FloatArray, std: FloatArray, skewness
 def _effective_tests(names: Sequence[str], vectors: FloatArray, skewness: FloatArray) -> float:
     """Compute the effective number of independent tests from the smallest p-value of each replicate.
 
-    Each replicate is standardised by the others. The maximum-likelihood m of ``P(p_min < p) = 1 - (1 - p)^m``
-    is ``-1 / mean(log(1 - p_min))``.
+    The maximum-likelihood m of ``P(p_min < p) = 1 - (1 - p)^m`` is ``-1 / mean(log(1 - p_min))``.
     """
     n, m = vectors.shape
     total, squares = vectors.sum(axis=0), (vectors**2).sum(axis=0)
     mean = (total - vectors) / (n - 1)
-    std = _std_of((squares - vectors**2) - (n - 1) * mean**2, n - 2)
+    std = _std((squares - vectors**2) - (n - 1) * mean**2, n - 2)
     pulls = (vectors - mean) / (std * np.sqrt(1.0 + 1.0 / (n - 1)))
     smallest = two_sided(_straight(names, pulls, std, skewness), n - 2 + _PRIOR_WEIGHT).min(axis=1)
     return float(np.clip(-1.0 / np.mean(np.log1p(-smallest)), 1.0, 4.0 * m))
@@ -351,12 +332,7 @@ def _effective_tests(names: Sequence[str], vectors: FloatArray, skewness: FloatA
 
 @dataclass(frozen=True)
 class Measured:
-    """The statistics of the data, shape (m,) each.
-
-    Attributes:
-        train, test: statistics of the parts used to find effects.
-        final: statistics of the part used only to measure the gap.
-    """
+    """The statistics of the data, shape (m,) each; the final part is used only to measure the gap."""
 
     train: FloatArray
     test: FloatArray
@@ -373,10 +349,6 @@ def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> BoolArray:
 
     Given the histograms, frames without an effect are in random order, which fixes all statistics of time,
     frame and space. Differences of adjacent codes are ancillary if electron peaks are farther apart.
-
-    Args:
-        names: names of the statistics.
-        maps: fitted parameters; the gain gives the distance of electron peaks.
     """
     step = float(np.nanmedian(1.0 / maps.conversion_gain[maps.usable])) if maps.usable.any() else 0.0
     free = {name for name, period in _OF_CODES.items() if _SHORTER * period <= step}
@@ -387,18 +359,13 @@ def free_of_parameters(names: Sequence[str], maps: PixelMaps) -> BoolArray:
 def disagrees(null: NullModel, z: Measured, significance: float, tolerance: FloatArray | float = 0.0) -> bool:
     """Test whether any statistic deviates significantly, with the same sign in both splits.
 
-    Args:
-        null: null distribution of the model.
-        z: the data.
-        significance: probability of a false alarm by any statistic.
-        tolerance: model error of each statistic, shape (m,), added in quadrature: effects in the model are
-            never known exactly.
+    ``significance`` is the probability of a false alarm by any statistic. The model error (``tolerance``) of
+    each, shape (m,), is added in quadrature: effects in the model are never known exactly.
     """
     p = null.p_values(z.both, 2, tolerance)
     limit = 1.0 - (1.0 - significance) ** (1.0 / null.effective_tests)
-    pulls = [null.pulls(part, 1, tolerance) for part in (z.train, z.test)]
-    alone = [null.p_of(pull) < _REPLICATION for pull in pulls]
-    same = alone[0] & alone[1] & (pulls[0] * pulls[1] > 0)
+    train, test = (null.pulls(part, 1, tolerance) for part in (z.train, z.test))
+    same = (null.p_of(train) < _REPLICATION) & (null.p_of(test) < _REPLICATION) & (train * test > 0)
     same |= np.isin(null.names, list(EXACT))  # no false positives: one split is enough
     return bool(np.any(same & (p < limit)))
 
@@ -416,14 +383,9 @@ def suspicious(null: NullModel, z: Measured) -> bool:
 def misfits(
     null: NullModel, z: Measured, shift: FloatArray, significance: float, tolerance: FloatArray
 ) -> bool:
-    """Test whether the statistics that an effect shifts most still deviate with it in the model.
+    """Test whether the statistics that an effect shifts most, (m,), still deviate with it in the model.
 
-    Args:
-        null: null distribution of the model with the effect.
-        z: the data.
-        shift: shift of the statistics by the effect, shape (m,).
-        significance: probability of a false alarm.
-        tolerance: see :func:`disagrees`.
+    The other arguments are those of :func:`disagrees`.
     """
     signature = np.abs(shift) > CLEAR * null.std
     if not signature.any():

@@ -2,15 +2,13 @@
 
 Each value is about N(0, 1) and independent of the others where nothing is wrong. Of every place of some
 family (:mod:`.families`: bands of rows or columns, rectangles, discs, lines at a period, single pixels) the
-mean inside is compared with the mean outside, so that something everywhere alike has no place. A series is a
-map of one row: its bands are ranges of frames, its pixels single frames. The probability is that of the
-largest deviation among all places of the family (the union bound), of all families: it counts every place
-that was looked at.
+mean inside is compared with the mean outside, so that a uniform deviation has no place. A series is a map of
+one row: its bands are ranges of frames, its pixels single frames. The p-value is corrected for all places of
+all families (the union bound).
 
-Samples beyond all that the PCD allows are few, and maps of their numbers nothing like normal: they are
-events. Given how many there are in all, each lies by chance in a place with the share of it that the laws of
-the pixels give, and in a range of frames with the share of its frames. Probabilities are those of binomial
-laws, and only more than chance makes has a place. How many are expected in all does not matter.
+Samples beyond the support of the PCD are rare events. Given their total number, each lies by chance in a
+place with the probability that the laws of the pixels give, and in a range of frames with the share of its
+frames. So their number in a place is binomial; only an excess counts.
 """
 
 from __future__ import annotations
@@ -30,7 +28,6 @@ from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 _FRAME_PERIODS = range(2, 33)
 _SWEEPS = 3  # of the ends of a range over the frames
 _RIDGE = 1e-3  # of a covariance of series that may all but coincide
-_LEAST = math.log(SMALLEST_MASS)  # of the smallest probability that is written
 _LITTLE = 0.25  # of the mean inside a place, that outside
 _MOST_SINGLE = 1000  # frames that are listed
 _MOST_EVENTS = 500  # frames with an event that are looked at: so many drawn of them tell a range as well
@@ -58,7 +55,7 @@ class Cluster:
     @property
     def p(self) -> float:
         """Probability of such a deviation by chance, at least 1e-300."""
-        return math.exp(max(self.log_p, _LEAST))
+        return math.exp(max(self.log_p, math.log(SMALLEST_MASS)))
 
     @property
     def log_places(self) -> float:
@@ -96,13 +93,9 @@ def scan_map(
 ) -> list[Suspect]:
     """Return the places that stand out of a map, the most significant first, each without those before it.
 
-    Args:
-        values: N(0, 1) where nothing is wrong, (y, x).
-        usable: pixels that count, (y, x).
-        significance: largest probability of a chance.
-        most: places at most.
-        single: look for single pixels, too; not where far tails are heavier than normal.
-        next_along: axis along which each value is of a pixel and the next one: places reach one further.
+    Values are N(0, 1) where nothing is wrong, (y, x). ``single`` pixels are looked for, too, but not where
+    far tails are heavier than normal. If values are of pixels and those ``next_along`` an axis, places reach
+    one further.
     """
     some = usable & np.isfinite(values)
 
@@ -133,14 +126,10 @@ def scan_series(
     most: int = 2,
     shortest: int = families.FEWEST,
 ) -> list[Stretch]:
-    """Return the frames that stand out of a series, the most significant first.
+    """Return the frames that stand out of a series, the most significant first, ``most`` stretches.
 
-    Args:
-        values: N(0, 1) and independent where nothing is wrong, (n,).
-        numbers: frame numbers, increasing, (n,).
-        significance: largest probability of a chance.
-        most: stretches at most.
-        shortest: frames that a range or a phase of a period must have.
+    Values are N(0, 1) and independent where nothing is wrong, (n,), of frames with increasing numbers. A
+    range or a phase of a period has ``shortest`` frames at least.
     """
     row = values[None]
 
@@ -202,10 +191,9 @@ def _significant(
     *,
     either_side: bool = False,
 ) -> families.Place | None:
-    """Return a place with its deviation in terms of the scatter inside and outside (Welch), if significant.
+    """Return a place with its deviation over the scatter inside and outside (Welch's t), if significant.
 
-    Where values scatter more, a mean that is off says less. ``either_side``: the place, or all outside of it
-    where that is what deviates from 0.
+    ``either_side``: the place, or all outside of it where that is what deviates from 0.
     """
     if place is None:
         return None
@@ -228,10 +216,7 @@ def affected_share(z: FloatArray, inside: BoolArray) -> float:
     test bounds the number of true deviations of all sets at once, so that the place may have been chosen
     after looking: ``max_u (1 - u + #{i inside: m p_i <= u a})`` with all m values (Hommel's smaller
     number would do, and give a little more). Any of these bounds is too large with the probability a = SURE.
-
-    Args:
-        z: one-sided deviations of all values, N(0, 1) by chance, (m,).
-        inside: the place, (m,).
+    The deviations z of all values, (m,), are one-sided, N(0, 1) by chance.
     """
     n = int(inside.sum())
     if n == 0:
@@ -246,18 +231,11 @@ def affected_share(z: FloatArray, inside: BoolArray) -> float:
 def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> tuple[int, int]:
     """Return the range of frames, its end excluded, with which all series together are most probable.
 
-    Inside and outside, all series are normal with a mean and a covariance of their own (a change point of
-    either, Hinkley 1970; its error goes as the inverse of what a frame tells, and not with the root of their
-    number); of each only the inverse hyperbolic sine counts, so that single frames far off decide nothing.
-    Where the series are not more probable with a range than without by as many nats as it has parameters
-    (Akaike 1974) and as choosing one of all ranges gains, they do not tell its ends: those that are given
-    stay.
-
-    Args:
-        series: N(0, 1) where nothing is wrong, (s, n), finite.
-        first: of a range near it.
-        last: its end, excluded.
-        shortest: frames inside, and outside, at least.
+    Inside and outside, all series, (s, n), are normal with different means and covariances (a change point of
+    either, Hinkley 1970); of each only the inverse hyperbolic sine counts, so that single frames far off
+    decide nothing. The given ends (the last one excluded) stay where a range does not raise the likelihood by
+    as many nats as it has parameters (Akaike 1974) and as choosing one of all ranges gains. At least
+    ``shortest`` frames are inside and outside.
     """
     x = np.arcsinh(series - np.median(series, axis=1, keepdims=True)).T
     total, square = (
@@ -269,20 +247,20 @@ def sharpest_range(series: FloatArray, first: int, last: int, shortest: int) -> 
     def nats(a: IntArray, b: IntArray) -> FloatArray:
         inside, whole = (total[b] - total[a], square[b] - square[a]), (total[-1], square[-1])
         outside = whole[0] - inside[0], whole[1] - inside[1]
-        likely = _normal(b - a, *inside) + _normal(n - b + a, *outside)
-        return np.where(np.minimum(b - a, n - b + a) >= shortest, likely, -np.inf)
+        likelihood = _log_likelihood(b - a, *inside) + _log_likelihood(n - b + a, *outside)
+        return np.where(np.minimum(b - a, n - b + a) >= shortest, likelihood, -np.inf)
 
     every, given = np.arange(n + 1), (first, last)
     for _ in range(_SWEEPS):
         first = int(np.argmax(nats(every[:last], np.full(last, last))))
         last = first + 1 + int(np.argmax(nats(np.full(n - first, first), every[first + 1 :])))
     with_range = nats(np.array([first]), np.array([last]))
-    gain = float((with_range - _normal(np.array([n]), total[-1:], square[-1:]))[0])
+    gain = float((with_range - _log_likelihood(np.array([n]), total[-1:], square[-1:]))[0])
     price = len(series) * (len(series) + 3) / 2 + math.log(n**2 / 2)
     return (first, last) if gain > price else given
 
 
-def _normal(count: IntArray, sums: FloatArray, squares: FloatArray) -> FloatArray:
+def _log_likelihood(count: IntArray, sums: FloatArray, squares: FloatArray) -> FloatArray:
     """Return the largest log likelihood of normal vectors, given their number, sums and sums of squares."""
     m = np.maximum(count, 1)[:, None]
     mean = sums / m
@@ -301,15 +279,8 @@ def scan_event_map(
 ) -> list[Suspect]:
     """Return the places with more events than their share, the most significant first.
 
-    Args:
-        seen: pixels with an event, (y, x).
-        expected: number of events in each, in proportion, (y, x).
-        usable: pixels that count, (y, x).
-        significance: largest probability of a chance.
-        most: places at most.
-
-    Returns:
-        Places; ``inside`` and ``outside`` are events beyond those expected per pixel.
+    Given are the pixels with an event, (y, x), and the number expected in each, but for a factor. ``inside``
+    and ``outside`` of a place are events beyond those expected per pixel.
     """
 
     def best(left: BoolArray) -> families.Place | None:
@@ -344,17 +315,12 @@ def scan_event_frames(
 
     Of n events in random order, those that follow the i-th by k in a share w of the frames are at least k of
     the others with the probability of a binomial law, which is uniform whatever i and k: the union bound has
-    as many terms as there are pairs of events.
+    as many terms as there are pairs of events. ``inside`` and ``outside`` are events beyond those expected
+    per frame.
 
-    Args:
-        positions: of the frames with an event, increasing, none twice, (m,).
-        numbers: of all frames in the run, increasing, (n,).
-        expected: number of events in all frames.
-        significance: largest probability of a chance.
-        shortest: frames that a range must have.
-
-    Returns:
-        The range; ``inside`` and ``outside`` are events beyond those expected per frame.
+    ``positions`` are those of the frames with an event, increasing, none twice, (m,); ``numbers`` are of all
+    frames in the run, (n,), in which ``expected`` events are by chance. A range has ``shortest`` frames or
+    more.
     """
     if positions.size > _MOST_EVENTS:
         expected *= _MOST_EVENTS / positions.size

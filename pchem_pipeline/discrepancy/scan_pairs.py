@@ -2,13 +2,11 @@
 
 Of every band of lines, every band across them, every rectangle, every n-th line, and the lines that stand out
 each by itself the mean covariance of the pairs inside is compared with that of all other pairs, so that noise
-which all pixels share has no place. What pixels share adds to the covariance of all their pairs, not only to
-that of neighbours: a row of w pixels has w (w - 1) / 2 pairs, and w - 1 neighbours. Given the histograms,
-frames without an effect are in random order: then products of different standardised pixels have mean 0,
-variance 1, and are uncorrelated, whatever the pixels' law. So the standard error of a mean of N pairs is
-``1 / sqrt(N)``, or what the frames' scatter gives where that is more; the sum of squares behind it is skewed,
-which Wilson and Hilferty's root takes away. The probability is the union bound over the places of the family,
-the families, modes and channels.
+which all pixels share has no place. Given the histograms, frames without an effect are in random order: then
+products of different standardised pixels have mean 0, variance 1, and are uncorrelated, whatever the pixels'
+law. So the standard error of a mean of N pairs is ``1 / sqrt(N)``, or what the frames' scatter gives where
+that is more; the skewness of the sum of squares behind it is removed (Wilson and Hilferty 1931). The p-value
+is the union bound over the places of the family, the families, modes and channels.
 
 Boxes are of cells, each of several rows or columns of a large sensor; each round of finer cells
 (:func:`.families.with_sharp_ends`) is another pass over the frames.
@@ -39,11 +37,11 @@ from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 MODES = {"row": (1, 2), "column": (2, 1), "frame": (2, 2)}
 #: Pixels of a place, and its share of the sensor at most.
 FEWEST_PIXELS, LARGEST = 16, 0.6
-#: Lines are told apart by their number modulo this.
+#: Lines are distinguished by their number modulo this.
 PERIOD = 32
 #: Cells along an edge of the sensor, for lines; half as many for frames.
 _CELLS = 64
-#: Of each table of sums of products: two channels and the counts, as gathered and as told.
+#: Of each table of sums of products: two channels and the counts, as gathered and as returned.
 _COPIES = 9
 _CONTRAST = 0.4  # mean outside of a place over that inside, at most
 #: Guesses that are held against the scatter of the frames, the most significant first.
@@ -78,10 +76,7 @@ class _Guess(NamedTuple):
 def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: int = 2) -> list[Shared]:
     """Return the places whose pixels share noise, the most significant first, each without those before it.
 
-    Args:
-        samples: standardised frames.
-        significance: largest probability of a chance in any place, mode and channel.
-        most: places at most.
+    The significance is that of any place, mode and channel; there are ``most`` places at most.
     """
     found: list[Shared] = []
     while len(found) < most and samples.usable.sum() > 2 * FEWEST_PIXELS:
@@ -94,12 +89,7 @@ def scan_pairs(samples: Samples, *, significance: float = SIGNIFICANCE, most: in
 
 
 def shared_elsewhere(samples: Samples, place: Shared) -> Region | None:
-    """Return all pixels outside a place if they share noise among themselves as those inside do; else None.
-
-    Args:
-        samples: standardised frames.
-        place: found among them.
-    """
+    """Return all pixels outside a place if they share noise among themselves, as those inside do."""
     rest = samples.without(place.region.mask(samples.usable.shape))
     if rest.usable.sum() <= 2 * FEWEST_PIXELS:
         return None
@@ -150,7 +140,7 @@ def _measured(samples: Samples, guess: _Guess) -> Shared:
     # partners of each pixel: squares of sums over w of them have this many degrees of freedom
     partners = 2.0 * own / max(int(parts[0].sum()), 1)
     freedom = 2.0 * n * own / max(partners - 1.0, 1e-9) ** 2
-    z = float(chi_square(max(freedom + z * math.sqrt(2.0 * freedom), 0.0), freedom))
+    z = float(chi_square(freedom + z * math.sqrt(2.0 * freedom), freedom))
     return Shared(
         family=place.family,
         z=z,
@@ -260,9 +250,7 @@ class PairContrast(families.Contrast):
 def pairs_of(samples: Samples, edges: families.Edges | None = None) -> list[dict[str, PairContrast]]:
     """Sum the products of all pairs in one pass over the frames; by channel, and by what the pixels share.
 
-    Args:
-        samples: standardised frames.
-        edges: of the cells of rows and of columns, pixels; None: cells of equal size.
+    ``edges`` are those of the cells of rows and of columns, pixels; None: cells of equal size.
     """
     if edges is None:
         rows, columns = (families.cell_edges(n, _CELLS) for n in samples.usable.shape)
@@ -277,22 +265,21 @@ def pairs_of(samples: Samples, edges: families.Edges | None = None) -> list[dict
         mode: (families.cumulative(n * table), n * rest) for mode, (table, rest) in counted.tables().items()
     }
     area = families.cumulative(samples.usable.astype(np.float64))
-    found: list[dict[str, PairContrast]] = []
-    for each in gathered:
-        found.append({})
-        for mode, (table, by_number) in each.tables().items():
-            cells, (number, number_by) = each.edges(mode), counts[mode]
-            found[-1][mode] = PairContrast(
-                edges=cells,
-                sums=families.cumulative(table),
-                counts=number,
-                # that pairs are counted twice doubles the variance of a sum
-                null=families.normal(float(table.sum()), float(number.flat[-1]), 2.0, 1.0, one_sided=True),
-                axes=MODES[mode],
-                area=area[np.ix_(*cells)],
-                by_number=(by_number, number_by),
-            )
-    return found
+
+    def contrast(mode: str, table: FloatArray, by_number: FloatArray) -> PairContrast:
+        cells, (number, number_by) = counted.edges(mode), counts[mode]
+        return PairContrast(
+            edges=cells,
+            sums=families.cumulative(table),
+            counts=number,
+            # that pairs are counted twice doubles the variance of a sum
+            null=families.normal(float(table.sum()), float(number.flat[-1]), 2.0, 1.0, one_sided=True),
+            axes=MODES[mode],
+            area=area[np.ix_(*cells)],
+            by_number=(by_number, number_by),
+        )
+
+    return [{mode: contrast(mode, *each) for mode, each in g.tables().items()} for g in gathered]
 
 
 def pairs_bytes(shape: tuple[int, int]) -> int:
@@ -314,7 +301,6 @@ class _Gathered:
     """
 
     def __init__(self, cells: families.Edges) -> None:
-        """Begin with nothing, for cells of rows and columns with these edges."""
         self.cells = cells
         y, x = (each.size - 1 for each in cells)
         self.stride = [2 if n > _CELLS // 2 else 1 for n in (y, x)]
@@ -356,12 +342,10 @@ class _Gathered:
             sums += folded.T @ folded - np.diag(_folded(each))
 
     def tables(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return the sums of each mode by cells, (y, x, x), (y, y, x) or (y, y, x, x), and by numbers.
-
-        Of frames those of pixels in different rows and columns.
-        """
+        """Return the sums of each mode by cells, (y, x, x), (y, y, x) or (y, y, x, x), and by numbers."""
         by, bx = (np.arange(0, len(each), n) for each, n in zip(self.lines, self.stride, strict=True))
         i, j = np.arange(by.size), np.arange(bx.size)
+        # of frames those of pixels in different rows and columns
         frames = self.frames.reshape(*2 * self.squares.shape).transpose(0, 2, 1, 3).copy()
         frames[i, i] -= _summed(self.lines[0], (by, bx, bx))
         frames[:, :, j, j] -= _summed(self.lines[1], (bx, by, by)).transpose(1, 2, 0)

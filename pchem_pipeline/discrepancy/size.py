@@ -32,12 +32,9 @@ _CHANGED = 1e-9
 
 
 def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
-    """Compute the size of an effect in its region and frames; None if it cannot be simulated.
+    """Compute the size of an effect in its region and frames of a run; None if it cannot be simulated.
 
-    Args:
-        effect: with its strength, in coordinates of these pixels.
-        maps: fitted parameters, (y, x) each.
-        n_frames: frames of the run.
+    Its coordinates are those of the pixels with these fitted parameters, (y, x) each.
     """
     if not maps.usable.any():
         return None
@@ -51,21 +48,19 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         # them by their own chance
         dn = float(getattr(effect, effect.strength))
         return Size(electrons=dn * float(np.median(gain)), dn=dn, of_read_noise=dn / noise)
-    blocks = _BLOCKS
-    if effect.far_reaching:
-        blocks = max(_BLOCKS * _MOST_ROWS**2 // maps.usable.size, _FEWEST_BLOCKS)
-    else:
-        maps = maps.of(np.s_[:_MOST_ROWS, :_MOST_ROWS])
+    whole = effect.far_reaching
+    maps = maps if whole else maps.of(np.s_[:_MOST_ROWS, :_MOST_ROWS])
     if not maps.usable.any():
         return None
+    blocks = max(_BLOCKS * _MOST_ROWS**2 // maps.usable.size, _FEWEST_BLOCKS) if whole else _BLOCKS
     blocks = min(blocks, -(-n_frames // _BLOCK_FRAMES))
-    stacks = 1 if effect.far_reaching else -(-_FEWEST_FRAMES // (blocks * _BLOCK_FRAMES))
+    stacks = 1 if whole else -(-_FEWEST_FRAMES // (blocks * _BLOCK_FRAMES))
     try:
         drawn = [_change(effect, maps, n_frames, blocks, seed) for seed in range(1, stacks + 1)]
     except PchEmError:
         return None
     inside = np.ones_like(maps.usable)
-    if effect.far_reaching and effect.region is not None:
+    if whole and effect.region is not None:
         ny, nx = maps.usable.shape
         inside = effect.region.mask((ny, nx))
     changes = [change[:, inside] for change in drawn if change is not None]

@@ -1,6 +1,4 @@
-"""The steps of a search for missing effects, from the split of the samples to the verdict.
-
-Split, null, gap, disagree, explain, add, close, verdict.
+"""The steps of a search for missing effects: split, null, gap, disagree, explain, add, close, verdict.
 
 They are the same for frames and for ready-made histograms; only the comparison of effects differs. With
 frames, effects are simulated and compared by their shift of many statistics (:mod:`.by_simulation`); with
@@ -34,13 +32,10 @@ class Prepared:
     """Data that are split into train, test and final part, and the model that they are compared with.
 
     Attributes:
-        settings: the section ``discrepancy``.
         samples: what the data are, for the verdict's sentence ("frames", "histograms").
         evidence: of the train part.
-        examined: what is looked at.
         first: statistics of the model before anything is added, from its replicates.
         z: statistics of the data.
-        effort: counts the work.
         untestable: effects that such data cannot show, and why.
         doubt: why the pixels are not identified and what would help; empty where they are.
         defects: candidates that failed, and why; more come to them.
@@ -112,9 +107,7 @@ def no_progress(_: str) -> None:
 def search(by: Explainer[Explanation], progress: Callable[[str], None] = no_progress) -> Discrepancy:
     """Find where data disagree with the fitted model, name the effects, and add them to the model.
 
-    Args:
-        by: tells effects apart; it has drawn the model.
-        progress: is given what is done next.
+    The explainer has drawn the model; ``progress`` is given what is done next.
     """
     data, present = by.prepared, by.model
     first, z, significance = data.first, data.z, data.settings.significance

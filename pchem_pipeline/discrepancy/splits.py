@@ -10,7 +10,7 @@ from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.verdict import Examined
 
-#: fewer frames leave hardly five blocks to each third
+#: Fewer frames leave hardly five blocks to each third.
 MINIMUM_FRAMES = 300
 _SHORTEST, _LONGEST, _BLOCKS = 20, 100, 60
 # the order changes from group to group, so that no part is always the earlier one
@@ -64,14 +64,9 @@ def block_length(n_frames: int, wanted: int | None = None) -> int:
 
 
 def split_frames(numbers: IntArray, block_frames: int) -> Splits:
-    """Deal whole blocks of consecutive frames to train, test and final in turn.
+    """Deal whole blocks of consecutive frames (numbers, increasing) to train, test and final in turn.
 
-    Args:
-        numbers: frame numbers, increasing, shape (n,).
-        block_frames: frames in a block.
-
-    Returns:
-        Positions of the frames of each part; a rest of fewer than three blocks is left out.
+    A rest of fewer than three blocks is left out.
     """
     # a block never spans a gap in the numbering
     breaks = np.flatnonzero(np.diff(numbers) != 1) + 1

@@ -43,8 +43,6 @@ State = Literal[
 ]
 
 _NAN = float("nan")
-
-
 Number = Annotated[
     float,
     BeforeValidator(lambda value: _NAN if value is None else value),
@@ -68,14 +66,12 @@ class Measured(_Part):
 
 
 class Candidate(_Part):
-    """An effect that was compared, with its log-likelihood of held-out samples.
+    """An effect that was compared, by its tag and fields.
 
     Attributes:
-        effect: its tag.
         score: held-out log-likelihood minus that of the best effect, nats (0 for the best).
         stderr: standard error of ``score``, nats.
         probability: posterior probability among all candidates.
-        parameters: the fields of the effect.
     """
 
     effect: str
@@ -99,13 +95,8 @@ class Candidate(_Part):
 class Size(_Part):
     """Root mean square change of the samples by an effect, around each pixel's mean change.
 
-    The average is over the changed samples only if these are fewer than :data:`RARE`.
-
-    Attributes:
-        electrons: the size, e-.
-        dn: the size, DN.
-        of_read_noise: the size over the median read noise.
-        samples: share of the samples that are changed, within the effect's region and frames.
+    It is given in e-, in DN and over the median read noise. The average is over the changed samples only if
+    their share ``samples`` within the effect's region and frames is below :data:`RARE`.
     """
 
     electrons: Number
@@ -116,20 +107,15 @@ class Size(_Part):
     def words(self) -> str:
         """Describe the size: ``samples change by 0.5 DN rms, 22 % of the read noise``."""
         which = "samples" if self.samples >= RARE else f"{percent(self.samples)} of samples"
-        return f"{which} change by {short(self.dn, 2)} DN rms, {self.beside_noise()}"
-
-    def beside_noise(self) -> str:
-        """Describe the size relative to the read noise, in per cent or as a multiple."""
         share = self.of_read_noise
         times = f"{percent(share)} of" if share < _TIMES else f"{short(share, 2)} times"
-        return f"{times} the read noise"
+        return f"{which} change by {short(self.dn, 2)} DN rms, {times} the read noise"
 
 
 class Rival(_Part):
-    """Another effect fitted instead of the named one, in the same way.
+    """Another effect (its tag) fitted instead of the named one, in the same way.
 
     Attributes:
-        effect: its tag.
         gap_after: the remaining gap, nats per sample.
         behind: log-likelihood minus that of the named one, nats; NaN if it was not scored.
         why: reason of the rejection.
@@ -162,9 +148,7 @@ class Place(_Part):
     """A disagreement of data and model: a statistic, and its pixels, codes or frames.
 
     Attributes:
-        statistic: its name in the catalogue.
-        sentence: the statistic in words.
-        channel: charge, readout, ...
+        statistic, sentence, channel: its name, words and channel in the catalogue.
         direction: "+" or "-".
         z: deviation from the expectation under the model, standard deviations.
         p: p-value, corrected for the number of statistics.
@@ -204,7 +188,7 @@ class Place(_Part):
         """Make a place with the sentence and channel of its statistic in the catalogue."""
         known = STATISTICS[statistic]
         words = {"sentence": known.says(z), "channel": known.channel, "direction": "+" if z > 0 else "-"}
-        return cls(statistic=statistic, z=z, **{**words, **more})
+        return cls(statistic=statistic, z=z, **(words | more))
 
     def spot(self) -> str:
         """Describe region and frames; empty if uniform."""
@@ -248,10 +232,8 @@ class GapChange(_Part):
     """The gap on held-out samples, before and after effects were added; see :mod:`.gap`.
 
     Attributes:
-        unit: unit of all numbers except ``closed_fraction``.
-        before, after: without and with the effects.
+        unit: unit of all numbers except ``closed_fraction`` (:func:`closed_share`).
         floor: 95 % quantile of sampling noise under the model.
-        closed_fraction: :func:`closed_share`.
         interval_before, interval_after: 95 % intervals.
         standing_out: families of statistics that are significant by themselves with the effects.
     """
@@ -301,12 +283,7 @@ class Surveyed(_Part):
 
 
 class Elsewhere(_Part):
-    """Test of the final model in another window of the sensor.
-
-    Attributes:
-        rows, columns: the window, first and end.
-        deviates: statistic that disagrees there, in words; empty: none.
-    """
+    """Test of the final model in another window (first and end); ``deviates`` says what disagrees there."""
 
     rows: tuple[int, int]
     columns: tuple[int, int]
@@ -473,11 +450,7 @@ class Verdict(_Part):
 
     @classmethod
     def from_json(cls, text: str, source: str = VERDICT_FILE) -> Verdict:
-        """Read the content of ``discrepancy.json``.
-
-        Args:
-            text: the content.
-            source: its origin, for the message.
+        """Read the content of ``discrepancy.json``; the message of an error names its ``source``.
 
         Raises:
             StoreError: it is damaged, or of another schema.
@@ -505,9 +478,9 @@ class Verdict(_Part):
     @property
     def closed_in_model(self) -> float:
         """Relative reduction of the gap by the effects in the final model."""
-        named = [step for step in self.steps if step.verdict != "described"]
         if not self.proposed:
             return self.gap.closed_fraction
+        named = [step for step in self.steps if step.verdict != "described"]
         return closed_share(self.gap.before, named[-1].gap_after) if named else 0.0
 
     def part_of_model(self, step: Step) -> bool:
@@ -524,13 +497,11 @@ class Verdict(_Part):
 
     def _repr_html_(self) -> str:
         """Return verdict and disagreements as HTML for a notebook."""
-        rows = [
+        rows = "".join(
             f"<li>{escape(place.sentence or place.statistic)} ({sigma_text(place.z)})</li>"
             for place in self.where
-        ]
-        return (
-            f"<p><b>{escape(self.word.capitalize())}</b>. {escape(self.sentence)}</p><ul>{''.join(rows)}</ul>"
         )
+        return f"<p><b>{escape(self.word.capitalize())}</b>. {escape(self.sentence)}</p><ul>{rows}</ul>"
 
     def added(self, step: Step) -> str:
         """Return the effect that a step added, or the likeliest of several."""
@@ -562,13 +533,9 @@ class Verdict(_Part):
         columns: tuple[int, int],
         pixel: Callable[[int, int], tuple[int, int]],
     ) -> Verdict:
-        """Return a copy in coordinates of the sensor.
+        """Return a copy in coordinates of a sensor of this shape, of which these rows, columns were examined.
 
-        Args:
-            shape: rows and columns of the sensor.
-            rows: examined rows, first and end.
-            columns: examined columns, first and end.
-            pixel: map from (y, x) in the examined window to (y, x) on the sensor.
+        ``pixel`` maps (y, x) in the examined window to (y, x) on the sensor.
         """
 
         def moved(place: Place) -> Place:
@@ -611,10 +578,6 @@ def parameters_of(effect: Effect, errors: Mapping[str, float]) -> dict[str, Meas
     """Return the fitted or chosen parameters of an effect, its strength first, with their standard errors.
 
     Those at their default say nothing, or have no meaning in this form of the effect.
-
-    Args:
-        effect: with its fitted parameters.
-        errors: standard errors by parameter.
     """
     fields = type(effect).model_fields
     numbers = effect.model_dump(exclude={"tag"})
@@ -643,7 +606,6 @@ class Discrepancy:
     """A verdict with its evidence.
 
     Attributes:
-        verdict: the content of ``discrepancy.json``.
         model: effects of the final model, earlier ones included.
         maps: parameters of the examined pixels under the final model.
         evidence: statistics of the train samples.

@@ -1,9 +1,8 @@
 """Locations of a disagreement: deviating statistics with their pixels, DN and frames.
 
-Samples that chance hardly makes are listed of either tail: those beyond the support of their pixel, and rarer
-ones. Of a thousand pixels up to ten have one beyond their support by chance. Those hide a dozen of a few
-pixels or frames with heavy tails, which lie farther out: so the samples are also looked at by themselves of
-which chance makes one in the whole stack.
+Rare samples are listed of either tail: those beyond the support of their pixel, which up to ten of a thousand
+pixels have by chance, and those of which chance makes one in the whole stack: a few pixels or frames with
+heavy tails have samples that lie farther out.
 """
 
 from __future__ import annotations
@@ -45,18 +44,9 @@ def suspected_regions(
 ) -> dict[str, list[Suspect]]:
     """Return where on the sensor each map of the evidence stands out from the rest of the sensor.
 
-    For whoever proposes effects with a place: ``suspect.region`` is one in the grammar of the YAML, the most
-    significant first, and what is everywhere alike has none. The probability counts all places and all maps.
-    Where ``suspect.only_there`` is false the rest of the sensor deviates as well, and the place may be but
-    where pixels differ in exposure or gain.
-
-    Args:
-        evidence: of frames or histograms; maps of (1, n) give ranges of columns.
-        significance: largest probability of a chance, in any place of any map.
-        names: the maps wanted (of :func:`pixel_maps`); None: all.
-
-    Returns:
-        By the name of the map; maps without a place are absent.
+    The places are by map (some of :func:`pixel_maps`, or all), the most significant first; maps without any
+    are absent. The p-value is corrected for all places and maps. Where ``suspect.only_there`` is false the
+    rest of the sensor deviates as well, and the place may only be where pixels differ in exposure or gain.
     """
     maps = {name: m for name, m in pixel_maps(evidence).items() if names is None or name in names}
     found = {
@@ -88,12 +78,9 @@ def suspected_frames(
 
 
 def unfitted_place(usable: BoolArray) -> Suspect | None:
-    """Return where pixels without a fit to be relied upon come together; None where chance explains it.
+    """Return where pixels without a reliable fit, (y, x), cluster; None where chance explains it.
 
     An effect of single pixels in a part of the sensor may leave only that to be seen.
-
-    Args:
-        usable: pixels with a fit, (y, x).
     """
     alike, every = np.ones(usable.shape), np.ones(usable.shape, np.bool_)
     return next(iter(scan_event_map(~usable, alike, every, most=1)), None)
@@ -176,7 +163,7 @@ def frame_series(evidence: Evidence) -> dict[str, FloatArray]:
 
 
 def map_of(statistic: str) -> str:
-    """Return the map (of :func:`pixel_maps`) in which a statistic shows its place; empty without any."""
+    """Return the map (of :func:`pixel_maps`) in which a statistic shows its place, or an empty name."""
     known = STATISTICS.get(statistic.partition("@")[0])
     return "" if known is None else known.map
 
@@ -184,11 +171,7 @@ def map_of(statistic: str) -> str:
 def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: float) -> list[Place]:
     """Return the disagreements that are significant among all statistics, the largest first.
 
-    Args:
-        evidence: of the train split.
-        null: of the model.
-        z: mean of the statistics of the train and test splits, shape (m,).
-        significance: largest probability of a chance.
+    The evidence is that of the train split, ``z`` the mean of the statistics of train and test, (m,).
     """
     pulls, p_values = null.pulls(z, splits=2), null.p_values(z, splits=2)
     chance = {
@@ -210,7 +193,7 @@ def locate(evidence: Evidence, null: NullModel, z: FloatArray, significance: flo
             spots["region_share"] = suspect.share
         for stretch in frames.get(STATISTICS[name].series, ())[:1]:
             spots |= {"when": stretch.when.numbers(), "when_p": stretch.p}
-        if "@" in name:  # of a part on the sensor: that is the place, not what stands out of it
+        if "@" in name:  # of a part of the sensor: that is the place, not what stands out of it
             part = zip(("region", "when"), parse_place(name.partition("@")[2]), strict=True)
             spots |= {key: place.numbers() for key, place in part if place is not None}
         places.append(
@@ -243,7 +226,7 @@ def _pixels(name: str, evidence: Evidence, maps: Mapping[str, FloatArray]) -> tu
     allowed = _FALSE_DISCOVERY_RATE * np.arange(1, p.size + 1) / max(int(evidence.maps.usable.sum()), 1)
     passed = np.flatnonzero(p[order] <= allowed)
     count = min(int(passed[-1]) + 1, _MOST_LISTED) if passed.size else 0
-    return tuple((int(i) // values.shape[1], int(i) % values.shape[1]) for i in order[:count])
+    return tuple(divmod(int(i), values.shape[1]) for i in order[:count])
 
 
 def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:
@@ -268,20 +251,20 @@ def _codes(name: str, evidence: Evidence) -> tuple[int, int] | None:
 
 def _frames(name: str, evidence: Evidence) -> tuple[int, ...]:
     """Return the frames that carry a statistic."""
-    time = evidence.time
+    time, found = evidence.time, np.zeros(0, np.int64)
     if time is None:
         return ()
     if name == "frame.repeated":
-        return tuple(int(f) for f in time.repeated[:_MOST_LISTED])
-    if name.startswith("tail.high") and time.hits.size:
-        return tuple(int(f) for f in np.unique(time.hits[:, 0])[:_MOST_LISTED])
-    if name.endswith(".largest"):
+        found = time.repeated
+    elif name.startswith("tail.high"):
+        found = np.unique(time.hits[:, 0])
+    elif name.endswith(".largest"):
         series = time.frame_charge if ".charge." in name else time.frame_readout
-        spread = robust_sd(series)
-        order = np.argsort(-np.abs(series - np.median(series)))
-        outlying = [i for i in order if abs(series[i] - np.median(series)) > 5.0 * spread]
-        return tuple(sorted(int(time.frames[i]) for i in (outlying or order[:1])[:_MOST_LISTED]))
-    return ()
+        away = np.abs(series - np.median(series))
+        order = np.argsort(-away)
+        outlying = order[away[order] > 5.0 * robust_sd(series)]
+        found = np.sort(time.frames[(outlying if outlying.size else order[:1])[:_MOST_LISTED]])
+    return tuple(found[:_MOST_LISTED].tolist())
 
 
 # -- samples that chance hardly makes ---------------------------------------------------------------
@@ -347,13 +330,9 @@ def single_samples(hits: IntArray) -> IntArray:
 
 
 def expected_beyond(hits: IntArray, maps: PixelMaps, n_frames: int, *, above: bool) -> FloatArray:
-    """Return how many samples as far out, or farther, the PCD of each pixel makes in all frames, (n,).
+    """Return how many samples at least as far out as each hit the PCD of its pixel makes in all frames, (n,).
 
-    Args:
-        hits: frame, y, x, DN, (n, 4).
-        maps: fitted parameters.
-        n_frames: samples of a pixel.
-        above: of the high tail; False: of the low one.
+    Hits are frame, y, x, DN, (n, 4), above the pixel's range of codes or below it.
     """
     found = np.empty(len(hits))
     for begin in range(0, len(hits), _CHUNK):

@@ -7,6 +7,8 @@ nearer to the one before than to those of other frames; and whether they follow 
 before. Lines that repeat those before them, of the same frame or of the frame before, never come by chance in
 analog data unless they are a few pixels long. Squares of equal samples are made by compression with losses,
 binning that is undone and repeated pixels; nothing analog does.
+
+Frames are codes (frame, y, x), DN, usable pixels are (y, x), and edges are positions of the blocks, (b + 1,).
 """
 
 from __future__ import annotations
@@ -43,12 +45,9 @@ _SMALLEST = 1e-4  # variance of a bit that the value before leaves, relative: be
 
 
 def groups_of(edges: IntArray, samples_of_a_frame: int, most_samples: int = MOST_SAMPLES) -> IntArray:
-    """Return positions of the first frames of groups of successive ones, evenly spread, (n,).
+    """Return positions of the first frames of groups of successive ones, evenly spread over blocks, (n,).
 
-    Args:
-        edges: positions of the blocks, (b + 1,).
-        samples_of_a_frame: rows times columns.
-        most_samples: of all groups together, unless there is but one.
+    There are ``most_samples`` in all groups together, unless there is only one.
     """
     first = np.concatenate([np.arange(a, b - GROUP + 1, GROUP) for a, b in pairwise(edges)])
     most = max(most_samples // (GROUP * samples_of_a_frame), 1)
@@ -57,13 +56,7 @@ def groups_of(edges: IntArray, samples_of_a_frame: int, most_samples: int = MOST
 
 
 def predicted_samples(frames: CodeArray, edges: IntArray, usable: BoolArray) -> dict[str, PredictedSamples]:
-    """Return how samples compare with their predictions, by kind; none where frames or pixels are too few.
-
-    Args:
-        frames: codes (frame, y, x), DN.
-        edges: positions of the blocks, (b + 1,).
-        usable: pixels that count, (y, x).
-    """
+    """Return how samples compare with their predictions, by kind; none where frames or pixels are too few."""
     first, inside = groups_of(edges, usable.size), usable[1:-1, 1:-1]
     if min(usable.shape) < 3 or not inside.any() or not first.size:
         return {}
@@ -83,7 +76,7 @@ def _compared(
 ) -> PredictedSamples:
     """Compare samples (group, frame, pixel), DN, with the predictions of each frame of their group.
 
-    Above thresholds only what equals its prediction too often is looked at, unless ``always``.
+    Thresholds are compared only where samples equal the prediction too often, or ``always``.
     """
     own = samples - prediction
     others = np.stack([samples - np.roll(prediction, shift, axis=1) for shift in range(1, GROUP)])
@@ -134,11 +127,6 @@ def nearer_statistics(frames: CodeArray, edges: IntArray, maps: PixelMaps) -> di
     two pairs of successive frames ``(x, y)`` and ``(x', y')`` the agreements of x with y and of x' with y'
     are counted, less those of x with y' and of x' with y: what the law of either sample makes is in both, so
     that without an effect the sum has mean 0, and for its variance the sum of the squares.
-
-    Args:
-        frames: codes (frame, y, x), DN.
-        edges: positions of the blocks, (b + 1,).
-        maps: parameters of the pixels.
     """
     first = groups_of(edges, maps.usable.size, MOST_PAIRED)
     half = first.size // 2
@@ -167,11 +155,6 @@ def previous_bits(frames: CodeArray, edges: IntArray, maps: PixelMaps) -> Previo
     What a sample has in common with the value of the one before is crosstalk of many kinds; what it has in
     common with single bits of it, beyond that value, is only of the converter's making. Differences of
     successive frames are regressed, so that nothing constant counts.
-
-    Args:
-        frames: codes (frame, y, x), DN.
-        edges: positions of the blocks, (b + 1,).
-        maps: parameters of the pixels.
     """
     usable = maps.usable
     noise = np.sqrt(maps.read_noise_dn**2 + maps.quanta_exposure / maps.conversion_gain**2)
@@ -208,7 +191,7 @@ def bit_statistics(found: PreviousBits | None) -> dict[str, float]:
         return {}
     scale = np.sqrt(np.maximum(np.diag(found.square), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(found.square / np.outer(scale, scale))
-    kept = (eigenvalues > _SMALLEST * eigenvalues.max()) if eigenvalues.size else np.zeros(0, np.bool_)
+    kept = eigenvalues > _SMALLEST * eigenvalues.max()
     if not kept.any():
         return {}
     projected = vectors.T[kept] @ (found.product / scale)
@@ -225,9 +208,9 @@ class Repeats:
 
     Attributes:
         frames: positions of frames equal to the one before.
-        rows_in_time: rows of other frames that are those of the frame before.
-        rows, columns: those that are the row above, and the column on the left.
-        consecutive: frames that directly follow another.
+        rows_in_time: number of rows of other frames that equal those of the frame before.
+        rows, columns: number of those that equal the row above, and the column on the left.
+        consecutive: number of frames that directly follow another.
     """
 
     frames: IntArray
@@ -252,11 +235,9 @@ class Repeats:
         )
 
     def statistics(self, seen: PixelHistograms, shape: tuple[int, ...]) -> dict[str, float]:
-        """Return the statistics of repeats; none of lines so short that chance repeats them in a frame.
+        """Return the statistics of repeats in frames of a shape (frame, y, x).
 
-        Args:
-            seen: histograms of the pixels.
-            shape: of the frames (frame, y, x).
+        None of lines so short that chance repeats them in a frame.
         """
         real = seen.counts.astype(np.float32)
         total = np.maximum(real.sum(axis=1) + seen.outside.sum(axis=1), 1.0)
@@ -304,11 +285,6 @@ def square_statistics(frames: CodeArray, seen: PixelHistograms, usable: BoolArra
     """Return the statistic of squares of equal samples; none without squares of usable pixels.
 
     Given the histograms, frames without an effect are in random order.
-
-    Args:
-        frames: codes (frame, y, x), DN.
-        seen: histograms of the pixels.
-        usable: pixels that count, (y, x).
     """
     counts, origin = seen.counts, seen.origin
     good = usable[1:, 1:] & usable[1:, :-1] & usable[:-1, 1:] & usable[:-1, :-1]

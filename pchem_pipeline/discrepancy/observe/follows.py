@@ -41,8 +41,8 @@ class Follows:
     Attributes:
         products: by frames before, rows and columns from the residual to the charge, the distance 0 in the
             middle, shape (2, 2 y - 1, 2 x - 1); 0 for a sample with itself.
-        pairs: how many they are.
-        wider: for each of `SOURCES`, by how much more than that of independent products their sum scatters.
+        pairs: their number.
+        wider: for each of `SOURCES`, the standard deviation of their sum over that of independent products.
     """
 
     products: FloatArray
@@ -52,10 +52,9 @@ class Follows:
     def of(self, source: Source) -> tuple[FloatArray, FloatArray]:
         """Return the products and pairs of single samples, or of all of a row, column or frame."""
         axes = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}[source]
-        return (
-            self.products.sum(axis=axes, keepdims=True) if axes else self.products,
-            self.pairs.sum(axis=axes, keepdims=True) if axes else self.pairs,
-        )
+        if not axes:
+            return self.products, self.pairs
+        return self.products.sum(axis=axes, keepdims=True), self.pairs.sum(axis=axes, keepdims=True)
 
     def z(self, source: Source) -> FloatArray:
         """Return the deviations from 0, standard errors; NaN where products are too few."""
@@ -95,15 +94,9 @@ class FollowingSamples:
         inside: BoolArray | None = None,
         most: int | None = None,
     ) -> FollowingSamples | None:
-        """Prepare frames; None where they are too few.
+        """Prepare frames, codes (frame, y, x), in blocks at ``edges``, (b + 1,); None where they are too few.
 
-        Args:
-            frames: codes (frame, y, x), DN.
-            edges: positions of the blocks, (b + 1,).
-            laws: of the pixels' samples.
-            maps: parameters of the pixels.
-            inside: pixels whose residuals count, (y, x); None: all.
-            most: samples that are looked at, in frames evenly spread; None: all.
+        Only residuals of pixels ``inside``, (y, x), count, of ``most`` samples, in frames evenly spread.
         """
         first = groups_of(edges, maps.usable.size, frames.size if most is None else most)
         if not first.size:
@@ -159,8 +152,8 @@ class FollowingSamples:
         number = (self.groups * (GROUP - np.arange(STEPS))).astype(np.float64)
         found = []
         for axes, total in zip(views, sums, strict=True):
-            told = np.flip(self.scale > 0.0, tuple(axis - 1 for axis in axes))
-            to, source = (fft.rfftn(mask.astype(np.float64), size) for mask in (self.inside, told))
+            counted = np.flip(self.scale > 0.0, tuple(axis - 1 for axis in axes))
+            to, source = (fft.rfftn(mask.astype(np.float64), size) for mask in (self.inside, counted))
             products = _centred(total, size, (ny, nx))
             pairs = np.rint(_centred((to.conj() * source)[None], size, (ny, nx))) * number[:, None, None]
             if not axes:
@@ -171,15 +164,12 @@ class FollowingSamples:
     def by_excess(
         self, place: tuple[int, int, int], columns: tuple[int, int] | None, above: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return sums of products with what the charge at a place has above some numbers, and of its squares.
+        """Return ``sum u f`` and ``sum f^2`` of residuals u and of the charge f above some numbers, (n,).
 
         Args:
             place: frames, rows and columns from the residual to the charge.
-            columns: first column of residuals that count, and the one behind; None: all.
+            columns: first column of residuals that count, and end; None: all.
             above: electrons, (n,).
-
-        Returns:
-            ``sum u f`` and ``sum f^2`` of residuals u, in their standard deviation, and f, e-, (n,) each.
         """
         step, (ny, nx) = -place[0], self.inside.shape
         here, there = self._pairs(place)
@@ -203,19 +193,15 @@ class FollowingSamples:
     def _pairs(self, place: tuple[int, int, int]) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
         """Return the rows and columns of residuals with a sample at a place, and those of the samples."""
         here, there = (
-            tuple(
-                slice(max(-sign * d, 0), n - max(sign * d, 0))
-                for d, n in zip(place[1:], self.inside.shape, strict=True)
-            )
-            for sign in (1, -1)
+            tuple(slice(max(-d, 0), n - max(d, 0)) for d, n in zip(away, self.inside.shape, strict=True))
+            for away in (place[1:], (-place[1], -place[2]))
         )
         return here, there
 
     def by_column(self, place: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
-        """Return the sums of products with the sample at a place, and how many, by the residual's column.
+        """Return the sums and numbers of products with the sample at a place, by the residual's column.
 
-        Args:
-            place: frames, rows and columns from the residual to the charge.
+        The place is in frames, rows and columns from the residual to the charge.
         """
         step, (ny, nx) = -place[0], self.inside.shape
         here, there = self._pairs(place)
@@ -232,12 +218,8 @@ class FollowingSamples:
 def _scatter(u: Float32Array) -> FloatArray:
     """Return the sums of squares of frames (t, y, x): of samples, row, column and frame sums."""
     rows, columns = u.sum(axis=2, dtype=np.float64), u.sum(axis=1, dtype=np.float64)
-    return np.array(
-        [
-            float((u**2).sum(dtype=np.float64)),
-            *(float((s**2).sum()) for s in (rows, columns, rows.sum(axis=1))),
-        ]
-    )
+    lines = [float((sums**2).sum()) for sums in (rows, columns, rows.sum(axis=1))]
+    return np.array([float((u**2).sum(dtype=np.float64)), *lines])
 
 
 def _centred(spectra: Spectra, size: tuple[int, int], shape: tuple[int, int]) -> FloatArray:

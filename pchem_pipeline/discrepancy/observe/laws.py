@@ -60,14 +60,17 @@ def largest_normal(values: FloatArray) -> float:
 
 
 def largest_power(power: NDArray[np.floating], averaged: int) -> float:
-    """Return the normal quantile of the largest of many powers.
+    """Return the normal quantile of the largest of many powers, of any shape.
 
-    Args:
-        power: each the mean of ``averaged`` independent exponential numbers of mean 1 (the periodogram of
-            white noise; the largest of them is Fisher's g-test), any shape.
-        averaged: how many.
+    Each is the mean of ``averaged`` independent exponential numbers of mean 1 (the periodogram of white
+    noise; the largest of them is Fisher's g-test).
     """
-    return _of_many(_log_gamma_tail(averaged, averaged * float(np.max(power))), power.size)
+    total = averaged * float(np.max(power))
+    tail = float(special.gammaincc(averaged, total))
+    if tail > 1e-250:
+        return _of_many(float(np.log(tail)), power.size)
+    log_tail = float((averaged - 1.0) * np.log(total) - total - special.gammaln(averaged))
+    return _of_many(log_tail, power.size)
 
 
 def _of_many(log_tail: float, n: float) -> float:
@@ -92,24 +95,11 @@ def _log_poisson_tail(count: int, expected: float) -> float:
     return float(above + np.log1p(-0.5 * np.exp(min(at - above, 0.0))))
 
 
-def _log_gamma_tail(shape: float, value: float) -> float:
-    tail = float(special.gammaincc(shape, value))
-    if tail > 1e-250:
-        return float(np.log(tail))
-    return float((shape - 1.0) * np.log(value) - value - special.gammaln(shape))
-
-
 def pile_up(observed: FloatArray, expected: FloatArray, at: int, *, top: bool) -> float:
-    """Return the normal quantile of the samples at the highest or lowest code, with none beyond it.
+    """Return the normal quantile of the samples at the highest (``top``) or lowest code, with none beyond it.
 
     The chance of none beyond the extreme code is uniform over repetitions, and given some, the counts on it
-    follow a Poisson law: both as normal quantiles, averaged.
-
-    Args:
-        observed: samples of each code, (n,).
-        expected: those expected, (n,).
-        at: the extreme code; anywhere else than among these nothing is expected.
-        top: it is the highest one.
+    follow a Poisson law: both as normal quantiles, averaged. Outside of the (n,) codes nothing is expected.
     """
     known = 0 <= at < expected.size
     count, on = (max(int(observed[at]), 1), max(float(expected[at]), _SMALL)) if known else (1, _SMALL)

@@ -1,10 +1,8 @@
 """Rows and columns of single frames whose samples belong to other pixels.
 
-Lines that change places, come a sample early or late, or lose one on the way: every sample is then one of
-another pixel, by whose histogram it is likely and by its own less so. A line's likelihood at another place
-over that at its own tells, for every place, and the sum of what a small share of such lines gains is the
-statistic. Lines put together of samples of different frames show what chance makes of it, whatever the
-histograms are.
+Lines change places, come a sample early or late, or lose one on the way: every sample is then one of another
+pixel. The statistic is the gain of log likelihood by a small share of lines at other places, less that of
+lines put together from samples of different frames, whatever the histograms are.
 """
 
 from __future__ import annotations
@@ -37,16 +35,9 @@ def misplaced_lines(
 ) -> tuple[dict[str, float], dict[str, FloatArray]]:
     """Return the statistics of misplaced rows and columns, and their shares by place.
 
-    Args:
-        frames: codes (frame, y, x), DN.
-        counts: histograms of the pixels over all frames, (y * x, B).
-        origin: DN of their bin 0, (y * x,).
-        usable: pixels that count, (y, x).
-
-    Returns:
-        By ``space.misplaced.rows`` and ``.columns`` how many standard deviations lines are likelier elsewhere
-        than chance makes them; by "rows" and "columns", where these stand out, the likeliest share of lines
-        from each of :data:`~.evidence.PLACES`, the share by chance taken off, shape (6,).
+    Frames are codes (frame, y, x), DN; histograms of their pixels are (y * x, B), with bin 0 at ``origin``.
+    The shares, by "rows" and "columns" where these stand out, are the likeliest ones of lines from each of
+    :data:`~.evidence.PLACES`, less those by chance, shape (6,).
     """
     z: dict[str, float] = {}
     shares: dict[str, FloatArray] = {}
@@ -70,12 +61,7 @@ def misplaced_lines(
 def own_lines(frames: CodeArray, usable: BoolArray, effects: Iterable[Effect]) -> CodeArray:
     """Return frames in which lines that effects likely misplaced are those of other frames, drawn at random.
 
-    Each sample in a pixel's histogram is then its own, as many as there were.
-
-    Args:
-        frames: codes (frame, y, x), DN.
-        usable: pixels that count, (y, x).
-        effects: of the model.
+    Each sample in a pixel's histogram is then of that pixel, and their number stays.
     """
     found = frames
     for effect in effects:

@@ -119,16 +119,10 @@ def observe(
 def observe_histograms(
     counts: CodeArray, origin: IntArray, *, parameters: FloatArray | None = None
 ) -> Evidence:
-    """Return the evidence of ready-made histograms: no time, no neighbours.
+    """Return the evidence of ready-made histograms (n, B) with bin 0 at ``origin``: maps (1, n), and no time.
 
-    Args:
-        counts: one histogram per pixel (and sample), (n, B).
-        origin: DN of bin 0, (n,).
-        parameters: (H, g, mu, sigma) of a fit of more than one histogram each, (n, 4), NaN where not usable;
-            None: each histogram is fitted by itself.
-
-    Returns:
-        Evidence with maps of shape (1, n) and ``time`` None.
+    The parameters are (H, g, mu, sigma) of a fit of more than one histogram each, (n, 4), NaN where not
+    usable; None: each histogram is fitted by itself.
 
     Raises:
         PchEmError: no pixel is usable.
@@ -215,15 +209,11 @@ def _fitted(
 
 
 def _without_steps(gain: FloatArray, usable: BoolArray) -> BoolArray:
-    """Return which pixels have a comb that whole DN hardly show, where most pixels have a coarser one, (n,).
+    """Return which usable pixels have a comb that whole DN hardly show, where most have a coarser one, (n,).
 
     Of noise that hides the electrons, as in the dark, in reference columns or in noisy pixels, a few of many
-    fits make such a comb by chance. Replicates of what they found would be of other pixels; and in samples
-    that it was not fitted to, a comb that is not there is off by hundreds of standard deviations.
-
-    Args:
-        gain: fitted, e-/DN, (n,).
-        usable: pixels whose fit succeeded, (n,).
+    fits make such a comb by chance. In samples that it was not fitted to, it is off by hundreds of standard
+    deviations.
     """
     if not usable.any():
         return np.zeros_like(usable)
@@ -240,12 +230,7 @@ def _inside(seen: PixelHistograms) -> BoolArray:
 
 
 def fitted_maps(frames: CodeArray, exclude: BoolArray) -> PixelMaps:
-    """Return the plain fit of some frames, from nothing, as :func:`observe` makes it.
-
-    Args:
-        frames: codes (n, y, x), DN.
-        exclude: pixels not to look at, (y, x).
-    """
+    """Return the plain fit of frames, from nothing, as :func:`observe` makes it, of pixels not excluded."""
     _, parameters, usable = _fitted(PixelHistograms.of(frames), ~exclude.ravel())
     return PixelMaps.known(parameters.T, usable.reshape(exclude.shape))
 
@@ -265,7 +250,7 @@ def _clusters(hits: IntArray, laws: PixelLaws, shape: tuple[int, ...]) -> float:
 
 
 def _time_series(view: FrameView, n_run: int, **others: Any) -> TimeSeries:
-    """Return what is kept along time; ``others``: its fields that are not of the view."""
+    """Return the time series; ``others``: its fields that are not of the view."""
     exposure, number = view.pixels.mode
 
     def over(values: FloatArray, count: FloatArray) -> FloatArray:
@@ -275,8 +260,8 @@ def _time_series(view: FrameView, n_run: int, **others: Any) -> TimeSeries:
         return np.where(view.pixels.usable, values, np.nan).astype(np.float32)
 
     def lags(name: str) -> Float32Array:
-        of = (view.correlations[f"time.lag{lag}.{name}"].of_pixels for lag in (1, 2, 3))
-        return np.stack(list(of)).astype(np.float32)
+        of = [view.correlations[f"time.lag{lag}.{name}"].of_pixels for lag in (1, 2, 3)]
+        return np.stack(of).astype(np.float32)
 
     rows, columns = (
         [over(each, number.sum(axis)).astype(np.float32) for each in sums[:2]]

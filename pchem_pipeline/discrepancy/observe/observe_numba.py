@@ -33,16 +33,10 @@ def look_up(
     weight: Float32Array,
     values: Float32Array,
 ) -> None:
-    """Fill values (2, t, y, x) with k and r of codes; codes beyond the support count as its ends.
+    """Fill values (2, t, y, x) with k and r of codes (t, y, x), DN, times a weight of each pixel, (y, x).
 
-    Args:
-        codes: of frames, DN, (t, y, x).
-        first: first code of each pixel, (y, x).
-        last: its last one.
-        start: row of its first code in ``tables``.
-        tables: of all pixels, (rows, 2).
-        weight: of each pixel, (y, x).
-        values: to fill.
+    Codes beyond the first and last one of a pixel, (y, x), count as these; ``start``: row of the first one in
+    the tables of all pixels, (rows, 2).
     """
     # row by row, whose tables stay in the cache
     for y in range(codes.shape[1]):

@@ -28,7 +28,7 @@ _LEADING = 2  # statistics of a signature that are looked at
 
 @dataclass(frozen=True)
 class SensorWindow:
-    """The rows and columns of a sensor that are looked at; regions are told on the sensor.
+    """The rows and columns of a sensor that are looked at; regions are in coordinates of the sensor.
 
     Attributes:
         rows, columns: first, and end.
@@ -57,10 +57,9 @@ class SensorWindow:
         found = []
         for effect in (each.to_window(self.rows, self.columns, self.shape) for each in effects):
             mask = self.mask(effect.region)
-            if effect.region is None or mask.all():
-                found.append(effect.at_place(None, effect.when))
-            elif mask.any():
-                found.append(effect.at_place(Region.of_mask(mask), effect.when))
+            if effect.region is None or mask.any():
+                region = None if effect.region is None or mask.all() else Region.of_mask(mask)
+                found.append(effect.at_place(region, effect.when))
         return tuple(found)
 
     def found(self, effect: Effect, part: Part | None = None) -> Effect:
@@ -120,12 +119,7 @@ def _beyond(found: tuple[Span, ...], window: Span, known: tuple[Span, ...]) -> t
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the sensor, of the run, or of both.
-
-    Attributes:
-        region: its pixels; None: all.
-        when: its frames; None: all.
-    """
+    """A part of the sensor (None: all pixels), of the run (None: all frames), or of both."""
 
     region: Region | None = None
     when: When | None = None
@@ -151,17 +145,10 @@ def part_evidence(
     window: SensorWindow | None = None,
     fitted: bool = True,
 ) -> Evidence:
-    """Return the evidence of a part alone, a sensor that ends with it: row 0 is its first.
+    """Return the evidence of a part alone, as of a sensor that ends with it: row 0 is its first.
 
-    Args:
-        frames: codes (n, y, x), DN.
-        numbers: of the frames in the run, shape (n,).
-        maps: fit of all these frames.
-        part: what to look at.
-        n_run: frames of the whole run.
-        block_frames: frames of a block; shorter ones where the part has few.
-        window: of the sensor that the frames are; None: all of it.
-        fitted: fit its pixels in its frames; False: take the maps as they are.
+    The maps are the fit of all these frames, of a window of the sensor (None: all of it); the other arguments
+    are those of `observe`. Blocks are shorter where the part has few frames.
 
     Raises:
         PchEmError: it holds too few frames, or no usable pixel.

@@ -38,7 +38,7 @@ class PixelStatistics:
             common to all pixels taken away.
         gain_variance: variance of that sum in one frame.
         noise: variance of r^2, in that of r squared: 2 for Gaussian residuals.
-        square: weights of r^2 by which a common relative change of the noise is told best.
+        square: weights of r^2 that measure a common relative change of the noise best.
     """
 
     usable: BoolArray
@@ -125,12 +125,9 @@ class FrameBlocks:
 
     @classmethod
     def of(cls, frames: CodeArray, chosen: IntArray | None = None, together: int = 1) -> FrameBlocks:
-        """Take frames in memory.
+        """Take frames in memory, codes (n, y, x): those at chosen positions (None: all).
 
-        Args:
-            frames: codes (n, y, x), DN.
-            chosen: positions of those that are meant; None: all.
-            together: successive ones of these that come in the same block.
+        Groups of ``together`` successive ones are never split between blocks.
         """
         n_frames = frames.shape[0] if chosen is None else chosen.size
 
@@ -179,15 +176,10 @@ class Samples:
     ) -> Samples:
         """Prepare frames by the laws of their pixels, made of all samples of the frames or of more.
 
-        Args:
-            frames: codes.
-            laws: of the pixels' samples.
-            maps: parameters of the pixels.
-            standardised: False: k (e-) and r (DN) as they are.
+        If not ``standardised``, k (e-) and r (DN) stay as they are.
         """
         pixels = pixel_statistics(laws, maps)
-        usable = pixels.usable
-        tables = laws.tables
+        usable, tables = pixels.usable, laws.tables
         if standardised:
             length = np.where(laws.good, laws.support[:, 1], 0)
             deviation = np.sqrt(np.where(usable, pixels.variance, 1.0)).reshape(2, -1).astype(np.float32)
@@ -206,7 +198,7 @@ class Samples:
         return self.frames.n_frames
 
     def without(self, pixels: BoolArray) -> Samples:
-        """Return it without some pixels, (y, x)."""
+        """Return the samples without some pixels, (y, x)."""
         return replace(self, usable=self.usable & ~pixels)
 
     def chunks(

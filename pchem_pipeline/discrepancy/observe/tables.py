@@ -115,12 +115,9 @@ class PixelLaws(NamedTuple):
 
 
 def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: BoolArray) -> PixelLaws:
-    """Compare the histogram of every usable pixel with its fitted law.
+    """Compare the histogram of every usable pixel, of n, with its fitted law.
 
-    Args:
-        seen: histograms of n pixels.
-        parameters: H, g, mu, sigma (with quantisation), (n, 4); anything where not usable.
-        usable: pixels to look at, (n,).
+    The parameters are H, g, mu, sigma (with quantisation), (n, 4), anything where not usable.
     """
     n = usable.size
     # harmless numbers for unusable pixels
@@ -136,15 +133,8 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: BoolArray)
     while n_codes > coarse * _MOST_BINS:
         coarse *= 2
     n_bins = n_codes // coarse + 1
-    codes = CodeSums(
-        first=axis,
-        coarse=coarse,
-        single=np.zeros((4, n_codes)),
-        fold=np.zeros(FOLD),
-        fold_covariance=np.zeros((FOLD, FOLD)),
-        bins=np.zeros((3, n_bins)),
-        bin_covariance=np.zeros((n_bins, n_bins)),
-    )
+    sizes = (4, n_codes), (FOLD,), (FOLD, FOLD), (3, n_bins), (n_bins, n_bins)
+    codes = CodeSums(axis, coarse, *(np.zeros(size) for size in sizes))
     moments, support = np.zeros(n, MOMENTS), np.tile(np.array([0, 1, 0]), (n, 1))
     tables = np.zeros((1 + int(length[good].sum()), 2), np.float32)
     factors, sums = np.zeros((n, N_NUISANCE, N_COLUMNS)), np.zeros((n, N_TESTS, N_TESTS + 3))
@@ -177,14 +167,13 @@ def efficient_scores(
 ) -> FloatArray:
     """Compute the standardised efficient scores of the samples, their skewness and kurtosis, (n, 3, N_TESTS).
 
+    NaN where a score has no variance.
+
     Args:
         sums: see :func:`~.tables_numba.sum_scores`, (n, N_TESTS, N_TESTS + 3).
         factors: of the whitening, (n, N_NUISANCE, N_COLUMNS).
         samples: of each pixel, (n,).
         exposure: H, e-, (n,).
-
-    Returns:
-        NaN where a score has no variance.
     """
     products, (total, third, fourth) = sums[:, :, :N_TESTS], np.moveaxis(sums[:, :, N_TESTS:], 2, 0)
     variance, samples = np.einsum("pii->pi", products), samples[:, None]
@@ -211,8 +200,8 @@ def _fit_covariance(factors: FloatArray) -> FloatArray:
 def _curvature(covariance: FloatArray, exposure: FloatArray) -> FloatArray:
     """Return the coefficients of the tests in ``sum_ab cov(a, b) D_a D_b p``, in their order, (N_TESTS, n).
 
-    The directions multiply the terms of the law by C1, He1, He1 C1, He2; two of them by the products, of
-    which only what is not spanned by the parameters matters.
+    D_a multiplies the terms of the law by C1, He1, He1 C1, He2. Of their products only what the parameters do
+    not span matters.
     """
     c, root2 = covariance, np.sqrt(2.0)
     return np.stack([

@@ -65,13 +65,9 @@ class CodeSums(NamedTuple):
 
 @kernel
 def supports(parameters: FloatArray, log_negligible: float, electrons: IntArray, codes: IntArray) -> None:
-    """Fill the ranges of electron numbers and of codes (n, 2) that the law of each pixel covers.
+    """Fill the ranges of electron numbers and of codes, (n, 2), that the law of each pixel covers.
 
-    Args:
-        parameters: H, 1/g, mu, analog read noise in DN, (n, 4).
-        log_negligible: logarithm of the probability of electron numbers that are left out.
-        electrons: to fill.
-        codes: to fill.
+    Parameters as of :class:`Fits`; electron numbers of negligible probability (its logarithm) are left out.
     """
     for p in range(parameters.shape[0]):
         exposure, step, bias, width = parameters[p]
@@ -181,14 +177,7 @@ def _expect(law: FloatArray, inverse: FloatArray, seen: FloatArray, expected: Fl
 def _goodness(
     law: FloatArray, seen: FloatArray, expected: FloatArray, shortest: float
 ) -> tuple[float, float, float]:
-    """Return Pearson's chi-square of merged codes, its mean and variance with the parameters fitted.
-
-    Args:
-        law: its columns of the parameters, whitened, (code, ...).
-        seen: samples of each code.
-        expected: those expected.
-        shortest: codes in a group, at least.
-    """
+    """Return Pearson's chi-square of groups of codes, with its mean and variance for fitted parameters."""
     taken = np.zeros(N_NUISANCE)
     n = remaining = seen.sum()
     chi2 = mean = inverse = observed = wanted = 0.0
@@ -221,12 +210,7 @@ def _goodness(
 def _centre(mass: FloatArray, k: FloatArray, r: FloatArray, seen: FloatArray, moments: Any) -> None:
     """Subtract from k and r their means over the samples, and fill the moments of the channels.
 
-    Args:
-        mass: of each code.
-        k: E[K | x], changed in place.
-        r: x - mu - k / g, likewise.
-        seen: samples of each code; those beyond the support count as its ends.
-        moments: of the pixel, one of :data:`~.tables.MOMENTS`.
+    Samples beyond the support count as its ends.
     """
     total, n = mass.sum(), seen.sum()
     spread = np.zeros(2)
@@ -255,10 +239,9 @@ def _centre(mass: FloatArray, k: FloatArray, r: FloatArray, seen: FloatArray, mo
 def _add_codes(
     law: FloatArray, seen: FloatArray, expected: FloatArray, shift: FloatArray, first: int, sums: CodeSums
 ) -> None:
-    """Add residuals of a pixel and their covariance: per code, per code modulo 16, per bin of codes.
+    """Add residuals of a pixel and their covariance: per code (from ``first`` on), modulo 16, and by bin.
 
-    In the bins they are weighted with ``shift``, what a shift of the scale does to each code, so that they
-    sum to the shift of the scale there. ``first`` is the place of the first code on the axis of the sums.
+    In the bins they are weighted with ``shift``, what a shift of the scale does to each code.
     """
     last, n = first + seen.size - 1, seen.sum()
     if first < 0 or last >= sums.single.shape[1]:

@@ -41,13 +41,10 @@ def pixel_forms(
     kurtosis: FloatArray | float = 0.0,
     two_sided: bool = True,
 ) -> dict[str, float]:
-    """Return the statistics of deviations of pixels, N(0, 1) by chance: their mean, their squares, outliers.
+    """Return the statistics of standardised deviations of pixels, (n,): their mean, their squares, outliers.
 
-    Args:
-        z: of mean 0 and variance 1, (n,).
-        normal: the same as normal quantiles, (n,); None: they are.
-        kurtosis: excess of each.
-        two_sided: whether far below counts as far above.
+    ``normal`` are the same as normal quantiles (None: they are), ``kurtosis`` is the excess of each; outliers
+    are on both sides, or above only.
     """
     quantiles = z if normal is None else normal
     count = int(np.sum((np.abs(quantiles) if two_sided else quantiles) > OUTLYING))
@@ -65,11 +62,7 @@ def named(start: str, forms: Mapping[str, float]) -> dict[str, float]:
 
 
 def goodness_of(chi_square: FloatArray) -> FloatArray:
-    """Return the goodness of fit of each pixel as a normal quantile, 0 without degrees of freedom, (n,).
-
-    Args:
-        chi_square: of the pixels, its mean and its variance, (n, 3).
-    """
+    """Return (chi-square, mean, variance), (n, 3), as normal quantiles, 0 without degrees of freedom."""
     value, mean, variance = chi_square.T
     some = mean > 0.5
     z = laws.chi_square(value, np.where(some, mean, 1.0), np.where(some, variance, 2.0))
@@ -77,13 +70,7 @@ def goodness_of(chi_square: FloatArray) -> FloatArray:
 
 
 def sample_statistics(pixels: PixelLaws, exposure: FloatArray, residuals: CodeResiduals) -> dict[str, float]:
-    """Return the families shape, code and tail (but for the clusters, which need frames).
-
-    Args:
-        pixels: laws of the pixels; at least one is good.
-        exposure: H, (n,).
-        residuals: counts per DN, with the extremes of the good pixels.
-    """
+    """Return the families shape, code and tail but for clusters; at least one pixel is good."""
     good = pixels.good
     found = _score_statistics(pixels.scores[good], np.log(exposure[good]))
     moments = pixels.moments[good]
@@ -92,19 +79,14 @@ def sample_statistics(pixels: PixelLaws, exposure: FloatArray, residuals: CodeRe
     for side in ("low", "high"):
         near, far = moments[side], moments[f"far_{side}"]
         found[f"tail.{side}.count"] = _beyond(near.sum(axis=0), far.sum(axis=0))
-        pixels_with = [
-            np.array([np.count_nonzero(seen), -np.expm1(-expected).sum()])
-            for seen, expected in (near.T, far.T)
-        ]
-        found[f"tail.{side}.pixels"] = _beyond(*pixels_with)
+        some = [np.array([np.count_nonzero(n), -np.expm1(-mean).sum()]) for n, mean in (near.T, far.T)]
+        found[f"tail.{side}.pixels"] = _beyond(*some)
     return found | _code_statistics(pixels.codes, residuals)
 
 
 def _beyond(near: FloatArray, far: FloatArray) -> float:
-    """Return the statistic of samples (seen, expected) beyond the support and far beyond it.
-
-    Few samples of heavy tails are far out, where none is expected; many of a satellite are near.
-    """
+    """Return the statistic of samples (seen, expected) beyond the support and far beyond it."""
+    # few samples of heavy tails are far out, where none is expected; many of a satellite are near
     z = laws.poisson(int(near[0]), float(near[1]))
     return laws.best(z, laws.poisson(int(far[0]), float(far[1]))) if far[0] > 0 else z
 
@@ -148,11 +130,8 @@ def width_statistics(codes: CodeSums) -> tuple[dict[str, float], FloatArray]:
 
 def _code_statistics(codes: CodeSums, residuals: CodeResiduals) -> dict[str, float]:
     found, _ = width_statistics(codes)
-    smooth = _absorbed_chi_square(
-        codes.bins[0], codes.bin_covariance, np.where(codes.bins[2] >= _ENOUGH, codes.bins[1], 0.0)
-    )
-    if np.isfinite(smooth):
-        found["code.smooth"] = smooth
+    poisson = np.where(codes.bins[2] >= _ENOUGH, codes.bins[1], 0.0)
+    found["code.smooth"] = _absorbed_chi_square(codes.bins[0], codes.bin_covariance, poisson)
     for name, code in (("top", residuals.maximum), ("bottom", residuals.minimum)):
         at = code - residuals.first
         found[f"code.{name}"] = laws.pile_up(residuals.observed, residuals.expected, at, top=name == "top")
@@ -160,12 +139,7 @@ def _code_statistics(codes: CodeSums, residuals: CodeResiduals) -> dict[str, flo
 
 
 def period_statistics(fold: FloatArray, covariance: FloatArray) -> dict[str, float]:
-    """Return the statistics of residuals by DN modulo 16; each period without the shorter ones in it.
-
-    Args:
-        fold: sums of the residuals, (16,).
-        covariance: of these, (16, 16).
-    """
+    """Return the statistics of residuals by DN modulo 16; each period without the shorter ones in it."""
     code = np.arange(FOLD)
     sign = (-1.0) ** code
     found = {"code.alternating": float(sign @ fold / np.sqrt(max(float(sign @ covariance @ sign), 1e-300)))}
@@ -282,7 +256,7 @@ def _quadrants(view: FrameView, channel: int) -> float:
 
 
 def product_statistics(view: FrameView) -> dict[str, float]:
-    """Return the statistics of products of samples: the mean over the pixels by the name of the products."""
+    """Return the statistics of products of samples; their mean also by the name of the products alone."""
     found: dict[str, float] = {}
     for name, seen in view.correlations.items():
         z = seen.deviations[np.isfinite(seen.of_pixels)]
@@ -341,7 +315,7 @@ def _line_forms(
 
 
 def _line_over_lines(view: FrameView, rest: FloatArray, used: int) -> float:
-    """Return the statistic of a wave across the lines, coherent over a block or over one frame only."""
+    """Return the statistic of a wave across the lines, coherent over a block or over one frame."""
     blocks = view.full_blocks(rest)
     count, length, lines = blocks.shape
     if count == 0 or min(length, used) < FEWEST_LINES:

@@ -101,15 +101,7 @@ class FrameView:
     def of(
         cls, frames: NDArray[Any], numbers: IntArray, block_frames: int, laws: PixelLaws, maps: PixelMaps
     ) -> FrameView:
-        """Sum over frames.
-
-        Args:
-            frames: codes (n, y, x), DN.
-            numbers: their frame numbers in the run, increasing, (n,).
-            block_frames: frames in a block; no block spans a gap.
-            laws: of the pixels' samples.
-            maps: parameters of the pixels.
-        """
+        """Sum over frames, codes (n, y, x), whose numbers in the run are increasing; no block spans a gap."""
         (n, ny, nx), edges = frames.shape, sums.blocks_of(numbers, block_frames)
         pixels = sums.pixel_statistics(laws, maps)
         samples = sums.Samples.by_laws(sums.FrameBlocks.of(frames), laws, maps, standardised=False)
@@ -211,10 +203,8 @@ class FrameView:
         return Correlation(of_pixels, average, _count(self.edges, lag))
 
     def _shared(self, a: int, b: int, one: _Slices, two: _Slices) -> FloatArray:
-        """Return what removing the common modes adds to covariances of channel a of pixels with b of others.
-
-        With ``a' = a - s sum(a)`` and ``b' = b - t sum(b)``, s and t the shares of the pixels in the modes.
-        """
+        """Return what removing the common modes adds to covariances of channels a and b of two pixels."""
+        # with a' = a - s sum(a) and b' = b - t sum(b), s and t the shares of the pixels in the modes
         pixels = self.pixels
         covariance = (pixels.variance[0], pixels.cross, pixels.variance[1])[a + b]
         share_a, share_b = (pixels.mode[each] / pixels.mode[each].sum() for each in (a, b))
@@ -233,14 +223,10 @@ class FrameView:
         return np.asarray(series[starts[:, None] + np.arange(self.block_frames)])
 
     def slow(self, series: FloatArray, freedom: int = 1) -> float:
-        """Return the statistic of slow variation of centred series of variance 1.
+        """Return the statistic of slow variation of centred series of variance 1, from :meth:`block_sums`.
 
         The squares of the slowest 2, 4, 8 ... waves over the blocks are summed, and those of all; the most
-        significant sum counts (the adaptive test of Neyman, Fan 1996).
-
-        Args:
-            series: sums over the blocks, divided by the root of their length, (b, m).
-            freedom: independent series among the m.
+        significant sum counts (the adaptive test of Neyman, Fan 1996). ``freedom`` series are independent.
         """
         root = np.sqrt(np.diff(self.edges).astype(np.float64))
         middle = 0.5 * (self.edges[:-1] + self.edges[1:]) / self.n
@@ -267,10 +253,8 @@ def _count(edges: IntArray, lag: int) -> int:
 
 
 def _add_products(u: Float32Array, known: int, products: dict[str, FloatArray]) -> None:
-    """Add the products of frames (2, t, y, x) with those before; the first ``known`` are that only.
-
-    A product with the pixel behind the end of a row is none of neighbours, and is not used.
-    """
+    """Add the products of frames (2, t, y, x) with those before; the first ``known`` are that only."""
+    # a product with the pixel behind the end of a row is none of neighbours, and is not used
     flat = u.reshape(2, u.shape[1], -1)
     for name, ((lag, dy, dx), channels) in PRODUCTS.items():
         ahead, first = dy * u.shape[3] + dx, max(known, lag)

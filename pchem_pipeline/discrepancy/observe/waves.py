@@ -52,14 +52,9 @@ class Waves:
 def waves_across(
     frames: CodeArray, numbers: IntArray, laws: PixelLaws, maps: PixelMaps, inside: BoolArray | None = None
 ) -> Waves:
-    """Look for waves in the residuals of frames.
+    """Look for waves in the residuals of frames (frame, y, x) with these numbers in the run, increasing.
 
-    Args:
-        frames: codes (frame, y, x), DN.
-        numbers: of the frames in the run, increasing, (frame,).
-        laws: of the pixels' samples.
-        maps: parameters of the pixels.
-        inside: pixels that are looked at, (y, x); None: all.
+    Only pixels ``inside`` are looked at, (y, x); None: all.
     """
     ny, nx = maps.usable.shape
     some = numbers - numbers[0] < max(_MOST_SAMPLES // maps.usable.size, 1)
@@ -97,7 +92,7 @@ def _spectrum(u: Float32Array, numbers: IntArray, pixels: int) -> tuple[Float32A
     power /= pixels * numbers.size
     for when in (0, len(power) // 2) if len(power) % 2 == 0 else (0,):
         power[when] = _halved(power[when], nx)
-    for level in _levels(power):
+    for level in _levels(power):  # so that humps are no lines
         power /= level
     return mean, power
 
@@ -111,18 +106,14 @@ def _squared(values: NDArray[np.complex64]) -> Float32Array:
 
 def _halved(power: Float32Array, columns: int) -> Float32Array:
     """Return powers with those of real waves halved: they have one phase, and twice the mean power."""
-    power = power.copy()
-    rows = power.shape[0] + 1
+    power, rows = power.copy(), power.shape[0] + 1
     if rows % 2 == 0 and columns % 2 == 0:
         power[rows // 2 - 1, columns // 2 - 1] /= 2.0
     return power
 
 
 def _levels(power: Float32Array) -> list[Float32Array]:
-    """Return the noise power of each place and of each time, at least that of white noise.
-
-    So humps are no lines.
-    """
+    """Return the noise power of each place and of each time, at least that of white noise."""
     series = power.reshape(len(power), -1)
     found = []
     for values, shape in ((series.T, (1, *power.shape[1:])), (series, (-1, 1, 1))):
@@ -175,8 +166,7 @@ def _climbed(
 ) -> tuple[dict[str, float], NDArray[np.complexfloating]]:
     """Return the frequencies near a peak, each in turn by ever finer steps, and the sums of samples there.
 
-    There is a sum for each place along an axis that is not in ``places``; a peak is as wide as one over the
-    size of its axis.
+    There is a sum for each place along an axis that is not in ``places``.
     """
     kept = "".join(letter for letter in "tyx" if letter not in places)
     steps = np.linspace(-1.0, 1.0, _STEPS)

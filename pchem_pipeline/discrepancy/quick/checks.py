@@ -67,7 +67,6 @@ class _Kind(NamedTuple):
     """What is said of a check, and what explains it.
 
     Attributes:
-        unit, title, advice: as of :class:`Check`.
         signs: statistics of the catalogue that show the same: an effect with one of them in its signature
             explains the check.
         limits: sizes (of those in DN shares of the read noise) from which it deserves caution, and from which
@@ -153,10 +152,9 @@ def check_of(name: str, p: float, size: float, *, how: str = "", **rest: Any) ->
 
 @dataclass(frozen=True)
 class QuickLook:
-    """All checks of a run.
+    """All checks of a run, in the order in which they were made.
 
     Attributes:
-        checks: in the order in which they were made.
         missing: checks that were not made, and why.
         samples: frames x pixels of the checks.
         command: command for a full search.
@@ -188,20 +186,15 @@ class QuickLook:
 def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[Effect]) -> tuple[Check, ...]:
     """Compute p-values corrected for the number of checks (Sidak), sizes in e- and read noises, and levels.
 
-    Args:
-        checks: the checks.
-        gain: median gain, e-/DN.
-        read_noise: median read noise, DN.
-        model: effects of the fitted model.
+    Given are the median gain, e-/DN, the median read noise, DN, and the effects of the fitted model.
     """
     shown = {name for effect in model for name in effect.signature}
     found = []
     for check in checks:
-        p_global = look_elsewhere(check.p, len(checks))
         in_dn = check.unit == "DN"
         done = replace(
             check,
-            p_global=p_global,
+            p_global=look_elsewhere(check.p, len(checks)),
             in_model=any(re.fullmatch(KINDS[check.name].signs, name) for name in shown),
             size_e=check.size * gain if in_dn else math.nan,
             share=check.size / read_noise if in_dn else math.nan,
@@ -213,10 +206,8 @@ def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[
 def _level(check: Check) -> Level:
     if not check.found:
         return "good"
-    if check.in_model:
-        return "note"
     size = check.share if check.unit == "DN" else abs(check.size)
     some, much = KINDS[check.name].limits
-    if size >= much:
-        return "serious"
-    return "caution" if size >= some else "note"
+    if check.in_model or not size >= some:
+        return "note"
+    return "serious" if size >= much else "caution"

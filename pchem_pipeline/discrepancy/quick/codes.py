@@ -54,8 +54,7 @@ class CodeSample:
         counts: samples at each DN, (n, bin).
         origin: DN of bin 0, (n,).
         parameters: H, g, mu, sigma (with quantisation), (n, 4), all finite.
-        joint: they come from a joint fit of several exposures, of which the histograms are one: they are
-            taken as they are.
+        joint: they come from a joint fit of several exposures, and are taken as they are.
         limits: first and last code of the ADC that the fit knows, DN; None: none.
     """
 
@@ -73,11 +72,7 @@ class CodeSample:
 
 
 def code_checks(sample: CodeSample) -> list[Check]:
-    """Return the checks of the codes: whether samples pile up at an end, and their widths where they do not.
-
-    Args:
-        sample: pixels with a fit that can be relied upon.
-    """
+    """Return the checks of the codes: whether samples pile up at an end, and else of their widths."""
     # pixels with samples, and of so many electrons that one of them is not too much
     most = _MOST_WORK // (2 * sample.counts.shape[1])
     kept = np.any(sample.counts, axis=1) & (sample.parameters[:, 0] < most)
@@ -116,10 +111,7 @@ def _sums(sample: CodeSample) -> CodeSums | None:
 
 
 def _widths(codes: CodeSums) -> Check | None:
-    """Return whether widths of codes differ, against the mean of both neighbours.
-
-    A width that is larger by d has ``1 + d`` times the samples.
-    """
+    """Return whether widths of codes (``1 + d``) differ, against the mean of both neighbours."""
     _, expected, residual, variance = codes.single
     judged = expected >= _ENOUGH
     some = judged[:-2] & judged[1:-1] & judged[2:]
@@ -144,10 +136,8 @@ def _widths(codes: CodeSums) -> Check | None:
 
 
 def _pile_up(codes: CodeSums, sample: CodeSample, code: int, top: bool) -> Check:
-    """Test whether samples are cut off at ``code``, the lowest or highest of all pixels, DN.
-
-    That of ``codes`` is no limit: it leaves out pixels that fit badly, often those with the farthest samples.
-    """
+    """Test whether samples are cut off at ``code``, the lowest or highest of all pixels, DN."""
+    # the end of the sums is no limit: they leave out pixels that fit badly, often with the farthest samples
     seen, expected = codes.single[:2]
     at = code - codes.first
     z = -math.inf

@@ -113,31 +113,21 @@ def _memory(series: FloatArray) -> Check:
 def levels_check(
     mean: FloatArray, variance: FloatArray, gain: float, empty: IntArray | tuple[()] = ()
 ) -> Check:
-    """Test whether the frames are of several exposures.
+    """Test whether the frames are of several exposures, from mean and variance of each over its pixels, DN.
 
-    Args:
-        mean: mean of each frame over its pixels, DN, (n,).
-        variance: variance of each frame over its pixels, DN^2, (n,).
-        gain: median gain, e-/DN.
-        empty: frames without samples of the sensor, which are no exposure.
+    Frames without samples of the sensor (``empty``) are no exposure. The gain is the median, e-/DN.
     """
-    levels, p = _parted(mean, variance, gain, np.setdiff1d(np.arange(mean.size), empty))
-    levels.sort(key=lambda frames: float(mean[frames].mean()))
-    several = len(levels) > 1
-    centres = [float(mean[frames].mean()) for frames in levels]
+    parts, p = _parted(mean, variance, gain, np.setdiff1d(np.arange(mean.size), empty))
+    levels = sorted(((float(mean[part].mean()), part) for part in parts), key=lambda level: level[0])
+    words = "; ".join(f"{odd_frames.frame_words(part, 1)} at {dn:.4g} DN" for dn, part in levels[:_SHOWN])
     more = f" and {len(levels) - _SHOWN} more levels" if len(levels) > _SHOWN else ""
-    shown = zip(levels[:_SHOWN], centres, strict=False)
-    where = (
-        "; ".join(f"{odd_frames.frame_words(frames, 1)} at {centre:.4g} DN" for frames, centre in shown)
-        + more
-    )
-    return check_of("levels", p, centres[-1] - centres[0], where=where if several else "")
+    return check_of("levels", p, levels[-1][0] - levels[0][0], where=words + more if len(levels) > 1 else "")
 
 
 def _parted(
     mean: FloatArray, variance: FloatArray, gain: float, frames: IntArray
 ) -> tuple[list[IntArray], float]:
-    """Return the frames of each level, and how probable the growth of the variance between any two is."""
+    """Return the frames of each level, and the least p-value of the growth of the variance between two."""
     levels, p = [frames], 1.0
     if frames.size < odd_frames.FEWEST_FRAMES:  # of 16, chance leaves such a gap in one of 400 runs
         return levels, p
@@ -145,7 +135,7 @@ def _parted(
     while len(levels) < _MOST_LEVELS:
         for number, frames in enumerate(levels):
             if halves := _halves(frames, mean, variance, gain, fewest):
-                p = min(p, _chance(variance[halves[0]], variance[halves[1]]))
+                p = min(p, _p_larger(variance[halves[0]], variance[halves[1]]))
                 levels[number : number + 1] = halves
                 break
         else:
@@ -153,8 +143,8 @@ def _parted(
     return levels, p
 
 
-def _chance(low: FloatArray, high: FloatArray) -> float:
-    """Return how probable it is that the mean of ``high`` is so much larger by chance (Student's test)."""
+def _p_larger(low: FloatArray, high: FloatArray) -> float:
+    """Return the one-sided p-value of Student's test that the mean of ``high`` is larger."""
     n = low.size + high.size
     within = (low.size * low.var() + high.size * high.var()) / (n - 2.0)
     error = np.sqrt(max(within, 1e-300) * (1.0 / low.size + 1.0 / high.size))
@@ -164,10 +154,7 @@ def _chance(low: FloatArray, high: FloatArray) -> float:
 def _halves(
     frames: IntArray, mean: FloatArray, variance: FloatArray, gain: float, fewest: int
 ) -> list[IntArray]:
-    """Return frames in two parts between which the means leave a clean gap, and the shot noise grows, or [].
-
-    Of all cuts through the sorted means the one with the least variance within both parts (Otsu 1979).
-    """
+    """Return frames in two parts (Otsu 1979) with a clean gap of the means and more shot noise, or []."""
     n = frames.size
     if n < 2 * fewest:
         return []

@@ -5,10 +5,7 @@ histograms, samples without any effect are in random order and independent of ot
 expectation and variance of all sums of products of different samples (permutation argument), so that a poor
 fit, a hot pixel or a heavy tail gives no false alarm. Noise common to a frame, row, column or to neighbours
 adds to the mean covariance of the pairs that share it; its components are separated as in an analysis of
-variance.
-
-A quick look gives a size, not a cause: for that, ``pchem discrepancy`` compares many more statistics with
-simulations.
+variance. The cause is found by ``pchem discrepancy``.
 """
 
 from __future__ import annotations
@@ -56,15 +53,10 @@ def quick_look(
     missing: dict[str, str] | None = None,
     command: str = "",
 ) -> QuickLook:
-    """Return the checks of a run.
+    """Return the checks of a run, of those of its sums and codes (histograms of some pixels) that there are.
 
-    Args:
-        sums: the summaries; None where there are none.
-        maps: the fitted parameters, (y, x).
-        codes: histograms of some pixels; None: codes are not looked at.
-        model: the effects that the pixels were fitted with.
-        missing: parts that are not looked at, and why.
-        command: what looks closer.
+    The pixels were fitted with the effects of the model. ``missing``: parts that are not looked at, and why;
+    ``command``: for a full search.
     """
     checks: list[Check] = []
     usable = maps.usable
@@ -118,13 +110,13 @@ def _wave(sums: StackSums, others: Sequence[Check]) -> list[Check]:
 
 @dataclass(frozen=True)
 class _Estimate:
-    """A mean covariance of pairs of pixels, DN^2, with its error and the freedom of the sum behind it."""
+    """A mean covariance of pairs of pixels, DN^2, with its error and degrees of freedom."""
 
     value: float
     error: float
     freedom: float
 
-    def less(self, other: _Estimate) -> _Estimate:
+    def __sub__(self, other: _Estimate) -> _Estimate:
         """Return the difference of independent estimates."""
         return _Estimate(self.value - other.value, math.hypot(self.error, other.error), self.freedom)
 
@@ -139,7 +131,7 @@ _NOTHING = _Estimate(0.0, math.inf, 1.0)
 
 def _normal(z: FloatArray, freedom: float) -> FloatArray:
     """Return normal quantiles of standardised sums of squares of so many degrees of freedom."""
-    return chi_square(np.maximum(freedom + z * math.sqrt(2.0 * freedom), 0.0), freedom)
+    return chi_square(freedom + z * math.sqrt(2.0 * freedom), freedom)
 
 
 def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
@@ -149,8 +141,8 @@ def _stack_checks(sums: StackSums, maps: PixelMaps) -> list[Check]:
         _noise_check(name, found, *lines)
         for name, found, *lines in (
             ("frame_noise", common.frame),
-            ("row_noise", common.rows.less(frame), sums.rows),
-            ("column_noise", common.columns.less(frame), sums.columns, sums.shape[1]),
+            ("row_noise", common.rows - frame, sums.rows),
+            ("column_noise", common.columns - frame, sums.columns, sums.shape[1]),
         )
         if math.isfinite(found.error)
     ]
@@ -163,18 +155,15 @@ def _located(checks: list[Check], sums: StackSums) -> list[Check]:
     """Return checks with the part of the sensor that they are about, and one of parts that drift apart."""
     cells = sensor_cells(sums)
     places = sensor_places(cells, SIGNIFICANCE)
-    found = []
-    for check in checks:
-        place = places.get(KINDS[check.name].map)
-        found.append(check if place is None else _placed(check, place, sums))
+    found = [_placed(check, places.get(KINDS[check.name].map), sums) for check in checks]
     for noise, neighbours in (("row_noise", "neighbours_x"), ("column_noise", "neighbours_y")):
-        found = _told_once(found, noise, neighbours)
+        found = _attributed(found, noise, neighbours)
     if "spread" in cells:
         found.append(_local_drift(sums, places.get("spread")))
     return found
 
 
-def _told_once(checks: list[Check], noise: str, neighbours: str) -> list[Check]:
+def _attributed(checks: list[Check], noise: str, neighbours: str) -> list[Check]:
     """Attribute the correlation of neighbours to the noise of their line where both have the same region."""
     first = next((check for check in checks if check.name == noise), None)
     if first is None or first.region is None or first.p > SIGNIFICANCE / len(checks):
@@ -187,8 +176,10 @@ def _told_once(checks: list[Check], noise: str, neighbours: str) -> list[Check]:
     ]
 
 
-def _placed(check: Check, place: Suspect, sums: StackSums) -> Check:
-    """Return a check with its place; noise of lines has the size that it has there."""
+def _placed(check: Check, place: Suspect | None, sums: StackSums) -> Check:
+    """Return a check with its place, if it has one; noise of lines has the size that it has there."""
+    if place is None:
+        return check
     p, size = check.p, check.size
     if check.name in ("neighbours_x", "neighbours_y", "lag"):  # a part of the sensor alone may fail
         p = look_elsewhere(min(check.p, place.p), 2.0)
@@ -271,9 +262,9 @@ def _single_lines(lines: Lines, line: str, width: int) -> tuple[float, str]:
 
 
 def _frame_means(sums: StackSums) -> FloatArray:
-    """Return the mean of each frame over the quiet rows; where sums are not at hand, over all rows."""
+    """Return the mean of each frame over the quiet rows; where sums of blocks are missing, over all rows."""
     quiet = _quiet(sums)
-    if not sums.whole or not quiet.any():
+    if sums.lengths.size != sums.n_blocks or not quiet.any():
         return sums.frame_mean if quiet.any() else np.zeros(0)
     return np.asarray(sums.row_sum[:, quiet].sum(axis=1) / sums.n_varying(quiet))
 
@@ -338,10 +329,9 @@ class _Common:
 def _resemblance(
     name: str, covariance: FloatArray, size: FloatArray, common: _Common, shared: tuple[float, float]
 ) -> list[Check]:
-    """Return whether pairs of samples resemble each other, beyond what they share with others.
+    """Return whether pairs of samples are correlated, beyond what they share with others (and its error).
 
-    The covariance of each pair, NaN where there is none, is compared with its ``size`` if both were equal,
-    DN^2; ``shared`` is the part of it that is not of the pair alone, and its error.
+    The covariance of each pair, NaN where there is none, is compared with that of equal samples, DN^2.
     """
     some = (size > 0) & np.isfinite(covariance)
     if not some.any():

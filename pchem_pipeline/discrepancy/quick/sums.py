@@ -29,7 +29,7 @@ _LINES_AT_ONCE = 1 << 12
 
 @dataclass(frozen=True)
 class Lines:
-    """Sums over lines (rows, or columns within a group of rows) of some frames, with what they are made of.
+    """Sums over lines (rows, or columns within a group of rows) of some frames, and moments of their pixels.
 
     Attributes:
         sums: of the lines in each frame, (frame, line), DN.
@@ -62,10 +62,7 @@ class Lines:
         return np.stack([each.sum(axis=0, dtype=np.int64) / len(each) for each in blocks])
 
     def centred(self, frames: slice = slice(None), lines: slice = slice(None)) -> FloatArray:
-        """Return sums less their mean over each block, (frame, line), DN; of some frames, or lines.
-
-        The sums of columns are many: as numbers of 64 bits they would take more than several maps.
-        """
+        """Return sums less their mean over each block, (frame, line), DN: some, as all take much memory."""
         values = self.sums[frames, lines].astype(np.float64)
         first = frames.indices(self.sums.shape[0])[0]
         block = np.searchsorted(self.starts, np.arange(first, first + len(values)), side="right") - 1
@@ -140,11 +137,6 @@ class StackSums:
         return self.block_sum.shape[1], self.block_sum.shape[2]
 
     @property
-    def whole(self) -> bool:
-        """Whether the sums of all blocks are at hand."""
-        return self.lengths.size == self.n_blocks
-
-    @property
     def starts(self) -> IntArray:
         """First frame of each block among those at hand, (b,)."""
         return np.asarray(np.cumsum(self.lengths) - self.lengths)
@@ -160,7 +152,7 @@ class StackSums:
         return float(self.n_frames - self.n_blocks)
 
     def _variance(self, blocks: IntArray | slice) -> FloatArray:
-        """Return the variance of each pixel about its mean over the block, of some blocks, (y, x), DN^2."""
+        """Return the variance of each pixel within some blocks, (y, x), DN^2."""
         lengths = self.lengths[blocks]
         within = np.zeros(self.shape)
         parts = (self.block_sum[blocks], self.block_sum_square[blocks], lengths.tolist())
@@ -175,8 +167,7 @@ class StackSums:
     def block_means(self, *, apart: bool) -> FloatArray:
         """Return the mean of each pixel over each block at hand, less that over all, (b, y, x), DN.
 
-        Args:
-            apart: less what all pixels do, too: the median, since hot pixels move more.
+        ``apart``: less the median over the pixels, too, which hot pixels do not move.
         """
         means = self.block_sum / self.lengths[:, None, None]
         means -= np.average(means, axis=0, weights=self.lengths)
@@ -275,10 +266,6 @@ class CellMap:
         for total, part in ((self.sums, kept), (self.counts, some.astype(np.float64))):
             np.add.at(total, at, np.add.reduceat(part, self.columns[:-1], axis=1))
 
-    def mask(self, cells: BoolArray) -> BoolArray:
-        """Return the pixels of some cells, (y, x)."""
-        return np.repeat(np.repeat(cells, np.diff(self.rows), axis=0), np.diff(self.columns), axis=1)
-
 
 def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
     """Return maps of all pixels, all frames, each N(0, 1) where samples are independent, summed over cells.
@@ -287,8 +274,7 @@ def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
     blocks of frames or more, ``spread`` (block means scatter); a pixel that never changes does not count.
     """
     v, root = sums.variance, math.sqrt(sums.freedom_of_all)
-    names = ("next_x", "next_y", "lag")
-    found = {name: CellMap.empty(sums.shape) for name in names}
+    found = {name: CellMap.empty(sums.shape) for name in ("next_x", "next_y", "lag")}
     rows = max(1, _AT_ONCE // v.shape[1])
     for first in range(0, v.shape[0], rows):
         band = slice(first, first + rows)
@@ -310,12 +296,7 @@ def sensor_cells(sums: StackSums) -> dict[str, CellMap]:
 def sensor_places(maps: Mapping[str, CellMap], significance: float) -> dict[str, Suspect]:
     """Return the part of the sensor where each map stands out most; none where it is everywhere alike.
 
-    Args:
-        maps: by name, as :func:`sensor_cells` makes them.
-        significance: largest probability of a chance in any of them.
-
-    Returns:
-        Places whose means are those of the map, standard deviations of a pixel.
+    The significance is that of any map. Means of a place are in standard deviations of a pixel.
     """
     found = {name: _place(name, cells, significance / len(maps)) for name, cells in maps.items()}
     return {name: place for name, place in found.items() if place is not None}
@@ -333,5 +314,5 @@ def _place(name: str, cells: CellMap, significance: float) -> Suspect | None:
     if not (usable[inside].any() and usable[~inside].any()):
         return None
     means = [float(cells.sums[part].sum() / cells.counts[part].sum()) for part in (inside, ~inside)]
-    region = Region.of_mask(cells.mask(inside))
-    return replace(places[0], region=region, inside=means[0], outside=means[1])
+    pixels = np.repeat(np.repeat(inside, np.diff(cells.rows), axis=0), np.diff(cells.columns), axis=1)
+    return replace(places[0], region=Region.of_mask(pixels), inside=means[0], outside=means[1])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +22,10 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS
 from pchem_pipeline.discrepancy.where import PAIRS, pixel_maps
-from pchem_pipeline.effects.framework.evidence import SCORES
-
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
-
+from pchem_pipeline.effects.framework.context import EffectContext
+from pchem_pipeline.effects.framework.effect import Effect, Plane
+from pchem_pipeline.effects.framework.evidence import SCORES, Evidence, TimeSeries
+from pchem_pipeline.simulate.streams import KeyedStreams
 
 _log = logging.getLogger(__name__)
 
@@ -44,32 +41,24 @@ def evidence_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of group ``discrepancy``, by their names without the group.
 
-    Args:
-        evidence: what the frames show beyond the PCD.
-        before: the statistics standardised by replicates of the plain model; None for ``evidence.z``.
-        after: the same for the model with effects; None where nothing was added.
-        effects: the named effects; those whose path does not depend on chance are drawn over the frames.
-        integration_time: s, as the effects are given it.
-        bit_depth: bits of the ADC, as the effects are given it.
-        code_extended: samples expected at each code with the added effects; None where nothing was added.
-
-    Returns:
-        Ready for ``RunStore.write_array(f"discrepancy/{name}", ...)``; what the evidence lacks (everything
-        along time for ready-made histograms) is absent.
+    The statistics ``before`` (None: those of the evidence) and ``after`` effects are added, with which
+    ``code_extended`` samples are expected at each code, are standardised by replicates. The paths of effects
+    that do not depend on chance are among the arrays. What the evidence lacks (everything along time for
+    ready-made histograms) is absent.
     """
     code = evidence.code
     found: dict[str, NDArray[Any]] = {
         "goodness": _single(evidence.goodness),
         "tail": np.stack([evidence.tail_low, evidence.tail_high]).astype(np.uint32),
         "code_dn": (code.first + np.arange(code.observed.size)).astype(np.int32),
-        "code_observed": np.asarray(code.observed, dtype=np.float64),
-        "code_expected": np.asarray(code.expected, dtype=np.float64),
+        "code_observed": _double(code.observed),
+        "code_expected": _double(code.expected),
         "z_before": _vector(evidence.z if before is None else before),
     }
     if all(name in evidence.scores for name in SCORES):
         found["score"] = np.stack([_single(evidence.scores[name]) for name in SCORES])
     if code_extended is not None:
-        found["code_extended"] = np.asarray(code_extended, dtype=np.float64)
+        found["code_extended"] = _double(code_extended)
     if after is not None:
         found["z_after"] = _vector(after)
     if evidence.time is not None:
@@ -80,6 +69,10 @@ def evidence_arrays(
 
 def _single(values: NDArray[Any]) -> Float32Array:
     return np.asarray(values, dtype=np.float32)
+
+
+def _double(values: NDArray[Any]) -> FloatArray:
+    return np.asarray(values, dtype=np.float64)
 
 
 def _vector(z: Mapping[str, float]) -> FloatArray:
@@ -95,21 +88,22 @@ def _time_arrays(evidence: Evidence, time: TimeSeries) -> dict[str, NDArray[Any]
         frame_sd = np.sqrt([float(v.sum()) for v in variance]) / sizes
     found: dict[str, NDArray[Any]] = {
         "frame_number": np.asarray(time.frames, dtype=np.int64),
-        "frame_charge": np.asarray(time.frame_charge, dtype=np.float64),
-        "frame_readout": np.asarray(time.frame_readout, dtype=np.float64),
+        "frame_charge": _double(time.frame_charge),
+        "frame_readout": _double(time.frame_readout),
         "frame_sd": np.where(np.isfinite(frame_sd), frame_sd, np.nan),
     }
     if time.frame_noise is not None:
-        found["frame_noise"] = np.asarray(time.frame_noise, dtype=np.float64)
+        found["frame_noise"] = _double(time.frame_noise)
     maps = pixel_maps(evidence)
     for name, short in (("lag1", "lag"), ("block_spread", "spread"), ("trend", "trend")):
         found[name] = _single(np.stack([maps[f"{short}.{channel}"] for channel in CHANNELS]))
     if time.neighbour_maps:
         nothing = np.full(usable.shape, np.nan)
         found["neighbour"] = _single(np.stack([maps.get(name, nothing) for name in PAIRS]))
-    lines = {"row": (1, time.row_charge, time.row_readout), "column": (0, time.column_charge,
-             time.column_readout)}  # fmt: skip
-    for line, (axis, charge, readout) in lines.items():
+    for line, axis, charge, readout in (
+        ("row", 1, time.row_charge, time.row_readout),
+        ("column", 0, time.column_charge, time.column_readout),
+    ):
         with np.errstate(divide="ignore", invalid="ignore"):
             sd = [np.sqrt(v.sum(axis=axis)) / usable.sum(axis=axis) for v in variance]
             scaled = np.stack([charge / sd[0], readout / sd[1]])
@@ -129,12 +123,6 @@ def path_arrays(
     mean k follows a change only in part, and the residual takes the rest: an exposure H (1 + a) moves the
     mean of k by a Var(k), and an offset of d electrons moves it by d E[Var(K|x)] / sigma_e^2, both to first
     order (scores of H and mu of the PCD, Hendrickson et al. 2023, eq. update_eqns).
-
-    Args:
-        evidence: gives the maps and the frame numbers.
-        effects: the named effects.
-        integration_time: s.
-        bit_depth: bits of the ADC.
 
     Returns:
         ``frame_charge_model`` (relative) and ``frame_readout_model`` (DN), shape (n_frames,) each; empty
@@ -177,14 +165,10 @@ def _path(
     evidence: Evidence, time: TimeSeries, effect: Effect, seed: int, integration_time: float, bit_depth: int
 ) -> FloatArray:
     """Return relative exposure and offset (DN) of every frame under one effect alone, shape (2, n_frames)."""
-    from pchem_pipeline.effects.framework.context import EffectContext
-    from pchem_pipeline.simulate.streams import KeyedStreams
-
     ny, nx = evidence.maps.usable.shape
     rows = np.unique(np.linspace(0, ny - 1, 4).astype(np.int64))
     whole = truth_of(evidence.maps)
-    names = (*PARAMETERS[:3], "analog_read_noise_e")
-    truth = {name: getattr(whole, name)[rows] for name in names}
+    truth = {name: getattr(whole, name)[rows] for name in (*PARAMETERS[:3], "analog_read_noise_e")}
     parts, step = [], 256
     for start in range(0, time.frames.size, step):
         frames = np.asarray(time.frames[start : start + step], dtype=np.int64)
@@ -204,22 +188,17 @@ def _path(
 
 def _moved(effect: Effect, context: EffectContext) -> FloatArray:
     """Return relative exposure and offset (DN) of the frames of a block, shape (2, n_frames)."""
-    from pchem_pipeline.effects.framework.effect import Plane
-
     truth, gain = context.truth, context.truth["conversion_gain"]
     full = (context.frames.size, *gain.shape)
     mean = np.array(np.broadcast_to(truth["quanta_exposure"], full))
-    charge = np.rint(mean)
-    nothing = np.zeros(context.frames.size)
+    charge, found = np.rint(mean), np.zeros((2, context.frames.size))
     if effect.plane is Plane.EXPOSURE:
-        relative = effect.apply(mean, context) / np.maximum(mean, 1e-12) - 1.0
-        return np.stack([relative.mean(axis=(1, 2)), nothing])
+        found[0] = (effect.apply(mean, context) / np.maximum(mean, 1e-12) - 1.0).mean(axis=(1, 2))
+        return found
     context = replace(context, exposure=mean, charge=charge.astype(np.int64), read_noise=np.zeros(full))
     if effect.plane is Plane.ANALOG:
-        offset = (effect.apply(charge, context) - charge) / gain
+        found[1] = ((effect.apply(charge, context) - charge) / gain).mean(axis=(1, 2))
     elif effect.plane is Plane.ADC:
         signal = charge / gain + truth["bias"]
-        offset = effect.apply(signal, context) - signal
-    else:
-        return np.stack([nothing, nothing])
-    return np.stack([nothing, offset.mean(axis=(1, 2))])
+        found[1] = (effect.apply(signal, context) - signal).mean(axis=(1, 2))
+    return found

@@ -74,7 +74,8 @@ def _run_frames(
 ) -> None:
     source = open_source(context)
     block_length(source.shape[0], context.config.discrepancy.block_frames)
-    model = (*before, *_limits(context, before))
+    limits = _limits(context, before)
+    model = (*before, *limits)
     settings, seen, whole = _surveyed(context, source, model, roi, progress)
     search = _Search(context, source, model, roi, seen, progress)
     window, found = search.found(settings, "")
@@ -86,26 +87,19 @@ def _run_frames(
         )
         window, found = search.found(whole, "whole-")
         elsewhere = search.elsewhere(whole, "whole-elsewhere-", window, found)
-    verdict = found.verdict.on_sensor(source.shape[1:], window.rows, window.columns, window.pixel)
+    rows, columns = window.rows, window.columns
+    verdict = found.verdict.on_sensor(
+        source.shape[1:], rows, columns, lambda y, x: (y + rows[0], x + columns[0])
+    )
     verdict = seen.told(verdict, window.share(source.shape)).costing(search.work)
     found = replace(found, verdict=verdict if elsewhere is None else verdict.checked(elsewhere))
-    _write(context, found, before)
-    write_added_exposure(context.store, _STAGE, found.added, found.model, window.rows, window.columns)
+    _write(context, found, limits)
+    write_added_exposure(context.store, _STAGE, found.added, found.model, rows, columns)
 
 
 @dataclass
 class _Search:
-    """Compares windows of the frames with simulations.
-
-    Attributes:
-        context: of the stage.
-        source: the frames.
-        model: its effects, the limits of the ADC among them.
-        roi: rows and columns that the user asked for.
-        seen: what was seen of the whole sensor.
-        progress: is given what is done next.
-        work: CPU seconds of all of it, by count.
-    """
+    """Compares windows of the frames with simulations, and counts the work, CPU seconds."""
 
     context: StageContext
     source: FrameSource
@@ -133,10 +127,7 @@ class _Search:
     def elsewhere(
         self, settings: DiscrepancySettings, prefix: str, window: Window, found: Discrepancy
     ) -> Elsewhere | None:
-        """Look whether effects that explain all hold in another window; None: there are none, or no window.
-
-        Those that are named in part leave something already.
-        """
+        """Test effects that explain everything in another window; None: there are none, or no window."""
         other = other_window(window, self.source.shape, self.roi)
         if other is None or found.verdict.verdict != "named":
             return None
@@ -144,8 +135,7 @@ class _Search:
         frames = FrameStack.of(
             read_window(self.source, other), other.times, settings.block_frames, **self._taken(other)
         )
-        there = Elsewhere(rows=other.rows, columns=other.columns)
-        effort = Effort(None)
+        there, effort = Elsewhere(rows=other.rows, columns=other.columns), Effort(None)
         # a verdict that is known is not lost for pixels that cannot be used, or an effect that fails there
         try:
             observed = ObservedFrames.of(frames)
@@ -159,16 +149,13 @@ class _Search:
 
     def _taken(self, window: Window) -> dict[str, Any]:
         """Return how the frames of a window were taken."""
+        n_frames, *shape = self.source.shape
+        known = tuple(place.region for place in self.seen.places.values())
         return {
-            "n_run": self.source.shape[0] - len(window.copied),
+            "n_run": n_frames - len(window.copied),
             "bit_depth": self.context.sensor.bit_depth,
             "integration_time": self.context.sensor.integration_time or 1.0,
-            "window": SensorWindow(
-                window.rows,
-                window.columns,
-                (self.source.shape[1], self.source.shape[2]),
-                tuple(place.region for place in self.seen.places.values()),
-            ),
+            "window": SensorWindow(window.rows, window.columns, (shape[0], shape[1]), known),
         }
 
 
@@ -179,14 +166,9 @@ def _surveyed(
     roi: tuple[int, ...] | None,
     progress: Callable[[str], None],
 ) -> tuple[DiscrepancySettings, Survey, DiscrepancySettings]:
-    """Look at the whole sensor, once; return that between two settings.
+    """Look at the whole sensor, once; return the settings of the search, that, and the most that it may take.
 
-    The first have as much as is compared closely, the second as much as may be.
-
-    Its marker keeps both: a search that was stopped goes on in the same window, whatever it may take then.
-
-    Raises:
-        ConfigError: the memory is not enough for any window.
+    A marker keeps all: a search that was stopped goes on in the same window.
     """
     settings, store = context.config.discrepancy, context.store
     known = store.records.summaries(_STAGE, context.fingerprint).get(WHOLE.key)
@@ -207,21 +189,21 @@ def _surveyed(
             context.note(
                 f"left out (empty, repeated, outlying or moved): {frame_words(np.array(seen.left_out))}"
             )
-        most, few = settings, fewer_samples(source, settings, roi, seen, model)
+        few = fewer_samples(source, settings, roi, seen, model)
         if few != settings:
             context.note(
                 f"clear disagreement in {few.max_samples:,} samples, so no more are compared; for smaller "
                 "errors and weaker effects raise discrepancy.clear_samples"
             )
-            settings, seen = few, _survey(context, source, few)
-        known = {"window": _taken_of(settings), "whole": _taken_of(most), **seen.numbers()}
+            seen = _survey(context, source, few)
+        known = {"window": _amounts(few), "whole": _amounts(settings), **seen.numbers()}
         context.run_units([WHOLE], lambda *_: known, total=1)
     whole = known.get("whole", known["window"])
     few, most = (settings.model_copy(update=each) for each in (known["window"], whole))
     return few, Survey.of_numbers(known), most
 
 
-def _taken_of(settings: DiscrepancySettings) -> dict[str, int]:
+def _amounts(settings: DiscrepancySettings) -> dict[str, int]:
     """Return the settings that the memory, or a clear disagreement, may lower."""
     names = ("max_samples", "max_pixels", "replicates", "extended_replicates")
     return {name: getattr(settings, name) for name in names}
@@ -255,11 +237,11 @@ def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...
 def _run_histograms(context: StageContext, before: Sequence[Effect], progress: Callable[[str], None]) -> None:
     """Do the same with ready-made histograms, or with those of several samples together, in one unit."""
     samples = _samples(context) if context.sensor.samples else [_histograms(context.store)]
-    model = (*before, *_limits(context, before))
+    limits, settings = _limits(context, before), context.config.discrepancy
     found = find_in_histograms(
-        samples, context.config.discrepancy, width=context.sensor.nx, model=model, progress=progress
+        samples, settings, width=context.sensor.nx, model=(*before, *limits), progress=progress
     )
-    _write(context, found, before)
+    _write(context, found, limits)
     context.run_units([WHOLE])
 
 
@@ -278,11 +260,7 @@ def _samples(context: StageContext) -> list[SampleHistograms]:
 
 
 def _histograms(store: RunStore) -> SampleHistograms:
-    """Return the histograms of all pixels of a run.
-
-    Raises:
-        StoreError: it has none.
-    """
+    """Return the histograms of all pixels of a run."""
     if not store.has("histogram/counts"):
         place = quoted(store.path)
         raise StoreError(f"{_STAGE}: no histograms in the store; run: pchem histogram {place}")
@@ -324,11 +302,8 @@ class _Mapper:
         found: list[Mapping[str, float] | Exception] = []
         for replicate in replicates:
             reason = self.context.failed.pop(replicate.key, None)
-            if reason is not None:
-                self.total -= 1
-                found.append(PchEmError(reason))
-            else:
-                found.append(summaries[replicate.key])
+            self.total -= reason is not None
+            found.append(summaries[replicate.key] if reason is None else PchEmError(reason))
         return found
 
 
@@ -336,7 +311,8 @@ def _simulate(unit: Named[Replicate], store: RunStore) -> dict[str, float]:
     return unit.content()
 
 
-def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) -> None:
+def _write(context: StageContext, found: Discrepancy, limits: Sequence[Effect]) -> None:
+    """Write the arrays, and the verdict with its model but for the limits of the ADC."""
     context.begin()
     names, z_before, z_after = found.statistics
     arrays = evidence_arrays(
@@ -350,7 +326,6 @@ def _write(context: StageContext, found: Discrepancy, before: Sequence[Effect]) 
     )
     for name, array in arrays.items():
         context.store.write_array(f"{_STAGE}/{name}", array)
-    limits = _limits(context, before)
     kept = tuple(each.model_dump(mode="json") for each in found.model if each not in limits)
     verdict = found.verdict.model_copy(update={"model_effects": kept})
     context.store.write_file(VERDICT_FILE, verdict.to_json().encode())

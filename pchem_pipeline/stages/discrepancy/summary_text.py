@@ -10,14 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pchem_pipeline.base.wording import fitted_or_chosen, percent, typeset
-from pchem_pipeline.discrepancy.verdict import (
-    Place,
-    Rival,
-    Step,
-    Verdict,
-    micronats,
-    sigma_text,
-)
+from pchem_pipeline.discrepancy.verdict import Place, Rival, Step, Verdict, micronats, sigma_text
 from pchem_pipeline.model.histogram.odd_frames import frame_words
 
 _WIDTH = 100
@@ -29,12 +22,8 @@ _BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|DN|e⁻|sigma\b|nats)")
 
 
 def verdict_text(found: Verdict) -> str:
-    """Format the verdict, the disagreements, candidates and gap, and the effects that are not testable.
-
-    Returns:
-        Lines of at most 100 characters, without one at the end.
-    """
-    lines = [*_wrapped(f"{found.word.upper()}: {found.sentence}", "  ")]
+    """Format verdict, disagreements, candidates, gap and untestable effects in lines of 100 characters."""
+    lines = _wrapped(f"{found.word.upper()}: {found.sentence}")
     agrees = found.verdict in ("consistent", "cannot_tell")
     lines += _places("largest deviation" if agrees else "disagreement", found.where, _MOST_PLACES)
     for number, step in enumerate(found.steps, 1):
@@ -59,19 +48,18 @@ def verdict_text(found: Verdict) -> str:
     return "\n".join(lines)
 
 
-def _wrapped(text: str, indent: str = "  ") -> list[str]:
+def _wrapped(text: str) -> list[str]:
     # line breaks in a plug-in's message would break the columns
     words = _BEFORE_UNIT.sub(_HELD, typeset(" ".join(text.split())))
-    lines = textwrap.wrap(words, _WIDTH, subsequent_indent=indent, break_long_words=True) or [""]
+    lines = textwrap.wrap(words, _WIDTH, subsequent_indent="  ") or [""]
     return [line.replace(_HELD, " ") for line in lines]
 
 
 def _places(title: str, places: Sequence[Place], most: int) -> list[str]:
     lines = []
     for place in places[:most]:
-        spots = _spots(place)
-        words = f"{place.sentence or place.statistic} ({sigma_text(place.z)}{f'; {spots}' if spots else ''})"
-        lines += _wrapped(f"{title}: {words}")
+        details = "; ".join(filter(None, (sigma_text(place.z), _spots(place))))
+        lines += _wrapped(f"{title}: {place.sentence or place.statistic} ({details})")
     more = len(places) - most
     return [*lines, f"{title}: {more} more (see discrepancy.json)"] if more > 0 else lines
 
@@ -108,20 +96,17 @@ def _step(step: Step, number: int, found: Verdict) -> list[str]:
         place = f" in {step.place}" if step.place else ""
         lines += _wrapped(f"{step.likeliest}{place}: {', '.join(values)}")
     if step.effect:
-        lines += [line for rival in step.rivals for line in _rejected(rival)]
+        lines += [line for other in step.rivals for line in _rejected(other)]
     elif found.verdict == "ambiguous":
-        lines += [
-            line
-            for rival, text in step.separate.items()
-            for line in _wrapped(f"to distinguish {rival}: {text}")
-        ]
+        for rival, text in step.separate.items():
+            lines += _wrapped(f"to distinguish {rival}: {text}")
     return lines
 
 
 def _rejected(rival: Rival) -> list[str]:
     nats = -rival.behind
-    lower = f"log-likelihood lower by {nats:{',.0f' if nats >= 100.0 else '.2g'}}"
-    score = f" ({lower})" if math.isfinite(nats) else ""
+    lower = f" (log-likelihood lower by {nats:{',.0f' if nats >= 100.0 else '.2g'}})"
+    score = lower if math.isfinite(nats) else ""
     return _wrapped(f"{rival.effect} is rejected{score}{f'; {rival.why}' if rival.why else ''}")
 
 

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,27 +25,23 @@ from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
 from pchem_pipeline.discrepancy.observe.sums import CHANNELS, FrameBlocks, Samples
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.vector import goodness_of
-from pchem_pipeline.discrepancy.quick.sums import CellMap, sensor_cells, sensor_places
+from pchem_pipeline.discrepancy.quick.sums import CellMap, StackSums, sensor_cells, sensor_places
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.scan_pairs import pairs_bytes, scan_pairs
+from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.frames.stream import FrameSource
 from pchem_pipeline.model.arithmetic.significance import NO_CHANCE, SIGNIFICANCE
 from pchem_pipeline.run.model_versions import model_of
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
 from pchem_pipeline.stages.discrepancy.window import Window, choose_window, frame_blocks
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 from pchem_pipeline.stages.quick_look import read_sums
+from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import equal_rows
-
-if TYPE_CHECKING:
-    from pchem_pipeline.discrepancy.quick.sums import StackSums
-    from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-    from pchem_pipeline.run.stage import StageContext
-    from pchem_pipeline.store.run_store import RunStore
-
 
 #: Codes of the tables of a band at most, and rows at least.
 _MOST_CODES, _FEWEST_ROWS = 1 << 26, 8
@@ -82,19 +78,14 @@ class Survey:
     def window(
         self, shape: tuple[int, int, int], settings: DiscrepancySettings, roi: Sequence[int] | None
     ) -> Window:
-        """Return what to look at closely, see `choose_window`."""
+        """Return what to compare closely, see `choose_window`."""
         return choose_window(shape, settings, roi, self.places, self.left_out, self.copied)
 
     def numbers(self) -> dict[str, Any]:
         """Return it as JSON data, of which :meth:`of_numbers` makes it again."""
         places = {
-            name: {
-                "region": each.region.numbers(),
-                "p": each.p,
-                "inside": each.inside,
-                "outside": each.outside,
-            }
-            for name, each in self.places.items()
+            name: {"region": at.region.numbers(), "p": at.p, "inside": at.inside, "outside": at.outside}
+            for name, at in self.places.items()
         }
         frames = {"left_out": list(self.left_out), "copied": list(self.copied)}
         return {"places": places, "shares": dict(self.shares), **frames}
@@ -116,7 +107,7 @@ class Survey:
         return cls(places, numbers["shares"], tuple(numbers["left_out"]), tuple(numbers["copied"]))
 
     def told(self, verdict: Verdict, share: float) -> Verdict:
-        """Return a verdict that says on what share of the samples it rests, and on what else."""
+        """Return the verdict with this survey, and the share of the samples that was compared."""
         spots = tuple(
             Surveyed(map=name, region=place.region.numbers(), p=place.p)
             for name, place in sorted(self.places.items(), key=lambda item: item[1].p)
@@ -137,13 +128,7 @@ class Survey:
 def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:
     """Look at every pixel and every frame of a run.
 
-    Args:
-        context: of the stage.
-        source: its frames.
-        compared: samples that can be compared closely: of a run with no more the frames are not read here.
-
-    Raises:
-        StoreError: an array is corrupt.
+    The frames of a run with no more samples than can be ``compared`` closely are not read here.
     """
     store, shape = context.store, source.shape
     odd, left_out = odd_frames_of(store)
@@ -161,12 +146,7 @@ def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:
 
 
 def places_of_sums(sums: StackSums | None, shape: tuple[int, int]) -> dict[str, Suspect] | None:
-    """Return where the sums of the stage histogram stand out; None where there are none of this sensor.
-
-    Args:
-        sums: of all frames.
-        shape: rows and columns of the sensor.
-    """
+    """Return where the sums of the stage histogram stand out; None where there are none of such a sensor."""
     if sums is None or sums.shape != shape or sums.freedom <= 0:
         return None
     return sensor_places(sensor_cells(sums), SIGNIFICANCE)
@@ -182,12 +162,8 @@ def places_of_bands(
 ) -> tuple[dict[str, Suspect], dict[str, float]]:
     """Return where histograms and pairs of pixels stand out, and the share of the samples looked at.
 
-    Args:
-        store: the run, with histograms and fit.
-        source: its frames.
-        plain: the pixels were fitted without effects, so that their histograms follow the plain law.
-        memory: bytes that this may take: lower bands; None: what the highest ones take.
-        left_out: frames that are not looked at.
+    The pixels are ``plain`` if they were fitted without effects, so that their histograms follow the plain
+    law. This takes ``memory`` bytes at most, by lower bands; None: what the highest ones take.
 
     Raises:
         ConfigError: it is not enough for the lowest ones.
@@ -231,16 +207,7 @@ def places_of_bands(
 
 
 def _band_size(store: RunStore, shape: tuple[int, int], memory: int | None) -> tuple[int, int]:
-    """Return the rows of a band, and the samples of its frames that are looked at at once.
-
-    Args:
-        store: the run.
-        shape: rows and columns of the sensor.
-        memory: bytes that both may take; None: as much as they can use.
-
-    Raises:
-        ConfigError: it is not enough.
-    """
+    """Return the rows of a band, and the samples of its frames looked at at once, within a memory, bytes."""
     ny, nx = shape
     counts = store.array("histogram/counts")
     fewest = min(ny, _FEWEST_ROWS)
@@ -286,15 +253,10 @@ def _laws(store: RunStore, rows: tuple[int, int]) -> tuple[PixelMaps, PixelLaws]
     usable &= np.isfinite(values).all(axis=0)
     usable &= counts.sum(axis=2) >= np.maximum(50, 100.0 * sum(outside))
     maps = PixelMaps(values[0], values[1], values[2], values[3], usable)
-    laws = pixel_laws(
-        PixelHistograms(
-            counts.reshape(-1, counts.shape[2]),
-            store.read("histogram/origin", part).ravel().astype(np.int64),
-            np.stack([each.ravel() for each in outside], axis=1).astype(np.float64),
-        ),
-        np.stack([each.ravel() for each in values], axis=1),
-        usable.ravel(),
-    )
+    origin = store.read("histogram/origin", part).ravel().astype(np.int64)
+    beyond = np.stack([each.ravel() for each in outside], axis=1).astype(np.float64)
+    seen = PixelHistograms(counts.reshape(-1, counts.shape[2]), origin, beyond)
+    laws = pixel_laws(seen, maps.columns, usable.ravel())
     return replace(maps, usable=laws.good.reshape(usable.shape)), laws
 
 

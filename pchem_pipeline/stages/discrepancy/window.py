@@ -59,14 +59,14 @@ class Window:
         """Frame numbers without the copies, which took no time."""
         return self.numbers - np.searchsorted(self.copied, self.numbers)
 
-    def pixel(self, y: int, x: int) -> tuple[int, int]:
-        """Return the place on the sensor of a pixel of the window."""
-        return y + self.rows[0], x + self.columns[0]
+    @property
+    def pixels(self) -> int:
+        """Number of its pixels."""
+        return (self.rows[1] - self.rows[0]) * (self.columns[1] - self.columns[0])
 
     def share(self, shape: tuple[int, int, int]) -> float:
         """Return its share of the samples of a stack of some shape."""
-        pixels = (self.rows[1] - self.rows[0]) * (self.columns[1] - self.columns[0])
-        return self.numbers.size * pixels / math.prod(shape)
+        return self.numbers.size * self.pixels / math.prod(shape)
 
 
 def choose_window(
@@ -82,13 +82,9 @@ def choose_window(
     The window lies where the sensor disagrees most, as much of it inside the place as outside: what is only
     there shows against its quiet neighbours. Without such a place it lies in the middle.
 
-    Args:
-        shape: frames, rows, columns of the stack.
-        settings: frames x pixels and pixels to look at, and frames in a block.
-        roi: rows and columns that the user asked for: y0, y1, x0, x1.
-        places: where the survey found that the sensor stands out.
-        left_out: odd frames, which are not looked at.
-        copied: those of them that are copies of earlier ones.
+    The shape of the stack is (frames, rows, columns), the ``roi`` (y0, y1, x0, x1) that the user asked for.
+    ``places`` are those where the sensor stands out, ``left_out`` odd frames, and ``copied`` those of them
+    that are copies of earlier ones.
     """
     kept = np.setdiff1d(np.arange(shape[0], dtype=np.int64), left_out)
     n_frames, ny, nx = kept.size, *shape[1:]
@@ -115,10 +111,7 @@ def choose_window(
 def other_window(window: Window, shape: tuple[int, int, int], roi: Sequence[int] | None) -> Window | None:
     """Return a window of the same size as far from one as there is; None where most of both is the same.
 
-    Args:
-        window: rows, columns and frames.
-        shape: frames, rows, columns of the stack.
-        roi: rows and columns that the user asked for: y0, y1, x0, x1.
+    The shape of the stack is (frames, rows, columns), the ``roi`` (y0, y1, x0, x1) that the user asked for.
     """
     y0, y1, x0, x1 = roi or (0, shape[1], 0, shape[2])
     height, width = (end - first for first, end in (window.rows, window.columns))
@@ -139,15 +132,9 @@ def other_window(window: Window, shape: tuple[int, int, int], roi: Sequence[int]
 
 
 def search_bytes(window: Window, codes: float) -> int:
-    """Return the memory that a search in a window takes with one worker, about.
-
-    Args:
-        window: that is looked at.
-        codes: of the law of a pixel.
-    """
-    pixels = (window.rows[1] - window.rows[0]) * (window.columns[1] - window.columns[0])
+    """Return the memory that a search in a window takes with one worker, with so many codes of each pixel."""
     each = _PIXEL_BYTES + codes * _CODE_BYTES + window.numbers.size * _SAMPLE_BYTES
-    return _PROGRAM_BYTES + int(pixels * each)
+    return _PROGRAM_BYTES + int(window.pixels * each)
 
 
 def within_memory(
@@ -157,22 +144,16 @@ def within_memory(
     codes: float,
     limit: int,
 ) -> DiscrepancySettings:
-    """Return the settings with as many samples and pixels as the memory allows.
+    """Return the settings with as many samples and pixels as a search may have within ``limit`` bytes.
 
-    Args:
-        settings: as configured.
-        shape: frames, rows, columns of the stack.
-        roi: rows and columns that the user asked for.
-        codes: of the law of a pixel.
-        limit: bytes that the search may take.
+    Shape and roi as of :func:`choose_window`; ``codes`` is the number of codes of the law of a pixel.
 
     Raises:
         ConfigError: it is not enough for the smallest window.
     """
     window = choose_window(shape, settings, roi)
     while (least := search_bytes(window, codes)) > limit:
-        (y0, y1), (x0, x1) = window.rows, window.columns
-        pixels = int((y1 - y0) * (x1 - x0) * _SMALLER)
+        pixels = int(window.pixels * _SMALLER)
         if pixels < _FEWEST_PIXELS:
             raise ConfigError(
                 f"discrepancy needs at least {-(-least >> 20)} MiB, compute.max_memory (--max-memory) allows "
@@ -187,13 +168,7 @@ def within_memory(
 def _corner(
     place: BoolArray | None, within: tuple[int, int, int, int], size: tuple[int, int]
 ) -> tuple[int, int]:
-    """Return first row and column of a window of some size: half in the place, else in the middle.
-
-    Args:
-        place: pixels that stand out, (y, x); None: nothing does.
-        within: rows and columns that the window may have: y0, y1, x0, x1.
-        size: rows and columns of the window.
-    """
+    """Return first row and column of a window within a region: half in the place, else in the middle."""
     y0, y1, x0, x1 = within
     middle = y0 + (y1 - y0 - size[0]) // 2, x0 + (x1 - x0 - size[1]) // 2
     if place is None or not place[y0:y1, x0:x1].any():
@@ -226,13 +201,9 @@ def read_window(source: FrameSource, window: Window) -> NDArray[np.unsignedinteg
 def frame_blocks(
     source: FrameSource, numbers: IntArray, rows: tuple[int, int], size: int
 ) -> Iterator[NDArray[np.unsignedinteger]]:
-    """Yield at most so many successive frames of some rows at a time, (frame, y, x), DN.
+    """Yield at most ``size`` successive frames of some rows at a time, (frame, y, x), DN.
 
-    Args:
-        source: the frames.
-        numbers: of those that are wanted, increasing.
-        rows: first, and end.
-        size: frames at a time.
+    The numbers of the frames are increasing; rows are given by the first and the end.
     """
     for part in np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) != 1) + 1):
         frames = int(numbers[part[0]]), int(numbers[part[-1]]) + 1
@@ -251,15 +222,8 @@ def fewer_samples(
     """Return the settings with as few samples to be compared as show the disagreement beyond any doubt.
 
     Those of ``clear_samples``, or twice as many, and so on; and fewer replicates.
-
-    Args:
-        source: the frames.
-        settings: as configured, or as the memory allows.
-        roi: rows and columns that the user asked for.
-        seen: what the survey found.
-        model: its effects; where there are any, only a simulation tells what disagrees with them.
     """
-    if model:
+    if model:  # only a simulation tells what disagrees with effects
         return settings
     most = seen.window(source.shape, settings, roi).share(source.shape)
     samples = settings.clear_samples
@@ -271,11 +235,9 @@ def fewer_samples(
         length = block_length(window.numbers.size, settings.block_frames)
         frames = read_window(source, window)
         if is_clear(frames, window.times, n_run=source.shape[0], block_frames=length):
-            lower = {  # enough where much is wrong
-                "replicates": min(settings.replicates, 24),
-                "extended_replicates": min(settings.extended_replicates, 12),
-            }
-            return few.model_copy(update=lower)
+            # enough where much is wrong
+            most_of = {"replicates": 24, "extended_replicates": 12}
+            return few.model_copy(update={k: min(getattr(few, k), n) for k, n in most_of.items()})
         samples *= 2
     return settings
 
@@ -285,11 +247,7 @@ def is_clear(
 ) -> bool:
     """Return whether frames disagree with the plain model beyond any doubt, without simulating it.
 
-    Args:
-        frames: codes (frame, y, x), DN.
-        numbers: of the frames in the run, increasing, shape (frame,).
-        n_run: frames of the whole run.
-        block_frames: frames in a block.
+    Arguments as of :func:`~pchem_pipeline.discrepancy.observe.observe.observe`.
     """
     try:
         evidence = observe(frames, numbers, n_run=n_run, block_frames=block_frames)
