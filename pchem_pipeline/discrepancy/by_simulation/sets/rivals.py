@@ -33,7 +33,7 @@ class Contender:
     Attributes:
         effect: itself.
         score: log score of the best set with it in that place, relative to the chosen set, nats.
-        stderr: of that score: how far the two predictions lie apart, nats.
+        stderr: of that score, nats.
         probability: among all that could stand there.
     """
 
@@ -50,8 +50,8 @@ class Comparison:
     Attributes:
         chosen: the best.
         tried: all, the best first.
-        by_histograms: by their tags, how far other sets are behind the chosen one by the likelihood of the
-            pixels' histograms, nats, and the error of that.
+        by_histograms: how far other sets (by tags) are behind the chosen one in the likelihood of the
+            histograms, nats, and the error of that.
     """
 
     chosen: Refitted
@@ -68,10 +68,9 @@ class Comparison:
                 continue
             [name] = new
             effect = next(h.effect for h in (added, *one.hypotheses) if h.tag == name)
-            if name != added.tag and effect.tag == added.effect.tag:
-                continue  # the same effect elsewhere
-            if name != added.tag and type(effect).empirical:
-                continue  # what has no name is no rival of a name
+            # neither the same effect elsewhere nor what has no name is a rival
+            if name != added.tag and (effect.tag == added.effect.tag or type(effect).empirical):
+                continue
             if one.tags in self.by_histograms:
                 behind, error = self.by_histograms[one.tags]
                 # neither need be the very law of the samples
@@ -88,11 +87,7 @@ class Comparison:
 
 
 def chosen(search: Search) -> Comparison | None:
-    """Choose among the sets that were tried; None: none holds.
-
-    The best of which each effect is seen, or where the statistics tell two sets badly apart the one by which
-    the histograms of the pixels are likelier.
-    """
+    """Return the best set of which each effect is seen, or one as good by which histograms are likelier."""
     best = _best_seen(search)
     if best is None:
         return None
@@ -120,7 +115,7 @@ def _best_seen(search: Search) -> Refitted | None:
 def _by_histograms(
     chosen: Refitted, tried: Sequence[Refitted], likelihood: HistogramLikelihood
 ) -> dict[frozenset[str], tuple[float, float]]:
-    """Ask about the sets nearly as good as the chosen one that have another effect in the place of one."""
+    """Compare sets nearly as good as the chosen one that have another effect in the place of one."""
     found: dict[frozenset[str], tuple[float, float]] = {}
     for one in tried:
         swapped = len(one.tags - chosen.tags) == len(chosen.tags - one.tags) == 1
@@ -133,13 +128,7 @@ def _by_histograms(
 
 
 def own_statistics(own: FloatArray, others: FloatArray, noise: FloatArray) -> BoolArray:
-    """Return which statistics an effect moves, and others leave alone, (m,).
-
-    Args:
-        own: what the effect does, shape (m,).
-        others: what the others do, shape (e, m).
-        noise: standard deviations of the statistics with the others, shape (m,).
-    """
+    """Return which statistics an effect moves, (m,), and others, (e, m), leave alone, beyond noise (m,)."""
     touched = np.abs(others).max(axis=0, initial=0.0)
     return np.asarray((np.abs(own) > CLEAR * noise) & (touched < _UNTOUCHED * np.abs(own)))
 
@@ -147,8 +136,8 @@ def own_statistics(own: FloatArray, others: FloatArray, noise: FloatArray) -> Bo
 def _all_seen(search: Search, one: Refitted) -> bool:
     """Test whether each effect of a set is needed beside the best fit of the others.
 
-    Of a set that leaves something each must have a statistic of its own, which stands out without it. Of one
-    that leaves nothing it suffices that without it the set is far behind.
+    Each must have a statistic of its own, which stands out without it. Of a set that leaves nothing it
+    suffices that without it the set is far behind.
     """
     if len(one.tags) == 1:
         # the same effect in two places: without it nothing is left to compare with
