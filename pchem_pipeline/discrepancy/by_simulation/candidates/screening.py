@@ -63,7 +63,7 @@ class Screening:
         classes: of the candidates, by tag.
         given: effects that the model had before the search.
         model_error: relative error of a fingerprint.
-        defects: candidates that failed, and why; more come to them.
+        defects: candidates that failed, and why; out.
     """
 
     observed: ObservedFrames
@@ -75,15 +75,7 @@ class Screening:
     defects: dict[str, str] = field(default_factory=dict)
 
     def of(self, model: tuple[Effect, ...], null: NullModel) -> Screened:
-        """Ask what they would do beside a model: everywhere and in the parts, split by split.
-
-        Args:
-            model: effects.
-            null: of that model.
-
-        Returns:
-            What they would do.
-        """
+        """Return what they would do beside a model with this null: everywhere and in the parts, by split."""
         simulator = self._simulator(model, null, "0")
         evidence = (self.observed.plain, *self.observed.parts[:2])
         histograms = Histograms(
@@ -97,8 +89,7 @@ class Screening:
         guesses = histograms.with_numbers(self._guesses(simulator, model, null, evidence, MOST_HYPOTHESES))
         parts = self.observed.frames.parts
         suggested = self._apart(model, histograms.suggested(self.classes, parts, guesses))
-        guesses += suggested
-        hypotheses = simulator.fingerprints(guesses)
+        hypotheses = simulator.fingerprints([*guesses, *suggested])
         shift = self.z.both - null.mean
         noise = noise_of_splits(null, 2, self.model_error)
         hypotheses = simulator.refined(hypotheses, shift, noise, histograms.told)
@@ -117,7 +108,7 @@ class Screening:
         Args:
             model: effects, the set among them.
             null: of that model.
-            slopes: how the statistics go with the strengths of the set, which are doubtful, shape (e, m).
+            slopes: of the statistics by the strengths of the set, which are uncertain, shape (e, m).
         """
         simulator = self._simulator(model, null, "/".join(["0", *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
@@ -164,10 +155,7 @@ class Screening:
         return [guess for guess in guesses if not share_place((*found, guess))]
 
     def _evidence_beside(self, model: tuple[Effect, ...], left: dict[str, float]) -> Evidence | None:
-        """Return the evidence of the seen frames beside the effects of a model; None where it has none.
-
-        Counts per code beside those that the model expects, and the vector as it deviates from the model's.
-        """
+        """Return the evidence of the seen frames beside the effects of a model; None where it has none."""
         if not model:
             return None
         plain = self.observed.plain
