@@ -58,16 +58,21 @@ class Comparison:
     tried: tuple[Refitted, ...]
     by_histograms: Mapping[frozenset[str], tuple[float, float]] = field(default_factory=dict)
 
+    def exchanged(self, added: Hypothesis) -> dict[str, tuple[Effect, Refitted]]:
+        """Return the effects, by tag, in the place of one of the chosen set, each with its best set."""
+        others = self.chosen.tags - {added.tag}
+        found: dict[str, tuple[Effect, Refitted]] = {}
+        for one in self.tried:
+            if others < one.tags and len(one.tags) == len(others) + 1:
+                new = next(h for h in one.hypotheses if h.tag not in others)
+                found.setdefault(new.tag, (new.effect, one))
+        return found
+
     def rivals_of(self, added: Hypothesis) -> tuple[Contender, ...]:
         """Return what could stand in the place of an effect of the chosen set, that one first."""
-        others = self.chosen.tags - {added.tag}
         found: dict[str, Contender] = {}
-        for one in self.tried:
-            new = one.tags - others
-            if not others <= one.tags or len(new) != 1 or new & found.keys():
-                continue
-            [name] = new
-            effect = next(h.effect for h in (added, *one.hypotheses) if h.tag == name)
+        for name, (new, one) in self.exchanged(added).items():
+            effect = added.effect if name == added.tag else new
             # neither the same effect elsewhere nor what has no name is a rival
             if name != added.tag and (effect.tag == added.effect.tag or type(effect).empirical):
                 continue
