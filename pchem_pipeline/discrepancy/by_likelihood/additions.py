@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
@@ -33,25 +34,20 @@ class AddedSets:
     """Fits the models of the steps to train and test together, and measures their gaps on the final part.
 
     Attributes:
-        found: what the search came to.
+        found: what the search found.
         whole: fits them on all codes, and scores them by the final part.
-        sets: the same on the codes that are compared.
     """
 
     found: Explanation
     whole: SetComparison
-    sets: SetComparison = field(init=False)
 
-    def __post_init__(self) -> None:
-        """Leave out the codes that were set aside."""
-        self.sets = replace(self.whole, kept=self.found.kept)
+    @functools.cached_property
+    def sets(self) -> SetComparison:
+        """The same as ``whole`` without the codes that were set aside."""
+        return replace(self.whole, kept=self.found.kept)
 
     def gap(self, fitted: FittedSet) -> Gap:
-        """Return the gap of a fit.
-
-        Codes that are set aside keep what they have under the plain model: what is not understood does not
-        count as closed.
-        """
+        """Return the gap of a fit; codes that are set aside have the masses of the plain law."""
         masses = on_all_codes(fitted.log_masses, self.found.kept, self.whole.plain.log_masses)
         return self.whole.gap(replace(fitted, log_masses=masses))
 
@@ -88,9 +84,8 @@ class AddedSets:
 
     def residuals(self, fitted: FittedSet) -> tuple[Place, ...]:
         """Return the codes that the model does not account for, a peak that was set aside first."""
-        counts, expected = self.sets.train.astype(np.float64), self._expected(fitted)
         own = self.sets.origin, fitted.fit.parameters, self.found.set_aside
-        return tuple(find_residuals(counts, expected, *own))
+        return tuple(find_residuals(self.sets.train.astype(np.float64), self._expected(fitted), *own))
 
     def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
         """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""

@@ -32,7 +32,7 @@ class SampleHistograms:
         origin: DN of bin 0, shape (n,).
         bias: frames without electrons, H = 0.
         integration_time: s; where all samples have one, and their exposures lie on a line over it, spurious
-            charge is told from dark current.
+            charge is distinguished from dark current.
     """
 
     counts: NDArray[np.integer]
@@ -48,7 +48,7 @@ class ObservedHistograms:
     Arrays have a row for each sample of each pixel, those of a pixel one after the other.
 
     Attributes:
-        parts: train, test and final samples of the rows that are looked at, shape (r, B) each.
+        parts: train, test and final samples of the chosen rows, shape (r, B) each.
         origin: DN of bin 0, shape (r,).
         start: H, g, mu, sigma of the plain fit of the train part, shape (r, 4).
         chosen: which rows of all they are, shape (r,).
@@ -81,7 +81,7 @@ class ObservedHistograms:
             together = _fitted_together(parts[0], origin, layout)
             parts, origin = _widened(parts, origin, together)
         evidence = _observe(parts[0], origin, layout, together)
-        start = np.stack([m.ravel() for m in evidence.maps.maps], axis=1) if together is None else together
+        start = evidence.maps.columns if together is None else together
         chosen = _choose(start, counts.sum(axis=1), layout.n)
         some = tuple(part[chosen] for part in parts)
         n_pixels = samples[0].counts.shape[0]
@@ -191,11 +191,7 @@ def _rows(samples: Sequence[SampleHistograms]) -> tuple[IntArray, IntArray]:
 def _widened(
     parts: Sequence[IntArray], origin: IntArray, parameters: FloatArray
 ) -> tuple[tuple[IntArray, ...], IntArray]:
-    """Return the histograms with all codes that the law reaches.
-
-    Histograms end at their extreme samples; replicates drawn within these ends would lack the tails that the
-    data have.
-    """
+    """Return the histograms with all codes that the law reaches, so that replicates have tails, too."""
     h, g, mu, sigma = parameters.T
     last = origin + parts[0].shape[1] - 1
     low = np.nanmax(origin - (mu - REACH * sigma))

@@ -155,7 +155,7 @@ class _Pairs(NamedTuple):
 
     @classmethod
     def of(cls, one: Float32Array, two: Float32Array, down: range, right: range, starts: IntArray) -> _Pairs:
-        """Return those of frames (n, y, x) with others, by distance and group of frames; ``starts`` of these."""
+        """Return those of frames (n, y, x) with others, by distance and by group of frames."""
         rows = [each.sum(axis=2, dtype=np.float64) for each in (one, two)]
         columns = [each.sum(axis=1, dtype=np.float64) for each in (one, two)]
         total = np.add.reduceat(rows[0].sum(axis=1) * rows[1].sum(axis=1), starts)
