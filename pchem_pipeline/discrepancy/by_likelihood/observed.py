@@ -135,13 +135,9 @@ def _split(counts: NDArray[np.integer], parts: int, rng: np.random.Generator) ->
     left = counts.astype(np.int64)
     found = []
     for remaining in range(parts, 1, -1):
-        drawn = np.stack(
-            [
-                rng.multivariate_hypergeometric(row, int(row.sum()) // remaining, method="marginals")
-                for row in left
-            ]
-        )
-        found.append(drawn.astype(np.int64))
+        totals = (left.sum(axis=1) // remaining).tolist()
+        drawn = [rng.multivariate_hypergeometric(*each) for each in zip(left, totals, strict=True)]
+        found.append(np.stack(drawn).astype(np.int64))
         left = left - found[-1]
     return (*found, left)
 

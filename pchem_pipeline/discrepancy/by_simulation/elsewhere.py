@@ -21,7 +21,7 @@ def deviation(by: Simulations, model: Sequence[Effect]) -> str:
     """Say what of the frames ``by`` simulates deviates beyond doubt from a model found in others, if any."""
     own = by.observed.statistics()
     try:
-        _, vectors = by.drawn(tuple(model), ENOUGH)
+        vectors = by.drawn(tuple(model), ENOUGH)
     except NotFittedError:
         return "almost no pixel can be fitted with it"
     names = by.observed.names([*own, *vectors])

@@ -25,7 +25,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screen
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import Refit, refit_maps
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import refit_maps
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     HistogramLikelihood,
@@ -255,9 +255,9 @@ class FrameExplainer(Explainer[Screened]):
         present, data = self.given, self.prepared
         first = data.first
 
-        def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
-            fit, vectors = self.work.drawn(along_chain(present, effects), count)
-            return fit, without_strays(as_matrix(first.names, vectors, first.mean))
+        def draw(effects: tuple[Effect, ...], count: int) -> FloatArray:
+            vectors = self.work.drawn(along_chain(present, effects), count)
+            return without_strays(as_matrix(first.names, vectors, first.mean))
 
         def allow(words: str) -> None:
             self.work.effort.check(f"{words} was fitted")

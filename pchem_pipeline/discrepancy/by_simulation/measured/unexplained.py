@@ -144,7 +144,7 @@ class Unexplained:
         best: Refitted | None = None
         for effect in measured:
             refitter.allow(effect.tag)
-            _, vectors = refitter.draw((*effects, effect), FEW)
+            vectors = refitter.draw((*effects, effect), FEW)
             shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
             found = refitter.refined((*kept, Hypothesis(effect, shift)))
             if best is None or found.score > best.score:

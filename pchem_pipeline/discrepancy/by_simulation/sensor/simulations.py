@@ -145,8 +145,8 @@ class Simulations:
         own = self.own_samples(model), self.frames.seen_numbers, fit, self.frames.effects(model)
         return learn_sensor(*own, self.plain.ambiguous, lost, before)
 
-    def drawn(self, model: tuple[Effect, ...], count: int) -> tuple[Refit, list[Mapping[str, float]]]:
-        """Return the fit of a model and the statistics of so many replicates, drawn where they are new.
+    def drawn(self, model: tuple[Effect, ...], count: int) -> list[Mapping[str, float]]:
+        """Return the statistics of so many replicates of a model, drawn where they are new.
 
         Raises:
             NotFittedError: hardly a pixel can be fitted with the model.
@@ -154,7 +154,7 @@ class Simulations:
         one = self.mapped(model)
         done = len(one.vectors)
         one.vectors += self.replicates(model, one.sensor, "grown", count - done, done)
-        return one.fit, one.vectors[:count]
+        return one.vectors[:count]
 
     def forget(self, model: tuple[Effect, ...]) -> None:
         """Forget all models but one: they are not asked for again."""

@@ -25,7 +25,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     correction,
     log_density,
 )
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, Refit
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import Covariance, NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
@@ -66,7 +66,6 @@ class Refitted:
     Attributes:
         hypotheses: the effects, with the shift of the statistics that each has a part in.
         stderr: relative standard errors of the factors (of ``strength ** power``), shape (e,).
-        fit: of the pixels with them.
         vectors: statistics of replicates drawn from it, shape (b, m).
         covariance: of the statistics of one split under it.
         slopes: derivatives of the statistics by the logarithm of each factor, shape (e, m).
@@ -80,7 +79,6 @@ class Refitted:
 
     hypotheses: tuple[Hypothesis, ...]
     stderr: FloatArray
-    fit: Refit
     vectors: FloatArray
     covariance: Covariance
     slopes: FloatArray
@@ -216,8 +214,8 @@ class Refitter:
     """Fits sets of effects to the statistics of the data.
 
     Attributes:
-        draw: refits the pixels with effects beside those of the model, and returns the fit and the statistics
-            of so many replicates of it, which share their random numbers whatever the effects.
+        draw: refits the pixels with effects beside those of the model, and returns the statistics of so many
+            replicates, (b, m), which share their random numbers whatever the effects.
         null: of the model without them.
         target: mean of the statistics of train and test frames, shape (m,).
         events: see :class:`~pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints.Noise`.
@@ -226,7 +224,7 @@ class Refitter:
         defects: effects that failed, and why; out.
     """
 
-    draw: Callable[[tuple[Effect, ...], int], tuple[Refit, FloatArray]]
+    draw: Callable[[tuple[Effect, ...], int], FloatArray]
     null: NullModel
     target: FloatArray
     events: FloatArray
@@ -345,7 +343,7 @@ class Refitter:
         """
         self.allow(one.words)
         try:
-            _, vectors = self.draw(effects, len(one.vectors))
+            vectors = self.draw(effects, len(one.vectors))
         except NotFittedError:
             return None
         apart = (vectors - one.vectors) / step
@@ -391,7 +389,7 @@ class Refitter:
         slopes: FloatArray | None = None,
     ) -> Refitted:
         """Simulate effects at their strengths; ``before`` is the same set at other strengths, if known."""
-        fit, vectors = self.draw(tuple(h.effect for h in hypotheses), replicates)
+        vectors = self.draw(tuple(h.effect for h in hypotheses), replicates)
         mean = vectors.mean(axis=0)
         covariance = self._covariance(vectors)
         parts = self._shifts(hypotheses, vectors, covariance)
@@ -415,7 +413,6 @@ class Refitter:
         return Refitted(
             found,
             stderr,
-            fit,
             vectors,
             covariance,
             slopes,
