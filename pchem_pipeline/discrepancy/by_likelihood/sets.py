@@ -133,7 +133,7 @@ class SetComparison:
         )
 
     def fit(self, members: Sequence[Member], start: FloatArray | None = None) -> FittedSet:
-        """Fit a set from the starts of its members, and from (H, g, mu, sigma), (n, 4); may raise anything."""
+        """Fit a set from the starts of its members and (H, g, mu, sigma), (n, 4); effects may raise."""
         problem = self.problem(members)
         shared = np.concatenate([np.zeros(0), *(m.start for m in members)])
         tolerance = max(_TOLERANCE, _TOLERANCE_PER_SAMPLE * float(np.where(self.kept, self.test, 0).sum()))

@@ -30,14 +30,7 @@ _OVERWHELMING = 30.0
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Judges sets of effects by the statistics of the data.
-
-    Attributes:
-        first: null of the model before anything was added.
-        z: statistics of the data.
-        gaps: measured with these, on the final frames.
-        settings: the section ``discrepancy``.
-    """
+    """Judges sets of effects by the statistics ``z`` of the data and the null before anything was added."""
 
     first: NullModel
     z: Measured

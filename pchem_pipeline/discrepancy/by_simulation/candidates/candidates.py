@@ -184,7 +184,7 @@ class ReplicateSimulator:
         results = self.mapper([task for _, task in new.values()]) if new else []
         for (effect, task), result in zip(new.values(), results, strict=True):
             if not isinstance(result, Exception):
-                self._rows[task.key] = self._row(result)
+                self._rows[task.key] = np.array([result.get(name, 0.0) for name in self.names], np.float64)
             elif effect is None:
                 raise result
             else:
@@ -265,9 +265,6 @@ class ReplicateSimulator:
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
         label = f"{'base' if effect is None else effect.tag}-{digest}-{repeat}"
         return Replicate(label, self.maps, effects, self.seed + repeat, self.acquisition)
-
-    def _row(self, vector: Vector) -> FloatArray:
-        return np.array([vector.get(name, 0.0) for name in self.names], np.float64)
 
 
 def _without_chance(shifts: FloatArray) -> FloatArray:

@@ -45,7 +45,7 @@ class Hypothesis:
     Attributes:
         effect: with guessed or refined parameters.
         fingerprint: shift of the statistics at this strength, shape (m,).
-        number: of effects with its tag, at several places of the model, the first, second and so on.
+        number: 1 for the first effect of its tag, 2 for the second one, at another place, and so on.
     """
 
     effect: Effect
@@ -102,13 +102,12 @@ class Noise:
 
 @dataclass(frozen=True)
 class SetFit:
-    """A set of hypotheses fitted to the shift of one split.
+    """A set of hypotheses fitted to the shift of one split, with arrays of shape (e,).
 
     Attributes:
-        hypotheses: the set.
-        factors: c_e of each, at least 0, shape (e,).
-        stderr: their standard errors, shape (e,).
-        certain: whether an exact count asks for it, however few events it has, shape (e,).
+        factors: c_e of each, at least 0.
+        stderr: their standard errors.
+        certain: whether an exact count asks for it, however few events it has.
     """
 
     hypotheses: tuple[Hypothesis, ...]

@@ -39,12 +39,9 @@ def noise_of_splits(null: NullModel, splits: int, model_error: float) -> Noise:
 
 @dataclass(frozen=True)
 class Screened:
-    """What the candidates would do beside a model.
+    """What the candidates would do beside a model: all and sets of them, the likeliest first.
 
-    Attributes:
-        hypotheses: all, the likeliest first.
-        sets: of them, the likeliest first.
-        gain: by which the first of these predicts held-out frames better than none, less its price, nats.
+    ``gain`` is that of the first set over none in predicting held-out frames, less its price, nats.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -54,11 +51,11 @@ class Screened:
 
 @dataclass(frozen=True)
 class Screening:
-    """Asks the candidates.
+    """Simulates the candidates.
 
     Attributes:
         observed: the frames.
-        work: simulates what they do.
+        work: simulates effects in them.
         z: statistics of the data.
         classes: of the candidates, by tag.
         given: effects that the model had before the search.

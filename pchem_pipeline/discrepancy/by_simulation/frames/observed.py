@@ -22,10 +22,9 @@ _NOT_IDENTIFIED = 0.5  # share of ambiguous pixels from which their parameters a
 
 @dataclass(frozen=True)
 class ObservedFrames:
-    """The frames of a search, observed.
+    """The frames of a search, with the parts of sensor and run that differ, observed.
 
     Attributes:
-        frames: with the parts of sensor and run that differ.
         plain: evidence of train and test frames together, fitted without effects.
         parts: evidence of train, test and final frames, each near that fit.
     """
@@ -37,8 +36,6 @@ class ObservedFrames:
     @classmethod
     def of(cls, frames: FrameStack) -> ObservedFrames:
         """Observe train and test frames together, then each part near their fit.
-
-        Parameters of a third of the frames scatter too much to stand for the pixels.
 
         Raises:
             InputError: usable pixels are too few.

@@ -51,12 +51,12 @@ class _Likely(NamedTuple):
 
 @dataclass
 class Unexplained:
-    """Measures frames beside effects.
+    """Measures train and test frames beside effects.
 
     Attributes:
-        work: fits and simulates the frames; train and test frames are measured.
+        work: fits and simulates the frames.
         refitter: fits effects to their statistics.
-        defects: forms that failed, and why.
+        defects: forms that failed, and why; out.
         known: what was measured, by the effects beside it.
     """
 
@@ -154,7 +154,7 @@ class Unexplained:
         return best
 
     def _mixture_shifts(self, part: Part, present: Model, beside: Model) -> Measurement | None:
-        """Measure the mixture shifts of a part beside effects, with the pixels as they now are."""
+        """Measure the mixture shifts of a part beside effects, with the pixels refitted with those there."""
         maps, frames = self.work.refit(present).maps, self.work.frames
         own = replace(maps, usable=maps.usable & frames.inside(part))
         if not own.usable.any():

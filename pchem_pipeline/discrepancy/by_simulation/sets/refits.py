@@ -426,15 +426,15 @@ class Refitter:
     def _shifts(
         self, hypotheses: tuple[Hypothesis, ...], vectors: FloatArray, covariance: Covariance
     ) -> FloatArray:
-        """Return by how much each effect has moved the statistics, shape (e, m).
-
-        As foreseen where that is within chance of what all together do: the shift of the refitted model is
-        its own, not that of the fingerprints.
-        """
+        """Return the shifts by each effect, shape (e, m): as foreseen where their sum is so within chance."""
         parts = np.array([h.fingerprint for h in hypotheses])
         error = np.sqrt(covariance.variances * (1.0 / len(vectors) + 1.0 / self.null.n_replicates))
         apart = vectors.mean(axis=0) - self.null.mean - parts.sum(axis=0)
-        return _spread(parts, beyond_chance(apart, error))
+        # shared among the effects by the squares of their shifts
+        weight = parts**2
+        total = weight.sum(axis=0)
+        share = np.where(total > 1e-12, weight / np.maximum(total, 1e-12), 1.0 / len(parts))
+        return np.asarray(parts + share * beyond_chance(apart, error))
 
     def _secants(
         self,
@@ -522,11 +522,3 @@ def lesser(slopes: FloatArray, parts: FloatArray) -> FloatArray:
 def beyond_chance(difference: FloatArray, error: FloatArray) -> FloatArray:
     """Return differences of means where they are beyond chance, 0 elsewhere."""
     return np.asarray(np.where(np.abs(difference) > OUTLYING * error, difference, 0.0))
-
-
-def _spread(parts: FloatArray, rest: FloatArray) -> FloatArray:
-    """Give what the parts together do not account for to each, as they have moved a statistic."""
-    weight = parts**2
-    total = weight.sum(axis=0)
-    share = np.where(total > 1e-12, weight / np.maximum(total, 1e-12), 1.0 / len(parts))
-    return np.asarray(parts + share * rest)
