@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +18,6 @@ from pchem_pipeline.discrepancy.build_verdict import (
 )
 from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals
 from pchem_pipeline.discrepancy.by_likelihood.gap import on_all_codes
-from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import changes
@@ -67,7 +65,7 @@ class AddedSets:
         gap, fitted = before, self.whole.plain
         additions: list[Addition] = []
         for named in self.found.named:
-            extended = self._refit((*fitted.members, named.member))
+            extended = self.sets.fit((*fitted.members, named.member), self.found.best.fit.parameters)
             after = self.gap(extended)
             addition = self._addition(named, (gap, after), (fitted, extended))
             additions.append(replace(addition, pulls=moved))
@@ -106,9 +104,6 @@ class AddedSets:
         inside = np.where(kept, mass, 0.0).sum(axis=1, keepdims=True)
         return np.asarray(mass / inside * np.where(kept, counts, 0.0).sum(axis=1, keepdims=True))
 
-    def _refit(self, members: Sequence[Member]) -> FittedSet:
-        return self.sets.fit(members, self.found.best.fit.parameters)
-
     def _addition(self, named: Named, gaps: tuple[Gap, Gap], fits: tuple[FittedSet, FittedSet]) -> Addition:
         """Return an effect with the gaps and the fits without and with it, and with rivals in its place."""
         before, after = fits
@@ -138,12 +133,12 @@ class AddedSets:
 
     def _rivals(self, named: Named, before: FittedSet) -> tuple[Rival, ...]:
         """Return what could stand in the place of an effect, refitted, with its gap, the best first."""
-        found = []
+        found, start = [], self.found.best.fit.parameters
         for other, behind, error in named.rivals:
             if any(other.excludes(m) for m in before.members):
                 continue
             try:
-                gap = self.gap(self._refit((*before.members, other)))
+                gap = self.gap(self.sets.fit((*before.members, other), start))
             except ValueError:
                 continue
             why = f"it predicts unseen samples worse, by {-behind:.3g} ± {error:.2g} nats"

@@ -86,12 +86,10 @@ class HistogramExplainer(Explainer[Explanation]):
     """Distinguishes effects in histograms.
 
     Attributes:
-        prepared: the histograms, split, and the model, drawn.
-        observed: the chosen rows.
+        prepared: the histograms, split, and replicates of the model.
         sets: fits sets of effects to the train part, and scores them by the test part.
         whole: fits them to both, and scores them by the final part.
         bare: fits the rows without any effects.
-        rng: all random numbers of the search.
         members: the candidates.
         effects: of the model, those added included.
         final: the fit of the final model to train and test part.

@@ -81,18 +81,7 @@ class Extension:
         hypotheses: tuple[Hypothesis, ...],
         certain: bool,
     ) -> Extension:
-        """Put a set, with many replicates, into the model, at the strengths to which these correct it.
-
-        Args:
-            work: fits the pixels with it.
-            given: effects that the model has.
-            accept: see the attributes, as for the others.
-            compared: how it was chosen.
-            added: the set.
-            stderr: of its effects.
-            hypotheses: all candidates.
-            certain: whether its effects are beyond doubt.
-        """
+        """Put a set with many replicates into a model, at the strengths to which these correct it."""
         # within a standard error the steps end, too
         near = np.abs(added.change) < np.maximum(_NEAR, added.stderr)
         change = np.where(near, np.expm1(added.change), 0.0)
@@ -127,18 +116,13 @@ class Extension:
         return np.asarray((self.accept.z.both - self.last.mean) / np.hypot(chance, self.tolerance))
 
     def close(self, before: Gap, still: bool) -> Added:
-        """Return the added effects, the weightiest first, and what is left.
-
-        Args:
-            before: gap of the model before.
-            still: whether the data disagree with the final model.
-        """
+        """Return the added effects, the weightiest first; ``still``: data and final model disagree."""
         after = self.accept.gap(self.last)
         unfinished = not after.at_floor and (still or after.too_wide(before.value))
         rest = self._left() if unfinished else None
         additions: list[Addition] = []
         gap, parts, mean = before, self.parts, self.accept.first.mean
-        order = np.argsort([-_weight(part, self.accept.first) for part in parts])
+        order = np.argsort(-np.sum((parts / self.accept.first.std) ** 2, axis=1))
         for place, member in enumerate(order):
             mean = mean + parts[member]
             last = place == len(order) - 1
@@ -312,10 +296,6 @@ def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, 
     if left[worst] <= CERTAIN:
         return ""
     return f"it leaves a misfit: {STATISTICS[null.names[worst]].says(float(rest[worst]))}"
-
-
-def _weight(part: FloatArray, null: NullModel) -> float:
-    return float(np.sum((part / null.std) ** 2))
 
 
 def _ambiguous_set(rivals: Sequence[Contender], certainty: float) -> list[Contender]:

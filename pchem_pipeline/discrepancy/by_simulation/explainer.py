@@ -118,11 +118,8 @@ class FrameExplainer(Explainer[Screened]):
     """Distinguishes effects in frames.
 
     Attributes:
-        prepared: the frames, split, and the model, drawn.
-        observed: the frames.
-        work: fits and simulates them.
-        screening: asks the candidates what they would do.
-        accept: judges sets by the statistics of the data.
+        prepared: the frames, split, and replicates of the model.
+        work: fits and simulates the frames.
         given: effects that the model had before the search.
         extension: the effects that it adds; None: none yet.
         progress: is given what is done next.

@@ -54,12 +54,7 @@ _FIRST_SHARE, _STEPS = 0.02, 60
 
 @dataclass(frozen=True)
 class _Mixture:
-    """Samples and the mass of their codes under each move.
-
-    Attributes:
-        counts: how many samples there are of each kind, shape (n,).
-        mass: of their codes with each move, the first is none, shape (l, n).
-    """
+    """Numbers of samples of each kind, (n,), and mass of their codes with each move, none first, (l, n)."""
 
     counts: FloatArray
     mass: FloatArray
@@ -123,13 +118,7 @@ def _likelihood(counts: FloatArray, mass: FloatArray, share: FloatArray) -> floa
 
 @dataclass(frozen=True)
 class _Laws:
-    """The mass of the codes of some pixels under a model.
-
-    Attributes:
-        pixels: their numbers on the sensor, shape (n,).
-        first: their first codes, shape (n,).
-        mass: of successive codes, 0 at both ends, shape (n, c).
-    """
+    """The mass (n, c) of successive codes from the first of n pixels on, 0 at both ends, under a model."""
 
     pixels: IntArray
     first: IntArray
@@ -185,14 +174,7 @@ def measured_mixture_shifts(
     maps: PixelMaps,
     effects: Sequence[Effect],
 ) -> Measurement | None:
-    """Return the moves that the samples of some frames need beside a model; None where they need none.
-
-    Args:
-        frames: (frame, y, x), DN.
-        numbers: of the frames in the run, increasing, shape (frame,).
-        maps: parameters of the pixels under the model.
-        effects: of the model.
-    """
+    """Return the moves that samples of frames (t, y, x) need beside a model, given its maps; None: none."""
     found = (
         _measured_shifts(frames, maps, effects),
         _measured_towards(frames, numbers, maps, effects),
@@ -260,14 +242,14 @@ def _component(
 
 @dataclass(frozen=True)
 class _Samples:
-    """Samples whose neighbours are known.
+    """Samples whose neighbours are known, shapes (m,).
 
     Attributes:
-        row: of the pixel's law, shape (m,).
+        row: of the pixel's law.
         place: frame, row and column, shape (3, m).
-        code: DN, shape (m,).
-        other: that of the neighbour, shape (m,).
-        chance: one of the neighbour's pixel at another time, shape (m,).
+        code: DN.
+        other: that of the neighbour.
+        chance: one of the neighbour's pixel at another time.
     """
 
     row: IntArray

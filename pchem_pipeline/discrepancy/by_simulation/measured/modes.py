@@ -178,13 +178,9 @@ def measured_mode(
     maps: PixelMaps,
     inside: BoolArray,
 ) -> Measurement | None:
-    """Return the change of gain, light or noise beyond a model's; None where a steady offset is clearer.
+    """Return the change of gain, light or noise beyond that of frames simulated with a model, if clear.
 
-    Args:
-        data: sums of the frames.
-        model: of frames simulated with it.
-        maps: parameters of the pixels.
-        inside: pixels of the sums, shape (y, x).
+    ``inside``, (y, x), are the pixels of the sums. None also where a steady offset is clearer.
     """
     found = [_Change.of(key, sums, model[key]) for key, sums in data.items()]
     found.sort(key=lambda one: -one.gain)

@@ -183,14 +183,7 @@ def _products(one: NDArray[Any], two: NDArray[Any], starts: IntArray) -> FloatAr
 def measured_noise(
     data: Covariances, model: Covariances, evidence: Evidence, inside: BoolArray
 ) -> Measurement | None:
-    """Return the noise that samples share beyond what a model makes; None where they share none.
-
-    Args:
-        data: covariances of the frames.
-        model: of frames simulated with it.
-        evidence: of the frames.
-        inside: pixels of the covariances, shape (y, x).
-    """
+    """Return the noise that samples of pixels ``inside``, (y, x), share; None: only what a model makes."""
     inside = inside & evidence.maps.usable
     own = {key: one for key, one in model.pairs.items() if abs(one.value) > CLEAR * one.error}
     none = Covariance(0.0, 0.0)

@@ -88,14 +88,7 @@ class _Term(NamedTuple):
 def measured_response(
     data: Responses | None, model: Responses | None, evidence: Evidence, inside: BoolArray
 ) -> Measurement | None:
-    """Return which samples follow which beyond what a model makes; None where none is clear.
-
-    Args:
-        data: of the frames.
-        model: of frames simulated with it.
-        evidence: of the frames.
-        inside: pixels of the responses, shape (y, x).
-    """
+    """Return which samples of pixels ``inside``, (y, x), follow which beyond what a model makes, if clear."""
     if data is None:
         return None
     left = {

@@ -205,10 +205,7 @@ def multistart(
 
 
 def _of_usual_noise(near: FloatArray, fitted: FloatArray) -> FloatArray:
-    """Return parameters (n, 4) with the gain and the read noise of most pixels, bias and mean of each.
-
-    Under strong effects plain fits have both too large in bright pixels, and those climb no way back.
-    """
+    """Return parameters (n, 4) with the gain and the read noise of most pixels, bias and mean of each."""
     found = np.where(np.isfinite(fitted), fitted, near)
     found[:, 0] *= np.nanmedian(fitted[:, 1]) / found[:, 1]
     found[:, [1, 3]] = np.nanmedian(fitted[:, [1, 3]], axis=0)
@@ -296,12 +293,8 @@ class Sensor:
     def refitted(self, before: PixelMaps, after: PixelMaps) -> Sensor:
         """Return it under another model: each pixel moves as its fit does, one without a fit as most do.
 
-        Args:
-            before: fits under the model by which it was learnt.
-            after: fits of the same frames under the other one.
-
         Raises:
-            NotFittedError: no pixel is fitted under both.
+            NotFittedError: no pixel is fitted before and after.
         """
         both = (before.usable & after.usable)[self.drawn]
         _require(both)
@@ -315,10 +308,6 @@ class Sensor:
 
         An effect of which the law knows only a part (what a neighbour adds) is in the fitted parameters,
         mostly the read noise, and simulated on top would be there twice.
-
-        Args:
-            wanted: plain fits of the data.
-            simulated: of a sensor drawn from this one, with the effects of the model.
 
         Raises:
             NotFittedError: no pixel is fitted in both.
@@ -356,7 +345,7 @@ def learn_sensor(
     Args:
         frames: that were fitted, (frame, y, x), DN.
         numbers: theirs in the run, shape (frame,).
-        fit: their maps under the model.
+        fit: of them with the effects.
         effects: of the model.
         mistaken: share of pixels whose bias may be off by an electron.
         lost: see :class:`Sensor`; None: not known yet.

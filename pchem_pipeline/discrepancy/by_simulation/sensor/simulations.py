@@ -53,7 +53,7 @@ class Simulations:
         seed: root of all random numbers.
         effort: counts the work.
         given: effects that the model had before the search.
-        known: the models that were mapped of late.
+        known: cache of `mapped`.
     """
 
     observed: ObservedFrames

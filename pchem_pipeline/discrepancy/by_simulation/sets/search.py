@@ -65,13 +65,9 @@ _MOST_GROWN = {1: 2, 2: 1}
 
 @dataclass(eq=False)
 class Trial:
-    """A set of effects, as far as it was simulated.
+    """A set of effects as proposed, the log score that their fingerprints promise, and its simulations.
 
-    Attributes:
-        members: the effects as proposed.
-        foreseen: log score that their fingerprints promise, nats.
-        way: steps to its best strengths; None: not simulated.
-        ended: whether no further step pays.
+    ``way`` has the steps to its best strengths (None: not simulated); ``ended``: no further step pays.
     """
 
     members: tuple[Hypothesis, ...]
@@ -109,9 +105,8 @@ class Search:
     """Sets of effects that are tried.
 
     Attributes:
-        refitter: simulates them.
         likelihood: of the pixels' histograms, which brings a set near its best.
-        trials: all of them.
+        trials: all sets.
         limit: what was next when the budget was used; None: it is not.
         rejected: sets that are not established.
         report: is given the tags of the best set after each step.
