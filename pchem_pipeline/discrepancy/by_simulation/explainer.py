@@ -21,7 +21,7 @@ from pchem_pipeline.discrepancy.by_simulation.additions import Extension
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper, candidate_classes, serial
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import standard_errors
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, SetFit
-from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened, Screening, noise_of_splits
+from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened, Screening
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained
@@ -259,8 +259,7 @@ class FrameExplainer(Explainer[Screened]):
         def allow(words: str) -> None:
             self.work.effort.check(f"{words} was fitted")
 
-        events = np.asarray(noise_of_splits(first, 2, data.settings.model_error).events)
-        return Refitter(draw, first, data.z.both, events, present, allow=allow, defects=data.defects)
+        return Refitter(draw, first, data.z.both, present, allow=allow, defects=data.defects)
 
     def _left_by(self, best: Refitted, refitter: Refitter) -> list[SetFit]:
         """Return what is likely beside a refitted set."""

@@ -160,10 +160,10 @@ def simulate_frames(
     truth = truth_of(maps)
     out = np.empty((taken.numbers.size, *shape), dn_dtype(taken.bit_depth))
     position = 0
-    for first, last in _runs(taken.numbers):
-        n = last - first
-        out[position : position + n], _ = simulate_block(truth, settings, (first, last), electron_frames=0)
-        position += n
+    for run in np.split(taken.numbers, np.flatnonzero(np.diff(taken.numbers) != 1) + 1):
+        block = int(run[0]), int(run[-1]) + 1
+        out[position : position + run.size], _ = simulate_block(truth, settings, block, electron_frames=0)
+        position += run.size
     return out
 
 
@@ -183,9 +183,3 @@ def truth_of(maps: PixelMaps) -> TruthMaps:
         analog_read_noise_e=analog * values["conversion_gain"],
         defect=np.zeros(maps.usable.shape, np.uint8),
     )
-
-
-def _runs(numbers: IntArray) -> list[tuple[int, int]]:
-    """Return the ranges of consecutive frame numbers, ends excluded."""
-    breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
-    return [(int(run[0]), int(run[-1]) + 1) for run in np.split(numbers, breaks)]

@@ -115,7 +115,10 @@ class Simulations:
                 sensor = self._learnt(fit, model, sensor.lost)  # the fits of single pixels say little
             elif model != self.given:
                 sensor = sensor.refitted(first.maps, fit.maps)
-            self.known[model] = Mapped(fit, self._corrected(sensor, model) if model else sensor)
+            if model and self.plain.ambiguous <= MANY_MISTAKEN:
+                # simulated with effects and fitted without, sensors must come out as the data do
+                sensor = sensor.corrected(self.plain.maps, self._once("fitted", sensor, model).fitted())
+            self.known[model] = Mapped(fit, sensor)
         return self.known[model]
 
     @functools.cached_property
@@ -159,12 +162,6 @@ class Simulations:
     def forget(self, model: tuple[Effect, ...]) -> None:
         """Forget all models but one: they are not asked for again."""
         self.known = {one: mapped for one, mapped in self.known.items() if one == model}
-
-    def _corrected(self, sensor: Sensor, model: tuple[Effect, ...]) -> Sensor:
-        """Return sensors that, simulated with effects and fitted without, come out as the data do."""
-        if self.plain.ambiguous > MANY_MISTAKEN:
-            return sensor
-        return sensor.corrected(self.plain.maps, self._once("fitted", sensor, model).fitted())
 
     def _once(self, purpose: str, sensor: Sensor, model: tuple[Effect, ...]) -> Replicate:
         """Return a stack of the seen frames to draw from a sensor once for a purpose, and count it."""

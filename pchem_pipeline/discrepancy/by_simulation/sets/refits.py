@@ -218,7 +218,6 @@ class Refitter:
             replicates, (b, m), which share their random numbers whatever the effects.
         null: of the model without them.
         target: mean of the statistics of train and test frames, shape (m,).
-        events: see :class:`~pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints.Noise`.
         present: other effects of the model.
         allow: is given the effects simulated next, and raises an error where the work is at its limit.
         defects: effects that failed, and why; out.
@@ -227,12 +226,11 @@ class Refitter:
     draw: Callable[[tuple[Effect, ...], int], FloatArray]
     null: NullModel
     target: FloatArray
-    events: FloatArray
     present: tuple[Effect, ...] = ()
     allow: Callable[[str], None] = lambda _: None
     defects: dict[str, str] = field(default_factory=dict)
 
-    def begin(self, hypotheses: Sequence[Hypothesis], replicates: int = FEW) -> Steps:
+    def begin(self, hypotheses: Sequence[Hypothesis]) -> Steps:
         """Simulate a set at its guessed strengths.
 
         Raises:
@@ -240,7 +238,7 @@ class Refitter:
             EffortSpentError: the work is at its limit.
         """
         self.allow(tags_of(hypotheses))
-        return Steps.begin(self.simulated(tuple(hypotheses), None, replicates))
+        return Steps.begin(self.simulated(tuple(hypotheses), None, FEW))
 
     def step(self, way: Steps) -> bool:
         """Simulate a set a step nearer to its best strengths; return whether another step may pay.
@@ -264,13 +262,13 @@ class Refitter:
             now = None  # a step too far
         return way.taken(step, now)
 
-    def refined(self, hypotheses: Sequence[Hypothesis], replicates: int = FEW) -> Refitted:
+    def refined(self, hypotheses: Sequence[Hypothesis]) -> Refitted:
         """Return a set at the strengths that explain the data best, or as near as the work allows.
 
         Raises:
             NotFittedError, EffortSpentError: see `begin`.
         """
-        way = self.begin(hypotheses, replicates)
+        way = self.begin(hypotheses)
         with contextlib.suppress(EffortSpentError):  # what was simulated is not lost
             while self.step(way):
                 pass
@@ -375,7 +373,8 @@ class Refitter:
 
     def noise(self, covariance: Covariance, replicates: int) -> Noise:
         """Return the noise of the data less the mean of so many replicates."""
-        return Noise(covariance.times(1.0 / _SPLITS + 1.0 / replicates), _FINE_ERROR, self.events)
+        scale = 1.0 / _SPLITS + 1.0 / replicates
+        return Noise(covariance.times(scale), _FINE_ERROR, self.null.events / _SPLITS)
 
     def scatter(self, covariance: Covariance, replicates: int) -> FloatArray:
         """Return standard deviations of the same, by chance alone, shape (m,)."""

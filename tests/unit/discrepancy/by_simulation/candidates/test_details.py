@@ -62,7 +62,7 @@ class World:
         return vectors
 
     def refitter(self) -> Refitter:
-        return Refitter(self.draw, self.null, (self.parts[0] + self.parts[1]) / 2.0, np.zeros(M))
+        return Refitter(self.draw, self.null, (self.parts[0] + self.parts[1]) / 2.0)
 
     def likely(self, hypotheses: list[Hypothesis]) -> list[SetFit]:
         refitter = self.refitter()

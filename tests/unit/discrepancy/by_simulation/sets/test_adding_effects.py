@@ -95,7 +95,7 @@ class World:
         return vectors
 
     def refitter(self) -> Refitter:
-        return Refitter(self.draw, self.null, self.z.both, np.zeros(M))
+        return Refitter(self.draw, self.null, self.z.both)
 
     def likely(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> list[SetFit]:
         noise = self.refitter().noise(self.null.covariance, 40)
