@@ -29,12 +29,7 @@ from pchem_pipeline.effects.framework.evidence import Evidence
 
 @dataclass
 class AddedSets:
-    """Fits the models of the steps to train and test together, and measures their gaps on the final part.
-
-    Attributes:
-        found: what the search found.
-        whole: fits them on all codes, and scores them by the final part.
-    """
+    """Fits what the search found on ``whole`` train and test parts, and measures gaps on the final part."""
 
     found: Explanation
     whole: SetComparison

@@ -33,7 +33,6 @@ class Coordinate:
     """A fitted field of an effect, as the power in which small effects are linear.
 
     Attributes:
-        name: of the field.
         power: the field is ``sign(c) |c| ** (1 / power)``.
         bounds: of the coordinate.
     """
@@ -58,12 +57,7 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class Member:
-    """A candidate at a start, with what of it is fitted.
-
-    Attributes:
-        effect: at the start.
-        coordinates: its strength first, if it has one.
-    """
+    """A candidate at a start, and its fitted coordinates, that of the strength first if it has one."""
 
     effect: Effect
     coordinates: tuple[Coordinate, ...]
@@ -198,13 +192,9 @@ def find_members(
     present: Sequence[Effect],
     failed: dict[str, str],
 ) -> tuple[list[Member], dict[str, str]]:
-    """Return the candidates that change a pixel's own histogram, and those that do not and why.
+    """Return the candidates that change a pixel's own histogram, and why the others do not.
 
-    Args:
-        classes: candidates by tag.
-        evidence: of the histograms, from which candidates estimate their starts.
-        present: effects of the model; they are not candidates.
-        failed: candidates that failed, and why; out.
+    Some estimate their starts from the evidence. ``failed`` gets those that failed, and why.
     """
     members: list[Member] = []
     untestable: dict[str, str] = {}

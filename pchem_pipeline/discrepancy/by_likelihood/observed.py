@@ -31,8 +31,8 @@ class SampleHistograms:
         counts: one histogram per pixel, shape (n, B).
         origin: DN of bin 0, shape (n,).
         bias: frames without electrons, H = 0.
-        integration_time: s; where all samples have one, and their exposures lie on a line over it, spurious
-            charge is distinguished from dark current.
+        integration_time: s; if all samples have one, and exposures lie on a line over it, spurious charge is
+            distinguished from dark current.
     """
 
     counts: NDArray[np.integer]

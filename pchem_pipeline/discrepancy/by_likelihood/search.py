@@ -25,7 +25,6 @@ class Named:
     """An effect of the explanation.
 
     Attributes:
-        member: as fitted.
         rivals: effects that could stand in its place, the best first, with the gain of the set with each over
             the chosen one, nats, and its standard error.
         apart: by how much its strength differs when fewer codes are compared.

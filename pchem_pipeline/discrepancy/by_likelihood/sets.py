@@ -41,8 +41,7 @@ class FittedSet:
 
     Attributes:
         members: at the fitted coordinates.
-        fit: of own and shared parameters.
-        log_masses: of the codes under it, shape (n, B).
+        log_masses: of the codes, shape (n, B).
         score: log-likelihood of the other part, nats.
     """
 
@@ -242,10 +241,7 @@ class SetComparison:
     def _first_step(
         self, base: FittedSet, log_masses: FloatArray, derivatives: FloatArray, member: Member
     ) -> tuple[float, Member]:
-        """Return the rise that a candidate promises, below 0 at negative strength, and the candidate there.
-
-        Its strength and the pixels' own parameters move; what is in the set stays.
-        """
+        """Return the rise that a candidate promises, below 0 at negative strength, and the candidate there."""
         if not member.coordinates:
             return np.inf, member
         theta, shared = self.samples.theta(base.fit.parameters), member.start

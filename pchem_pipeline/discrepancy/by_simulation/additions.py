@@ -234,7 +234,6 @@ class _Other:
     """An effect fitted in the place of a chosen one.
 
     Attributes:
-        effect: at its best strength.
         behind: its log score against the chosen set, nats.
         mean: statistics of the model with it, shape (m,).
         rest: what is left of the data, in its errors, shape (m,).
@@ -276,9 +275,7 @@ def without_company(additions: Sequence[Addition]) -> list[Addition]:
 
 
 def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, null: NullModel) -> str:
-    """Return in words what the whole model leaves in the families of the effect's signature; empty: nothing.
-
-    Or in its place, or of what it moves.
+    """Say what the model leaves in the families of an effect's signature, in its place or of what it moves, if any.
 
     Args:
         effect: an effect.

@@ -1,8 +1,7 @@
 """Effects are distinguished in frames by simulation: what each would do to many statistics, refit included.
 
 The frames are split in three; effects are estimated and compared on the first two parts, and the gap that
-remains is measured on the third. That one has no part in finding or fitting anything; what it does not show
-at all is not named.
+remains is measured on the third, which has no part in finding or fitting anything.
 """
 
 from __future__ import annotations
@@ -291,11 +290,7 @@ class FrameExplainer(Explainer[Screened]):
         return Added((), before) if self.extension is None else self.extension.close(before, disagreed)
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
-        """Return the maps under the model, without the exposure that effects add to single pixels.
-
-        Such exposure is looked for in all frames, since those are fitted in the end. The replicates of the
-        search are simulated with the pixels' mean exposure.
-        """
+        """Return the maps under the model, without the exposure that effects add to single pixels in all frames."""
         frames, plain, expected = self.observed.frames, self.observed.plain, None
         maps = self.work.mapped(self.model).fit.maps
         assert plain.covariance is not None

@@ -91,7 +91,6 @@ class ReplicateSimulator:
 
     Attributes:
         maps: parameters of the pixels under the model.
-        model: effects that the model has.
         acquisition: of the split that is simulated.
         names: of the statistics.
         mapper: runs the replicates.
@@ -203,8 +202,7 @@ class ReplicateSimulator:
     ) -> list[Hypothesis]:
         """Bring the strengths of the most promising hypotheses to what the data ask for, each by itself.
 
-        One far behind the best by itself, that brings nothing beside it, is left as it is, and so are
-        effects ``told`` by the histograms.
+        Those that promise little, and effects ``told`` by the histograms, are left as they are.
         """
         if not hypotheses:
             return []
@@ -268,10 +266,7 @@ class ReplicateSimulator:
 
 
 def _without_chance(shifts: FloatArray) -> FloatArray:
-    """Return the mean shift of simulations, (repeat, statistic), without what is likely chance.
-
-    Regressed on chance, every strength would come out too low.
-    """
+    """Return the mean of shifts (repeat, statistic) without chance, which would bias regressed strengths low."""
     mean, repeats = shifts.mean(axis=0), shifts.shape[0]
     # below the one a single simulation shows nothing, above the other all of it
     low, high, error = POSSIBLE, CERTAIN, np.ones_like(mean)

@@ -1,10 +1,9 @@
 """Parameters of effects beside their strengths, tuned to what the data ask for by simulation.
 
-A time constant or a step that is in no law of a sample is at first what an estimator made of it. Where the
-rest that a set leaves lies in statistics that such an effect moves, its parameters are tuned: a small step of
-each shows the slope of the statistics (replicates share their random numbers), and all of them and the
-strengths are corrected together (Gauss-Newton, damped as by Levenberg 1944), the slopes by secants from step
-to step (Broyden 1965).
+Those in no law of a sample are at first what an estimator made of them. Where a set leaves something that
+such an effect moves, a small step of each parameter shows the slope of the statistics (replicates share their
+random numbers), and all of them and the strengths are corrected together (Gauss-Newton, damped as by
+Levenberg 1944), the slopes by secants from step to step (Broyden 1965).
 """
 
 from __future__ import annotations
@@ -99,12 +98,8 @@ def tuned(refitter: Refitter, one: Refitted) -> Refitted:
 def standard_errors(refitter: Refitter, one: Refitted, least: FloatArray) -> list[dict[str, float]]:
     """Return the standard errors of the strength and parameters of each effect of a set, by name.
 
-    From the inverse of the information of all together. A parameter that the data hardly constrain has none.
-
-    Args:
-        refitter: simulates the set.
-        one: the set.
-        least: relative errors of the factors where the parameters are known, shape (e,).
+    From the inverse of the information of all together; none of a parameter that the data hardly constrain.
+    ``least`` are relative errors of the factors where the parameters are known, shape (e,).
     """
     details = _details(refitter, one)
     information, _ = _normal_equations(refitter, one, details)

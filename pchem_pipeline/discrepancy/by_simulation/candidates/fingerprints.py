@@ -2,11 +2,9 @@
 
 The shift of the statistics against the null is regressed on the fingerprints of candidate effects, as climate
 science attributes warming (Hasselmann 1997; Allen and Tett 1999): ``y = sum_e c_e F_e + noise`` with ``c_e
->= 0``. The noise has the covariance of the null replicates, and a relative error of each fingerprint on top,
-since the details of a real effect are never those of the library.
-
-Sets of up to three candidates are compared by their likelihood, less a price for every effect: the best are
-worth a refit of the pixels.
+>= 0``. The noise has the covariance of the null replicates, and a relative error of each fingerprint on top:
+details of real effects differ. Sets of up to three candidates are compared by their likelihood, less a price
+for every effect: the best are worth a refit of the pixels.
 """
 
 from __future__ import annotations
@@ -143,8 +141,7 @@ def correction(
         slopes: derivatives of the statistics by the relative strengths, shape (e, m).
         residual: what the model with all effects leaves, shape (m,).
         covariance: of the residual, model errors included.
-        scatter: residuals of replicates, shape (b, m); the scatter of their changes is the error if it is
-            larger than that by the covariance, which is estimated, too; None: there are too few.
+        scatter: residuals of enough replicates, shape (b, m), whose changes may scatter more than that.
     """
     design = covariance.white(slopes).T
     weights = np.linalg.pinv(design)
@@ -284,8 +281,6 @@ def _all_needed(fit: SetFit, shift: FloatArray, noise: Noise) -> bool:
 
 def seen_among(part: FloatArray, others: FloatArray, shift: FloatArray, noise: Noise) -> bool:
     """Return whether a statistic deviates from what other effects make of it, in the direction of an effect.
-
-    Where a strong effect moves a statistic, a weak one is lost in the details of the strong one.
 
     Args:
         part: shift of the statistics by the effect, shape (m,).

@@ -54,8 +54,6 @@ class Screening:
     """Simulates the candidates.
 
     Attributes:
-        observed: the frames.
-        work: simulates effects in them.
         z: statistics of the data.
         classes: of the candidates, by tag.
         given: effects that the model had before the search.
@@ -100,12 +98,9 @@ class Screening:
         return Screened(tuple(hypotheses), sets, gain)
 
     def beside(self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray) -> list[SetFit]:
-        """Return sets that are likely beside one that was refitted, the likeliest first.
+        """Return the likeliest sets beside a refitted one in a model with this null.
 
-        Args:
-            model: effects, the set among them.
-            null: of that model.
-            slopes: of the statistics by the strengths of the set, which are uncertain, shape (e, m).
+        ``slopes`` are those of the statistics by the uncertain strengths of the set, shape (e, m).
         """
         simulator = self._simulator(model, null, "/".join(["0", *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)

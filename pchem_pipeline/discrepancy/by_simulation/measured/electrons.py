@@ -56,12 +56,7 @@ _NOTHING: Chances = (Chance(0.0, np.inf), Chance(0.0, np.inf))
 
 
 class Electrons(NamedTuple):
-    """Variances and covariances of electron numbers.
-
-    Attributes:
-        excess: of the variance over Poisson, as further electrons of the same sample.
-        together: covariance with the numbers at a distance, as further electrons there.
-    """
+    """Excess of the variance of electron numbers over Poisson, and covariances by distance, as further electrons."""
 
     excess: Chances
     together: dict[Distance, Chances]

@@ -328,16 +328,13 @@ class Refitter:
     def measured_slope(
         self, one: Refitted, effects: tuple[Effect, ...], step: float, foreseen: FloatArray | float = 0.0
     ) -> FloatArray | None:
-        """Return the slope (m,) of the statistics by the logarithm of a parameter, from a simulation.
+        """Return the slope (m,) of the statistics by the logarithm of a parameter of a set, by simulation.
 
         Args:
             one: the set.
             effects: the same with one parameter changed.
             step: change of its logarithm.
             foreseen: the slope where the measured one does not differ beyond chance, shape (m,).
-
-        Returns:
-            The slope; None where the effects cannot be fitted.
         """
         self.allow(one.words)
         try:

@@ -31,7 +31,6 @@ class Contender:
     """An effect that could stand in the place of a chosen one.
 
     Attributes:
-        effect: itself.
         score: log score of the best set with it in that place, relative to the chosen set, nats.
         stderr: of that score, nats.
         probability: among all that could stand there.
@@ -45,13 +44,10 @@ class Contender:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Sets at their best fit.
+    """The best set and all, the best first, at their best fit.
 
-    Attributes:
-        chosen: the best.
-        tried: all, the best first.
-        by_histograms: how far other sets (by tags) are behind the chosen one in the likelihood of the
-            histograms, nats, and the error of that.
+    ``by_histograms`` says how far others (by tags) are behind the chosen one in the likelihood of the
+    histograms, nats, with the error.
     """
 
     chosen: Refitted
