@@ -79,7 +79,8 @@ def find_residuals(
     The codes of all pixels are sorted into cells by their place on the comb; each p-value counts all cells.
 
     Args:
-        seen, expected: samples, in the data and under the model, shape (n, B).
+        seen: samples, shape (n, B).
+        expected: the same under the model.
         origin: DN of bin 0, shape (n,).
         parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
         peaks: that were set aside; they come first, and their codes are in no other cell.

@@ -64,7 +64,7 @@ def sum_over_samples(seen: FloatArray, values: FloatArray) -> tuple[float, float
 
 
 def _of_cells(expected: FloatArray) -> tuple[float, float]:
-    """Return mean and variance of ``sum n log(n / e) - n + e`` for Poisson counts n of expectation e, nats."""
+    """Return mean and variance of ``sum n log(n / e) - n + e``, nats, n being Poisson of expectation e."""
     grid, *tables = _chance_table()
     some = np.maximum(expected[expected > 0.0], np.exp(grid[0]))
     mean, variance = (float(np.interp(np.log(some), grid, values).sum()) for values in tables)

@@ -241,7 +241,7 @@ class SetComparison:
     def _first_step(
         self, base: FittedSet, log_masses: FloatArray, derivatives: FloatArray, member: Member
     ) -> tuple[float, Member]:
-        """Return the rise that a candidate promises, below 0 at negative strength, and the candidate there."""
+        """Return the rise that a candidate promises, below 0 at negative strength, and the candidate then."""
         if not member.coordinates:
             return np.inf, member
         theta, shared = self.samples.theta(base.fit.parameters), member.start

@@ -275,7 +275,7 @@ def without_company(additions: Sequence[Addition]) -> list[Addition]:
 
 
 def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, null: NullModel) -> str:
-    """Say what the model leaves in the families of an effect's signature, in its place or of what it moves, if any.
+    """Say what a model leaves in the families of an effect's signature, in its place, or of what it moves.
 
     Args:
         effect: an effect.

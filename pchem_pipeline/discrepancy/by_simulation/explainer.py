@@ -290,7 +290,7 @@ class FrameExplainer(Explainer[Screened]):
         return Added((), before) if self.extension is None else self.extension.close(before, disagreed)
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
-        """Return the maps under the model, without the exposure that effects add to single pixels in all frames."""
+        """Return the maps under the model, without the exposure that effects add to single pixels."""
         frames, plain, expected = self.observed.frames, self.observed.plain, None
         maps = self.work.mapped(self.model).fit.maps
         assert plain.covariance is not None

@@ -266,7 +266,7 @@ class ReplicateSimulator:
 
 
 def _without_chance(shifts: FloatArray) -> FloatArray:
-    """Return the mean of shifts (repeat, statistic) without chance, which would bias regressed strengths low."""
+    """Return the mean of shifts (repeat, statistic) without chance, which would bias strengths low."""
     mean, repeats = shifts.mean(axis=0), shifts.shape[0]
     # below the one a single simulation shows nothing, above the other all of it
     low, high, error = POSSIBLE, CERTAIN, np.ones_like(mean)

@@ -56,7 +56,7 @@ _NOTHING: Chances = (Chance(0.0, np.inf), Chance(0.0, np.inf))
 
 
 class Electrons(NamedTuple):
-    """Excess of the variance of electron numbers over Poisson, and covariances by distance, as further electrons."""
+    """Excess of the variance of electron numbers over Poisson, and covariances, both as further electrons."""
 
     excess: Chances
     together: dict[Distance, Chances]

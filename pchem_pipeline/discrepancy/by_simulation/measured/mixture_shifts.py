@@ -242,14 +242,9 @@ def _component(
 
 @dataclass(frozen=True)
 class _Samples:
-    """Samples whose neighbours are known, shapes (m,).
+    """Samples whose neighbours are known, (m,), with the rows of their laws and places in the stack, (3, m).
 
-    Attributes:
-        row: of the pixel's law.
-        place: frame, row and column, shape (3, m).
-        code: DN.
-        other: that of the neighbour.
-        chance: one of the neighbour's pixel at another time.
+    ``other`` is the code of the neighbour, ``chance`` that of its pixel at another time.
     """
 
     row: IntArray
@@ -397,10 +392,7 @@ def _of_groups(ratio: FloatArray, place: IntArray, together: Together, shape: tu
 
 
 def share_of(ratio: FloatArray, first: float = _FIRST_SHARE) -> tuple[float, float]:
-    """Return the share of groups that are moved, and what it gains, nats, by EM from a first share.
-
-    ``ratio`` is the log likelihood of each group moved less that of the group not moved, shape (n,).
-    """
+    """Return the share of groups that are moved, by EM from their log likelihood ratios, and the gain."""
     ratio, share = ratio[np.isfinite(ratio)], first
     for _ in range(_STEPS if ratio.size else 0):
         share = float(special.expit(ratio + special.logit(share)).mean())

@@ -110,13 +110,7 @@ def common_scores(samples: PartSamples) -> dict[tuple[Shared, Changed], Sums]:
 
 
 class CodeScores(NamedTuple):
-    """Scores of the samples of some pixels for changes of their law, by tables of their codes.
-
-    Attributes:
-        codes: of the samples, (frame, n), DN.
-        first: lowest code of each pixel, (n,).
-        tables: see `score_tables`, shape (5, n, c).
-    """
+    """Codes (frame, n), DN, and their `score_tables` from the ``first`` code of each pixel on."""
 
     codes: NDArray[np.unsignedinteger]
     first: IntArray
@@ -149,10 +143,7 @@ def _in_blocks(values: FloatArray) -> FloatArray:
 
 
 def codes_within_reach(maps: PixelMaps, pixels: IntArray, first: IntArray, last: IntArray) -> int:
-    """Return how many codes from the first on, (n,), to the last ones tables of n pixels need.
-
-    At most up to far above the highest peak: a sample beyond, as of a particle, counts as the last of them.
-    """
+    """Return how many codes from the first on, (n,), tables need, but not far above the highest peak."""
     exposure, gain, bias, sigma = (values.ravel()[pixels] for values in maps.maps)
     most = np.ceil(exposure.max() + 8.0 * np.sqrt(exposure.max()) + 4.0)
     reach = bias + most / gain + _REACH * sigma
@@ -269,8 +260,8 @@ class _Change(NamedTuple):
 def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:
     """Return sums of frames weighted by the shape of the change over the sensor, and that; none where even.
 
-    The shape is the largest principal component of the blocks' sums, each in its noise (Karhunen 1947, Loeve
-    1948), where its power lies beyond what blocks without a change reach (Marchenko and Pastur 1967).
+    The shape is the largest principal component of the sums of blocks (Karhunen 1947, Loeve 1948) where its
+    power lies beyond chance (Marchenko and Pastur 1967).
     """
     if one.blocks is None or one.blocks[1].size < 2:
         return one, ()

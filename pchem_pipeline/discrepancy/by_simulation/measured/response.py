@@ -42,12 +42,7 @@ _STEPS = 8  # up to that, before all numbers near the clearest are tried
 
 
 class Responses(NamedTuple):
-    """How the residuals of frames go with the charge of other samples.
-
-    Attributes:
-        views: the frames, as they are and with their charge mirrored, by axes.
-        covariances: sums of products of residuals and charge of each.
-    """
+    """The frames, with their charge as it is and mirrored, and its covariances with the residuals."""
 
     views: Mapping[Mirrored, FollowingSamples]
     covariances: Mapping[Mirrored, Follows]

@@ -42,7 +42,6 @@ class PartSamples:
         maps: plain fit of these frames, or of more of the same pixels.
         evidence: of the frames of the data, with the errors of charge and residuals.
         inside: pixels of the part, shape (y, x).
-        part: its frames are those that are measured.
         whole_lines: kinds of lines ("row", "column") that are here from end to end.
         known: what was measured in them.
     """

@@ -51,14 +51,7 @@ class _Likely(NamedTuple):
 
 @dataclass
 class Unexplained:
-    """Measures train and test frames beside effects.
-
-    Attributes:
-        work: fits and simulates the frames.
-        refitter: fits effects to their statistics.
-        defects: forms that failed, and why; out.
-        known: what was measured, by the effects beside it.
-    """
+    """Measures train and test frames beside effects; ``defects`` are forms that failed, and why."""
 
     work: Simulations
     refitter: Refitter

@@ -156,10 +156,7 @@ def _acted_on(effects: Sequence[Effect], shape: tuple[int, int]) -> BoolArray:
 
 
 def shift_bias_by_electrons(start: FloatArray, electrons: float) -> FloatArray:
-    """Return parameters (n, 4) whose bias is lower, and exposure higher, by so many electrons.
-
-    Under noise of another law the peak that was taken for that of no electron may be that of one.
-    """
+    """Return parameters (n, 4) whose bias is lower, and exposure higher, by so many electrons."""
     off = start.copy()
     off[:, 0] = np.maximum(start[:, 0] + electrons, _LEAST_LEFT * start[:, 0])
     off[:, 2] -= electrons / start[:, 1]
@@ -225,7 +222,7 @@ def expected_codes(
     numbers: IntArray,
     added: AddedExposure | None = None,
 ) -> FloatArray | None:
-    """Return the samples that a model expects at each code, all usable pixels together.
+    """Return the samples, (c,), that a model expects at each code in all usable pixels; None: it has no law.
 
     Args:
         maps: parameters of the pixels under the model.
@@ -233,9 +230,6 @@ def expected_codes(
         codes: successive DN, shape (c,).
         numbers: of the frames in the run, one sample of each pixel in each.
         added: see :class:`Refit`.
-
-    Returns:
-        Shape (c,); None where the effects give no law.
     """
     usable = maps.usable.ravel()
     own = maps.flat.of(usable)

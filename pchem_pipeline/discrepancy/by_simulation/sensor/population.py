@@ -73,13 +73,7 @@ _OUTLYING = 15.0  # median deviations of a cumulant beyond which a pixel is not 
 
 @dataclass(frozen=True)
 class Population:
-    """Student's t of theta over the pixels.
-
-    Attributes:
-        centre: m, shape (4,).
-        scatter: T, shape (4, 4).
-        uncertainty: covariance of the estimate of m, shape (4, 4).
-    """
+    """Student's t of theta over the pixels: m, (4,), T, (4, 4), and the covariance of the estimate of m."""
 
     centre: FloatArray
     scatter: FloatArray
@@ -91,7 +85,6 @@ class Posterior:
     """Where the true theta of n pixels may lie: a mixture of Gaussians about j maxima each.
 
     Attributes:
-        population: of all pixels.
         theta: maxima, shape (j, n, 4).
         covariance: shape (j, n, 4, 4).
         weight: of the maxima, sums to 1 over j, shape (j, n).
@@ -409,8 +402,7 @@ def _inside(theta: FloatArray) -> FloatArray:
 def _seeds(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> list[tuple[FloatArray, Population]]:
     """Return starts of theta (n, 4) and of the population: from the fits, and from all pixels' cumulants.
 
-    Where peaks are hardly resolved the fits of single pixels are biased, all to the same side. Where they are
-    resolved, but pixels differ widely, or effects are in the law, the cumulants of all are.
+    Fits are biased where peaks are hardly resolved, cumulants where pixels differ widely.
     """
     known = np.asarray(np.isfinite(parameters).all(axis=1))
     mean, k = _cumulants(pixels)

@@ -61,8 +61,7 @@ class Acquisition:
     ) -> Evidence:
         """Return the evidence of frames, (frame, y, x), DN, with these numbers, fitted near maps if any.
 
-        A fit from nothing finds a bias that is off by an electron more often than one near the truth: data
-        and replicates must be treated alike.
+        Data and replicates must be treated alike: a fit from nothing finds a wrong bias more often.
         """
         return observe(
             frames,
@@ -90,7 +89,6 @@ class Replicate:
         maps: parameters of the pixels.
         effects: of the model, in their order.
         seed: root of its random numbers; equal seeds share them whatever the effects.
-        acquisition: which frames.
     """
 
     key: str

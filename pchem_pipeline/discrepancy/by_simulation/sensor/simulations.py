@@ -48,7 +48,6 @@ class Simulations:
     """Fits of the seen frames, and stacks simulated from them.
 
     Attributes:
-        observed: the frames.
         mapper: runs the simulated stacks.
         seed: root of all random numbers.
         effort: counts the work.

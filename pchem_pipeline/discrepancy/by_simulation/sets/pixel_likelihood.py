@@ -1,8 +1,8 @@
-"""The likelihood of the pixels' histograms, asked where the statistics tell effects badly apart.
+"""The likelihood of the pixels' histograms, asked where the statistics distinguish effects badly.
 
-The statistics of a search are few, and two effects on the law of a sample (a wide tail, a skew) may differ
-little in them. The joint likelihood of the pixels' own parameters and all numbers of such effects holds all
-that the histograms say, for a fraction of the cost of one simulation.
+Two effects on the law of a sample (a wide tail, a skew) may differ little in the statistics of a search. The
+joint likelihood of the pixels' own parameters and all those of such effects holds all that the histograms
+say, for a fraction of the cost of one simulation.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ class PixelLikelihood:
             defects: effects that failed, and why; out.
         """
         step = max(1, np.count_nonzero(maps.usable) // pixels)
-        some = tuple(each[::step] for each in np.nonzero(maps.usable))
-        histograms = histogram_frames(frames[:, *some][:, None, :])
+        y, x = (each[::step] for each in np.nonzero(maps.usable))
+        histograms = histogram_frames(frames[:, y, x][:, None, :])
         counts = histograms.counts[0].astype(np.int64)
-        origin, start = histograms.origin[0].astype(np.int64), maps.of(some).columns
+        origin, start = histograms.origin[0].astype(np.int64), maps.of((y, x)).columns
         kept = np.ones(counts.shape, np.bool_)
         self._sets = SetComparison(counts, counts, origin, kept, tuple(present), start, effort=effort)
         self._asked: dict[tuple[frozenset[str], tuple[Effect, ...]], FittedSet | None] = {}
@@ -103,10 +103,9 @@ class PixelLikelihood:
         return sorted(fits, key=lambda fit: -fit[0])
 
     def suggested(self, kinds: Iterable[type[Effect]]) -> list[Effect]:
-        """Return effects that explain much of the histograms, as fitted, the likeliest first.
+        """Return effects that explain much of the histograms, fitted from two strengths, the likeliest first.
 
-        An estimator goes by what an effect does to pixels that are fitted well: where it is so strong that
-        their bias is off by an electron, it may see nothing. Of each kind from two strengths on.
+        An estimator sees nothing of an effect so strong that the bias of the pixels is off by an electron.
         """
         fits: list[tuple[float, Effect]] = []
         for kind in kinds:
@@ -138,11 +137,8 @@ class PixelLikelihood:
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
         """Return how far a set is behind another in likelihood, nats, and the standard error (Vuong 1989).
 
-        Each number of an effect costs a nat (Akaike 1974). None where they cannot be fitted.
-
-        Args:
-            one: effects.
-            other: the same but for those that `identifiable_from_histograms`.
+        Each parameter of an effect costs a nat (Akaike 1974). None where they cannot be fitted. They differ
+        in effects that are `identifiable_from_histograms`.
         """
         first, second = self._fit_set(one), self._fit_set(other, one)
         if first is None or second is None:
@@ -151,10 +147,7 @@ class PixelLikelihood:
         return rise - (first.fit.shared.size - second.fit.shared.size), error
 
     def _fit_set(self, effects: Sequence[Effect], like: Sequence[Effect] | None = None) -> FittedSet | None:
-        """Fit a set, those that are not `identifiable_from_histograms` as they are in it, or in another one.
-
-        From where they are asked about first: other strengths of the same lead to the same.
-        """
+        """Fit a set, what is not `identifiable_from_histograms` being as it is there or in another set."""
         own = [e for e in effects if identifiable_from_histograms(e)]
         others = effects if like is None else like
         besides = tuple(e for e in others if not identifiable_from_histograms(e))
@@ -189,11 +182,7 @@ class PixelLikelihood:
 
 @dataclass(frozen=True)
 class HistogramLikelihood:
-    """The likelihood of the pixels where one law holds for all their samples; by default it says nothing.
-
-    Attributes:
-        of: returns it where some effects may be in the samples, of about so many pixels; None: no one law.
-    """
+    """The `PixelLikelihood` beside some effects, of about so many pixels; None where they have no one law."""
 
     of: Callable[[Sequence[Effect], int], PixelLikelihood | None] = lambda effects, pixels: None
 
@@ -251,9 +240,7 @@ class Histograms:
     def with_numbers(self, guesses: Sequence[Effect]) -> list[Effect]:
         """Return guesses with parameters fitted to histograms, the likeliest of an effect in a place first.
 
-        Those of effects with a law, by the samples on which they act: a strong effect has moved the pixels
-        from which its estimator takes a strength. Those that give single pixels levels of their own, by these
-        levels. Others, and those that no pixel can be fitted with, stay as they are.
+        Of effects with a law, and of those that give single pixels levels of their own; others stay.
         """
         by_place: dict[Part, dict[str, list[Effect]]] = {}
         for g in guesses:
@@ -293,9 +280,10 @@ class Histograms:
     def _of(self, part: Part) -> PixelLikelihood | None:
         """Return the likelihood of the samples of a part; None: they are too few, or have no one law."""
         if part not in self._known:
-            own = self._samples(part)
-            others = self.present, self.effort, FEW_PIXELS, self.defects
-            self._known[part] = None if own is None else PixelLikelihood(*own, *others)
+            known = None
+            if (own := self._samples(part)) is not None:
+                known = PixelLikelihood(*own, self.present, self.effort, FEW_PIXELS, self.defects)
+            self._known[part] = known
         return self._known[part]
 
     def _samples(self, part: Part) -> tuple[NDArray[np.unsignedinteger], PixelMaps] | None:

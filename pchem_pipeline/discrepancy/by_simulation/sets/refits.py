@@ -1,10 +1,9 @@
 """Sets of effects at their best fit under the law: refit, simulate, compare, correct, until they stop moving.
 
-The fingerprint of an effect is what it does on top of pixels that were fitted without it. A strong effect has
-moved those: their read noise holds a part of what it adds, and the fingerprint extrapolates badly. Here the
-pixels are fitted with the effects in their law, replicates are drawn from that fit, and the strengths are
-corrected by what the replicates leave of the data (indirect inference, Gourieroux, Monfort and Renault 1993,
-by secants): an effect is judged by what is left after its best fit.
+The fingerprint of a strong effect extrapolates badly, since the read noise of the plain fit holds a part of
+it. Here the pixels are fitted with the effects in their law, replicates are drawn from that fit, and the
+strengths are corrected by what the replicates leave of the data (indirect inference, Gourieroux, Monfort and
+Renault 1993, by secants): an effect is judged by what is left after its best fit.
 """
 
 from __future__ import annotations
@@ -154,10 +153,7 @@ def broyden(slopes: FloatArray, step: FloatArray, unforeseen: FloatArray) -> Flo
 
 @dataclass
 class Steps(DampedSteps[Refitted]):
-    """The search for the strengths of a set that explain the data best.
-
-    Slopes are those of the last step, and what a set leaves is a matter of chance, too: a step may explain
-    less where the way on explains more, or do a fraction of what it promised, time after time.
+    """The search for the strengths of a set that explain the data best; it may go through a dip of the score.
 
     Attributes:
         now: the set at its last strengths.
@@ -508,10 +504,7 @@ def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:
 
 
 def lesser(slopes: FloatArray, parts: FloatArray) -> FloatArray:
-    """Return the lesser of slopes and shifts, shape (e, m): a share of it is not held against effects.
-
-    An effect near a limit of its strength has slopes far above all that it does.
-    """
+    """Return the lesser of slopes and shifts, (e, m), of which a share is not held against effects."""
     return np.asarray(np.where(np.abs(slopes) < np.abs(parts), slopes, parts))
 
 

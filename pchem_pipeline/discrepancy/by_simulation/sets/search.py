@@ -154,7 +154,7 @@ class Search:
         return next((each for each in self.trials if {h.kind for h in each.members} == kinds), None)
 
     def compare(self, sets: Iterable[Sequence[Hypothesis]]) -> None:
-        """Simulate sets, the most promising one a step further each time, then simplify and tune the best one."""
+        """Simulate sets, the most promising one a step further each time, then simplify and tune the best."""
         for members in sets:
             self.add(members)
         while self.limit is None and (left := [trial for trial in self.trials if self._is_open(trial)]):
