@@ -67,15 +67,18 @@ class FrameStack:
         return cls(stack, numbers, splits, n_run, bit_depth, integration_time, window=window)
 
     @property
-    def here(self) -> SensorWindow:
+    def sensor_window(self) -> SensorWindow:
         """The window of the sensor that the frames are."""
         return self.window or SensorWindow.whole(self.stack.shape)
 
     @property
     def whole_lines(self) -> set[str]:
         """Kinds of lines of the sensor, "row" and "column", that are here from end to end."""
-        whole = SensorWindow.whole(self.here.shape)
-        lines = {"row": self.here.columns == whole.columns, "column": self.here.rows == whole.rows}
+        whole = SensorWindow.whole(self.sensor_window.shape)
+        lines = {
+            "row": self.sensor_window.columns == whole.columns,
+            "column": self.sensor_window.rows == whole.rows,
+        }
         return {of for of, is_whole in lines.items() if is_whole}
 
     @property
@@ -170,4 +173,4 @@ class FrameStack:
 
     def inside(self, part: Part) -> BoolArray:
         """Return which of the pixels lie in a part, (y, x)."""
-        return self.here.mask(part.region)
+        return self.sensor_window.mask(part.region)

@@ -78,7 +78,7 @@ class ObservedFrames:
         frames, usable = self.frames, self.plain.maps.usable
         known, place = frames.splits.examined(frames.stack.shape), unfitted_place(usable)
         spots = []
-        if place is not None and (region := frames.here.on_sensor(place.region)) is not None:
+        if place is not None and (region := frames.sensor_window.on_sensor(place.region)) is not None:
             spots.append(Surveyed(map="unfitted", region=region.numbers(), p=place.p))
         return known.model_copy(update={"unfitted": int((~usable).sum()), "places": tuple(spots)})
 
