@@ -141,7 +141,7 @@ def correction(
         slopes: derivatives of the statistics by the relative strengths, shape (e, m).
         residual: what the model with all effects leaves, shape (m,).
         covariance: of the residual, model errors included.
-        scatter: residuals of enough replicates, shape (b, m), whose changes may scatter more than that.
+        scatter: residuals of replicates, shape (b, m), whose changes may scatter more; None: too few.
     """
     design = covariance.white(slopes).T
     weights = np.linalg.pinv(design)

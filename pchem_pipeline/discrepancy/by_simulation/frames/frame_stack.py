@@ -74,11 +74,8 @@ class FrameStack:
     @property
     def whole_lines(self) -> set[str]:
         """Kinds of lines of the sensor, "row" and "column", that are here from end to end."""
-        whole = SensorWindow.whole(self.sensor_window.shape)
-        lines = {
-            "row": self.sensor_window.columns == whole.columns,
-            "column": self.sensor_window.rows == whole.rows,
-        }
+        window, whole = self.sensor_window, SensorWindow.whole(self.sensor_window.shape)
+        lines = {"row": window.columns == whole.columns, "column": window.rows == whole.rows}
         return {of for of, is_whole in lines.items() if is_whole}
 
     @property
