@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+import functools
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
@@ -18,7 +18,6 @@ from pchem_pipeline.discrepancy.build_verdict import (
 )
 from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals
 from pchem_pipeline.discrepancy.by_likelihood.gap import on_all_codes
-from pchem_pipeline.discrepancy.by_likelihood.members import Member
 from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import changes
@@ -30,28 +29,18 @@ from pchem_pipeline.effects.framework.evidence import Evidence
 
 @dataclass
 class AddedSets:
-    """Fits the models of the steps to train and test together, and measures their gaps on the final part.
-
-    Attributes:
-        found: what the search came to.
-        whole: fits them on all codes, and scores them by the final part.
-        sets: the same on the codes that are compared.
-    """
+    """Fits what the search found on ``whole`` train and test parts, and measures gaps on the final part."""
 
     found: Explanation
     whole: SetComparison
-    sets: SetComparison = field(init=False)
 
-    def __post_init__(self) -> None:
-        """Leave out the codes that were set aside."""
-        self.sets = replace(self.whole, kept=self.found.kept)
+    @functools.cached_property
+    def sets(self) -> SetComparison:
+        """The same as ``whole`` without the codes that were set aside."""
+        return replace(self.whole, kept=self.found.kept)
 
     def gap(self, fitted: FittedSet) -> Gap:
-        """Return the gap of a fit.
-
-        Codes that are set aside keep what they have under the plain model: what is not understood does not
-        count as closed.
-        """
+        """Return the gap of a fit; codes that are set aside have the masses of the plain law."""
         masses = on_all_codes(fitted.log_masses, self.found.kept, self.whole.plain.log_masses)
         return self.whole.gap(replace(fitted, log_masses=masses))
 
@@ -71,7 +60,7 @@ class AddedSets:
         gap, fitted = before, self.whole.plain
         additions: list[Addition] = []
         for named in self.found.named:
-            extended = self._refit((*fitted.members, named.member))
+            extended = self.sets.fit((*fitted.members, named.member), self.found.best.fit.parameters)
             after = self.gap(extended)
             addition = self._addition(named, (gap, after), (fitted, extended))
             additions.append(replace(addition, pulls=moved))
@@ -88,9 +77,8 @@ class AddedSets:
 
     def residuals(self, fitted: FittedSet) -> tuple[Place, ...]:
         """Return the codes that the model does not account for, a peak that was set aside first."""
-        counts, expected = self.sets.train.astype(np.float64), self._expected(fitted)
         own = self.sets.origin, fitted.fit.parameters, self.found.set_aside
-        return tuple(find_residuals(counts, expected, *own))
+        return tuple(find_residuals(self.sets.train.astype(np.float64), self._expected(fitted), *own))
 
     def codes(self, fitted: FittedSet, evidence: Evidence) -> FloatArray | None:
         """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""
@@ -110,9 +98,6 @@ class AddedSets:
         mass = self.sets.problem(fitted.members).masses(fitted.fit.theta, fitted.fit.shared)
         inside = np.where(kept, mass, 0.0).sum(axis=1, keepdims=True)
         return np.asarray(mass / inside * np.where(kept, counts, 0.0).sum(axis=1, keepdims=True))
-
-    def _refit(self, members: Sequence[Member]) -> FittedSet:
-        return self.sets.fit(members, self.found.best.fit.parameters)
 
     def _addition(self, named: Named, gaps: tuple[Gap, Gap], fits: tuple[FittedSet, FittedSet]) -> Addition:
         """Return an effect with the gaps and the fits without and with it, and with rivals in its place."""
@@ -143,12 +128,12 @@ class AddedSets:
 
     def _rivals(self, named: Named, before: FittedSet) -> tuple[Rival, ...]:
         """Return what could stand in the place of an effect, refitted, with its gap, the best first."""
-        found = []
+        found, start = [], self.found.best.fit.parameters
         for other, behind, error in named.rivals:
             if any(other.excludes(m) for m in before.members):
                 continue
             try:
-                gap = self.gap(self._refit((*before.members, other)))
+                gap = self.gap(self.sets.fit((*before.members, other), start))
             except ValueError:
                 continue
             why = f"it predicts unseen samples worse, by {-behind:.3g} ± {error:.2g} nats"

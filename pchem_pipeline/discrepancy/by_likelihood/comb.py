@@ -1,9 +1,9 @@
 """Codes by their position (x - bias) * gain: which to compare, and where data and model disagree.
 
 Where no known effect brings the model to the data, something unknown is in them, and likely in one place: a
-peak that was cut by a trigger, samples between the peaks. A fit to all codes bends every parameter towards
-it. So the comparison is repeated on fewer codes (a side band, as where a background is fitted next to a
-bump), and what is named must be found in all of these views. What is left is located at the peaks or between.
+peak that was cut by a trigger, samples between the peaks. A fit to all codes is biased by it. So the
+comparison is repeated on fewer codes (a side band), and what is named must be found in all of these views.
+What is left is located at the peaks or between.
 """
 
 from __future__ import annotations
@@ -28,12 +28,7 @@ _SIGNIFICANT = 0.005
 
 
 def doubtful_peaks(counts: NDArray[np.integer], electrons: FloatArray) -> list[Interval]:
-    """Return peaks of few samples: each alone, and each with all above it.
-
-    Args:
-        counts: histograms, shape (n, B).
-        electrons: place of every code, e-, shape (n, B).
-    """
+    """Return peaks of few samples, given the place of every code, e-: each alone, and with all above it."""
     peaks: list[Interval] = [(None, 0.5)]
     for k in range(1, _last(electrons) + 1):
         peaks += [(k - 0.5, k + 0.5), (k - 0.5, None)]
@@ -81,15 +76,14 @@ def find_residuals(
 ) -> list[Place]:
     """Return where on the comb are too many or too few samples, the most significant first.
 
-    The codes of pixels are lined up by their place on the comb, and parted in quarters of an electron: either
-    half of a peak, and of a valley. Each p-value counts all of these.
+    The codes of all pixels are sorted into cells by their place on the comb; each p-value counts all cells.
 
     Args:
         seen: samples, shape (n, B).
         expected: the same under the model.
         origin: DN of bin 0, shape (n,).
         parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
-        peaks: that were set aside; they come first, and their codes in no quarter.
+        peaks: that were set aside; they come first, and their codes are in no other cell.
     """
     electrons = electrons_of(origin, seen.shape[1], parameters[:, 1], parameters[:, 2])
     gain, bias = float(np.median(parameters[:, 1])), float(np.median(parameters[:, 2]))

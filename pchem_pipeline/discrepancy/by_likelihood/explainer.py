@@ -1,8 +1,8 @@
 """Comparison of effects in ready-made histograms by likelihood.
 
-There is no order in time and there are no neighbours. The samples of every pixel are split at random into
-three parts: one to fit, one to score, one for the final gap. Effects enter the exact likelihood of the
-histograms (:mod:`pchem_pipeline.model.fit.shared`), so that no simulation is needed to name them.
+The samples of every pixel are split at random into three parts: one to fit, one to score, one for the final
+gap. Effects enter the exact likelihood of the histograms (:mod:`pchem_pipeline.model.fit.shared`), so that no
+simulation is needed to name them.
 """
 
 from __future__ import annotations
@@ -83,19 +83,17 @@ def find_in_histograms(
 
 @dataclass
 class HistogramExplainer(Explainer[Explanation]):
-    """Tells effects apart in histograms.
+    """Distinguishes effects in histograms.
 
     Attributes:
-        prepared: the histograms, split, and the model, drawn.
-        observed: the rows that are looked at.
+        prepared: the histograms, split, and replicates of the model.
         sets: fits sets of effects to the train part, and scores them by the test part.
         whole: fits them to both, and scores them by the final part.
         bare: fits the rows without any effects.
-        rng: all random numbers of the search.
         members: the candidates.
-        effects: of the model; those that were there before, and those added since.
+        effects: of the model, those added included.
         final: the fit of the final model to train and test part.
-        found: what the search came to, for the final part; None: nothing.
+        found: what the search found, for the final part; None: nothing.
     """
 
     prepared: Prepared
@@ -121,13 +119,7 @@ class HistogramExplainer(Explainer[Explanation]):
     ) -> HistogramExplainer:
         """Fit the model to the train part, and observe histograms drawn from it, each with its own fit.
 
-        Args:
-            observed: the rows.
-            settings: the section ``discrepancy``.
-            classes: of the candidates, by tag.
-            model: effects that it has already.
-            times: integration time of each sample of a pixel, s; None: not known.
-            rng: all random numbers.
+        ``times`` are the integration times of the samples of a pixel, s; None: not known.
         """
         effort = Effort(settings.effort)
         train, test, final = observed.parts
@@ -143,8 +135,7 @@ class HistogramExplainer(Explainer[Explanation]):
         bare = replace(sets, present=(), start=sets.plain.fit.parameters)
         seen = [observed.statistics(part, bare) for part in observed.parts]
         vectors = observed.drawn(sets.plain.log_masses, bare, settings.replicates, rng)
-        common = set(STATISTICS).intersection(*vectors, *seen)
-        names = tuple(name for name in STATISTICS if name in common)
+        names = tuple(name for name in STATISTICS if all(name in each for each in (*vectors, *seen)))
         whole = replace(sets, start=bare.start, train=train + test, test=final)
         effort.begin()
         first = NullModel.from_replicates(names, as_matrix(names, vectors), effects=bool(model))
@@ -206,16 +197,15 @@ class HistogramExplainer(Explainer[Explanation]):
 def _on_a_line(
     free: SetComparison, settings: DiscrepancySettings, times: Sequence[float | None]
 ) -> SetComparison | None:
-    """Return the same with exposures in proportion to time, where a line with spurious charge fits; or None.
+    """Return the same with exposures in proportion to time, where a line with spurious charge fits, or None.
 
-    That tells the charge, which does not grow with time, from dark current.
+    That distinguishes the charge, which does not grow with time, from dark current.
     """
     dark = free.samples.dark
     illuminated = [time for time, is_dark in zip(times, dark, strict=True) if not is_dark]
     wanted = settings.candidates is None or _SPURIOUS in settings.candidates
-    if None in illuminated or len(set(illuminated)) < 2 or not wanted or _SPURIOUS in settings.exclude:
-        return None
-    if _SPURIOUS in {effect.tag for effect in free.present}:
+    unwanted = {*settings.exclude, *(effect.tag for effect in free.present)}
+    if None in illuminated or len(set(illuminated)) < 2 or not wanted or _SPURIOUS in unwanted:
         return None
     line = Samples(dark, tuple(time or 0.0 for time in times))
     straight = replace(free, samples=line)

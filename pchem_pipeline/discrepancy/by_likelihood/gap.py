@@ -26,13 +26,13 @@ def gap_of(
     share: float,
     kept: BoolArray | bool = True,
 ) -> Gap:
-    """Return the gap of histograms from a fit.
+    """Return the gap of histograms (n, B) from a fit.
 
     Args:
-        counts: histograms, shape (n, B).
+        counts: histograms.
         log_masses: of the codes under the fit, given that they are kept, shape (n, B).
         n_parameters: of the fit.
-        share: samples here for each sample that was fitted.
+        share: ratio of these samples to the fitted ones.
         kept: codes that are compared, shape (n, B); True: all.
     """
     seen = np.where(kept, counts, 0).astype(np.float64)
@@ -48,34 +48,23 @@ def gap_of(
 
 
 def on_all_codes(log_masses: FloatArray, kept: BoolArray, plain: FloatArray) -> FloatArray:
-    """Return the log masses of all codes: a fit's where they are kept, with the share that the plain law has.
+    """Return the log masses (n, B) of all codes: of kept ones a fit's, of the others those of the plain law.
 
-    Args:
-        log_masses: under the fit, given that a code is kept, shape (n, B).
-        kept: codes that were not set aside, shape (n, B).
-        plain: of all codes under the plain law, shape (n, B).
+    Kept codes have together the share of the plain law; the masses of the fit are given that they are kept.
     """
     share = np.log(np.where(kept, np.exp(plain), 0.0).sum(axis=1, keepdims=True))
     return np.where(kept, log_masses + share, plain)
 
 
 def sum_over_samples(seen: FloatArray, values: FloatArray) -> tuple[float, float]:
-    """Return the sum of what each sample adds by its code, and its variance, by the samples of each row.
-
-    Args:
-        seen: samples, shape (n, B).
-        values: what one adds, shape (n, B).
-    """
+    """Return the sum of values over samples, both (n, B), and its variance by the samples of each row."""
     sums = (seen * values).sum(axis=1)
     variance = (seen * values**2).sum(axis=1) - sums**2 / np.maximum(seen.sum(axis=1), 1.0)
     return float(sums.sum()), float(max(variance.sum(), 0.0))
 
 
 def _of_cells(expected: FloatArray) -> tuple[float, float]:
-    """Return mean and variance of ``sum n log(n / e) - n + e`` for Poisson counts n of expectation e, nats.
-
-    Both are 1/2 per cell where many counts are expected, and less where few are.
-    """
+    """Return mean and variance of ``sum n log(n / e) - n + e``, nats, n being Poisson of expectation e."""
     grid, *tables = _chance_table()
     some = np.maximum(expected[expected > 0.0], np.exp(grid[0]))
     mean, variance = (float(np.interp(np.log(some), grid, values).sum()) for values in tables)

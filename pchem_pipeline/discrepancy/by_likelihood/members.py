@@ -30,10 +30,9 @@ _LONGEST_STEP = 50.0  # times the strength of the start
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A fitted field of an effect, as the power of it in which small effects are linear.
+    """A fitted field of an effect, as the power in which small effects are linear.
 
     Attributes:
-        name: of the field.
         power: the field is ``sign(c) |c| ** (1 / power)``.
         bounds: of the coordinate.
     """
@@ -51,19 +50,14 @@ class Coordinate:
         return float(np.sign(value) * abs(value) ** self.power)
 
     def stderr(self, coordinate: float, stderr: float) -> float:
-        """Return the standard error of the field, given its coordinate and that of it."""
+        """Return the standard error of the field from that of its coordinate."""
         at = abs(coordinate)
         return float(stderr * at ** (1.0 / self.power - 1.0) / self.power) if at else stderr
 
 
 @dataclass(frozen=True)
 class Member:
-    """A candidate at a start, with what of it is fitted.
-
-    Attributes:
-        effect: at the start.
-        coordinates: its strength first, if it has one.
-    """
+    """A candidate at a start, and its fitted coordinates, that of the strength first if it has one."""
 
     effect: Effect
     coordinates: tuple[Coordinate, ...]
@@ -109,7 +103,7 @@ class Member:
 
     @property
     def tabulated(self) -> bool:
-        """Whether it is a table of numbers read off the residuals, which mimics whatever left them."""
+        """Whether it is a table of numbers read off the residuals, which mimics any cause."""
         return any(isinstance(v, tuple | list) and len(v) > _LONGEST_LIST for _, v in self.effect)
 
     @property
@@ -119,7 +113,7 @@ class Member:
 
     @property
     def at_limit(self) -> bool:
-        """Whether a fitted field is at a limit of its range: another effect is what it stands for."""
+        """Whether a fitted field is at a limit of its range: it mimics another effect."""
         reached = np.isclose(self.start[:, None], [c.bounds for c in self.coordinates], rtol=1e-6, atol=0.0)
         return bool(reached.any()) if self.coordinates else False
 
@@ -158,7 +152,7 @@ _ONE_PIXEL = pixel_maps([np.array([v]) for v in (2.0, 0.1, 100.0, 3.0)], np.ones
 
 
 def split_coordinates(members: Sequence[Member], values: FloatArray) -> list[FloatArray]:
-    """Return the part of each member of values that all have one after the other."""
+    """Split concatenated values into those of each member."""
     return np.split(values, np.cumsum([len(m.coordinates) for m in members]))[:-1]
 
 
@@ -174,9 +168,9 @@ def law_of(
     Args:
         present: effects of the model.
         members: candidates.
-        shared: coordinates of all members, one after the other.
+        shared: coordinates of all members, concatenated.
         own: (H, g, mu, sigma) of the rows, shape (n, 4).
-        samples: which rows are of one pixel; those without electrons get none from effects either.
+        samples: of each pixel; those without electrons get none from effects either.
     """
     parts = split_coordinates(members, shared)
     effects = [*present, *(m.at(part) for m, part in zip(members, parts, strict=True))]
@@ -198,16 +192,9 @@ def find_members(
     present: Sequence[Effect],
     failed: dict[str, str],
 ) -> tuple[list[Member], dict[str, str]]:
-    """Return the candidates that change a pixel's own histogram, at one or more starts each.
+    """Return the candidates that change a pixel's own histogram, and why the others do not.
 
-    Args:
-        classes: candidates by tag.
-        evidence: of the histograms, from which some estimate themselves.
-        present: effects of the model; they are not candidates.
-        failed: candidates that failed, and why; more come to them.
-
-    Returns:
-        Members; effects that histograms cannot show and why.
+    Some estimate their starts from the evidence. ``failed`` gets those that failed, and why.
     """
     members: list[Member] = []
     untestable: dict[str, str] = {}
@@ -236,7 +223,7 @@ def find_members(
 
 
 def _distinct(effects: Sequence[Effect]) -> list[Effect]:
-    """Leave out starts that differ in nothing but their strength, sign included."""
+    """Leave out starts that differ in their absolute strength only."""
     kept: dict[tuple[str, float], Effect] = {}
     for effect in effects:
         sign = float(np.sign(getattr(effect, effect.strength, 0.0)))

@@ -31,8 +31,8 @@ class SampleHistograms:
         counts: one histogram per pixel, shape (n, B).
         origin: DN of bin 0, shape (n,).
         bias: frames without electrons, H = 0.
-        integration_time: s; where all samples have one, and their exposures lie on a line over it, spurious
-            charge is told from dark current.
+        integration_time: s; if all samples have one, and exposures lie on a line over it, spurious charge is
+            distinguished from dark current.
     """
 
     counts: NDArray[np.integer]
@@ -48,7 +48,7 @@ class ObservedHistograms:
     Arrays have a row for each sample of each pixel, those of a pixel one after the other.
 
     Attributes:
-        parts: train, test and final samples of the rows that are looked at, shape (r, B) each.
+        parts: train, test and final samples of the chosen rows, shape (r, B) each.
         origin: DN of bin 0, shape (r,).
         start: H, g, mu, sigma of the plain fit of the train part, shape (r, 4).
         chosen: which rows of all they are, shape (r,).
@@ -81,7 +81,7 @@ class ObservedHistograms:
             together = _fitted_together(parts[0], origin, layout)
             parts, origin = _widened(parts, origin, together)
         evidence = _observe(parts[0], origin, layout, together)
-        start = np.stack([m.ravel() for m in evidence.maps.maps], axis=1) if together is None else together
+        start = evidence.maps.columns if together is None else together
         chosen = _choose(start, counts.sum(axis=1), layout.n)
         some = tuple(part[chosen] for part in parts)
         n_pixels = samples[0].counts.shape[0]
@@ -135,13 +135,9 @@ def _split(counts: NDArray[np.integer], parts: int, rng: np.random.Generator) ->
     left = counts.astype(np.int64)
     found = []
     for remaining in range(parts, 1, -1):
-        drawn = np.stack(
-            [
-                rng.multivariate_hypergeometric(row, int(row.sum()) // remaining, method="marginals")
-                for row in left
-            ]
-        )
-        found.append(drawn.astype(np.int64))
+        totals = (left.sum(axis=1) // remaining).tolist()
+        drawn = [rng.multivariate_hypergeometric(*each) for each in zip(left, totals, strict=True)]
+        found.append(np.stack(drawn).astype(np.int64))
         left = left - found[-1]
     return (*found, left)
 
@@ -191,11 +187,7 @@ def _rows(samples: Sequence[SampleHistograms]) -> tuple[IntArray, IntArray]:
 def _widened(
     parts: Sequence[IntArray], origin: IntArray, parameters: FloatArray
 ) -> tuple[tuple[IntArray, ...], IntArray]:
-    """Return the histograms with all codes that the law reaches.
-
-    Histograms end at their extreme samples; replicates drawn within these ends would lack the tails that the
-    data have.
-    """
+    """Return the histograms with all codes that the law reaches, so that replicates have tails, too."""
     h, g, mu, sigma = parameters.T
     last = origin + parts[0].shape[1] - 1
     low = np.nanmax(origin - (mu - REACH * sigma))

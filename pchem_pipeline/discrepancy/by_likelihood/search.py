@@ -25,9 +25,8 @@ class Named:
     """An effect of the explanation.
 
     Attributes:
-        member: as fitted.
-        rivals: effects that could stand in its place, the best first, with how far the set with each is
-            behind the judged one, nats, and the standard error.
+        rivals: effects that could stand in its place, the best first, with the gain of the set with each over
+            the chosen one, nats, and its standard error.
         apart: by how much its strength differs when fewer codes are compared.
     """
 
@@ -43,7 +42,7 @@ class Named:
 
 @dataclass(frozen=True)
 class Explanation:
-    """What the search came to.
+    """What the search found.
 
     Attributes:
         kept: codes that the gap compares, shape (n, B): all but a peak set aside.
@@ -52,7 +51,7 @@ class Explanation:
         named: its effects, the weightiest first, compared on perhaps fewer codes, perhaps beside others.
         stand_ins: tags of effects that fit in one view and not in another, for something unknown.
         rest: share of the gap that is left among the codes on which effects were compared.
-        rise: by how much the set of them predicts these better than none, nats, and the standard error.
+        rise: gain of the set of them over none on these codes, nats, and its standard error.
     """
 
     kept: BoolArray
@@ -65,12 +64,7 @@ class Explanation:
 
 
 def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
-    """Find the effects that explain histograms.
-
-    Args:
-        sets: with all codes.
-        candidates: effects at their starts.
-    """
+    """Find the effects, among candidates at their starts, that explain histograms on all codes or fewer."""
     best = select(sets, candidates)
     right = best
     if sets.samples.n == 1 and best.members:  # bias frames leave no choice of the bias
@@ -96,11 +90,7 @@ def _rest(sets: SetComparison, best: FittedSet) -> float:
 
 
 def combs_coincide(parameters: FloatArray) -> bool:
-    """Return whether the peaks of all pixels lie at the same DN: codes cannot be told from electrons then.
-
-    Args:
-        parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
-    """
+    """Return whether the peaks of pixels with parameters (n, 4) lie at the same DN, as codes do."""
     gain, bias = np.median(parameters[:, 1]), parameters[:, 2]
     return bool(np.ptp(np.quantile(bias, [0.1, 0.9])) * gain < _COINCIDE)
 
@@ -136,13 +126,7 @@ def _narrowed(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:
 def _cut_peak(
     views: Mapping[Interval, SetComparison], candidates: Sequence[Member], excess: float
 ) -> tuple[Interval, ...]:
-    """Return the peak without which a known effect explains far more, if there is one.
-
-    Args:
-        views: by the peak that each leaves out.
-        candidates: effects at their starts.
-        excess: gap that is left with all peaks, nats.
-    """
+    """Return the peak that views leave out without which a candidate leaves far less than an excess, nats."""
     likely = sorted(views, key=lambda peak: _excess(views[peak], views[peak].plain))[:_PEAKS_TRIED]
     left = {p: _excess(views[p], select(views[p], candidates, largest=1)) for p in likely}
     best = min(left, key=lambda peak: left[peak], default=None)

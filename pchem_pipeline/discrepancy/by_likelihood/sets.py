@@ -41,8 +41,7 @@ class FittedSet:
 
     Attributes:
         members: at the fitted coordinates.
-        fit: of own and shared parameters.
-        log_masses: of the codes under it, shape (n, B).
+        log_masses: of the codes, shape (n, B).
         score: log-likelihood of the other part, nats.
     """
 
@@ -87,7 +86,7 @@ class SetComparison:
         present: effects that the model has.
         start: (H, g, mu, sigma), shape (n, 4).
         samples: which rows are of one pixel.
-        failed: candidates that could not be fitted, and why; more come to them.
+        failed: candidates that could not be fitted, and why; out.
         effort: counts the masses, and ends the search at its limit.
     """
 
@@ -103,7 +102,7 @@ class SetComparison:
     _known: dict[frozenset[str], FittedSet] = field(default_factory=dict, init=False)
 
     def of(self, rows: slice, start: FloatArray) -> SetComparison:
-        """Return the same of some of the rows, begun elsewhere: ``start`` has shape (n, 4)."""
+        """Return the same of some of the rows, with another start (n, 4)."""
         taken = {name: getattr(self, name)[rows] for name in ("train", "test", "origin", "kept")}
         return replace(self, **taken, start=start[rows])
 
@@ -133,11 +132,7 @@ class SetComparison:
         )
 
     def fit(self, members: Sequence[Member], start: FloatArray | None = None) -> FittedSet:
-        """Fit a set from the starts of its members, and from (H, g, mu, sigma) of another one, shape (n, 4).
-
-        Raises:
-            Exception: whatever an effect raises.
-        """
+        """Fit a set from the starts of its members and (H, g, mu, sigma), (n, 4); effects may raise."""
         problem = self.problem(members)
         shared = np.concatenate([np.zeros(0), *(m.start for m in members)])
         tolerance = max(_TOLERANCE, _TOLERANCE_PER_SAMPLE * float(np.where(self.kept, self.test, 0).sum()))
@@ -168,20 +163,13 @@ class SetComparison:
             return None
 
     def with_right_peaks(self, fitted: FittedSet) -> FittedSet:
-        """Return a fit with pixels whose bias is an electron off where that is clearly likelier, or as it is.
-
-        Where effects explain much, the peak that was taken for that of no electron without them may be that
-        of one.
-        """
+        """Return a fit with the bias an electron off in the pixels where that is clearly likelier."""
         for electrons in (-1.0, 1.0):
             fitted = self._electrons_off(fitted, electrons)
         return fitted
 
     def _electrons_off(self, fitted: FittedSet, electrons: float) -> FittedSet:
-        """Return the same with pixels whose bias is so many electrons lower.
-
-        Some pixels tell first whether it ever is: from there a fit takes many steps.
-        """
+        """Return the same with pixels whose bias is so many electrons lower, if it is in some probed ones."""
         if len(self.train) > 2 * PROBED:
             few = self.of(slice(None, None, len(self.train) // PROBED), fitted.fit.parameters)
             probe = few.fit(fitted.members)
@@ -215,8 +203,7 @@ class SetComparison:
     def beats(self, one: FittedSet, part: FittedSet, least: float = 0.0) -> bool:
         """Return whether a set predicts better than a part of it, beyond chance and by more than the price.
 
-        And, where it misfits, by that share of what it explains: others leave as much, that are not quite
-        those in the data.
+        And, where it misfits, by a ``least`` share of what it explains.
         """
         rise, error = self.difference(one, part)
         price = PRICE
@@ -236,7 +223,7 @@ class SetComparison:
         return gap_of(self.test, found.log_masses, found.n_parameters, share=share, kept=self.kept)
 
     def promising(self, base: FittedSet, candidates: Sequence[Member]) -> list[Member]:
-        """Return candidates, each moved by a first-order step, by the rise that this promises (Rao 1948)."""
+        """Return candidates after a first-order step each, sorted by the rise that it promises (Rao 1948)."""
         theta = self.samples.theta(base.fit.parameters)
         slopes = self.problem(base.members).slopes(theta, base.fit.shared)
         ranked = []
@@ -254,10 +241,7 @@ class SetComparison:
     def _first_step(
         self, base: FittedSet, log_masses: FloatArray, derivatives: FloatArray, member: Member
     ) -> tuple[float, Member]:
-        """Return the rise that a candidate promises, and the candidate there; below 0 on the wrong side of 0.
-
-        Of its strength and the pixels' own parameters; what is in the set stays.
-        """
+        """Return the rise that a candidate promises, below 0 at negative strength, and the candidate then."""
         if not member.coordinates:
             return np.inf, member
         theta, shared = self.samples.theta(base.fit.parameters), member.start
@@ -265,9 +249,8 @@ class SetComparison:
         problem = self.problem((*base.members, member))
         moved = problem.log_masses(theta, np.concatenate([base.fit.shared, shared]))
         slope = (moved - log_masses) / shared[0]
-        expansion = problem.expansion(
-            log_masses, np.concatenate([derivatives[:, :4], slope[:, None]], axis=1)
-        )
+        derivatives = np.concatenate([derivatives[:, :4], slope[:, None]], axis=1)
+        expansion = problem.expansion(log_masses, derivatives)
         ascent = Ascent(theta, np.zeros(1), expansion, np.array([[-np.inf, np.inf]]), np.ones(1))
         variance = float(ascent.covariance()[1][0, 0])
         if not variance > 0.0:

@@ -30,14 +30,7 @@ _OVERWHELMING = 30.0
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Judges sets of effects by the statistics of the data.
-
-    Attributes:
-        first: null of the model before anything was added.
-        z: statistics of the data.
-        gaps: measured with these, on the final frames.
-        settings: the section ``discrepancy``.
-    """
+    """Judges sets of effects by the statistics ``z`` of the data and the null before anything was added."""
 
     first: NullModel
     z: Measured
@@ -64,13 +57,11 @@ class Acceptance:
         return self.gap_at(mean, added.vectors).interval[0] > before.value
 
     def established(self, added: Refitted) -> tuple[Hypothesis, ...]:
-        """Return the effects of which the data have certainly some, the final frames too.
+        """Return the effects that are significant in the data, and in the final frames alone.
 
         Those had no part in finding them: a true effect of 4.5 standard errors in two thirds of the frames
-        misses them once in seventy times; a chance passes once in six. What is measured without a name needs
-        3 standard errors in either. The variance of a noise of n frames is known to sqrt(2 / n) of itself,
-        however strong it is: where that is beyond doubt 3 of these are enough. Likewise a strength by a dozen
-        events, where chance makes one, is known to a third: there it counts how far from chance they are.
+        misses them once in seventy times; a chance passes once in six. What has no name or is overwhelming,
+        though its strength be known badly, needs 3 standard errors; a strength by few events counts by these.
         """
         first, n, model_error = self.first, len(added.vectors), self.settings.model_error
         certain = counted(added.parts, self.z.both - first.mean, noise_of_splits(first, 2, model_error))
@@ -81,8 +72,7 @@ class Acceptance:
         change, stderr = correction(added.slopes, self.z.final - added.mean, allowed)
         measured = np.array([type(h.effect).empirical for h in added.hypotheses])
         sure = measured | _overwhelming(added.parts, self.z.both - first.mean, first.std)
-        # few forms are tried of what is measured without a name, and only where the data disagree with all
-        # that has one
+        # few forms are tried of what is measured without a name
         clear = np.exp(added.change) > np.where(sure, CLEAR, ESTABLISHED) * added.stderr
         proven = 1.0 + change > np.where(measured, CLEAR, _CONFIRMED) * stderr
         proven &= change > -LARGEST_DECREASE
@@ -106,13 +96,7 @@ class Acceptance:
 
 
 def _overwhelming(parts: FloatArray, shift: FloatArray, scatter: FloatArray) -> BoolArray:
-    """Tell of which effects some statistic stands out far beyond what all the others make of it.
-
-    Args:
-        parts: shifts of the statistics by effect, shape (e, m).
-        shift: what is seen of all, shape (m,).
-        scatter: standard deviations of the statistics without any effect, shape (m,).
-    """
+    """Return of which effects some statistic stands out far beyond what all the others make of it, (e,)."""
     others = np.abs(parts).sum(axis=0) - np.abs(parts)
     beyond = (np.abs(shift) - others) * np.sign(shift)
     least = _OVERWHELMING * scatter

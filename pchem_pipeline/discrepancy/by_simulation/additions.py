@@ -52,8 +52,7 @@ class Extension:
         added: the effects of the chosen one, with what each has moved of the statistics.
         stderr: standard errors of their parameters, of those that have one.
         hypotheses: all candidates.
-        first: null of the model before.
-        last: of the model with them.
+        last: null of the model with them.
         moved: change of the parameter maps by their refit with the effects.
         certain: whether the effects are beyond doubt; else they only leave nothing.
         accept: measures gaps on the final frames, and says what is allowed to the details of effects.
@@ -64,7 +63,6 @@ class Extension:
     added: tuple[Hypothesis, ...]
     stderr: tuple[Mapping[str, float], ...]
     hypotheses: tuple[Hypothesis, ...]
-    first: NullModel
     last: NullModel
     moved: Mapping[str, Moved]
     certain: bool
@@ -83,23 +81,12 @@ class Extension:
         hypotheses: tuple[Hypothesis, ...],
         certain: bool,
     ) -> Extension:
-        """Put a set into the model, at the strengths to which its replicates correct it.
-
-        Args:
-            work: fits the pixels with it.
-            given: effects that the model has.
-            accept: see the attributes, as `compared`, `hypotheses` and `certain`.
-            compared: how it was chosen.
-            added: the set with many replicates.
-            stderr: standard errors of the parameters of its effects.
-            hypotheses: all candidates.
-            certain: whether its effects are beyond doubt.
-        """
+        """Put a set with many replicates into a model, at the strengths to which these correct it."""
         # within a standard error the steps end, too
         near = np.abs(added.change) < np.maximum(_NEAR, added.stderr)
         change = np.where(near, np.expm1(added.change), 0.0)
         try:
-            taken = _corrected(added, change)
+            taken = tuple(h.times(1.0 + float(c)) for h, c in zip(added.hypotheses, change, strict=True))
             model = along_chain(given, [h.effect for h in taken])
             moved = work.mapped(model).fit.moved
         except NotFittedError:  # a step too far
@@ -111,8 +98,7 @@ class Extension:
         last = last.shifted(np.sum(slopes * change[:, None], axis=0))
         fitted = np.array([bool(h.effect.strength) for h in added.hypotheses])
         last = replace(last, strengths=slopes * (added.stderr * fitted)[:, None])
-        own = taken, tuple(stderr), hypotheses, accept.first, last, moved, certain, accept, model
-        return cls(compared, *own)
+        return cls(compared, taken, tuple(stderr), hypotheses, last, moved, certain, accept, model)
 
     @property
     def parts(self) -> FloatArray:
@@ -130,28 +116,23 @@ class Extension:
         return np.asarray((self.accept.z.both - self.last.mean) / np.hypot(chance, self.tolerance))
 
     def close(self, before: Gap, still: bool) -> Added:
-        """Return the added effects, the weightiest first, and what is left.
-
-        Args:
-            before: gap of the model before.
-            still: whether the data disagree with the final model.
-        """
+        """Return the added effects, the weightiest first; ``still``: data and final model disagree."""
         after = self.accept.gap(self.last)
         unfinished = not after.at_floor and (still or after.too_wide(before.value))
         rest = self._left() if unfinished else None
         additions: list[Addition] = []
-        gap, parts, mean = before, self.parts, self.first.mean
-        order = np.argsort([-_weight(part, self.first) for part in parts])
+        gap, parts, mean = before, self.parts, self.accept.first.mean
+        order = np.argsort(-np.sum((parts / self.accept.first.std) ** 2, axis=1))
         for place, member in enumerate(order):
             mean = mean + parts[member]
             last = place == len(order) - 1
-            now = after if last else self.accept.gap_at(mean, self.first.replicates)
+            now = after if last else self.accept.gap_at(mean, self.accept.first.replicates)
             against = ""
-            if rest is not None:
+            if rest is not None and after.too_wide(gap.value - now.value):
+                against = LEAVES_TOO_MUCH
+            elif rest is not None:
                 effect = self.added[member].effect
-                against = unexplained_of_its_kind(effect, parts[member], rest, self.first)
-                if after.too_wide(gap.value - now.value):
-                    against = LEAVES_TOO_MUCH
+                against = unexplained_of_its_kind(effect, parts[member], rest, self.accept.first)
             against = against or self._against(int(member), still)
             later = parts[order[place + 1 :]].sum(axis=0)
             additions.append(self._addition(int(member), (gap, now), against, later))
@@ -162,14 +143,13 @@ class Extension:
         return Added(tuple(additions), after, unfinished)
 
     def _against(self, member: int, still: bool) -> str:
-        """Return in words why an effect is not in the data, whatever is there besides; empty: nothing.
+        """Return in words why an effect is not in the data; empty: nothing.
 
-        A parameter that can go no further was driven there by another effect; and at its best fit an effect
-        accounts for all that it moves. That is asked where the data disagree with the whole model: one that
-        agrees, with every effect in it, is not judged a second time by fewer statistics.
+        A parameter at a limit was driven there by another effect. Where data and whole model disagree
+        (``still``) the effect must also account for all that it moves.
         """
         added, parts = self.added[member], self.parts
-        allowed = tolerance(parts, self.accept.allowed, self.first.events)
+        allowed = tolerance(parts, self.accept.allowed, self.accept.first.events)
         significance = self.accept.settings.significance
         wrong = still and misfits(self.last, self.accept.z, parts[member], significance, allowed)
         return added.effect.stuck_words() or (
@@ -197,9 +177,9 @@ class Extension:
             after=gaps[1],
             rivals=tuple(self._rival(one, later) for one in self._others(member)[:MOST_RIVALS]),
             pulls=largest_pulls(
-                self.first.names,
-                added.fingerprint / self.first.std,
-                self.first.pulls(self.accept.z.both, 2),
+                self.accept.first.names,
+                added.fingerprint / self.accept.first.std,
+                self.accept.first.pulls(self.accept.z.both, 2),
                 self.last.pulls(self.accept.z.both, 2),
             ),
             moved=self.moved,
@@ -211,24 +191,20 @@ class Extension:
         compared, added = self.compared, self.added[member]
         kept = [h for h in self.added if h is not added]
         found: dict[str, _Other] = {}
-        for one in compared.tried:
-            new = one.tags - compared.chosen.tags
-            if len(new) == 1 and one.tags == (compared.chosen.tags - {added.tag}) | new:
-                hypothesis = next(h for h in one.hypotheses if h.tag in new)
-                behind, error = compared.by_histograms.get(
-                    one.tags, (one.score - compared.chosen.score, None)
-                )
-                other = _Other(hypothesis.effect, behind, one.mean, one.rest, True, error)
-                found.setdefault(hypothesis.tag, other)
-        noise = Noise(self.first.covariance.times(0.5), self.accept.settings.model_error)
-        shift = self.accept.z.both - self.first.mean
+        for name, (effect, one) in compared.exchanged(added).items():
+            if name != added.tag:
+                by_score = one.score - compared.chosen.score, None
+                behind, error = compared.by_histograms.get(one.tags, by_score)
+                found[name] = _Other(effect, behind, one.mean, one.rest, True, error)
+        noise = Noise(self.accept.first.covariance.times(0.5), self.accept.settings.model_error)
+        shift = self.accept.z.both - self.accept.first.mean
         best = fit_set(self.added, shift, noise).log_score(shift, noise)
         refitted = {*compared.chosen.tags, *found}
         for hypothesis in self.hypotheses:
             if hypothesis.tag in refitted or hypothesis.effect.tag == added.effect.tag:
                 continue
             fit = fit_set([*kept, hypothesis], shift, noise)
-            mean = self.first.mean + fit.parts.sum(axis=0)
+            mean = self.accept.first.mean + fit.parts.sum(axis=0)
             rest = (self.accept.z.both - mean) / np.sqrt(noise.of(fit.parts).variances)
             behind = fit.log_score(shift, noise) - best
             if hypothesis.tag not in found or behind > found[hypothesis.tag].behind:
@@ -237,18 +213,14 @@ class Extension:
         return sorted(found.values(), key=lambda other: -other.behind)
 
     def _rival(self, other: _Other, later: FloatArray) -> Rival:
-        """Return a rival with the gap that it leaves, and the statistic that speaks most against it.
-
-        It was fitted beside all others; its gap stands beside that of the effect in whose place
-        it is, which is measured without those that come later.
-        """
-        gap = self.accept.gap_at(other.mean - later, self.first.replicates)
+        """Return a rival with its gap without ``later`` effects, and what speaks against it."""
+        gap = self.accept.gap_at(other.mean - later, self.accept.first.replicates)
         worst = int(np.argmax(np.abs(other.rest)))
         if not other.closes:
             why = "it explains nothing at any strength"
         elif abs(other.rest[worst]) > CERTAIN:
             left = float(other.rest[worst])
-            says = STATISTICS[self.first.names[worst]].says(left)
+            says = STATISTICS[self.accept.first.names[worst]].says(left)
             why = f"it leaves a misfit of {sigma_text(left)}: {says}"
         elif other.error is not None:
             why = f"it fits the pixel histograms worse, by {-other.behind:.1f} ± {other.error:.1f} nats"
@@ -257,22 +229,16 @@ class Extension:
         return Rival(effect=other.effect.tag, gap_after=gap.value, behind=other.behind, why=why)
 
 
-def _corrected(added: Refitted, change: FloatArray) -> tuple[Hypothesis, ...]:
-    """Return the effects of a set, their factors changed by shares."""
-    return tuple(h.times(1.0 + float(c)) for h, c in zip(added.hypotheses, change, strict=True))
-
-
 @dataclass(frozen=True)
 class _Other:
     """An effect fitted in the place of a chosen one.
 
     Attributes:
-        effect: at its best strength.
         behind: its log score against the chosen set, nats.
         mean: statistics of the model with it, shape (m,).
         rest: what is left of the data, in its errors, shape (m,).
         closes: whether a strength above 0 explains anything.
-        error: of ``behind`` where the histograms of the pixels say it, nats; None: all statistics do.
+        error: of ``behind`` if that is by the histograms of the pixels, nats; None: by all statistics.
     """
 
     effect: Effect
@@ -284,10 +250,7 @@ class _Other:
 
 
 def without_better_reason(addition: Addition) -> Addition:
-    """Take the name from the only effect found if an unrelated one with a name closes as much, or nearly.
-
-    Asked where the data disagree with the model all the same: both merely mimic what it is.
-    """
+    """Take the name from the only effect found if an unrelated one with a name closes nearly as much."""
     closed, effect, classes = addition.before.value - addition.after.value, addition.effect, effect_classes()
     left = math.inf
     for rival in addition.rivals:
@@ -300,13 +263,7 @@ def without_better_reason(addition: Addition) -> Addition:
 
 
 def without_company(additions: Sequence[Addition]) -> list[Addition]:
-    """Take the names from effects beside one which moves more and does not fit or has no name.
-
-    What a description leaves of something unknown is explained by whatever is like it.
-
-    Args:
-        additions: the weightiest first.
-    """
+    """Take the names from effects, the weightiest first, after one which does not fit or has no name."""
     nameless = [i for i, each in enumerate(additions) if each.against or each.described]
     first = nameless[0] if nameless else len(additions)
     return [
@@ -318,10 +275,7 @@ def without_company(additions: Sequence[Addition]) -> list[Addition]:
 
 
 def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, null: NullModel) -> str:
-    """Return in words what the whole model leaves in the families of the effect's signature; empty: nothing.
-
-    Or in its place, or of what it moves. What is missing there may be what makes its signature as well, and
-    then this is not its name.
+    """Say what a model leaves in the families of an effect's signature, in its place, or of what it moves.
 
     Args:
         effect: an effect.
@@ -341,12 +295,8 @@ def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, 
     return f"it leaves a misfit: {STATISTICS[null.names[worst]].says(float(rest[worst]))}"
 
 
-def _weight(part: FloatArray, null: NullModel) -> float:
-    return float(np.sum((part / null.std) ** 2))
-
-
 def _ambiguous_set(rivals: Sequence[Contender], certainty: float) -> list[Contender]:
-    """Return the likeliest rivals that together have the wanted share of what all have."""
+    """Return the likeliest rivals that together have a share of the probability."""
     total = sum(r.probability for r in rivals)
     kept: list[Contender] = []
     share = 0.0
@@ -355,6 +305,6 @@ def _ambiguous_set(rivals: Sequence[Contender], certainty: float) -> list[Conten
         share += rival.probability / total
         if share >= certainty:
             break
-    # what goes its own way in every simulation is not beaten by a few nats
+    # what differs from simulation to simulation is not beaten by a few nats
     erratic = [r for r in rivals if type(r.effect).random_realisation and r.score > -_CLEAR_MARGIN]
     return kept + [r for r in erratic if r not in kept]

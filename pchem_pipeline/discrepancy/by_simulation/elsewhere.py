@@ -1,8 +1,4 @@
-"""Test of the final model in another window of the sensor.
-
-A search compares a window of a large sensor with simulations. What is larger than that window may look there
-like something else: of a slope along each row one end is like noise of the rows.
-"""
+"""Test of the final model in another window of the sensor: there what is larger than one looks different."""
 
 from __future__ import annotations
 
@@ -13,12 +9,7 @@ import numpy as np
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import ENOUGH
-from pchem_pipeline.discrepancy.null import (
-    Measured,
-    NullModel,
-    as_matrix,
-    disagrees,
-)
+from pchem_pipeline.discrepancy.null import Measured, NullModel, as_matrix, disagrees
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import NO_CHANCE
@@ -27,15 +18,10 @@ _DETAILS = 0.1  # of what the effects do
 
 
 def deviation(by: Simulations, model: Sequence[Effect]) -> str:
-    """Say what of frames deviates beyond doubt from a model that was found in others; empty: nothing.
-
-    Args:
-        by: simulates the frames.
-        model: effects.
-    """
+    """Say what of the frames ``by`` simulates deviates beyond doubt from a model found in others, if any."""
     own = by.observed.statistics()
     try:
-        _, vectors = by.drawn(tuple(model), ENOUGH)
+        vectors = by.drawn(tuple(model), ENOUGH)
     except NotFittedError:
         return "almost no pixel can be fitted with it"
     names = by.observed.names([*own, *vectors])

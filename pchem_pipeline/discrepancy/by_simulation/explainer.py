@@ -1,8 +1,7 @@
-"""Effects are told apart in frames by simulation: what each would do to many statistics, refit included.
+"""Effects are distinguished in frames by simulation: what each would do to many statistics, refit included.
 
 The frames are split in three; effects are estimated and compared on the first two parts, and the gap that
-remains is measured on the third. That one has no part in finding or fitting anything; what it does not show
-at all is not named.
+remains is measured on the third, which has no part in finding or fitting anything.
 """
 
 from __future__ import annotations
@@ -21,14 +20,11 @@ from pchem_pipeline.discrepancy.by_simulation.additions import Extension
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Mapper, candidate_classes, serial
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import standard_errors
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis, SetFit
-from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened, Screening, noise_of_splits
+from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened, Screening
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFrames
 from pchem_pipeline.discrepancy.by_simulation.measured.unexplained import Unexplained
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
-    Refit,
-    refit_maps,
-)
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import refit_maps
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     HistogramLikelihood,
@@ -118,14 +114,11 @@ def find_discrepancies(
 
 @dataclass
 class FrameExplainer(Explainer[Screened]):
-    """Tells effects apart in frames.
+    """Distinguishes effects in frames.
 
     Attributes:
-        prepared: the frames, split, and the model, drawn.
-        observed: the frames.
-        work: fits and simulates them.
-        screening: asks the candidates what they would do.
-        accept: tells by the statistics of the data what is accepted.
+        prepared: the frames, split, and replicates of the model.
+        work: fits and simulates the frames.
         given: effects that the model had before the search.
         extension: the effects that it adds; None: none yet.
         progress: is given what is done next.
@@ -162,25 +155,11 @@ class FrameExplainer(Explainer[Screened]):
         effort.begin()
         untestable = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
         z = Measured(*as_matrix(names, own))
-        prepared = Prepared(
-            settings,
-            "frames",
-            observed.parts[0],
-            observed.examined(),
-            first,
-            z,
-            effort,
-            untestable,
-            observed.doubt(),
-        )
-        return cls(
-            prepared,
-            observed,
-            work,
-            Screening(observed, work, z, classes, model, settings.model_error, prepared.defects),
-            Acceptance(first, z, StatisticsGap(first, observed.final_samples), settings),
-            model,
-        )
+        data = observed.parts[0], observed.examined(), first, z, effort
+        prepared = Prepared(settings, "frames", *data, untestable, observed.doubt())
+        screening = Screening(observed, work, z, classes, model, settings.model_error, prepared.defects)
+        accept = Acceptance(first, z, StatisticsGap(first, observed.final_samples), settings)
+        return cls(prepared, observed, work, screening, accept, model)
 
     @property
     def model(self) -> tuple[Effect, ...]:
@@ -205,9 +184,8 @@ class FrameExplainer(Explainer[Screened]):
     def add(self, explanation: Screened, null: NullModel) -> NullModel | None:
         """Put the effects of the best refitted set into the model; None where none is established.
 
-        Asked of the strengths as the data give them, and of the final frames. Where that fails, what is left
-        of the set is one more that is tried, and the next best is asked; where data and model disagree, one
-        that leaves nothing though nothing of it is certain is told in the end.
+        Where a set is not, what is established of it is one more that is tried, and the next best is judged.
+        Where data and model disagree, one that leaves nothing is taken in the end, though it is not certain.
         """
         self.work.forget(self.given)
         self.candidates = [h.tag for h in explanation.hypotheses]
@@ -223,7 +201,7 @@ class FrameExplainer(Explainer[Screened]):
         self.work.effort.choose()
         # what was chosen is not lost for the little that is left to do: no limit
         refitter = replace(refitter, allow=lambda _: None)
-        told = disagrees(null, self.prepared.z, settings.significance)
+        disagree = disagrees(null, self.prepared.z, settings.significance)
         doubtful: tuple[Comparison, Refitted] | None = None
         for _ in range(_MOST_JUDGED):
             found = chosen(sets)
@@ -235,7 +213,7 @@ class FrameExplainer(Explainer[Screened]):
             kept = self.accept.established(added)
             if len(kept) == len(added.hypotheses) and self._closes(added):
                 return self._put(found, added, explanation, certain=True)
-            if told and doubtful is None and not kept and refitter.passes_goodness_of_fit(found.chosen):
+            if disagree and doubtful is None and not kept and refitter.passes_goodness_of_fit(found.chosen):
                 doubtful = found, added
             sets.rejected.append(found.chosen)
             if 0 < len(kept) < len(added.hypotheses):
@@ -273,26 +251,24 @@ class FrameExplainer(Explainer[Screened]):
         present, data = self.given, self.prepared
         first = data.first
 
-        def draw(effects: tuple[Effect, ...], count: int) -> tuple[Refit, FloatArray]:
-            fit, vectors = self.work.drawn(along_chain(present, effects), count)
-            return fit, without_strays(as_matrix(first.names, vectors, first.mean))
+        def draw(effects: tuple[Effect, ...], count: int) -> FloatArray:
+            vectors = self.work.drawn(along_chain(present, effects), count)
+            return without_strays(as_matrix(first.names, vectors, first.mean))
 
         def allow(words: str) -> None:
             self.work.effort.check(f"{words} was fitted")
 
-        events = np.asarray(noise_of_splits(first, 2, data.settings.model_error).events)
-        return Refitter(draw, first, data.z.both, events, present, allow=allow, defects=data.defects)
+        return Refitter(draw, first, data.z.both, present, allow=allow, defects=data.defects)
 
     def _left_by(self, best: Refitted, refitter: Refitter) -> list[SetFit]:
-        """Return what is likely beside a refitted set: what that hid stands out there."""
+        """Return what is likely beside a refitted set."""
         null = NullModel.from_replicates(self.prepared.first.names, best.vectors, self.prepared.first)
         null = null.shifted(np.expm1(best.change) @ best.slopes)
         return self.screening.beside(refitter.model(best.effects), null, best.slopes)
 
     def _likelihood(self, effects: Sequence[Effect], pixels: int) -> PixelLikelihood | None:
         """Return the likelihood of some pixels beside what the model had at first; None: not one law."""
-        frames = self.observed.frames
-        present = frames.effects(self.given)
+        present = self.observed.frames.effects(self.given)
         if not all(effect.everywhere for effect in (*present, *effects)):
             return None
         # a law has all samples; others may have replaced some
@@ -300,10 +276,9 @@ class FrameExplainer(Explainer[Screened]):
         if key not in self._likelihoods:
             if len(self._likelihoods) >= _LIKELIHOODS:
                 del self._likelihoods[next(iter(self._likelihoods))]
-            samples = self.work.own_samples((*present, *effects))
-            self._likelihoods[key] = PixelLikelihood(
-                samples, self.observed.plain.maps, present, self.work.effort, pixels, self.prepared.defects
-            )
+            own = self.work.own_samples((*present, *effects)), self.observed.plain.maps, present
+            how = self.work.effort, pixels, self.prepared.defects
+            self._likelihoods[key] = PixelLikelihood(*own, *how)
         return self._likelihoods[key]
 
     def tolerance(self) -> FloatArray | float:
@@ -315,12 +290,7 @@ class FrameExplainer(Explainer[Screened]):
         return Added((), before) if self.extension is None else self.extension.close(before, disagreed)
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
-        """Return the maps under the model, with that taken out of H which effects add to single pixels.
-
-        Such exposure is looked for in all frames, since those are fitted in the end; nothing else rests on
-        it. The replicates of the search are simulated with the pixels' mean exposure: which ones blink is
-        drawn anew.
-        """
+        """Return the maps under the model, without the exposure that effects add to single pixels."""
         frames, plain, expected = self.observed.frames, self.observed.plain, None
         maps = self.work.mapped(self.model).fit.maps
         assert plain.covariance is not None

@@ -91,12 +91,11 @@ class ReplicateSimulator:
 
     Attributes:
         maps: parameters of the pixels under the model.
-        model: effects that the model has.
         acquisition: of the split that is simulated.
         names: of the statistics.
-        mapper: who does the work.
+        mapper: runs the replicates.
         seed: of the random numbers that all candidates share.
-        defects: candidates that failed, and why.
+        defects: candidates that failed, and why; out.
     """
 
     maps: PixelMaps
@@ -118,15 +117,12 @@ class ReplicateSimulator:
     ) -> list[Effect]:
         """Ask every candidate for hypotheses; one that raises is a defect.
 
-        The first evidence in which a candidate sees anything counts. A guess says only what to look at:
-        strengths are fitted on one split and scored on the other, both ways round. The evidence of a part of
-        the sensor or run gives hypotheses that act there only. What the model has at some places is looked
-        for at others. Beside the effects of the model others stand
-        out that the frames hide: that evidence comes first, and where an estimator sees nothing although the
-        leading statistics of its effect deviate, what is typical is a guess. Of one effect, everywhere, there
-        are ``most`` at most. In parts there are six times as many of all effects together: the likeliest of
-        each first, and of these the ones whose leading statistics stand out most; where much is wrong, all
-        parts ask for nearly all effects.
+        The first evidence in which a candidate sees anything counts; that ``beside`` the effects of the model
+        comes first, and where an estimator sees nothing there although the leading statistics of its effect
+        deviate, what is typical is a guess. The evidence of a part of the sensor or run gives hypotheses that
+        act there only. What the model has at some places is looked for at others. Of one effect, everywhere,
+        there are ``most`` at most; in parts six times as many of all effects together, the likeliest of each
+        first, and of these the ones whose leading statistics stand out most.
         """
         known = [] if beside is None else [beside]
         found: list[Effect] = []
@@ -141,9 +137,7 @@ class ReplicateSimulator:
                 if not guessed and known and known[0].strongest(*effect.signature[:2]) > CERTAIN:
                     guessed = list(effect.typical())
                 for each in guessed[:1]:
-                    identifiable_from_histograms(
-                        each
-                    )  # it is asked of each later: a defect shows here, where it is noted
+                    identifiable_from_histograms(each)  # asked of each later: a defect shows here
                 found += [] if taken else [window.found(each) for each in guessed[:most]]
                 for part, own in parts:
                     clear = own.strongest(*effect.signature[:2])
@@ -166,13 +160,7 @@ class ReplicateSimulator:
         return pixels and (one.when is None or other.when is None or one.when.overlap(other.when, n_run) > 0)
 
     def fingerprints(self, effects: Sequence[Effect], repeats: int = 1) -> list[Hypothesis]:
-        """Simulate effects on the random numbers of the model without them; failures are defects.
-
-        Args:
-            effects: with their parameters.
-            repeats: simulations of each; what moves a statistic by less than chance does in a single one is
-                lost there, and that is what separates relatives.
-        """
+        """Simulate each effect so often on the random numbers of the model without; failures are defects."""
         if not effects:
             return []
         shown = [effect.representative(self.acquisition.numbers) for effect in effects]
@@ -195,7 +183,7 @@ class ReplicateSimulator:
         results = self.mapper([task for _, task in new.values()]) if new else []
         for (effect, task), result in zip(new.values(), results, strict=True):
             if not isinstance(result, Exception):
-                self._rows[task.key] = self._row(result)
+                self._rows[task.key] = np.array([result.get(name, 0.0) for name in self.names], np.float64)
             elif effect is None:
                 raise result
             else:
@@ -214,8 +202,7 @@ class ReplicateSimulator:
     ) -> list[Hypothesis]:
         """Bring the strengths of the most promising hypotheses to what the data ask for, each by itself.
 
-        Those are simulated several times in the end. One that is far behind the best by itself, and beside
-        it brings nothing, is left as it is; ``told`` are effects whose numbers are known better.
+        Those that promise little, and effects ``told`` by the histograms, are left as they are.
         """
         if not hypotheses:
             return []
@@ -244,8 +231,7 @@ class ReplicateSimulator:
     def _visible(self, hypotheses: Sequence[Hypothesis], told: Sequence[Effect]) -> list[Hypothesis]:
         """Return hypotheses, four times as strong where chance hides all that they do.
 
-        A fingerprint that is lost in chance cannot be scaled to the data. Effects whose numbers are told stay
-        as they are: they do a quarter of it.
+        Of effects ``told`` by the histograms the strengths stay, and their fingerprint is a quarter of that.
         """
         faint = {id(h): h.rescaled(_STRONGER) for h in hypotheses if np.abs(h.fingerprint).max() < CERTAIN}
         seen = {id(h.effect): h for h in self.fingerprints(list(faint.values()))}
@@ -259,10 +245,7 @@ class ReplicateSimulator:
         return [shown(h) for h in hypotheses]
 
     def _tuned(self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[Hypothesis]:
-        """Tune the strength of each by simulation; a step that predicts worse is halved.
-
-        Extrapolation alone is not enough: a line that drowns, or a clipped tail, is far from any power law.
-        """
+        """Tune the strength of each by simulation; a step that predicts worse is halved."""
         ways = [DampedSteps(h, _as_simulated(h, shift, noise)) for h in hypotheses]
         for _ in range(_STEPS):
             proposals = [_proposal(way, shift, noise) for way in ways]
@@ -281,16 +264,9 @@ class ReplicateSimulator:
         label = f"{'base' if effect is None else effect.tag}-{digest}-{repeat}"
         return Replicate(label, self.maps, effects, self.seed + repeat, self.acquisition)
 
-    def _row(self, vector: Vector) -> FloatArray:
-        return np.array([vector.get(name, 0.0) for name in self.names], np.float64)
-
 
 def _without_chance(shifts: FloatArray) -> FloatArray:
-    """Return the mean shift of simulations, (repeat, statistic), without what is likely chance.
-
-    The random numbers are shared with the model without the effect, but where every sample moves a little the
-    histograms are drawn anew; regressed on such chance, every strength would come out too low.
-    """
+    """Return the mean of shifts (repeat, statistic) without chance, which would bias strengths low."""
     mean, repeats = shifts.mean(axis=0), shifts.shape[0]
     # below the one a single simulation shows nothing, above the other all of it
     low, high, error = POSSIBLE, CERTAIN, np.ones_like(mean)

@@ -1,10 +1,9 @@
-"""Numbers of effects beside their strengths, tuned to what the data ask for by simulation.
+"""Parameters of effects beside their strengths, tuned to what the data ask for by simulation.
 
-A time constant or a step that no law of a sample tells is at first what an estimator made of it. Where the
-rest that a set leaves lies in statistics that such an effect moves, its numbers are measured as strengths
-are: a small step of each shows how the statistics go with it (replicates share their random numbers), and all
-of them and the strengths are corrected together (Gauss-Newton, damped as by Levenberg 1944), the slopes by
-secants from step to step (Broyden 1965).
+Those in no law of a sample are at first what an estimator made of them. Where a set leaves something that
+such an effect moves, a small step of each parameter shows the slope of the statistics (replicates share their
+random numbers), and all of them and the strengths are corrected together (Gauss-Newton, damped as by
+Levenberg 1944), the slopes by secants from step to step (Broyden 1965).
 """
 
 from __future__ import annotations
@@ -48,13 +47,7 @@ _ELSEWHERE = 0.5  # of the squares of what is left, the most where its effects m
 
 @dataclass(frozen=True)
 class _Detail:
-    """A number of an effect of a set, and how the statistics go with its logarithm.
-
-    Attributes:
-        place: of the effect in the set.
-        name: of the number.
-        slope: shape (m,).
-    """
+    """A parameter of an effect of a set, by its place there, and the slope (m,) by its logarithm."""
 
     place: int
     name: str
@@ -62,7 +55,7 @@ class _Detail:
 
 
 def may_be_tuned(refitter: Refitter, one: Refitted) -> bool:
-    """Return whether what a set leaves lies where effects move it whose numbers are not known."""
+    """Return whether what a set leaves lies where effects move it whose parameters may be tuned."""
     places = sorted({place for place, _ in _numbers(refitter, one.hypotheses)})
     if not places:
         return False
@@ -73,7 +66,7 @@ def may_be_tuned(refitter: Refitter, one: Refitted) -> bool:
 
 
 def tuned(refitter: Refitter, one: Refitted) -> Refitted:
-    """Return a set at the numbers and strengths that explain the data best, or itself.
+    """Return a set at the parameters and strengths that explain the data best, or itself.
 
     Raises:
         EffortSpentError: the work is at its limit, and nothing was tuned.
@@ -103,15 +96,10 @@ def tuned(refitter: Refitter, one: Refitted) -> Refitted:
 
 
 def standard_errors(refitter: Refitter, one: Refitted, least: FloatArray) -> list[dict[str, float]]:
-    """Return the standard errors of the strength and of the numbers of each effect of a set.
+    """Return the standard errors of the strength and parameters of each effect of a set, by name.
 
-    All are taken to be uncertain together (the inverse of the information). A number of which the data tell
-    hardly more than the guess has none.
-
-    Args:
-        refitter: simulates the set.
-        one: the set.
-        least: relative errors of the factors where the numbers are known, shape (e,).
+    From the inverse of the information of all together; none of a parameter that the data hardly constrain.
+    ``least`` are relative errors of the factors where the parameters are known, shape (e,).
     """
     details = _details(refitter, one)
     information, _ = _normal_equations(refitter, one, details)
@@ -128,7 +116,7 @@ def standard_errors(refitter: Refitter, one: Refitted, least: FloatArray) -> lis
 
 
 def _details(refitter: Refitter, one: Refitted) -> list[_Detail]:
-    """Return the numbers that may be tuned, with their slopes."""
+    """Return the parameters that may be tuned, with their slopes."""
     found = []
     for place, name in _numbers(refitter, one.hypotheses):
         # an effect of a plug-in may raise anything: what is known of the others counts all the same
@@ -142,18 +130,13 @@ def _details(refitter: Refitter, one: Refitted) -> list[_Detail]:
 
 
 def _numbers(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> list[tuple[int, str]]:
-    """Return the numbers that may be tuned, by the place of their effect; a law tells those of others.
-
-    Those that have a logarithm; none of an effect that fails.
-    """
+    """Return the parameters that may be tuned, with the place of their effect: positive, and in no law."""
     found: list[tuple[int, str]] = []
     for place, h in enumerate(hypotheses):
         # an effect of a plug-in may raise anything: the others are compared all the same
         try:
-            tuned = (
-                h.effect.details() if h.effect.strength and not identifiable_from_histograms(h.effect) else ()
-            )
-            named = [(name, getattr(h.effect, name)) for name in tuned]
+            free = h.effect.strength and not identifiable_from_histograms(h.effect)
+            named = [(name, getattr(h.effect, name)) for name in (h.effect.details() if free else ())]
         except Exception as error:
             note_defect(refitter.defects, h.tag, error)
             continue
@@ -162,7 +145,7 @@ def _numbers(refitter: Refitter, hypotheses: Sequence[Hypothesis]) -> list[tuple
 
 
 def _measured(refitter: Refitter, one: Refitted, place: int, name: str) -> _Detail | None:
-    """Return a number with its slope, from a step of it alone; None: it cannot be moved, or moves nothing."""
+    """Return a parameter with its slope, from a step of it alone; None: it cannot move, or moves nothing."""
     for ahead in (_TRIAL, -_TRIAL):
         effects = list(one.effects)
         effects[place] = effects[place].times(name, float(np.exp(ahead)))
@@ -176,7 +159,7 @@ def _measured(refitter: Refitter, one: Refitted, place: int, name: str) -> _Deta
 
 
 def _correction(refitter: Refitter, one: Refitted, details: Sequence[_Detail]) -> tuple[FloatArray, float]:
-    """Return changes of the logarithms of factors and numbers, (e + d,), and the score that they promise."""
+    """Return changes of the logarithms of factors and parameters, (e + d,), and the score they promise."""
     n = len(one.hypotheses)
     step = np.asarray(np.linalg.solve(*_normal_equations(refitter, one, details)), np.float64)
     scaling = [bool(h.effect.strength) for h in one.hypotheses]
@@ -190,7 +173,7 @@ def _correction(refitter: Refitter, one: Refitted, details: Sequence[_Detail]) -
 def _normal_equations(
     refitter: Refitter, one: Refitted, details: Sequence[_Detail]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the information of the logarithms of factors and numbers, (e + d, e + d), and the score."""
+    """Return the information of the logarithms of factors and parameters, (e + d, e + d), and the score."""
     noise, kept = refitter.noise(one.covariance, len(one.vectors)), refitter.kept(one.hypotheses)
     covariance = noise.among(kept).of(one.parts[:, kept])
     design = covariance.white(_slopes(one, details)[:, kept]).T
@@ -200,14 +183,14 @@ def _normal_equations(
 
 
 def _slopes(one: Refitted, details: Sequence[_Detail]) -> FloatArray:
-    """Return how the statistics go with the logarithms of factors and numbers, shape (e + d, m)."""
+    """Return the slopes by the logarithms of factors and parameters, shape (e + d, m)."""
     return np.concatenate([one.slopes, *(detail.slope[None] for detail in details)])
 
 
 def _moved(
     one: Refitted, guessed: Refitted, details: Sequence[_Detail], step: FloatArray
 ) -> tuple[tuple[Hypothesis, ...], FloatArray]:
-    """Return a set so many logarithms away, as far as its limits let it, and the step that was taken."""
+    """Return a set after a step of the logarithms, as far as its limits allow, and the step taken."""
     n = len(one.hypotheses)
     taken = step.copy()
     found = [h.times(float(np.exp(s))) for h, s in zip(one.hypotheses, step[:n], strict=True)]
@@ -224,7 +207,7 @@ def _moved(
 
 
 def _secant(before: Refitted, after: Refitted, details: Sequence[_Detail], step: FloatArray) -> list[_Detail]:
-    """Return the numbers with the slopes that account for what a step has done, too."""
+    """Return the parameters with slopes corrected by what a step has done."""
     slopes = _slopes(before, details)
     difference = after.vectors - before.vectors
     error = difference.std(axis=0, ddof=1) / np.sqrt(len(difference))
@@ -234,5 +217,5 @@ def _secant(before: Refitted, after: Refitted, details: Sequence[_Detail], step:
 
 
 def _logarithm(one: Effect, other: Effect, name: str) -> float:
-    """Return the logarithm of the factor between a number of two effects."""
+    """Return the logarithm of the factor between a parameter of two effects."""
     return float(np.log(getattr(other, name) / getattr(one, name)))

@@ -2,11 +2,9 @@
 
 The shift of the statistics against the null is regressed on the fingerprints of candidate effects, as climate
 science attributes warming (Hasselmann 1997; Allen and Tett 1999): ``y = sum_e c_e F_e + noise`` with ``c_e
->= 0``. The noise has the covariance of the null replicates, and a relative error of each fingerprint on top,
-since the details of a real effect are never those of the library.
-
-Sets of up to three candidates are compared by their likelihood, less a price for every effect: the best are
-worth a refit of the pixels.
+>= 0``. The noise has the covariance of the null replicates, and a relative error of each fingerprint on top:
+details of real effects differ. Sets of up to three candidates are compared by their likelihood, less a price
+for every effect: the best are worth a refit of the pixels.
 """
 
 from __future__ import annotations
@@ -45,7 +43,7 @@ class Hypothesis:
     Attributes:
         effect: with guessed or refined parameters.
         fingerprint: shift of the statistics at this strength, shape (m,).
-        number: of effects with its tag, at several places of the model, the first, second and so on.
+        number: 1 for the first effect of its tag, 2 for the second one, at another place, and so on.
     """
 
     effect: Effect
@@ -54,7 +52,7 @@ class Hypothesis:
 
     @property
     def tag(self) -> str:
-        """Tag of the effect, with its number if there are others of it beside: what tells it from those."""
+        """Tag of the effect, with its number if it is not the first of its tag."""
         return self.effect.tag if self.number == 1 else f"{self.effect.tag} {self.number}"
 
     @functools.cached_property
@@ -80,9 +78,8 @@ class Noise:
     Attributes:
         covariance: of the statistics under the null, its estimation included.
         model_error: relative error of a fingerprint, no unit.
-        events: of exact counts, by how much an event raises the statistic, over the number of splits in the
-            mean; 0 for all others, shape (m,). Their number scatters as Poisson counts do; without an effect
-            that predicts some there is none.
+        events: of exact counts, which are Poisson, by how much an event raises the statistic, over the number
+            of splits in the mean; 0 for all others, shape (m,).
     """
 
     covariance: Covariance
@@ -103,13 +100,12 @@ class Noise:
 
 @dataclass(frozen=True)
 class SetFit:
-    """A set of hypotheses fitted to the shift of one split.
+    """A set of hypotheses fitted to the shift of one split, with arrays of shape (e,).
 
     Attributes:
-        hypotheses: the set.
-        factors: c_e of each, at least 0, shape (e,).
-        stderr: their standard errors, shape (e,).
-        certain: whether an exact count asks for it, however few events it has, shape (e,).
+        factors: c_e of each, at least 0.
+        stderr: their standard errors.
+        certain: whether an exact count asks for it, however few events it has.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -142,12 +138,10 @@ def correction(
     """Return relative changes of the strengths that a residual asks for, and standard errors, (e,) each.
 
     Args:
-        slopes: how the statistics go with each strength, shape (e, m).
+        slopes: derivatives of the statistics by the relative strengths, shape (e, m).
         residual: what the model with all effects leaves, shape (m,).
-        covariance: of the residual, with what is not held against the effects.
-        scatter: deviations like that of the residual, of replicates, shape (b, m): the weights of so many
-            statistics are tuned to a covariance that is itself estimated, and what they make of replicates
-            that had no part in it is the error if it is larger; None: there are too few.
+        covariance: of the residual, model errors included.
+        scatter: residuals of replicates, shape (b, m), whose changes may scatter more; None: too few.
     """
     design = covariance.white(slopes).T
     weights = np.linalg.pinv(design)
@@ -164,14 +158,9 @@ def correction(
 def tolerance(parts: FloatArray, model_error: float, events: FloatArray | float) -> FloatArray:
     """Return the deviations that are not held against effects, shape (m,).
 
-    A fraction of what they do to each statistic, and a tenth of that of the largest that they do to any: the
-    details of a very strong effect show where the effect itself does not. An exact count has no details:
-    however many lines are repeated, the others are what they are.
-
-    Args:
-        parts: shifts of the statistics by effect, shape (e, m).
-        model_error: the fraction.
-        events: see :class:`Noise`.
+    A fraction ``model_error`` of their shifts ``parts`` (e, m), and a tenth of that of the largest shift of
+    each: the details of a very strong effect show where the effect itself does not. An exact count (see
+    :class:`Noise`) has no details.
     """
     own = np.sum(parts**2, axis=0)
     leaked = np.sum((_LEAK * np.max(np.where(np.equal(events, 0.0), np.abs(parts), 0.0), axis=1)) ** 2)
@@ -185,13 +174,7 @@ def log_density(residual: FloatArray, covariance: Covariance) -> float:
 
 
 def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> SetFit:
-    """Fit non-negative factors of the fingerprints to a shift by generalised least squares, reweighted.
-
-    Args:
-        hypotheses: one or more, of different effects.
-        shift: measured statistics minus null mean, shape (m,).
-        noise: covariance of the shift.
-    """
+    """Fit non-negative factors of fingerprints to a shift (m,) by generalised least squares, reweighted."""
     columns = np.array([h.fingerprint for h in hypotheses])
     factors = np.ones(len(hypotheses))
     stderr = np.full(len(hypotheses), np.inf)
@@ -206,23 +189,14 @@ def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -
 
 
 def counted(parts: FloatArray, shift: FloatArray, noise: Noise) -> BoolArray:
-    """Return which effects an exact count asks for, however few events it has, shape (e,).
-
-    Args:
-        parts: shifts of the statistics by effect, shape (e, m).
-        shift: what is seen of all, shape (m,).
-        noise: of the shift.
-    """
+    """Return which effects, (e,), of shifts (e, m) an exact count in the shift seen, (m,), asks for."""
     return np.asarray(((parts * noise.events > 0.0) & (shift > 0.0)).any(axis=1))
 
 
 def held_out_gain(
     members: Sequence[Hypothesis], shifts: tuple[FloatArray, FloatArray], noise: Noise
 ) -> float:
-    """Return how much better a set, fitted to each split, predicts the other one than no effect, nats.
-
-    Less the price of its effects: none is there unless something speaks for it.
-    """
+    """Return the gain of a set fitted to each split in predicting the other one, less its price, nats."""
     predicted = (fit_set(members, shift, noise) for shift in shifts)
     scores = (fit.log_score(shift, noise) for fit, shift in zip(predicted, reversed(shifts), strict=True))
     without = sum(log_density(shift, noise.covariance) for shift in shifts)
@@ -230,11 +204,7 @@ def held_out_gain(
 
 
 def share_place(effects: Iterable[Effect]) -> bool:
-    """Return whether several effects act in one part of the sensor or run.
-
-    Effects that have nothing to do with each other meet in one tap or range of frames by coincidence only:
-    where several are needed there, they mimic one cause, and none of them is it.
-    """
+    """Return whether several effects act in one part of the sensor or run: they mimic one cause there."""
     placed = itertools.combinations([e for e in effects if not e.everywhere], 2)
     return any(
         (a.region is not None and a.region == b.region) or (a.when is not None and a.when == b.when)
@@ -243,7 +213,7 @@ def share_place(effects: Iterable[Effect]) -> bool:
 
 
 def seconds(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return those of an effect in another region than its first one, as second ones beside that."""
+    """Return those of an effect in another region than its first one, as second ones."""
     first: dict[str, Hypothesis] = {}
     placed = [h for h in hypotheses if h.effect.region is not None]
     apart = [h for h in placed if first.setdefault(h.tag, h).effect.region != h.effect.region]
@@ -263,15 +233,9 @@ def firsts(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
 
 
 def likeliest_sets(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -> list[SetFit]:
-    """Fit sets of up to three effects, and return them, those of the largest likelihood first.
+    """Fit sets of up to three effects to a shift (m,), and return those likelier than no effect, sorted.
 
-    Less the price of their effects, and only those that are likelier than no effect. Each effect is there by
-    more than its error, and seen among the others.
-
-    Args:
-        hypotheses: candidates; several may be of one effect.
-        shift: measured statistics minus null mean, shape (m,).
-        noise: covariance of the shift.
+    By their likelihood less the price of their effects. Each is beyond its error, and seen among the others.
     """
     shortlist, alone = _shortlist(hypotheses, shift, noise), set(firsts(hypotheses))
     found: list[tuple[float, SetFit]] = []
@@ -306,12 +270,7 @@ def _shortlist(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise
 
 
 def _all_needed(fit: SetFit, shift: FloatArray, noise: Noise) -> bool:
-    """Test whether every effect of a set is there by more than its error, and seen among the others.
-
-    Seen means: some statistic deviates, in the direction of the effect, from what the others make of it.
-    Where a strong effect moves a statistic, a weak one is lost in the details of the strong one; and
-    one without a statistic of its own only helps out where others fit badly.
-    """
+    """Test whether every effect of a set is beyond its error, and seen among the others."""
     parts = fit.parts
     if not np.all((fit.factors > POSSIBLE * fit.stderr) | fit.certain):
         return False
@@ -324,9 +283,9 @@ def seen_among(part: FloatArray, others: FloatArray, shift: FloatArray, noise: N
     """Return whether a statistic deviates from what other effects make of it, in the direction of an effect.
 
     Args:
-        part: what the effect does to the statistics, shape (m,).
-        others: what the other effects do to them, shape (e, m).
-        shift: what is seen of all, shape (m,).
+        part: shift of the statistics by the effect, shape (m,).
+        others: by the other effects, shape (e, m).
+        shift: seen of all, shape (m,).
         noise: of the shift.
     """
     blur = _BLUR * tolerance(others, noise.model_error, noise.events)

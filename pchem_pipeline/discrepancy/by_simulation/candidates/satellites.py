@@ -1,9 +1,8 @@
-"""The numbers of an effect that gives single pixels satellite peaks, such as a trap in the source follower.
+"""Parameters of effects that give single pixels satellite peaks, as a trap in the source follower does.
 
-It is in few pixels, and differs from one to the other; no one number of the sensor tells what it is like. The
-pixels that the model does not fit are fitted with free satellites
-(:attr:`~pchem_pipeline.model.law.sample_law.SampleLaw.free_satellites`) of amplitudes over a wide range: what
-is found in them is a sample of amplitudes and weights.
+It is in few pixels, and differs from one to the other. The pixels that the model does not fit are fitted with
+free satellites (:attr:`~pchem_pipeline.model.law.sample_law.SampleLaw.free_satellites`) of amplitudes over a
+wide range: what is found in them is a sample of amplitudes and weights.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ def with_satellites(
     effort: Effort,
     defects: dict[str, str],
 ) -> dict[str, list[Effect]]:
-    """Return effects with the numbers that free satellites of the pixels tell, by tag, the likeliest first.
+    """Return effects with parameters from fitted free satellites of the pixels, by tag, the likeliest first.
 
     Effects whose law has no free satellites are left out, and so are all where no pixel has any.
 
@@ -49,10 +48,10 @@ def with_satellites(
         present: effects of the model, which act everywhere.
         guesses: effects by tag.
         effort: counts the work.
-        defects: effects that failed, and why; more come to them.
+        defects: effects that failed, and why; out.
     """
-    usable = np.flatnonzero(maps.usable.ravel())
-    start = np.stack([values.ravel()[usable] for values in maps.maps], axis=1)
+    usable = np.flatnonzero(maps.usable)
+    start = maps.columns[usable]
     near = pixel_maps(list(start.T), np.ones(usable.size, np.bool_))
     laws = {}
     for guess in (g for own in guesses.values() for g in own):

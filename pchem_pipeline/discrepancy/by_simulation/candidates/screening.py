@@ -39,12 +39,9 @@ def noise_of_splits(null: NullModel, splits: int, model_error: float) -> Noise:
 
 @dataclass(frozen=True)
 class Screened:
-    """What the candidates would do beside a model.
+    """What the candidates would do beside a model: all and sets of them, the likeliest first.
 
-    Attributes:
-        hypotheses: all, the likeliest first.
-        sets: of them, the likeliest first.
-        gain: by which the first of these predicts held-out frames better than none, less its price, nats.
+    ``gain`` is that of the first set over none in predicting held-out frames, less its price, nats.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -54,16 +51,14 @@ class Screened:
 
 @dataclass(frozen=True)
 class Screening:
-    """Asks the candidates.
+    """Simulates the candidates.
 
     Attributes:
-        observed: the frames.
-        work: simulates what they do.
         z: statistics of the data.
         classes: of the candidates, by tag.
         given: effects that the model had before the search.
         model_error: relative error of a fingerprint.
-        defects: candidates that failed, and why; more come to them.
+        defects: candidates that failed, and why; out.
     """
 
     observed: ObservedFrames
@@ -75,15 +70,7 @@ class Screening:
     defects: dict[str, str] = field(default_factory=dict)
 
     def of(self, model: tuple[Effect, ...], null: NullModel) -> Screened:
-        """Ask what they would do beside a model: everywhere and in the parts, split by split.
-
-        Args:
-            model: effects.
-            null: of that model.
-
-        Returns:
-            What they would do.
-        """
+        """Return what they would do beside a model with this null: everywhere and in the parts, by split."""
         simulator = self._simulator(model, null, "0")
         evidence = (self.observed.plain, *self.observed.parts[:2])
         histograms = Histograms(
@@ -97,8 +84,7 @@ class Screening:
         guesses = histograms.with_numbers(self._guesses(simulator, model, null, evidence, MOST_HYPOTHESES))
         parts = self.observed.frames.parts
         suggested = self._apart(model, histograms.suggested(self.classes, parts, guesses))
-        guesses += suggested
-        hypotheses = simulator.fingerprints(guesses)
+        hypotheses = simulator.fingerprints([*guesses, *suggested])
         shift = self.z.both - null.mean
         noise = noise_of_splits(null, 2, self.model_error)
         hypotheses = simulator.refined(hypotheses, shift, noise, histograms.told)
@@ -112,12 +98,9 @@ class Screening:
         return Screened(tuple(hypotheses), sets, gain)
 
     def beside(self, model: tuple[Effect, ...], null: NullModel, slopes: FloatArray) -> list[SetFit]:
-        """Return sets that are likely beside one that was refitted, the likeliest first.
+        """Return the likeliest sets beside a refitted one in a model with this null.
 
-        Args:
-            model: effects, the set among them.
-            null: of that model.
-            slopes: how the statistics go with the strengths of the set, which are doubtful, shape (e, m).
+        ``slopes`` are those of the statistics by the uncertain strengths of the set, shape (e, m).
         """
         simulator = self._simulator(model, null, "/".join(["0", *(e.tag for e in model)]))
         guesses = self._guesses(simulator, model, null, (), _MOST_BESIDE)
@@ -164,10 +147,7 @@ class Screening:
         return [guess for guess in guesses if not share_place((*found, guess))]
 
     def _evidence_beside(self, model: tuple[Effect, ...], left: dict[str, float]) -> Evidence | None:
-        """Return the evidence of the seen frames beside the effects of a model; None where it has none.
-
-        Counts per code beside those that the model expects, and the vector as it deviates from the model's.
-        """
+        """Return the evidence of the seen frames beside the effects of a model; None where it has none."""
         if not model:
             return None
         plain = self.observed.plain

@@ -21,7 +21,7 @@ _BLOCKS_IN_A_RANGE, _SHORTEST_BLOCK = 15, 10  # frames
 
 @dataclass(frozen=True)
 class FrameStack:
-    """The frames that are looked at.
+    """The frames that are examined.
 
     Attributes:
         stack: (frame, y, x), DN.
@@ -31,7 +31,7 @@ class FrameStack:
         bit_depth: bits of the ADC.
         integration_time: s.
         parts: of sensor and run that differ from the rest.
-        window: of the sensor that they are; None: all of it.
+        window: of the sensor; None: all of it.
     """
 
     stack: NDArray[np.unsignedinteger]
@@ -55,7 +55,7 @@ class FrameStack:
         integration_time: float,
         window: SensorWindow | None,
     ) -> FrameStack:
-        """Split frames; what is None is told by them.
+        """Split frames; what is None is derived from them.
 
         Raises:
             InputError: they are too few.
@@ -67,15 +67,16 @@ class FrameStack:
         return cls(stack, numbers, splits, n_run, bit_depth, integration_time, window=window)
 
     @property
+    def sensor_window(self) -> SensorWindow:
+        """The window of the sensor that the frames are."""
+        return self.window or SensorWindow.whole(self.stack.shape)
+
+    @property
     def whole_lines(self) -> set[str]:
         """Kinds of lines of the sensor, "row" and "column", that are here from end to end."""
-        window = self.window or SensorWindow.whole(self.stack.shape)
-        ny, nx = window.shape
-        return {
-            of
-            for of, whole in (("row", window.columns == (0, nx)), ("column", window.rows == (0, ny)))
-            if whole
-        }
+        window, whole = self.sensor_window, SensorWindow.whole(self.sensor_window.shape)
+        lines = {"row": window.columns == whole.columns, "column": window.rows == whole.rows}
+        return {of for of, is_whole in lines.items() if is_whole}
 
     @property
     def seen(self) -> IntArray:
@@ -109,10 +110,7 @@ class FrameStack:
         return replace(self, parts=parts, splits=splits)
 
     def with_ends(self, maps: PixelMaps) -> FrameStack:
-        """Return it with its ranges of frames as those frames tell them that are seen now.
-
-        Shorter blocks leave less between them that is not seen.
-        """
+        """Return it with the ends of its ranges of frames sharpened by the frames that are seen now."""
         parts = [
             part if part.when is None else with_ends(part, self._apart(Part(part.region), maps, fitted=False))
             for part in self.parts
@@ -120,7 +118,7 @@ class FrameStack:
         return replace(self, parts=tuple(parts))
 
     def effects(self, model: Sequence[Effect]) -> tuple[Effect, ...]:
-        """Return the effects of a model as they act on these pixels, row 0 being the first of these."""
+        """Return the effects of a model as they act on these pixels, the first of which is in row 0."""
         return tuple(model) if self.window is None else self.window.effects(model)
 
     def on_sensor(self, effect: Effect) -> Effect:
@@ -149,11 +147,7 @@ class FrameStack:
         )
 
     def acquisition(self, as_data: bool = False) -> Acquisition:
-        """Return how replicates of the train part are taken.
-
-        Args:
-            as_data: those of train and test part, treated as the data are from the fit on.
-        """
+        """Return how replicates of the train part are taken; ``as_data``: with the test part as the other."""
         return Acquisition(
             self.numbers[self.splits.train],
             self.n_run,
@@ -167,7 +161,8 @@ class FrameStack:
 
     def samples(self, part: Part) -> int:
         """Return how many samples of the train and test frames are in a part."""
-        return int(part.frames(self.seen_numbers).sum()) * int(self.inside(part).sum())
+        frames, pixels = self.samples_of(part)
+        return int(frames.sum()) * int(pixels.sum())
 
     def samples_of(self, part: Part) -> tuple[BoolArray, BoolArray]:
         """Return which of the train and test frames, (frame,), and which pixels, (y, x), are a part."""
@@ -175,5 +170,4 @@ class FrameStack:
 
     def inside(self, part: Part) -> BoolArray:
         """Return which of the pixels lie in a part, (y, x)."""
-        window = self.window or SensorWindow.whole(self.stack.shape)
-        return window.mask(part.region)
+        return self.sensor_window.mask(part.region)

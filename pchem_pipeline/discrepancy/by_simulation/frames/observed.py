@@ -1,4 +1,4 @@
-"""What a search sees of the frames before it asks anything: the parts that differ, and the evidence."""
+"""The frames of a search, observed: the parts that differ, and the evidence."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
 from pchem_pipeline.discrepancy.by_simulation.frames.suspects import suspected_parts
 from pchem_pipeline.discrepancy.null import free_of_parameters
-from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
+from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.verdict import Examined, Surveyed
 from pchem_pipeline.discrepancy.where import unfitted_place
 from pchem_pipeline.effects.framework.evidence import Evidence
@@ -22,10 +22,9 @@ _NOT_IDENTIFIED = 0.5  # share of ambiguous pixels from which their parameters a
 
 @dataclass(frozen=True)
 class ObservedFrames:
-    """The frames of a search, observed.
+    """The frames of a search, with the parts of sensor and run that differ, observed.
 
     Attributes:
-        frames: with the parts of sensor and run that differ.
         plain: evidence of train and test frames together, fitted without effects.
         parts: evidence of train, test and final frames, each near that fit.
     """
@@ -37,8 +36,6 @@ class ObservedFrames:
     @classmethod
     def of(cls, frames: FrameStack) -> ObservedFrames:
         """Observe train and test frames together, then each part near their fit.
-
-        Parameters of a third of the frames scatter too much to stand for the pixels.
 
         Raises:
             InputError: usable pixels are too few.
@@ -60,10 +57,7 @@ class ObservedFrames:
         return [self.frames.statistics(part, e) for part, e in zip(parts, self.parts, strict=True)]
 
     def names(self, vectors: Sequence[Mapping[str, float]]) -> tuple[str, ...]:
-        """Return the statistics that all vectors have, in their order, as far as they can be relied upon.
-
-        Where the pixels are not identified only what does not rest on their parameters counts.
-        """
+        """Return the statistics that all vectors have, without those that rest on unidentified parameters."""
         names = tuple(name for name in vectors[0] if all(name in each for each in vectors[1:]))
         if self.doubt():
             names = tuple(np.array(names)[free_of_parameters(names, self.plain.maps)].tolist())
@@ -83,9 +77,8 @@ class ObservedFrames:
         """Return what is looked at, and where the pixels are that have no fit to be relied upon."""
         frames, usable = self.frames, self.plain.maps.usable
         known, place = frames.splits.examined(frames.stack.shape), unfitted_place(usable)
-        window = frames.window or SensorWindow.whole(usable.shape)
         spots = []
-        if place is not None and (region := window.on_sensor(place.region)) is not None:
+        if place is not None and (region := frames.sensor_window.on_sensor(place.region)) is not None:
             spots.append(Surveyed(map="unfitted", region=region.numbers(), p=place.p))
         return known.model_copy(update={"unfitted": int((~usable).sum()), "places": tuple(spots)})
 

@@ -1,11 +1,9 @@
 """Parts of the sensor and of the run that differ from the rest: guesses of the place of an effect.
 
-What the scans of :mod:`pchem_pipeline.discrepancy.where` find in maps of pixels and series of frames, and
-what :mod:`pchem_pipeline.discrepancy.scan_pairs` finds in the pairs of pixels that share a row, a column or a
-frame: a common mode of a part is far larger in those than in any map. Samples that chance hardly makes, which
-no mean shows, are events with a scan of their own (:mod:`pchem_pipeline.discrepancy.scan`). A part was
-chosen by the samples that it is then judged by, so none may be a chance: the probabilities count all places
-that were looked at.
+From scans of maps of pixels and series of frames (:mod:`pchem_pipeline.discrepancy.where`), of pairs of
+pixels that share a row, a column or a frame (:mod:`pchem_pipeline.discrepancy.scan_pairs`), where a common
+mode of a part is far larger, and of rare events (:mod:`pchem_pipeline.discrepancy.scan`). A part is judged by
+the samples that it was chosen by: its probability counts all places that were looked at.
 """
 
 from __future__ import annotations
@@ -51,12 +49,7 @@ _C = TypeVar("_C", bound=Cluster)
 
 
 def suspected_parts(evidence: Evidence, frames: NDArray[np.unsignedinteger[Any]]) -> tuple[Part, ...]:
-    """Return the parts that stand out most from the rest: two regions and two ranges at most, and a crossing.
-
-    Args:
-        evidence: of the frames.
-        frames: codes (n, y, x), DN.
-    """
+    """Return the parts of frames (n, y, x) that stand out most: two regions, two ranges, one crossing."""
     time, usable = evidence.time, evidence.maps.usable
     if time is None:
         return ()
@@ -79,12 +72,12 @@ def suspected_parts(evidence: Evidence, frames: NDArray[np.unsignedinteger[Any]]
 
 
 def with_ends(part: Part, evidence: Evidence) -> Part:
-    """Return a part with the ends of its range of frames as all series of the frames tell them."""
+    """Return a part with the ends of its range of frames sharpened by all series of the frames."""
     time = evidence.time
     if time is None or part.when is None or len(part.when.range) != 1:
         return part
     at = np.flatnonzero(part.frames(time.frames))
-    # how far the means are off says nothing beside the means
+    # deviations of the means say nothing beside the means
     known = frame_series(evidence).items()
     series = np.array([values for name, values in known if not name.startswith("scatter.")])
     if at.size < FEWEST_FRAMES or not np.isfinite(series).all():
@@ -95,12 +88,7 @@ def with_ends(part: Part, evidence: Evidence) -> Part:
 
 
 def _apart(found: Iterable[tuple[_C, BoolArray]], grown: Callable[[BoolArray], BoolArray]) -> list[_C]:
-    """Return what stands out most and does not overlap.
-
-    Args:
-        found: places or frames, and masks of their pixels or frames.
-        grown: returns those that one which is far less clear than the first may not have.
-    """
+    """Return what stands out most and does not overlap; what is far less clear, not even grown masks."""
     ordered = sorted(found, key=lambda one: -one[0].z)
     chosen: list[_C] = []
     taken = np.zeros_like(ordered[0][1]) if ordered else np.zeros(0, np.bool_)
@@ -144,11 +132,7 @@ def _places_of_frames(
 
 
 def _regions(evidence: Evidence) -> Iterator[Suspect]:
-    """Yield the places that stand out in a map, or in all shapes of the histograms together.
-
-    Where little of it is elsewhere, and not scattered pixels: effects of few pixels are simulated in others,
-    and would never do to these what the data do.
-    """
+    """Yield the places, no scattered pixels, that alone stand out in a map or in all shapes of histograms."""
     usable = evidence.maps.usable
     shapes, log_maps = _shapes(evidence), float(np.log(len(pixel_maps(evidence))))
     for suspects in suspected_regions(evidence, _SIGNIFICANCE_OF_GUESSES).values():
@@ -163,10 +147,7 @@ def _regions(evidence: Evidence) -> Iterator[Suspect]:
 
 
 def _shapes(evidence: Evidence) -> Callable[[BoolArray], float]:
-    """Return a function of pixels (y, x) that says by how many standard deviations their means are off.
-
-    Of the maps of all shapes of histograms together, of which effects move several at once (Hotelling 1931).
-    """
+    """Return a function of pixels (y, x): how far their mean histogram shapes are off (Hotelling 1931)."""
     usable = evidence.maps.usable
     maps = [evidence.goodness, evidence.peaks, *evidence.scores.values()]
     values = np.nan_to_num(np.array([each[usable] for each in maps], np.float64))
@@ -224,7 +205,7 @@ def _stretches(evidence: Evidence, time: TimeSeries) -> Iterator[Stretch]:
 
 
 def _with_unseen(when: When, seen: IntArray) -> When:
-    """Return a range with half of the frames at its ends that were not looked at."""
+    """Return a range with half of the unseen frames at its ends."""
     if len(when.range) != 1:
         return when
     first, last = when.range[0]

@@ -1,8 +1,8 @@
 """Empirical component: correlated electron numbers, from their variances and covariances.
 
 The excess of the variance over Poisson is measured by the score of the second Charlier polynomial (Rao 1948),
-and how numbers go together by the products of the expected electrons of samples beside each other and of
-successive frames. Both are divided by what one event for each electron, or for each of its pairs, would make.
+covariances by the products of the expected electrons of neighbouring samples and of successive frames. Both
+are divided by what one event for each electron, or for each of its pairs, would make.
 """
 
 from __future__ import annotations
@@ -56,19 +56,14 @@ _NOTHING: Chances = (Chance(0.0, np.inf), Chance(0.0, np.inf))
 
 
 class Electrons(NamedTuple):
-    """How electron numbers vary and go together.
-
-    Attributes:
-        excess: of the variance over Poisson, as further electrons of the same sample.
-        together: how numbers at a place go with those of the sample, as further electrons there.
-    """
+    """Excess of the variance of electron numbers over Poisson, and covariances, both as further electrons."""
 
     excess: Chances
     together: dict[Distance, Chances]
 
 
 def electron_chances(samples: PartSamples) -> Electrons:
-    """Measure how electron numbers vary and go together."""
+    """Measure variances and covariances of electron numbers."""
     maps, evidence = samples.maps, samples.evidence
     inside = samples.inside & maps.usable & evidence.maps.usable & (maps.quanta_exposure > 0)
     if not inside.any():
@@ -85,14 +80,10 @@ def electron_chances(samples: PartSamples) -> Electrons:
 def _together(
     u: Float32Array, numbers: IntArray, exposure: FloatArray, spread: FloatArray, place: Distance
 ) -> Chances:
-    """Return how electrons go with those at a place, per electron and per pair of them.
+    """Return the covariance of electrons with those at a distance, per electron and per pair of them.
 
-    Args:
-        u: expected electrons beyond the mean, in their standard deviation, (frame, y, x), 0 where not known.
-        numbers: of the frames in the run, shape (frame,).
-        exposure: H, e-, shape (y, x).
-        spread: standard deviation of the expected electrons, 0 where not known, e-, shape (y, x).
-        place: frames later, rows and columns.
+    ``u`` are expected electrons beyond the mean, in units of their standard deviation ``spread``, e-, both 0
+    where not known; ``exposure`` is H, e-.
     """
     first, later = frames_apart(numbers, place[0])
     ny, nx = exposure.shape
@@ -128,12 +119,7 @@ def _chance(sums: FloatArray, variance: FloatArray | float, response: FloatArray
 
 
 def measured_electrons(data: Electrons, model: Electrons) -> Measurement | None:
-    """Return what electrons do beyond what a model makes; None where nothing is clear.
-
-    Args:
-        data: chances of the frames.
-        model: of frames simulated with it.
-    """
+    """Return what electrons do beyond those of frames simulated with a model, if anything is clear."""
     following = {
         place: _beyond(chances, model.together.get(place, _NOTHING))
         for place, chances in data.together.items()

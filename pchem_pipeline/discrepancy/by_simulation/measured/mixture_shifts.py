@@ -1,10 +1,9 @@
 """The empirical component: what no known effect explains, measured as a mixture of shifts of the samples.
 
-The samples are taken for a mixture of their law and of what shifts would make of it: those on a grid, and,
-given the sample beside or before, those towards that one. The shares of the shifts are those of maximum
-likelihood (Laird 1978; by Newton steps as Kim, Carbonetto, Stephens and Anitescu 2020 take them). Few of them
-come out different from nothing, and those that the likelihood needs are kept. A neighbour must explain more
-than a sample of the same pixel from another time, which stands for it where the law alone is wrong.
+The samples are a mixture of their law and of shifts of it: those on a grid, and those towards the sample
+beside or before. The shares of the shifts are those of maximum likelihood (Laird 1978; by Newton steps: Kim,
+Carbonetto, Stephens and Anitescu 2020); those that the likelihood needs are kept. A neighbour must explain
+more than a sample of the same pixel from another time, as it would by chance where the law alone is wrong.
 """
 
 from __future__ import annotations
@@ -55,12 +54,7 @@ _FIRST_SHARE, _STEPS = 0.02, 60
 
 @dataclass(frozen=True)
 class _Mixture:
-    """Samples and the mass of their codes under each move.
-
-    Attributes:
-        counts: how many samples there are of each kind, shape (n,).
-        mass: of their codes with each move, the first is none, shape (l, n).
-    """
+    """Numbers of samples of each kind, (n,), and mass of their codes with each move, none first, (l, n)."""
 
     counts: FloatArray
     mass: FloatArray
@@ -71,8 +65,8 @@ class _Mixture:
         ``sum n log(M s) - N sum s`` is concave: Newton steps, each a problem of non-negative least squares,
         halved where they overshoot.
         """
-        mass, total = self.mass[list(used)], float(self.counts.sum())
-        counts = self.counts
+        counts, mass = self.counts, self.mass[list(used)]
+        total = float(counts.sum())
         share = np.full(len(used), 1e-3 / max(len(used) - 1, 1))
         share[0] = 1.0 - share[1:].sum()
         best = _likelihood(counts, mass, share)
@@ -124,13 +118,7 @@ def _likelihood(counts: FloatArray, mass: FloatArray, share: FloatArray) -> floa
 
 @dataclass(frozen=True)
 class _Laws:
-    """The mass of the codes of some pixels under a model.
-
-    Attributes:
-        pixels: their numbers on the sensor, shape (n,).
-        first: their first codes, shape (n,).
-        mass: of successive codes, 0 at both ends, shape (n, c).
-    """
+    """The mass (n, c) of successive codes from the first of n pixels on, 0 at both ends, under a model."""
 
     pixels: IntArray
     first: IntArray
@@ -186,21 +174,15 @@ def measured_mixture_shifts(
     maps: PixelMaps,
     effects: Sequence[Effect],
 ) -> Measurement | None:
-    """Return the moves that the samples of some frames need beside a model; None where they need none.
-
-    Args:
-        frames: (frame, y, x), DN.
-        numbers: of the frames in the run, increasing, shape (frame,).
-        maps: parameters of the pixels under the model.
-        effects: of the model.
-    """
-    shifts = _measured_shifts(frames, maps, effects)
-    towards = _measured_towards(frames, numbers, maps, effects)
-    squares = _measured_squares(frames, maps)
-    found = [one for one in (shifts, towards, squares) if one is not None]
-    if not found:
+    """Return the moves that samples of frames (t, y, x) need beside a model, given its maps; None: none."""
+    found = (
+        _measured_shifts(frames, maps, effects),
+        _measured_towards(frames, numbers, maps, effects),
+        _measured_squares(frames, maps),
+    )
+    best = max(filter(None, found), key=lambda one: one.gain, default=None)
+    if best is None:
         return None
-    best = max(found, key=lambda one: one.gain)
     return best._replace(gain=best.gain * len(frames) * int(np.count_nonzero(maps.usable)))
 
 
@@ -260,14 +242,9 @@ def _component(
 
 @dataclass(frozen=True)
 class _Samples:
-    """Samples whose neighbours are known.
+    """Samples whose neighbours are known, (m,), with the rows of their laws and places in the stack, (3, m).
 
-    Attributes:
-        row: of the pixel's law, shape (m,).
-        place: frame, row and column, shape (3, m).
-        code: DN, shape (m,).
-        other: that of the neighbour, shape (m,).
-        chance: one of the neighbour's pixel at another time, shape (m,).
+    ``other`` is the code of the neighbour, ``chance`` that of its pixel at another time.
     """
 
     row: IntArray
@@ -312,13 +289,7 @@ def _measured_towards(
 def without_squares(
     frames: NDArray[np.unsignedinteger], usable: BoolArray, effects: Sequence[Effect]
 ) -> NDArray[np.unsignedinteger]:
-    """Return frames in which squares that effects likely averaged are replaced by the pixels' other samples.
-
-    Args:
-        frames: (frame, y, x), DN.
-        usable: pixels that count, (y, x).
-        effects: of the model.
-    """
+    """Return frames (t, y, x) with other samples of the pixels in place of squares that effects averaged."""
     for effect in effects:
         if isinstance(effect, Empirical) and effect.squares:
             inside = usable if effect.region is None else usable & effect.region.mask(usable.shape)
@@ -390,21 +361,14 @@ def _mixture(laws: _Laws, samples: _Samples, moves: Sequence[MixtureShift], othe
     return _Mixture(np.ones(samples.code.size), np.stack([laws.at(samples.row, samples.code), *mass]))
 
 
-def _log_ratio(
-    laws: _Laws, samples: _Samples, moves: Sequence[MixtureShift], shares: FloatArray
-) -> FloatArray:
-    """Return by how much likelier samples are if they were moved, nats, shape (m,)."""
-    mass = _mixture(laws, samples, moves, samples.other).mass
-    moved = shares[1:] @ mass[1:] / max(float(shares[1:].sum()), _LEAST)
-    ratio = np.log(np.maximum(moved, SMALLEST_MASS) / np.maximum(mass[0], SMALLEST_MASS))
-    return np.asarray(ratio.clip(-_SURE, _SURE))
-
-
 def _together(
     laws: _Laws, samples: _Samples, moves: Sequence[MixtureShift], shares: FloatArray, shape: tuple[int, ...]
 ) -> tuple[Together, float]:
     """Return what is moved alike, by the likelihood, and the share of it that is."""
-    ratio = _log_ratio(laws, samples, moves, shares)
+    mass = _mixture(laws, samples, moves, samples.other).mass
+    moved = shares[1:] @ mass[1:] / max(float(shares[1:].sum()), _LEAST)
+    # by how much likelier samples are if they were moved, nats
+    ratio = np.log(np.maximum(moved, SMALLEST_MASS) / np.maximum(mass[0], SMALLEST_MASS)).clip(-_SURE, _SURE)
     single = min(float(shares[1:].sum()), 1.0 - _LEAST)
     best = float(np.logaddexp(np.log1p(-single), np.log(single) + ratio).sum()) + DECISIVE
     found: tuple[Together, float] = ("sample", 0.0)
@@ -428,12 +392,7 @@ def _of_groups(ratio: FloatArray, place: IntArray, together: Together, shape: tu
 
 
 def share_of(ratio: FloatArray, first: float = _FIRST_SHARE) -> tuple[float, float]:
-    """Return the share of groups that are moved, and what it gains, nats, by expectation and maximisation.
-
-    Args:
-        ratio: log likelihood of each group moved, over that of the group as it should be, shape (n,).
-        first: share from which the steps begin.
-    """
+    """Return the share of groups that are moved, by EM from their log likelihood ratios, and the gain."""
     ratio, share = ratio[np.isfinite(ratio)], first
     for _ in range(_STEPS if ratio.size else 0):
         share = float(special.expit(ratio + special.logit(share)).mean())

@@ -1,10 +1,9 @@
 """Empirical component: common variation of gain, light or read noise in frames, rows or columns.
 
 To first order a common change of the offset, the gain, the light or the read noise moves the sum of the
-samples' scores for it, by the information that they have of it. Where there is none such a sum is Gaussian,
-of a variance that is the information; the excess of its variance is the power of the change, and of several
-changes that are correlated in the samples the one that is there has the clearest excess (Rao 1948: the score
-test).
+samples' scores for it by their Fisher information. Where there is none such a sum is Gaussian, and its
+variance is the information; the excess of its variance is the power of the change, and of several changes the
+true one has the clearest excess (Rao 1948: the score test).
 """
 
 from __future__ import annotations
@@ -111,13 +110,7 @@ def common_scores(samples: PartSamples) -> dict[tuple[Shared, Changed], Sums]:
 
 
 class CodeScores(NamedTuple):
-    """Scores of the samples of some pixels for changes of their law, by tables of their codes.
-
-    Attributes:
-        codes: of the samples, (frame, n), DN.
-        first: lowest code of each pixel, (n,).
-        tables: see `score_tables`, shape (5, n, c).
-    """
+    """Codes (frame, n), DN, and their `score_tables` from the ``first`` code of each pixel on."""
 
     codes: NDArray[np.unsignedinteger]
     first: IntArray
@@ -150,17 +143,7 @@ def _in_blocks(values: FloatArray) -> FloatArray:
 
 
 def codes_within_reach(maps: PixelMaps, pixels: IntArray, first: IntArray, last: IntArray) -> int:
-    """Return how many codes from the first on tables need, at most up to far above the highest peak.
-
-    A sample beyond, which no law made, counts as the last of them: a single hit by a particle would have
-    tables of its thousands of codes, and outweigh all other samples.
-
-    Args:
-        maps: parameters of the pixels.
-        pixels: positions of those that are looked at, shape (n,).
-        first: their lowest codes, shape (n,).
-        last: their highest codes, shape (n,).
-    """
+    """Return how many codes from the first on, (n,), tables need, but not far above the highest peak."""
     exposure, gain, bias, sigma = (values.ravel()[pixels] for values in maps.maps)
     most = np.ceil(exposure.max() + 8.0 * np.sqrt(exposure.max()) + 4.0)
     reach = bias + most / gain + _REACH * sigma
@@ -170,8 +153,7 @@ def codes_within_reach(maps: PixelMaps, pixels: IntArray, first: IntArray, last:
 def score_tables(maps: PixelMaps, pixels: IntArray, first: IntArray, length: int) -> FloatArray:
     """Return the scores of codes for changes of their law, shape (5, n, c).
 
-    Of an offset (1/DN), a relative gain, a relative light, a relative read noise, and a in the variance
-    ``H + a H^2`` of electrons.
+    Of offset (1/DN), relative gain, light and read noise, and a in the variance ``H + a H^2`` of electrons.
     """
     exposure, gain, bias, sigma = (values.ravel()[pixels][:, None] for values in maps.maps)
     given = pcd_posterior(first[:, None] + np.arange(length), exposure, gain, bias, sigma)
@@ -187,13 +169,9 @@ def measured_mode(
     maps: PixelMaps,
     inside: BoolArray,
 ) -> Measurement | None:
-    """Return the change of gain, light or noise beyond a model's; None where a steady offset is clearer.
+    """Return the change of gain, light or noise beyond that of frames simulated with a model, if clear.
 
-    Args:
-        data: sums of the frames.
-        model: of frames simulated with it.
-        maps: parameters of the pixels.
-        inside: pixels that were looked at, shape (y, x).
+    ``inside``, (y, x), are the pixels of the sums. None also where a steady offset is clearer.
     """
     found = [_Change.of(key, sums, model[key]) for key, sums in data.items()]
     found.sort(key=lambda one: -one.gain)
@@ -219,7 +197,7 @@ class _Change(NamedTuple):
         sums: of its scores, weighted by its shape.
         shape: over the sensor, in blocks; none: even.
         power: mean square of it, beyond a model's, no unit.
-        gain: by how much likelier the sums are with it, nats.
+        gain: in log-likelihood of the sums, nats.
         wave: its cycles, and rms; None: it is noise for the most part.
     """
 
@@ -249,13 +227,7 @@ class _Change(NamedTuple):
         return cls(*key, sums, shape, power, gain, (wave, line.amplitude * root_mean_square(wave)))
 
     def effect(self, maps: PixelMaps, inside: BoolArray, gain: float) -> EmpiricalNoise:
-        """Return it as an effect at its size.
-
-        Args:
-            maps: parameters of the pixels.
-            inside: pixels that were looked at, shape (y, x).
-            gain: of the clearest, nats.
-        """
+        """Return it as an effect at its size, ``gain`` being that of the clearest, nats."""
         of_noise, signal = self.changed == "noise", 1.0  # of an offset the scores are by DN
         if self.changed != "offset":
             scale = maps.read_noise_dn if of_noise else maps.quanta_exposure / maps.conversion_gain
@@ -271,7 +243,10 @@ class _Change(NamedTuple):
         if self.wave is not None:
             wave, rms = self.wave
             return EmpiricalNoise(noise_dn=rms * signal, modes=(mode(wave=wave),))
-        burst, size = _bursts(_from_quiet(self.sums) if of_noise else self.sums, gain)
+        sums = self.sums
+        if of_noise:  # lines with bursts had their part in the noise of the pixels
+            sums = sums._replace(sums=sums.sums - np.median(sums.sums, axis=0))
+        burst, size = _bursts(sums, gain)
         if burst is None:
             lags, correlation = _correlation(self.sums, self.power)
             rms = float(np.sqrt(self.power))
@@ -285,8 +260,8 @@ class _Change(NamedTuple):
 def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:
     """Return sums of frames weighted by the shape of the change over the sensor, and that; none where even.
 
-    The shape is the largest principal component of the blocks' sums, each in its noise (Karhunen 1947, Loeve
-    1948), where its power lies beyond what blocks without a change reach (Marchenko and Pastur 1967).
+    The shape is the largest principal component of the sums of blocks (Karhunen 1947, Loeve 1948) where its
+    power lies beyond chance (Marchenko and Pastur 1967).
     """
     if one.blocks is None or one.blocks[1].size < 2:
         return one, ()
@@ -308,10 +283,7 @@ def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:
 
 
 def _line(one: Sums, power: float, model: Sums) -> Line | None:
-    """Return the wave that a change is for the most part; none that a model makes.
-
-    What whole frames share is told of those.
-    """
+    """Return the wave that a change is for the most part; none that a model makes or whole frames share."""
     line, known = _highest_line(one), int(np.count_nonzero(one.information))
     if line is None or (one.information.size > 1 and abs(line.along) * known < _SAME_PHASE):
         return None
@@ -345,17 +317,12 @@ def _correlation(one: Sums, power: float) -> tuple[tuple[Lag, ...], tuple[float,
     return tuple(lags), tuple(found)
 
 
-def _from_quiet(one: Sums) -> Sums:
-    """Return sums from those of most lines on: loud ones had their part in the noise of the pixels."""
-    return one._replace(sums=one.sums - np.median(one.sums, axis=0))
-
-
 def _bursts(one: Sums, gaussian: float) -> tuple[float | None, float]:
     """Return the share of lines that have a change, and its relative size; None where all have some."""
     known = one.information > 0.0
     sums = one.sums[:, known].ravel()
     information = np.broadcast_to(one.information[known], one.sums[:, known].shape).ravel()
-    # of a change far beyond chance a Gaussian explains all but what its spread costs: no more can be won
+    # no more can be gained than a Gaussian of a change far beyond chance explains
     most = min(gaussian, 0.5 * one.number * float(np.log(max(one.ratio, 1.0))))
     found: list[tuple[float, float, float]] = []
 

@@ -1,11 +1,10 @@
 """Empirical component: correlated noise, from its covariance over frames, rows and columns.
 
-The readout residuals of pairs of samples are multiplied, and their mean products sorted by distance: those of
-near samples, of samples far apart in one row, far apart in one column, and far apart in both. What the model
-makes of such pairs is measured in frames simulated with it, and taken off. What is left beyond chance is the
-covariance of a Gaussian noise. Its variance is known where whole rows, columns or frames share it; that of
-single samples is read noise as well, so there it is the least with which the others are a covariance. An
-offset may also run as a wave across rows, columns and frames.
+The mean products of the readout residuals of pairs of samples are sorted by distance: near, far apart in one
+row, in one column, and in both. Those of frames simulated with the model are subtracted; what is left beyond
+chance is the covariance of a Gaussian noise. Its variance is known where whole rows, columns or frames share
+it; that of single samples is read noise as well, so there it is the least with which the others are a
+covariance. An offset may also run as a wave across rows, columns and frames.
 """
 
 from __future__ import annotations
@@ -66,12 +65,7 @@ class Line(NamedTuple):
 
 
 class Covariances(NamedTuple):
-    """Mean products of residuals.
-
-    Attributes:
-        pairs: by what shares one value, and by distance.
-        lines: in a row, and in a column, by the places of both.
-    """
+    """Mean products of residuals: by what shares one value and distance, and in lines by both places."""
 
     pairs: Mapping[tuple[Shared, Lag], Covariance]
     lines: Mapping[Shared, Line]
@@ -161,10 +155,7 @@ class _Pairs(NamedTuple):
 
     @classmethod
     def of(cls, one: Float32Array, two: Float32Array, down: range, right: range, starts: IntArray) -> _Pairs:
-        """Return those of frames (n, y, x) with others, at distances of rows and columns, by group of frames.
-
-        ``starts`` are the first frames of the groups.
-        """
+        """Return those of frames (n, y, x) with others, by distance and by group of frames."""
         rows = [each.sum(axis=2, dtype=np.float64) for each in (one, two)]
         columns = [each.sum(axis=1, dtype=np.float64) for each in (one, two)]
         total = np.add.reduceat(rows[0].sum(axis=1) * rows[1].sum(axis=1), starts)
@@ -192,14 +183,7 @@ def _products(one: NDArray[Any], two: NDArray[Any], starts: IntArray) -> FloatAr
 def measured_noise(
     data: Covariances, model: Covariances, evidence: Evidence, inside: BoolArray
 ) -> Measurement | None:
-    """Return the noise that samples share beyond what a model makes; None where they share none.
-
-    Args:
-        data: covariances of the frames.
-        model: of frames simulated with it.
-        evidence: of the frames.
-        inside: pixels that were looked at, shape (y, x).
-    """
+    """Return the noise that samples of pixels ``inside``, (y, x), share; None: only what a model makes."""
     inside = inside & evidence.maps.usable
     own = {key: one for key, one in model.pairs.items() if abs(one.value) > CLEAR * one.error}
     none = Covariance(0.0, 0.0)
@@ -260,11 +244,7 @@ class _Profile(NamedTuple):
     def take_off(
         self, of: Shared, left: dict[tuple[Shared, Lag], float], response: float
     ) -> dict[tuple[Shared, Lag], float]:
-        """Take it off from what lines share alike, which stands for it badly, and from near samples.
-
-        Returns:
-            What was taken off from near samples.
-        """
+        """Subtract it from what lines share alike and from near samples; return what was from the latter."""
         alike = left[of, (0, 0, 0)]
         taken: dict[tuple[Shared, Lag], float] = {}
         for key in list(left):
@@ -280,22 +260,18 @@ class _Profile(NamedTuple):
 
 
 def _profile(of: Shared, data: Covariances, model: Covariances, response: FloatArray) -> _Profile | None:
-    """Return the shape along a line of which each line has so much; None where lines have all alike.
+    """Return the shape along a line that lines have in varying amounts; None where it is even.
 
     The covariance of two places far apart is that of a few points between which it is linear; its largest
-    principal component is the shape (Karhunen 1947, Loeve 1948).
-
-    ``response`` is that of the pixels that are looked at, NaN elsewhere, shape (y, x), 1/DN.
+    principal component is the shape (Karhunen 1947, Loeve 1948). ``response``, (y, x), is in 1/DN or NaN.
     """
     if of not in data.lines:
         return None
     products, counts = data.lines[of]
     variance = 1.0 / np.maximum(counts, 1.0)
     if of in model.lines:
-        products, variance = (
-            products - model.lines[of].products,
-            variance + 1.0 / np.maximum(model.lines[of].counts, 1.0),
-        )
+        products = products - model.lines[of].products
+        variance += 1.0 / np.maximum(model.lines[of].counts, 1.0)
     known = np.isfinite(response)
     axis = 0 if of == "row" else 1
     unit = np.where(known, response, 0.0).sum(axis=axis) / np.maximum(known.sum(axis=axis), 1)
@@ -315,12 +291,10 @@ def _profile(of: Shared, data: Covariances, model: Covariances, response: FloatA
     shape = np.linalg.eigh(hats @ between @ hats.T)[1][:, -1] * np.sqrt(size)
 
     def power(shape: FloatArray) -> tuple[float, float]:
-        """Return the power of a shape, and by how many standard errors it is there."""
+        """Return the power of a shape, and the same in standard errors."""
         made = shape[one] * shape[two] * weight
-        square = float(made @ made)
-        if square == 0.0:
-            return 0.0, 0.0
-        return float(made @ (seen * weight)) / square, float(made @ (seen * weight)) / np.sqrt(square)
+        square, product = float(made @ made), float(made @ (seen * weight))
+        return (product / square, product / np.sqrt(square)) if square else (0.0, 0.0)
 
     (found, clear), (_, alike) = power(shape), power(np.ones(size))
     if clear < _CLEAR_SHAPE or clear**2 < _BETTER * alike**2 + _CLEAR_SHAPE**2 / 2.0:
@@ -334,14 +308,7 @@ def running_waves(samples: PartSamples) -> Waves:
 
 
 def measured_wave(data: Waves, model: Waves, evidence: Evidence, inside: BoolArray) -> Measurement | None:
-    """Return the wave whose phase runs on, beyond a model's; None where there is none.
-
-    Args:
-        data: of the frames.
-        model: of frames simulated with it.
-        evidence: of the frames.
-        inside: pixels that were looked at, shape (y, x).
-    """
+    """Return the wave of steady phase in the pixels ``inside`` beyond a model's; None: there is none."""
     wave, made = data.steady, model.steady
     if wave is None or (made is not None and made.amplitude > MADE * wave.amplitude):
         return None

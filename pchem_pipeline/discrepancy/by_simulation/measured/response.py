@@ -1,8 +1,8 @@
 """Empirical component: response of samples to the charge of others, by distance and of whole lines.
 
-The map of all distances is searched for what stands out most: one distance, or all samples of a row, a column
-or a frame alike. Its part is taken off, and the rest searched again (matching pursuit, Mallat and Zhang 1993;
-electrons of different samples are independent, so that what is found first does not move what comes later).
+Matching pursuit (Mallat and Zhang 1993) in the map of all distances: what stands out most, one distance or
+all samples of a row, a column or a frame, is subtracted, and the rest searched again. Electrons of different
+samples are independent, so that what is found first does not move what comes later.
 """
 
 from __future__ import annotations
@@ -42,12 +42,7 @@ _STEPS = 8  # up to that, before all numbers near the clearest are tried
 
 
 class Responses(NamedTuple):
-    """How the residuals of frames go with the charge of other samples.
-
-    Attributes:
-        views: the frames, as they are and with their charge mirrored, by along what.
-        covariances: sums of products of residuals and charge of all of them, likewise.
-    """
+    """The frames, with their charge as it is and mirrored, and its covariances with the residuals."""
 
     views: Mapping[Mirrored, FollowingSamples]
     covariances: Mapping[Mirrored, Follows]
@@ -88,14 +83,7 @@ class _Term(NamedTuple):
 def measured_response(
     data: Responses | None, model: Responses | None, evidence: Evidence, inside: BoolArray
 ) -> Measurement | None:
-    """Return which samples follow which beyond what a model makes; None where none is clear.
-
-    Args:
-        data: of the frames.
-        model: of frames simulated with it.
-        evidence: of the frames.
-        inside: pixels that were looked at, shape (y, x).
-    """
+    """Return which samples of pixels ``inside``, (y, x), follow which beyond what a model makes, if clear."""
     if data is None:
         return None
     left = {
@@ -127,6 +115,8 @@ def measured_response(
         return None
     responses = [term.value / _response_of_one(evidence, inside, term) for term in terms]
     largest = max(abs(response) for response in responses)
+    ny, nx = inside.shape
+    numbers: dict[Source, int] = {"sample": 1, "row": nx, "column": ny, "frame": ny * nx}
     effect = EmpiricalResponse(
         response=min(largest, 1.0),
         terms=tuple(
@@ -134,7 +124,7 @@ def measured_response(
                 of=term.of,
                 place=term.place,
                 weight=round(response / largest, 4),
-                number=_number(term.of, inside.shape),
+                number=numbers[term.of],
                 columns=term.columns,
                 above=float(term.above),
                 mirrored=term.mirrored,
@@ -163,7 +153,7 @@ class _Left:
         return cls(products, data.pairs, data.wider)
 
     def clearest(self, mirrored: bool) -> _Term | None:
-        """Return what is followed most clearly, if anything is; of what is mirrored single samples only."""
+        """Return what is followed most clearly, if anything is; if mirrored, of single samples only."""
         best: _Term | None = None
         now = Follows(self.products, self.pairs, self.wider)
         for source in SOURCES[:1] if mirrored else SOURCES:
@@ -177,7 +167,7 @@ class _Left:
         return best
 
     def take_off(self, term: _Term) -> None:
-        """Take off what a term makes of all distances that it holds."""
+        """Subtract what a term makes of all its distances."""
         y, x = (size // 2 for size in self.products.shape[1:])
         rows = slice(None) if term.of in ("column", "frame") else y + term.place[1]
         columns = slice(None) if term.of in ("row", "frame") else x + term.place[2]
@@ -185,21 +175,16 @@ class _Left:
         self.products[here] -= term.value * self.pairs[here]
 
     def take_off_pairs(self, own: FollowingSamples, view: FollowingSamples, term: _Term) -> None:
-        """Take off what single samples that are told in another view make of the distances of the own one."""
+        """Subtract what single samples found in another view make of the distances of the own one."""
+        ny, nx = view.inside.shape
         y, x = np.nonzero(view.inside)
-        columns = slice(*term.columns) if term.columns else slice(None)
-        some = np.isin(x, np.arange(view.inside.shape[1])[columns])
-        y, x = y[some], x[some]
-        there = y + term.place[1], x + term.place[2]
-        known = np.ones(y.size, np.bool_)
-        for at, size in zip(there, view.inside.shape, strict=True):
-            known &= (at >= 0) & (at < size)
-        y, x = y[known], x[known]
-        there = there[0][known], there[1][known]
-        known = view.told[there]
+        there_y, there_x = y + term.place[1], x + term.place[2]
+        known = (there_y >= 0) & (there_y < ny) & (there_x >= 0) & (there_x < nx)
+        known &= np.isin(x, np.arange(nx)[_columns(term)])
+        known[known] = view.told[there_y[known], there_x[known]]
         # mirrored twice is as it was
         distances = []
-        for axis, (here, at) in enumerate(zip((y, x), there, strict=True), 1):
+        for axis, (here, at) in enumerate(((y, there_y), (x, there_x)), 1):
             turned = (axis in own.mirrored) != (axis in view.mirrored)
             at = view.inside.shape[axis - 1] - 1 - at if turned else at
             distances.append((at - here)[known] + self.products.shape[axis] // 2)
@@ -207,8 +192,13 @@ class _Left:
         np.subtract.at(self.products, (-term.place[0], *distances), term.value * number)
 
 
+def _columns(term: _Term) -> slice:
+    """Return the columns that follow."""
+    return slice(*term.columns) if term.columns else slice(None)
+
+
 def _in_columns(samples: FollowingSamples, term: _Term) -> _Term:
-    """Return a term with the columns that follow, where others have no sample there or clearly do not."""
+    """Return a term with the columns that follow, where others have no sample or clearly do not."""
     if term.of != "sample":
         return term
     products, pairs = samples.by_column(term.place)
@@ -228,7 +218,7 @@ def _in_columns(samples: FollowingSamples, term: _Term) -> _Term:
 
 
 def _beyond(samples: FollowingSamples, term: _Term) -> _Term:
-    """Return a term by what the charge exceeds, where that is followed far more clearly than all of it."""
+    """Return a term by the charge above a threshold, where that is followed far more clearly than all."""
     if term.of != "sample":
         return term
     most = min(int(np.max(samples.exposure + _FAR * np.sqrt(samples.exposure))), _HIGHEST)
@@ -255,8 +245,7 @@ def _beyond(samples: FollowingSamples, term: _Term) -> _Term:
 def _response_of_one(evidence: Evidence, inside: BoolArray, term: _Term) -> float:
     """Return the mean product where samples follow by all of the charge.
 
-    A shift of i by K_j changes ``E[R_i | x]`` by ``K_j Var(r_i) / sigma_i^2`` on average, and K_j varies with
-    the part of k_j that r_j does not hold by the variance of that part.
+    A shift of i by K_j changes ``E[R_i | x]`` by ``K_j Var(r_i) / sigma_i^2`` on average.
     """
     maps = evidence.maps
     gain = np.where(maps.usable, maps.conversion_gain, np.nan)
@@ -265,17 +254,11 @@ def _response_of_one(evidence: Evidence, inside: BoolArray, term: _Term) -> floa
     mixed = (maps.quanta_exposure + noise - readout - charge) / 2.0
     shift = np.where(inside, np.sqrt(readout) / noise, np.nan)
     if term.above:
-        return float(np.nanmean(shift[:, slice(*term.columns) if term.columns else slice(None)]))
+        return float(np.nanmean(shift[:, _columns(term)]))
     apart = np.sqrt(np.maximum(charge - mixed**2 / readout, 0.0))
-    columns = slice(*term.columns) if term.columns else slice(None)
     if term.of != "sample":
         return float(np.nanmean(shift) * np.nanmean(apart))
     turned = np.flip(apart[None], tuple(AXES[each] for each in term.mirrored))
     source, known = neighbours(np.ascontiguousarray(turned), (0, *term.place[1:]))
     pairs = np.where(known[0], source[0], np.nan) * shift
-    return float(np.nanmean(pairs[:, columns]))
-
-
-def _number(source: Source, shape: tuple[int, ...]) -> int:
-    """Return how many samples a row, a column or a frame has."""
-    return {"sample": 1, "row": shape[1], "column": shape[0], "frame": shape[0] * shape[1]}[source]
+    return float(np.nanmean(pairs[:, _columns(term)]))

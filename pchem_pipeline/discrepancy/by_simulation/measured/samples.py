@@ -37,12 +37,11 @@ class PartSamples:
     """Samples of a part of sensor and run.
 
     Attributes:
-        stack: frames of all of the run that is seen, (frame, y, x), DN.
+        stack: all seen frames of the run, (frame, y, x), DN.
         stack_numbers: theirs in the run, increasing, shape (frame,).
         maps: plain fit of these frames, or of more of the same pixels.
-        evidence: of the frames of the data, which says how well charge and residuals are told.
-        inside: pixels that are looked at, shape (y, x).
-        part: of which the frames are looked at.
+        evidence: of the frames of the data, with the errors of charge and residuals.
+        inside: pixels of the part, shape (y, x).
         whole_lines: kinds of lines ("row", "column") that are here from end to end.
         known: what was measured in them.
     """
@@ -78,9 +77,9 @@ class PartSamples:
         return cast(Answer, self.known[measure])
 
     def scores(self, kind: int, inside: BoolArray, *box: slice) -> Float32Array:
-        """Return expected electrons (kind 0) or readout residuals (1) of the pixels inside of a box.
+        """Return standardised expected electrons (kind 0) or readout residuals (1) of pixels of a box.
 
-        Each beyond its mean, in its standard deviation, 0 where it is not known, shape (frame, y, x).
+        0 where they are not known, shape (frame, y, x).
         """
         samples = Samples.by_laws(FrameBlocks.of(self.frames), self.laws, self.maps).without(~inside)
         return np.concatenate([chunk for (chunk,) in samples.chunks((kind,), *box)])

@@ -51,14 +51,7 @@ class _Likely(NamedTuple):
 
 @dataclass
 class Unexplained:
-    """Measures frames beside effects.
-
-    Attributes:
-        work: fits and simulates the frames; train and test frames are measured.
-        refitter: fits effects to their statistics.
-        defects: forms that failed, and why.
-        known: what was measured, by the effects beside it.
-    """
+    """Measures train and test frames beside effects; ``defects`` are forms that failed, and why."""
 
     work: Simulations
     refitter: Refitter
@@ -82,9 +75,9 @@ class Unexplained:
         return {tag: form for tag, form in forms.items() if tag not in {e.tag for e in self.refitter.present}}
 
     def measured(self, kept: tuple[Hypothesis, ...]) -> Iterator[Refitted]:
-        """Yield effects with what explains most beside them, each at its best fit, the likeliest first.
+        """Yield effects with what explains most beside them, each at its best fit, until one leaves little.
 
-        Until one leaves little. Forms that are among the effects are not measured again; none is what fails.
+        The likeliest first; forms that are among the effects are not measured again.
 
         Raises:
             EffortSpentError: the work is at its limit.
@@ -143,23 +136,18 @@ class Unexplained:
             measured = tuple(e.at_place(part.region, part.when) for e in on_sensor)
         best: Refitted | None = None
         for effect in measured:
-            found = self._fitted(kept, effect)
+            refitter.allow(effect.tag)
+            vectors = refitter.draw((*effects, effect), FEW)
+            shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
+            found = refitter.refined((*kept, Hypothesis(effect, shift)))
             if best is None or found.score > best.score:
                 best = found
-            if self.refitter.residual_is_small(best):
+            if refitter.residual_is_small(best):
                 break
         return best
 
-    def _fitted(self, kept: tuple[Hypothesis, ...], effect: Effect) -> Refitted:
-        """Return effects with what was measured at their best fit."""
-        refitter = self.refitter
-        refitter.allow(effect.tag)
-        _, vectors = refitter.draw((*(h.effect for h in kept), effect), FEW)
-        shift = vectors.mean(axis=0) - refitter.null.mean - sum(h.fingerprint for h in kept)
-        return refitter.refined((*kept, Hypothesis(effect, shift)))
-
     def _mixture_shifts(self, part: Part, present: Model, beside: Model) -> Measurement | None:
-        """Measure the mixture shifts of a part beside effects, with the pixels as they now are."""
+        """Measure the mixture shifts of a part beside effects, with the pixels refitted with those there."""
         maps, frames = self.work.refit(present).maps, self.work.frames
         own = replace(maps, usable=maps.usable & frames.inside(part))
         if not own.usable.any():

@@ -68,7 +68,7 @@ class Refit:
         covariance: of (H, g, mu, sigma) of each pixel, shape (y, x, 4, 4).
         components: of the law of a sample, with all effects.
         evaluations: of the likelihood of a pixel, on average.
-        added: exposure beside H that the effects add to each pixel, (j, y, x); None: it counts as part of H.
+        added: exposure that the effects add to H of each pixel, (j, y, x); None: it counts as part of H.
     """
 
     maps: PixelMaps
@@ -87,7 +87,7 @@ def refit_maps(
     added: AddedExposure | None = None,
     numbers: IntArray | None = None,
 ) -> Refit:
-    """Fit the pixels of some frames with effects in their law.
+    """Fit the pixels of some frames with effects in their law; the old maps stay where they give none.
 
     Args:
         frames: (frame, y, x), DN.
@@ -97,24 +97,21 @@ def refit_maps(
         added: exposure that the effects add to each pixel; None: it counts as part of H.
         numbers: of the frames in the run, shape (frame,); None: 0, 1, 2, ...
 
-    Returns:
-        New maps; the old ones where the effects cannot be fitted with.
-
     Raises:
         NotFittedError: almost no pixel can be fitted, or each would take seconds.
     """
     shape = maps.usable.shape
-    flat = maps.flat.maps
+    plain = maps.flat
     try:
         numbers = np.arange(frames.shape[0]) if numbers is None else numbers
-        law = sample_law(effects, pixel_maps(flat, maps.usable), added, _places(maps, numbers))
+        law = sample_law(effects, pixel_maps(plain.maps, maps.usable), added, _places(maps, numbers))
     except ConfigError:
         return Refit(maps, {}, covariance)
     if law.components > _MOST_COMPONENTS:
         raise NotFittedError(f"each peak would have {law.components} components")
     histograms = histogram_frames(frames)
     counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
-    near = np.stack(flat, axis=1)
+    near = plain.columns
     if added is not None:
         mean = (added.flat().exposure_e * added.flat().weight).sum(axis=0)
         near[:, 0] = np.maximum(near[:, 0] - mean, _LEAST_LEFT * near[:, 0])
@@ -124,9 +121,9 @@ def refit_maps(
         return fit_histograms(counts[some], origin, law=law.of(some), start=start[some], settings=_SEARCHED)
 
     acted_on = _acted_on(effects, (shape[0], shape[1])).ravel()
-    known = np.flatnonzero(maps.usable.ravel() & acted_on)
     # an effect of a part of the sensor leads no other pixels astray
-    known = known if known.size else np.flatnonzero(maps.usable.ravel())
+    known = np.flatnonzero(plain.usable & acted_on)
+    known = known if known.size else np.flatnonzero(plain.usable)
     probed = known[:: max(1, known.size // _PROBED)]
     probe = fitted(probed)
     if np.mean(np.isfinite(probe.bias)) < _LEAST_FITTED:
@@ -139,31 +136,27 @@ def refit_maps(
             better = np.flatnonzero(_likelier(other, fit.of(known)))
             fit = fit.with_pixels(known[better], other.of(better))
     astray, start = multistart(counts, histograms.origin.ravel(), law, fit.columns)
-    inside = maps.usable.ravel()[astray] & acted_on[astray]
+    inside = plain.usable[astray] & acted_on[astray]
     if inside.any():
         fit = fit.with_pixels(astray[inside], fitted(astray[inside], start))
-    new = fit.maps
-    good = maps.usable.ravel() & np.isfinite(fit.columns).all(axis=1)
+    good = plain.usable & np.isfinite(fit.columns).all(axis=1)
     stderr = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2))
     inside = good & acted_on
-    moved = changes(np.stack(flat, axis=1)[inside], np.stack(new, axis=1)[inside], stderr[inside])
-    new_maps = PixelMaps.known(new, good.reshape(shape))
+    moved = changes(plain.columns[inside], fit.columns[inside], stderr[inside])
+    new_maps = PixelMaps.known(fit.maps, good.reshape(shape))
     covariance = fit.covariance[:, :4, :4].reshape(*shape, 4, 4)
     return Refit(new_maps, moved, covariance, law.components, float(fit.n_iterations.mean()), added)
 
 
 def _acted_on(effects: Sequence[Effect], shape: tuple[int, int]) -> BoolArray:
-    """Return the pixels, (y, x), that any of the effects is about: all of them where one has no place."""
+    """Return the pixels, (y, x), on which any of the effects acts; all where there is none."""
     regions = [effect.region for effect in effects]
     inside = [np.ones(shape, np.bool_) if region is None else region.mask(shape) for region in regions]
     return np.asarray(np.logical_or.reduce(inside)) if inside else np.ones(shape, np.bool_)
 
 
 def shift_bias_by_electrons(start: FloatArray, electrons: float) -> FloatArray:
-    """Return parameters (n, 4) whose bias is lower, and exposure higher, by so many electrons.
-
-    Under noise of another law the peak that was taken for that of no electron may be that of one.
-    """
+    """Return parameters (n, 4) whose bias is lower, and exposure higher, by so many electrons."""
     off = start.copy()
     off[:, 0] = np.maximum(start[:, 0] + electrons, _LEAST_LEFT * start[:, 0])
     off[:, 2] -= electrons / start[:, 1]
@@ -175,9 +168,8 @@ def multistart(
 ) -> tuple[NDArray[np.intp], FloatArray]:
     """Find pixels whose bias a few samples below all others led astray, and what is likelier under a law.
 
-    The PCD has no place for a sample far below its peaks, and a fit that counts each one lowers the bias by
-    electrons for it; an effect that makes such samples would then be judged by pixels without any. Those that
-    have some are fitted anew, from what the tail guard makes of them and from an electron beside that, too.
+    The PCD has no place for a sample far below its peaks: a fit lowers the bias by electrons for it. Pixels
+    with some are fitted anew, begun at the fit with the tail guard and an electron beside that.
 
     Args:
         counts: histograms, (n, B).
@@ -210,10 +202,7 @@ def multistart(
 
 
 def _of_usual_noise(near: FloatArray, fitted: FloatArray) -> FloatArray:
-    """Return parameters (n, 4) with the gain and the read noise of most pixels, bias and mean of each.
-
-    Under strong effects plain fits have both too large in bright pixels, and those climb no way back.
-    """
+    """Return parameters (n, 4) with the gain and the read noise of most pixels, bias and mean of each."""
     found = np.where(np.isfinite(fitted), fitted, near)
     found[:, 0] *= np.nanmedian(fitted[:, 1]) / found[:, 1]
     found[:, [1, 3]] = np.nanmedian(fitted[:, [1, 3]], axis=0)
@@ -233,27 +222,23 @@ def expected_codes(
     numbers: IntArray,
     added: AddedExposure | None = None,
 ) -> FloatArray | None:
-    """Return the samples that a model expects at each code, all usable pixels together.
+    """Return the samples, (c,), that a model expects at each code in all usable pixels; None: it has no law.
 
     Args:
         maps: parameters of the pixels under the model.
         effects: of the model.
         codes: successive DN, shape (c,).
         numbers: of the frames in the run, one sample of each pixel in each.
-        added: exposure beside H that the effects add to each pixel, (j, y, x); None: it is part of H.
-
-    Returns:
-        Shape (c,); None where the effects give no law.
+        added: see :class:`Refit`.
     """
     usable = maps.usable.ravel()
-    flat = tuple(values.ravel()[usable] for values in maps.maps)
+    own = maps.flat.of(usable)
     try:
         places = _places(maps, numbers).of(usable)
-        beside = None if added is None else added.flat().of(usable)
-        law = sample_law(effects, pixel_maps(flat, usable[usable]), beside, places)
+        law = sample_law(effects, own, None if added is None else added.flat().of(usable), places)
     except ConfigError:
         return None
-    return np.asarray(numbers.size * sample_mass(law, flat, codes, smallest=1e-50).sum(axis=0))
+    return np.asarray(numbers.size * sample_mass(law, own, codes, smallest=1e-50).sum(axis=0))
 
 
 def _places(maps: PixelMaps, numbers: IntArray) -> PixelPlaces:
@@ -279,13 +264,13 @@ def changes(before: FloatArray, after: FloatArray, stderr: FloatArray) -> dict[s
 
 @dataclass(frozen=True)
 class Sensor:
-    """What is known of the true parameters of the pixels: sensors to simulate whose fits come out alike.
+    """The distribution of the true parameters of the pixels: sensors to simulate whose fits come out alike.
 
     Attributes:
         posterior: of the pixels that can be simulated.
         drawn: which those are, shape (y, x).
         usable: pixels whose fit can be relied upon, shape (y, x).
-        lost: by how much log sigma_R^2 is learnt too low, which is corrected.
+        lost: bias of log sigma_R^2, which is corrected.
     """
 
     posterior: Posterior
@@ -302,21 +287,14 @@ class Sensor:
     def refitted(self, before: PixelMaps, after: PixelMaps) -> Sensor:
         """Return it under another model: each pixel moves as its fit does, one without a fit as most do.
 
-        The samples are the same, and so is nearly all that chance makes of both fits.
-
-        Args:
-            before: fits under the model by which it was learnt.
-            after: fits of the same frames under the other one.
-
         Raises:
-            NotFittedError: no pixel is fitted under both.
+            NotFittedError: no pixel is fitted before and after.
         """
         both = (before.usable & after.usable)[self.drawn]
         _require(both)
-        old, new = (np.stack([m[self.drawn] for m in fit.maps], axis=1)[both] for fit in (before, after))
-        moves = to_theta(new) - to_theta(old)
-        change = np.tile(np.median(moves, axis=0), (both.size, 1))
-        change[both] = moves
+        old, new = (to_theta(fit.of(self.drawn).columns[both]) for fit in (before, after))
+        change = np.tile(np.median(new - old, axis=0), (both.size, 1))
+        change[both] = new - old
         return replace(self, posterior=self.posterior.moved(change), usable=after.usable)
 
     def corrected(self, wanted: PixelMaps, simulated: PixelMaps) -> Sensor:
@@ -325,19 +303,12 @@ class Sensor:
         An effect of which the law knows only a part (what a neighbour adds) is in the fitted parameters,
         mostly the read noise, and simulated on top would be there twice.
 
-        Args:
-            wanted: plain fits of the data.
-            simulated: of a sensor drawn from this one, with the effects of the model.
-
         Raises:
             NotFittedError: no pixel is fitted in both.
         """
-        both = (wanted.usable & simulated.usable).ravel()
+        both = wanted.usable & simulated.usable
         _require(both)
-        theta = [
-            to_theta(np.stack([m.ravel()[both] for m in fit.maps], axis=1)) for fit in (wanted, simulated)
-        ]
-        change = clipped_mean(theta[0] - theta[1])
+        change = clipped_mean(to_theta(wanted.of(both).columns) - to_theta(simulated.of(both).columns))
         # variances add up, their logarithms do not
         change[3] = np.log(max(2.0 - np.exp(-change[3]), _LEAST_LEFT))
         return replace(self, posterior=self.posterior.moved(change))
@@ -368,19 +339,18 @@ def learn_sensor(
     Args:
         frames: that were fitted, (frame, y, x), DN.
         numbers: theirs in the run, shape (frame,).
-        fit: their maps under the model.
+        fit: of them with the effects.
         effects: of the model.
         mistaken: share of pixels whose bias may be off by an electron.
         lost: see :class:`Sensor`; None: not known yet.
-        before: frames like these before effects replaced samples of them, which tell what stands in for
-            each; None: those that were fitted, which differ little.
+        before: frames before effects replaced samples, from which the replacements are; None: ``frames``.
 
     Raises:
         NotFittedError: no pixel tells anything.
     """
     maps = fit.maps
     usable = maps.usable.ravel()
-    parameters = np.where(usable[:, None], np.stack(maps.flat.maps, axis=1), np.nan)
+    parameters = maps.flat.columns
     covariance, places = fit.covariance.reshape(-1, 4, 4), _places(maps, numbers)
     law = _law_of_all(effects, parameters, places, fit.added)
     if law is None or law.free_satellites:

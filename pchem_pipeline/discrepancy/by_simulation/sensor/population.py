@@ -73,13 +73,7 @@ _OUTLYING = 15.0  # median deviations of a cumulant beyond which a pixel is not 
 
 @dataclass(frozen=True)
 class Population:
-    """Student's t of theta over the pixels.
-
-    Attributes:
-        centre: m, shape (4,).
-        scatter: T, shape (4, 4).
-        uncertainty: covariance of the estimate of m, shape (4, 4).
-    """
+    """Student's t of theta over the pixels: m, (4,), T, (4, 4), and the covariance of the estimate of m."""
 
     centre: FloatArray
     scatter: FloatArray
@@ -91,7 +85,6 @@ class Posterior:
     """Where the true theta of n pixels may lie: a mixture of Gaussians about j maxima each.
 
     Attributes:
-        population: of all pixels.
         theta: maxima, shape (j, n, 4).
         covariance: shape (j, n, 4, 4).
         weight: of the maxima, sums to 1 over j, shape (j, n).
@@ -115,8 +108,7 @@ class Posterior:
     def draw(self, rng: np.random.Generator) -> FloatArray:
         """Draw (H, g, mu, sigma) of every pixel, shape (n, 4), the centre of all within its error.
 
-        The mean ``mu + H / g`` of the samples is known far better than its parts: mu follows the exponentials
-        of the others, not their slopes, which far from the maximum would lead to samples below 0 DN.
+        The mean ``mu + H / g`` of the samples is known far better than its parts, and drawn with its error.
         """
         j, n = self.weight.shape
         chosen = (rng.random(n) > np.cumsum(self.weight, axis=0)[: j - 1]).sum(axis=0)
@@ -178,12 +170,7 @@ def posterior_of(
 def shrinkage_bias(posterior: Posterior, totals: NDArray[np.integer], law: SampleLaw | None = None) -> float:
     """Return by how much log sigma_R^2 is learnt too low: where peaks overlap some noise is taken for signal.
 
-    Histograms are drawn from what was learnt, and learnt from again (parametric bootstrap: Efron 1979).
-
-    Args:
-        posterior: of n pixels.
-        totals: samples of each, shape (n,), whole numbers.
-        law: of the samples; the PCD if None.
+    By a parametric bootstrap (Efron 1979) of n pixels with ``totals`` samples, (n,), under a law (None: PCD).
     """
     rng = np.random.default_rng(totals.size)
     some = rng.permutation(totals.size)[:_MOST_DRAWN_AGAIN]
@@ -201,17 +188,14 @@ def shrinkage_bias(posterior: Posterior, totals: NDArray[np.integer], law: Sampl
 
 
 def clipped_mean(values: FloatArray) -> FloatArray:
-    """Return means over the pixels, (n, m) -> (m,), one at least, those far off cut to three deviations."""
+    """Return means over one or more pixels, (n, m) -> (m,), outliers clipped to three deviations."""
     middle = np.median(values, axis=0)
     widest = 3.0 * robust_sd(values, middle, axis=0)
     return np.asarray(np.clip(values, middle - widest, middle + widest).mean(axis=0))
 
 
 def posterior_of_estimates(parameters: FloatArray, covariance: FloatArray) -> Posterior:
-    """Learn the same from estimates (n, 4) with covariances (n, 4, 4), whose errors are taken for Gaussian.
-
-    Pixels without them are drawn like the others; one at least has them.
-    """
+    """Learn the same from estimates (n, 4) with Gaussian errors of covariance (n, 4, 4), some of them NaN."""
     known = np.asarray(np.isfinite(parameters).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
     theta = to_theta(np.where(known[:, None], parameters, 1.0))
     population = _first_guess(theta[known])
@@ -263,10 +247,10 @@ class _Pixels:
 
 @dataclass
 class _Maxima:
-    """The log-likelihood about theta (j, n, 4), shapes (j, n, ...), and each pixel's widening of T.
+    """The log-likelihood about theta (j, n, 4), and each pixel's widening of T.
 
-    ``evidence`` is the logarithm of each pixel's marginal likelihood as of the last solution, shape (n,);
-    ``parabolic`` likelihoods are parabolas everywhere, so that one step arrives.
+    ``evidence`` is the log marginal likelihood of the last solution, shape (n,). ``parabolic`` likelihoods
+    are parabolas everywhere, so that one step arrives.
     """
 
     theta: FloatArray
@@ -311,7 +295,7 @@ class _Maxima:
         return self._among(slice(None), some)
 
     def with_those(self, found: _Maxima, some: NDArray[np.intp]) -> _Maxima:
-        """Return it with what was found for some pixels, if that has all kinds of maxima; changes it."""
+        """Return it with what was found for some pixels, if that has all kinds of maxima; in place."""
         if len(found.theta) == len(self.theta):
             self.theta[:, some] = found.theta
             self.expansion.put((slice(None), some), found.expansion)
@@ -363,10 +347,7 @@ def _climb(pixels: _Pixels, start: _Maxima, population: Population, steps: int) 
 
 
 def _learn(pixels: _Pixels, start: _Maxima, population: Population) -> tuple[_Maxima, Population, float]:
-    """Return maxima, the population that makes the histograms likeliest, and how likely a pixel's is, nats.
-
-    A centre that has an uncertainty stays.
-    """
+    """Return maxima, the likeliest population, and the mean log evidence of a pixel, nats."""
     before = -np.inf
     for _ in range(_ROUNDS):
         maxima = _climb(pixels, start, population, _NEWTON_STEPS)
@@ -380,7 +361,7 @@ def _learn(pixels: _Pixels, start: _Maxima, population: Population) -> tuple[_Ma
 
 
 def _expectation_maximisation(maxima: _Maxima, population: Population) -> Population:
-    """Return centre (unless held) and scatter that maximise the marginal likelihood of the parabolas."""
+    """Maximise the marginal likelihood of the parabolas; a centre that has an uncertainty stays."""
     hold = bool(population.uncertainty.any())
     for _ in range(_EM_STEPS):
         mean, covariance, weight = maxima.solve(population)
@@ -403,7 +384,7 @@ def _expectation_maximisation(maxima: _Maxima, population: Population) -> Popula
 
 
 def _at_least(scatter: FloatArray) -> FloatArray:
-    """Return a scatter with at least the least one along every direction."""
+    """Return a scatter no smaller than the least one along any direction."""
     white = scatter / np.outer(_LEAST_SCATTER, _LEAST_SCATTER)
     sizes, axes = np.linalg.eigh((white + white.T) / 2.0)
     full = (axes * np.maximum(sizes, 1.0)) @ axes.T
@@ -421,9 +402,7 @@ def _inside(theta: FloatArray) -> FloatArray:
 def _seeds(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> list[tuple[FloatArray, Population]]:
     """Return starts of theta (n, 4) and of the population: from the fits, and from all pixels' cumulants.
 
-    Where peaks are hardly resolved the fits of single pixels lead far from the truth, all to the same side.
-    Where they are resolved, but pixels differ widely, or effects are in the law, the cumulants of all do. The
-    fits are taken where they are clearly likelier; a few mistaken pixels need no other start.
+    Fits are biased where peaks are hardly resolved, cumulants where pixels differ widely.
     """
     known = np.asarray(np.isfinite(parameters).all(axis=1))
     mean, k = _cumulants(pixels)
@@ -454,9 +433,8 @@ def _seeds(pixels: _Pixels, parameters: FloatArray, mistaken: float) -> list[tup
 def _centres_of(k: FloatArray) -> FloatArray:
     """Return log H, log 1/g, log sigma_R^2 of pixels that are alike from mean cumulants 2 to 4, DN^j, (b, 3).
 
-    ``k_2 = sigma^2 + H / g^2, k_3 = H / g^3, k_4 = H / g^4``. Of many electrons k_4 says little, and k_2 and
-    k_3 nearly all: then 1/g is what they give at a usual read noise. Both are weighted by their errors, which
-    the scatter of the rows (resamplings of the first) tells.
+    ``k_2 = sigma^2 + H / g^2, k_3 = H / g^3, k_4 = H / g^4``: 1/g is ``k_4 / k_3``, or what k_2 and k_3 give
+    at a usual read noise, weighted by the scatter of each over the rows (resamplings of the first).
     """
     k2, k3, k4 = np.maximum(k, [1e-3, 1e-3, 1e-6]).T
     # from no read noise at all to much
@@ -510,10 +488,7 @@ def _first_guess(theta: FloatArray) -> Population:
 
 
 def _usual(pixels: _Pixels, population: Population) -> FloatArray:
-    """Return theta (n, 4) of the usual pixel, with the exposure that the mean of each asks for.
-
-    Where many samples were replaced the fit of a pixel by itself may be electrons off.
-    """
+    """Return theta (n, 4) of the usual pixel, with the exposure that the mean of each asks for."""
     theta = np.tile(population.centre, (len(pixels.counts), 1))
     electrons = (_cumulants(pixels)[0] - theta[:, 2]) * np.exp(-theta[:, 1])
     theta[:, 0] = np.log(np.maximum(electrons, _LEAST_ELECTRONS))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 
@@ -40,10 +41,9 @@ class Acquisition:
         bit_depth: bits of the ADC.
         integration_time: s.
         other: numbers of the frames of a second part; None: there is none. With one, both are treated as
-            those of the data: all their frames are fitted from nothing, this says which pixels can be used,
-            and each part is observed near that fit. Without one the fits are begun at the truth, which is
-            faster and will do for the difference that an effect makes.
-        parts: of sensor and run of which the leading statistics are looked at apart.
+            the data: all their frames are fitted from nothing, and each part is observed near that fit.
+            Without one the fits are begun at the truth, which is faster.
+        parts: of sensor and run that have leading statistics of their own.
         window: of the sensor that is simulated; None: all of it.
     """
 
@@ -59,10 +59,9 @@ class Acquisition:
     def observe(
         self, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps | None = None
     ) -> Evidence:
-        """Return the evidence of frames, (frame, y, x), DN, with these numbers: of the pixels of near maps.
+        """Return the evidence of frames, (frame, y, x), DN, with these numbers, fitted near maps if any.
 
-        A fit from nothing (``maps`` None) finds a bias that is off by an electron more often than one near
-        the truth: frames and replicates that were not treated alike would differ without any effect.
+        Data and replicates must be treated alike: a fit from nothing finds a wrong bias more often.
         """
         return observe(
             frames,
@@ -78,8 +77,7 @@ class Acquisition:
     ) -> dict[str, float]:
         """Return the statistics of frames with this evidence, those of the parts included, by name."""
         own = frames, numbers, evidence.maps, self.parts
-        apart = part_statistics(*own, block_frames=self.block_frames, window=self.window)
-        return {**evidence.z, **apart}
+        return {**evidence.z, **part_statistics(*own, block_frames=self.block_frames, window=self.window)}
 
 
 @dataclass(frozen=True)
@@ -87,11 +85,10 @@ class Replicate:
     """A stack to simulate from maps and effects, and to observe.
 
     Attributes:
-        key: names it among all others of a run of the workflow.
+        key: unique in a run of the workflow.
         maps: parameters of the pixels.
         effects: of the model, in their order.
         seed: root of its random numbers; equal seeds share them whatever the effects.
-        acquisition: which frames.
     """
 
     key: str
@@ -117,10 +114,6 @@ class Replicate:
         """How often its pixels are fitted."""
         return 1 if self.acquisition.other is None else 3
 
-    def evidence(self) -> tuple[Evidence, ...]:
-        """Simulate, and observe each part."""
-        return tuple(evidence for _, _, evidence in self._observed())
-
     def simulated(self) -> NDArray[np.unsignedinteger]:
         """Return the frames of the first part, (frame, y, x), DN."""
         return simulate_frames(self.maps, self.effects, self.seed, self.acquisition)
@@ -129,17 +122,13 @@ class Replicate:
         """Simulate, and fit the frames of the first part, from nothing, without any effect."""
         return fitted_maps(self.simulated(), ~self.maps.usable)
 
-    def _observed(self) -> Iterator[tuple[NDArray[np.unsignedinteger], IntArray, Evidence]]:
+    def observed(self) -> Iterator[tuple[NDArray[np.unsignedinteger], IntArray, Evidence]]:
         """Simulate; yield the frames of each part, their numbers and their evidence."""
-        taken, start = self.acquisition, self.maps
-        parts: tuple[IntArray, ...] = (taken.numbers,)
-        if taken.other is None:
-            seen = taken.numbers
-            frames = simulate_frames(self.maps, self.effects, self.seed, taken)
-        else:
-            parts, seen = (*parts, taken.other), np.union1d(taken.numbers, taken.other)
-            frames = simulate_frames(self.maps, self.effects, self.seed, replace(taken, numbers=seen))
-            start = fitted_maps(frames, ~self.maps.usable)
+        taken = self.acquisition
+        parts = (taken.numbers,) if taken.other is None else (taken.numbers, taken.other)
+        seen = functools.reduce(np.union1d, parts)
+        frames = simulate_frames(self.maps, self.effects, self.seed, replace(taken, numbers=seen))
+        start = self.maps if taken.other is None else fitted_maps(frames, ~self.maps.usable)
         for numbers in parts:
             some = frames[np.isin(seen, numbers)]
             yield some, numbers, taken.observe(some, numbers, start)
@@ -148,7 +137,7 @@ class Replicate:
         """Simulate, observe, and return the statistics by name, those of the second part behind a mark."""
         return {
             mark + name: float(value)
-            for mark, seen in zip(("", OF_OTHER), self._observed(), strict=False)
+            for mark, seen in zip(("", OF_OTHER), self.observed(), strict=False)
             for name, value in self.acquisition.statistics(*seen).items()
         }
 
@@ -169,10 +158,10 @@ def simulate_frames(
     truth = truth_of(maps)
     out = np.empty((taken.numbers.size, *shape), dn_dtype(taken.bit_depth))
     position = 0
-    for first, last in _runs(taken.numbers):
-        n = last - first
-        out[position : position + n], _ = simulate_block(truth, settings, (first, last), electron_frames=0)
-        position += n
+    for run in np.split(taken.numbers, np.flatnonzero(np.diff(taken.numbers) != 1) + 1):
+        block = int(run[0]), int(run[-1]) + 1
+        out[position : position + run.size], _ = simulate_block(truth, settings, block, electron_frames=0)
+        position += run.size
     return out
 
 
@@ -192,9 +181,3 @@ def truth_of(maps: PixelMaps) -> TruthMaps:
         analog_read_noise_e=analog * values["conversion_gain"],
         defect=np.zeros(maps.usable.shape, np.uint8),
     )
-
-
-def _runs(numbers: IntArray) -> list[tuple[int, int]]:
-    """Return the ranges of consecutive frame numbers, ends excluded."""
-    breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
-    return [(int(run[0]), int(run[-1]) + 1) for run in np.split(numbers, breaks)]

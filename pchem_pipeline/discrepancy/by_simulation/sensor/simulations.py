@@ -36,13 +36,7 @@ from pchem_pipeline.effects.framework.evidence import Evidence
 
 @dataclass
 class Mapped:
-    """The seen frames under a model.
-
-    Attributes:
-        fit: of their pixels.
-        sensor: sensors to draw replicates from.
-        vectors: statistics of the replicates drawn so far.
-    """
+    """The seen frames under a model: the fit of their pixels, and statistics of replicates drawn so far."""
 
     fit: Refit
     sensor: Sensor
@@ -54,12 +48,11 @@ class Simulations:
     """Fits of the seen frames, and stacks simulated from them.
 
     Attributes:
-        observed: the frames.
         mapper: runs the simulated stacks.
         seed: root of all random numbers.
         effort: counts the work.
         given: effects that the model had before the search.
-        known: the models that were mapped of late.
+        known: cache of `mapped`.
     """
 
     observed: ObservedFrames
@@ -121,20 +114,22 @@ class Simulations:
                 sensor = self._learnt(fit, model, sensor.lost)  # the fits of single pixels say little
             elif model != self.given:
                 sensor = sensor.refitted(first.maps, fit.maps)
-            self.known[model] = Mapped(fit, self._corrected(sensor, model) if model else sensor)
+            if model and self.plain.ambiguous <= MANY_MISTAKEN:
+                # simulated with effects and fitted without, sensors must come out as the data do
+                sensor = sensor.corrected(self.plain.maps, self._once("fitted", sensor, model).fitted())
+            self.known[model] = Mapped(fit, sensor)
         return self.known[model]
 
     @functools.cached_property
     def _first(self) -> tuple[Refit, Sensor]:
-        """The fit of the seen frames under the model before the search, and the sensor that both tell."""
+        """The fit of the seen frames under the model before the search, and the sensor learnt from both."""
         fit = self.refit(self.given)
         return fit, self._learnt(fit, self.given)
 
     def _of_replaced(self, fit: Refit, model: tuple[Effect, ...], others: tuple[Effect, ...]) -> Sensor:
         """Return the sensor under a model that replaces samples, ``others`` without the effects that do so.
 
-        What stands in for them is taken from the frames and, once these have told a sensor, from frames
-        drawn of it: in those that are seen it is itself replaced in part.
+        The replacements are in frames drawn of the sensor without: in the seen ones some are replaced, too.
         """
         lost = self._first[1].lost
         before = self._once("before", self._learnt(fit, model, lost), others).simulated()
@@ -147,14 +142,13 @@ class Simulations:
         lost: float | None = None,
         before: NDArray[np.unsignedinteger] | None = None,
     ) -> Sensor:
-        """Return the sensor that the seen frames and their fit under a model tell; see `learn_sensor`."""
+        """Return the sensor learnt from the seen frames and their fit under a model; see `learn_sensor`."""
         self.effort.learn(self.plain.maps.usable.size, fit.components)
-        frames, numbers = self.own_samples(model), self.frames.seen_numbers
-        effects = self.frames.effects(model)
-        return learn_sensor(frames, numbers, fit, effects, self.plain.ambiguous, lost, before)
+        own = self.own_samples(model), self.frames.seen_numbers, fit, self.frames.effects(model)
+        return learn_sensor(*own, self.plain.ambiguous, lost, before)
 
-    def drawn(self, model: tuple[Effect, ...], count: int) -> tuple[Refit, list[Mapping[str, float]]]:
-        """Return the fit of a model and the statistics of so many replicates, drawn where they are new.
+    def drawn(self, model: tuple[Effect, ...], count: int) -> list[Mapping[str, float]]:
+        """Return the statistics of so many replicates of a model, drawn where they are new.
 
         Raises:
             NotFittedError: hardly a pixel can be fitted with the model.
@@ -162,17 +156,11 @@ class Simulations:
         one = self.mapped(model)
         done = len(one.vectors)
         one.vectors += self.replicates(model, one.sensor, "grown", count - done, done)
-        return one.fit, one.vectors[:count]
+        return one.vectors[:count]
 
     def forget(self, model: tuple[Effect, ...]) -> None:
         """Forget all models but one: they are not asked for again."""
         self.known = {one: mapped for one, mapped in self.known.items() if one == model}
-
-    def _corrected(self, sensor: Sensor, model: tuple[Effect, ...]) -> Sensor:
-        """Return sensors that, simulated with effects and fitted without, come out as the data do."""
-        if self.plain.ambiguous > MANY_MISTAKEN:
-            return sensor
-        return sensor.corrected(self.plain.maps, self._once("fitted", sensor, model).fitted())
 
     def _once(self, purpose: str, sensor: Sensor, model: tuple[Effect, ...]) -> Replicate:
         """Return a stack of the seen frames to draw from a sensor once for a purpose, and count it."""
@@ -192,12 +180,10 @@ class Simulations:
         """
         text = "|".join(e.model_dump_json() for e in model)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-        taken, stacks = self.frames.acquisition(as_data=True), range(begin // 2, (begin + count + 1) // 2)
-        seeds = {i: self.seed_of(prefix, i) for i in stacks}
-        tasks = [
-            Replicate(f"{prefix}-null-{digest}-{i}", sensor.draw(seed), model, seed, taken)
-            for i, seed in seeds.items()
-        ]
+        taken, tasks = self.frames.acquisition(as_data=True), list[Replicate]()
+        for i in range(begin // 2, (begin + count + 1) // 2):
+            seed = self.seed_of(prefix, i)
+            tasks.append(Replicate(f"{prefix}-null-{digest}-{i}", sensor.draw(seed), model, seed, taken))
         vectors: list[Mapping[str, float]] = []
         for result in self.counted(tasks):
             if isinstance(result, Exception):

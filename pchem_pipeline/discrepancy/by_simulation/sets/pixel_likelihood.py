@@ -1,13 +1,14 @@
-"""The likelihood of the pixels' histograms, asked where the statistics tell effects badly apart.
+"""The likelihood of the pixels' histograms, asked where the statistics distinguish effects badly.
 
-The statistics of a search are few, and two effects on the law of a sample (a wide tail, a skew) may differ
-little in them. The joint likelihood of the pixels' own parameters and all numbers of such effects holds all
-that the histograms say, for a fraction of the cost of one simulation.
+Two effects on the law of a sample (a wide tail, a skew) may differ little in the statistics of a search. The
+joint likelihood of the pixels' own parameters and all those of such effects holds all that the histograms
+say, for a fraction of the cost of one simulation.
 """
 
 from __future__ import annotations
 
 import copy
+import functools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -65,42 +66,32 @@ class PixelLikelihood:
             present: effects of the model, which act everywhere.
             effort: counts the work.
             pixels: about so many are looked at.
-            defects: effects that failed, and why; more come to them.
+            defects: effects that failed, and why; out.
         """
-        y, x = np.nonzero(maps.usable)
-        some = slice(None, None, max(1, y.size // pixels))
-        histograms = histogram_frames(frames[:, y[some], x[some]][:, None, :])
-        counts = histograms.counts.reshape(-1, histograms.counts.shape[2])
-        self._sets = SetComparison(
-            counts.astype(np.int64),
-            counts.astype(np.int64),
-            histograms.origin.ravel().astype(np.int64),
-            np.ones(counts.shape, np.bool_),
-            tuple(present),
-            np.stack([values[y[some], x[some]] for values in maps.maps], axis=1),
-            effort=effort,
-        )
+        step = max(1, np.count_nonzero(maps.usable) // pixels)
+        y, x = (each[::step] for each in np.nonzero(maps.usable))
+        histograms = histogram_frames(frames[:, y, x][:, None, :])
+        counts = histograms.counts[0].astype(np.int64)
+        origin, start = histograms.origin[0].astype(np.int64), maps.of((y, x)).columns
+        kept = np.ones(counts.shape, np.bool_)
+        self._sets = SetComparison(counts, counts, origin, kept, tuple(present), start, effort=effort)
         self._asked: dict[tuple[frozenset[str], tuple[Effect, ...]], FittedSet | None] = {}
         self._without: dict[tuple[Effect, ...], float] = {}  # log-likelihood, by what is present
-        self._fewer: PixelLikelihood | None = None
         self._defects = {} if defects is None else defects
 
+    @functools.cached_property
     def fewer(self) -> PixelLikelihood:
-        """Return that of a part of these pixels, a first answer for a fraction of the work; itself if few."""
+        """That of a part of these pixels, a first answer for a fraction of the work; itself if few."""
         n = len(self._sets.train)
         if n <= 2 * PROBED:
             return self
-        if self._fewer is None:
-            self._fewer = copy.copy(self)
-            self._fewer._sets = self._sets.of(slice(None, None, n // PROBED), self._sets.start)
-            self._fewer._asked, self._fewer._without = {}, {}
-        return self._fewer
+        found = copy.copy(self)
+        found._sets = self._sets.of(slice(None, None, n // PROBED), self._sets.start)
+        found._asked, found._without = {}, {}
+        return found
 
     def fitted(self, guesses: Sequence[Effect]) -> list[tuple[float, Effect]]:
-        """Return an effect as fitted from several starts, and by how much it is likelier than none, nats.
-
-        The likeliest first; none where no fit holds.
-        """
+        """Return an effect as fitted from several starts, with its gain in nats, the likeliest first."""
         fits: list[tuple[float, Effect]] = []
         for guess in guesses[:MOST_STARTS]:
             one = self._fit([guess], ())
@@ -112,10 +103,9 @@ class PixelLikelihood:
         return sorted(fits, key=lambda fit: -fit[0])
 
     def suggested(self, kinds: Iterable[type[Effect]]) -> list[Effect]:
-        """Return effects that explain much of the histograms, as fitted, the likeliest first.
+        """Return effects that explain much of the histograms, fitted from two strengths, the likeliest first.
 
-        An estimator goes by what an effect does to pixels that are fitted well: where it is so strong that
-        their bias is off by an electron, it may see nothing. Of each kind from two strengths on.
+        An estimator sees nothing of an effect so strong that the bias of the pixels is off by an electron.
         """
         fits: list[tuple[float, Effect]] = []
         for kind in kinds:
@@ -125,58 +115,47 @@ class PixelLikelihood:
             except Exception as error:
                 note_defect(self._defects, tag_of(kind), error)
                 continue
-            rough = self.fewer().fitted(starts)
+            rough = self.fewer.fitted(starts)
             # an effect that explains less in few pixels is not in more of them
             if rough and rough[0][0] > NO_DIFFERENCE:
-                fits += rough[:1] if self.fewer() is self else self.fitted([rough[0][1]])
+                fits += rough[:1] if self.fewer is self else self.fitted([rough[0][1]])
         return [effect for rise, effect in sorted(fits, key=lambda fit: -fit[0]) if rise > _SPEAKS]
 
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-        """Return the effects of a set at the numbers that are likeliest together, where a law tells them."""
-        fit = self._fit_set(hypotheses)
+        """Return the effects of a set at the parameters that are likeliest together, where a law has them."""
+        fit = self._fit_set([h.effect for h in hypotheses])
         if fit is None or any(member.at_limit for member in fit.members):
             return tuple(hypotheses)
         likely = {member.tag: member.effect for member in fit.members}
         return tuple(_at(h, likely[h.tag]) if h.tag in likely else h for h in hypotheses)
 
     def standard_errors(self, hypotheses: Sequence[Hypothesis]) -> dict[str, dict[str, float]]:
-        """Return the standard errors of the fields of a set that a law tells, by tag."""
-        fit = self._fit_set(hypotheses)
+        """Return the standard errors of the fields of a set that a law has, by tag."""
+        fit = self._fit_set([h.effect for h in hypotheses])
         return {} if fit is None else {member.tag: fit.stderr(member) for member in fit.members}
-
-    def _fit_set(self, hypotheses: Sequence[Hypothesis]) -> FittedSet | None:
-        told = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
-        return self._fit_once(
-            told, [h.effect for h in hypotheses if not identifiable_from_histograms(h.effect)]
-        )
 
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
         """Return how far a set is behind another in likelihood, nats, and the standard error (Vuong 1989).
 
-        Each number of an effect costs a nat (Akaike 1974). None where they cannot be fitted.
-
-        Args:
-            one: effects.
-            other: the same but for those that `identifiable_from_histograms`.
+        Each parameter of an effect costs a nat (Akaike 1974). None where they cannot be fitted. They differ
+        in effects that are `identifiable_from_histograms`.
         """
-        besides = [e for e in one if not identifiable_from_histograms(e)]
-        fits = [
-            self._fit_once([e for e in each if identifiable_from_histograms(e)], besides)
-            for each in (one, other)
-        ]
-        if fits[0] is None or fits[1] is None:
+        first, second = self._fit_set(one), self._fit_set(other, one)
+        if first is None or second is None:
             return None
-        rise, error = self._sets.difference(fits[0], fits[1])
-        return rise - (fits[0].fit.shared.size - fits[1].fit.shared.size), error
+        rise, error = self._sets.difference(first, second)
+        return rise - (first.fit.shared.size - second.fit.shared.size), error
 
-    def _fit_once(self, effects: Sequence[Effect], besides: Sequence[Effect]) -> FittedSet | None:
-        """Fit effects from where they are asked about first: other strengths of the same lead to the same."""
-        without = [e.model_dump_json(exclude={e.strength}) for e in effects]
-        asked = frozenset(without), tuple(besides)
+    def _fit_set(self, effects: Sequence[Effect], like: Sequence[Effect] | None = None) -> FittedSet | None:
+        """Fit a set, what is not `identifiable_from_histograms` being as it is there or in another set."""
+        own = [e for e in effects if identifiable_from_histograms(e)]
+        others = effects if like is None else like
+        besides = tuple(e for e in others if not identifiable_from_histograms(e))
+        asked = frozenset(e.model_dump_json(exclude={e.strength}) for e in own), besides
         if asked not in self._asked:
             if len(self._asked) >= _REMEMBERED:
                 del self._asked[next(iter(self._asked))]
-            self._asked[asked] = self._fit(effects, besides)
+            self._asked[asked] = self._fit(own, besides)
         return self._asked[asked]
 
     def _fit(self, effects: Sequence[Effect], besides: Sequence[Effect]) -> FittedSet | None:
@@ -203,19 +182,12 @@ class PixelLikelihood:
 
 @dataclass(frozen=True)
 class HistogramLikelihood:
-    """The likelihood of the pixels where one law holds for all their samples; by default it says nothing.
-
-    Attributes:
-        of: returns it where some effects may be in the samples, of about so many pixels; None: no one law.
-    """
+    """The `PixelLikelihood` beside some effects, of about so many pixels; None where they have no one law."""
 
     of: Callable[[Sequence[Effect], int], PixelLikelihood | None] = lambda effects, pixels: None
 
     def begun(self, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-        """Return a set at its likeliest numbers; see `PixelLikelihood.begun`.
-
-        A number beside the strength stays as it is told here; a few pixels tell it badly.
-        """
+        """Return a set at its likeliest parameters; see `PixelLikelihood.begun`."""
         pixels = self._pixels(hypotheses)
         return tuple(hypotheses) if pixels is None else pixels.begun(hypotheses)
 
@@ -225,10 +197,10 @@ class HistogramLikelihood:
         return {} if pixels is None else pixels.standard_errors(hypotheses)
 
     def _pixels(self, hypotheses: Sequence[Hypothesis]) -> PixelLikelihood | None:
-        """Return the likelihood for a set; None where no law tells anything of it."""
-        told = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
-        number = MANY_PIXELS if any(len(Member.of(e).coordinates) > 1 for e in told) else FEW_PIXELS
-        return self.of([h.effect for h in hypotheses], number) if told else None
+        """Return the likelihood for a set, of few pixels where only strengths are fitted; None: no law."""
+        own = [h.effect for h in hypotheses if identifiable_from_histograms(h.effect)]
+        number = MANY_PIXELS if any(len(Member.of(e).coordinates) > 1 for e in own) else FEW_PIXELS
+        return self.of([h.effect for h in hypotheses], number) if own else None
 
     def behind(self, one: Sequence[Effect], other: Sequence[Effect]) -> tuple[float, float] | None:
         """Return how far a set is behind another by many pixels; see `PixelLikelihood.behind`.
@@ -252,8 +224,8 @@ class Histograms:
         present: effects of the model.
         effort: counts the work.
         samples_of: returns the frames, (frame,), and the pixels, (y, x), of a part.
-        defects: effects that failed, and why; more come to them.
-        told: effects of which the numbers are those that the histograms tell.
+        defects: effects that failed, and why; out.
+        told: effects whose parameters were fitted to the histograms; out.
     """
 
     frames: NDArray[np.unsignedinteger]
@@ -266,12 +238,9 @@ class Histograms:
     _known: dict[Part, PixelLikelihood | None] = field(default_factory=dict, repr=False)
 
     def with_numbers(self, guesses: Sequence[Effect]) -> list[Effect]:
-        """Return guesses with the numbers that histograms tell, the likeliest of an effect in a place first.
+        """Return guesses with parameters fitted to histograms, the likeliest of an effect in a place first.
 
-        Those of effects with a law, by the samples on which they act: a strong effect has moved the pixels
-        from which its estimator takes a strength. Those that give single pixels levels of their own, by these
-        levels. Others, and those that no pixel can be fitted with, stay as they are. Guesses that come to the
-        same are one.
+        Of effects with a law, and of those that give single pixels levels of their own; others stay.
         """
         by_place: dict[Part, dict[str, list[Effect]]] = {}
         for g in guesses:
@@ -279,13 +248,9 @@ class Histograms:
         likely: dict[tuple[str, Part], list[Effect]] = {}
         for place, own in by_place.items():
             anywhere = {tag: [g.at_place(None) for g in there] for tag, there in own.items()}
-            told = {
-                tag: there
-                for tag, there in anywhere.items()
-                if any(identifiable_from_histograms(g) for g in there)
-            }
-            by = self._of(place) if told else None
-            numbers = {} if by is None else _likeliest(by, told)
+            known = {tag: gs for tag, gs in anywhere.items() if any(map(identifiable_from_histograms, gs))}
+            by = self._of(place) if known else None
+            numbers = {} if by is None else _likeliest(by, known)
             levels: dict[str, list[Effect]] = {}
             if (samples := self._samples(place)) is not None:
                 levels = with_satellites(*samples, self.present, anywhere, self.effort, self.defects)
@@ -332,12 +297,8 @@ class Histograms:
 
 
 def _likeliest(by: PixelLikelihood, guesses: Mapping[str, Sequence[Effect]]) -> dict[str, list[Effect]]:
-    """Return the numbers of effects in a place, by tag: as a part of its pixels tells them first.
-
-    As all of them do where an effect comes near the best one; the others are in vain, or beside it, where
-    numbers that were fitted without it say little.
-    """
-    few = by.fewer()
+    """Return effects as fitted to a part of the pixels of a place, by tag; those near the best, to all."""
+    few = by.fewer
     rough = {tag: few.fitted(own) for tag, own in guesses.items()}
     best = max((fits[0][0] for fits in rough.values() if fits), default=0.0)
     found = {}
@@ -358,7 +319,7 @@ def _at(hypothesis: Hypothesis, effect: Effect) -> Hypothesis:
 
 
 def _starts(kind: type[Effect]) -> tuple[Effect, ...]:
-    """Return what is typical of an effect and the same stronger; nothing where no law tells it."""
+    """Return what is typical of an effect and the same stronger; nothing where no law has it."""
     typical = next((e for e in kind.typical() if e.strength and identifiable_from_histograms(e)), None)
     return () if typical is None else (typical, typical.scaled(_STRONG))
 
@@ -391,7 +352,7 @@ def identifiable_from_histograms(effect: Effect) -> bool:
 
 
 def _refuses(error: Exception) -> bool:
-    """Return whether an effect says that its numbers do not go together, or are no law of the pixels."""
+    """Return whether an effect says that its parameters do not go together, or are no law of the pixels."""
     return isinstance(error.__cause__ or error, ValueError | ConfigError)
 
 

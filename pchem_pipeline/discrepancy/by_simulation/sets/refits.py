@@ -1,14 +1,14 @@
 """Sets of effects at their best fit under the law: refit, simulate, compare, correct, until they stop moving.
 
-The fingerprint of an effect is what it does on top of pixels that were fitted without it. A strong effect has
-moved those: their read noise holds a part of what it adds, and the fingerprint extrapolates badly. Here the
-pixels are fitted with the effects in their law, replicates are drawn from that fit, and the strengths are
-corrected by what the replicates leave of the data (indirect inference, Gourieroux, Monfort and Renault 1993,
-by secants): an effect is judged by what is left after its best fit.
+The fingerprint of a strong effect extrapolates badly, since the read noise of the plain fit holds a part of
+it. Here the pixels are fitted with the effects in their law, replicates are drawn from that fit, and the
+strengths are corrected by what the replicates leave of the data (indirect inference, Gourieroux, Monfort and
+Renault 1993, by secants): an effect is judged by what is left after its best fit.
 """
 
 from __future__ import annotations
 
+import contextlib
 import operator
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     correction,
     log_density,
 )
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, Refit
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import Covariance, NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
@@ -63,25 +63,21 @@ class Refitted:
     """A set of effects at strengths for which the refitted model was simulated.
 
     Attributes:
-        hypotheses: the effects, with the shift of the statistics that each has a part in, (m,) each.
+        hypotheses: the effects, with the shift of the statistics that each has a part in.
         stderr: relative standard errors of the factors (of ``strength ** power``), shape (e,).
-        fit: of the pixels with them.
         vectors: statistics of replicates drawn from it, shape (b, m).
         covariance: of the statistics of one split under it.
-        slopes: how the statistics go with the logarithm of each factor, shape (e, m): a quantile of a sum of
-            squares goes as a root of a strong effect, which is less than the shift that it has made.
+        slopes: derivatives of the statistics by the logarithm of each factor, shape (e, m).
         change: logarithms of the factors by which the data ask for more of each, shape (e,).
-        rest: deviations of the data from the mean, with their errors and those allowed to the effects as the
-            unit, shape (m,).
+        rest: deviations of the data from the mean in standard errors, model errors included, shape (m,).
         score: log density of the rest, nats.
-        promise: the same where the strengths are changed as the data ask for, if all goes in proportion.
+        promise: the same after that change, if the statistics are linear.
         chance: the same of a rest that chance leaves.
-        tuned: other numbers of the effects were brought to theirs.
+        tuned: whether other parameters of the effects than strengths were tuned.
     """
 
     hypotheses: tuple[Hypothesis, ...]
     stderr: FloatArray
-    fit: Refit
     vectors: FloatArray
     covariance: Covariance
     slopes: FloatArray
@@ -105,7 +101,7 @@ class Refitted:
     @property
     def words(self) -> str:
         """Tags of the effects."""
-        return " + ".join(h.tag for h in self.hypotheses)
+        return tags_of(self.hypotheses)
 
     @property
     def price(self) -> float:
@@ -135,13 +131,7 @@ class Refitted:
 
 @dataclass
 class DampedSteps(Generic[State]):
-    """The best of several states, and the length of the next step, which a step in vain halves.
-
-    Attributes:
-        best: the state of the highest score so far.
-        score: its log score, nats.
-        length: of the next step, in what the data ask for.
-    """
+    """The state of the highest log score so far, and the length of the next step, which a failure halves."""
 
     best: State
     score: float
@@ -157,28 +147,19 @@ class DampedSteps(Generic[State]):
 
 
 def broyden(slopes: FloatArray, step: FloatArray, unforeseen: FloatArray) -> FloatArray:
-    """Return slopes that account for what a step has done, too (Broyden 1965).
-
-    Args:
-        slopes: of the statistics with each coordinate, shape (e, m).
-        step: of the coordinates, shape (e,).
-        unforeseen: change of the statistics beyond that by these slopes, shape (m,).
-    """
+    """Return slopes (e, m) corrected by the change (m,) beyond them after a step (e,) (Broyden 1965)."""
     return np.asarray(slopes + np.outer(step, unforeseen / float(step @ step)))
 
 
 @dataclass
 class Steps(DampedSteps[Refitted]):
-    """A way to the strengths of a set that explain the data best, as far as it was gone.
-
-    Slopes are those of the last step, and what a set leaves is a matter of chance, too: a step may explain
-    less where the way on explains more, or do a fraction of what it promised, time after time.
+    """The search for the strengths of a set that explain the data best; it may go through a dip of the score.
 
     Attributes:
         now: the set at its last strengths.
         step: that led there, logarithms of factors, shape (e,).
-        gained: by the last step to something better, nats.
-        further: steps that were gone on after one that explains less.
+        gained: nats, by the last improvement.
+        further: steps since the last improvement.
         taken_so_far: steps in all.
     """
 
@@ -219,11 +200,7 @@ class Steps(DampedSteps[Refitted]):
 
 
 def _lengthened(change: FloatArray, step: FloatArray) -> float:
-    """Return by how much the next step is to be longer than the change that is asked for after a step.
-
-    Where each asks for nearly as much as the last one, slopes are too steep: all of them together are a
-    geometric series.
-    """
+    """Return the factor of the next step: where changes shrink slowly, that of their geometric series."""
     ratio = float(change @ step) / max(float(step @ step), 1e-12)
     return 1.0 if ratio < _SLOW else 1.0 / (1.0 - min(ratio, _SLOWEST))
 
@@ -233,37 +210,31 @@ class Refitter:
     """Fits sets of effects to the statistics of the data.
 
     Attributes:
-        draw: refits the pixels with effects beside those of the model, and returns the fit and the statistics
-            of so many replicates of it, which share their random numbers whatever the effects.
+        draw: refits the pixels with effects beside those of the model, and returns the statistics of so many
+            replicates, (b, m), which share their random numbers whatever the effects.
         null: of the model without them.
         target: mean of the statistics of train and test frames, shape (m,).
-        events: see :class:`~pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints.Noise`.
-        present: effects that the model has besides.
-        allow: hears which effects are simulated next, and raises an error where the work is at its limit.
-        defects: effects that failed, and why; more come to them.
+        present: other effects of the model.
+        allow: is given the effects simulated next, and raises an error where the work is at its limit.
+        defects: effects that failed, and why; out.
     """
 
-    draw: Callable[[tuple[Effect, ...], int], tuple[Refit, FloatArray]]
+    draw: Callable[[tuple[Effect, ...], int], FloatArray]
     null: NullModel
     target: FloatArray
-    events: FloatArray
     present: tuple[Effect, ...] = ()
     allow: Callable[[str], None] = lambda _: None
     defects: dict[str, str] = field(default_factory=dict)
 
-    def begin(self, hypotheses: Sequence[Hypothesis], replicates: int = FEW) -> Steps:
+    def begin(self, hypotheses: Sequence[Hypothesis]) -> Steps:
         """Simulate a set at its guessed strengths.
-
-        Args:
-            hypotheses: effects with guessed strengths and what they do there.
-            replicates: at each strength.
 
         Raises:
             NotFittedError: hardly a pixel can be fitted with the set.
             EffortSpentError: the work is at its limit.
         """
-        self.allow(" + ".join(h.tag for h in hypotheses))
-        return Steps.begin(self.simulated(tuple(hypotheses), None, replicates))
+        self.allow(tags_of(hypotheses))
+        return Steps.begin(self.simulated(tuple(hypotheses), None, FEW))
 
     def step(self, way: Steps) -> bool:
         """Simulate a set a step nearer to its best strengths; return whether another step may pay.
@@ -287,18 +258,16 @@ class Refitter:
             now = None  # a step too far
         return way.taken(step, now)
 
-    def refined(self, hypotheses: Sequence[Hypothesis], replicates: int = FEW) -> Refitted:
+    def refined(self, hypotheses: Sequence[Hypothesis]) -> Refitted:
         """Return a set at the strengths that explain the data best, or as near as the work allows.
 
         Raises:
             NotFittedError, EffortSpentError: see `begin`.
         """
-        way = self.begin(hypotheses, replicates)
-        try:
+        way = self.begin(hypotheses)
+        with contextlib.suppress(EffortSpentError):  # what was simulated is not lost
             while self.step(way):
                 pass
-        except EffortSpentError:
-            pass  # what was simulated is not lost
         return way.best
 
     def model(self, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
@@ -328,10 +297,7 @@ class Refitter:
             return self.simulated(one.hypotheses, one, replicates)
 
     def _slopes(self, one: Refitted) -> FloatArray | None:
-        """Return the slopes of effects that are strong, each from a step beside it; None where none is.
-
-        Replicates share their random numbers, whatever the strength: few of them show a slope.
-        """
+        """Return slopes, those of strong effects measured by a step of each alone; None: none is strong."""
         strong = np.max(np.abs(one.parts) / self.null.std, axis=1) > _STRONG
         if not strong.any() or is_expensive(one.effects):
             return None
@@ -358,17 +324,17 @@ class Refitter:
     def measured_slope(
         self, one: Refitted, effects: tuple[Effect, ...], step: float, foreseen: FloatArray | float = 0.0
     ) -> FloatArray | None:
-        """Measure how the statistics go with a number of a set, by a simulation; None: it cannot be fitted.
+        """Return the slope (m,) of the statistics by the logarithm of a parameter of a set, by simulation.
 
         Args:
             one: the set.
-            effects: the same with one number changed.
-            step: by how much the logarithm of it was changed.
+            effects: the same with one parameter changed.
+            step: change of its logarithm.
             foreseen: the slope where the measured one does not differ beyond chance, shape (m,).
         """
         self.allow(one.words)
         try:
-            _, vectors = self.draw(effects, len(one.vectors))
+            vectors = self.draw(effects, len(one.vectors))
         except NotFittedError:
             return None
         apart = (vectors - one.vectors) / step
@@ -394,16 +360,14 @@ class Refitter:
         return little or self.passes_goodness_of_fit(one)
 
     def kept(self, hypotheses: Sequence[Hypothesis]) -> BoolArray:
-        """Return which statistics tell strengths.
-
-        A part was chosen because it stands out: what acts everywhere would come out too strong by it.
-        """
+        """Return which statistics tell strengths: of effects everywhere, not those of conspicuous parts."""
         placed = any(not h.effect.everywhere for h in hypotheses)
         return np.array([placed or "@" not in name for name in self.null.names])
 
     def noise(self, covariance: Covariance, replicates: int) -> Noise:
         """Return the noise of the data less the mean of so many replicates."""
-        return Noise(covariance.times(1.0 / _SPLITS + 1.0 / replicates), _FINE_ERROR, self.events)
+        scale = 1.0 / _SPLITS + 1.0 / replicates
+        return Noise(covariance.times(scale), _FINE_ERROR, self.null.events / _SPLITS)
 
     def scatter(self, covariance: Covariance, replicates: int) -> FloatArray:
         """Return standard deviations of the same, by chance alone, shape (m,)."""
@@ -417,7 +381,7 @@ class Refitter:
         slopes: FloatArray | None = None,
     ) -> Refitted:
         """Simulate effects at their strengths; ``before`` is the same set at other strengths, if known."""
-        fit, vectors = self.draw(tuple(h.effect for h in hypotheses), replicates)
+        vectors = self.draw(tuple(h.effect for h in hypotheses), replicates)
         mean = vectors.mean(axis=0)
         covariance = self._covariance(vectors)
         parts = self._shifts(hypotheses, vectors, covariance)
@@ -426,15 +390,13 @@ class Refitter:
         noise = self.noise(covariance, replicates)
         residual = self.target - mean
         scaling = np.array([bool(h.effect.strength) for h in hypotheses])
-        scatter = None
-        if replicates >= ENOUGH:
-            scatter = (vectors - mean) * np.sqrt(1.0 / _SPLITS + 1.0 / replicates)
         kept = self.kept(hypotheses)
+        scatter = (vectors - mean)[:, kept] * np.sqrt(1.0 / _SPLITS + 1.0 / replicates)
         change, stderr = correction(
             slopes[:, kept],
             residual[kept],
             noise.among(kept).of(lesser(slopes, parts)[:, kept]),
-            None if scatter is None else scatter[:, kept],
+            scatter if replicates >= ENOUGH else None,
         )
         change = np.where(scaling, np.log1p(np.maximum(change, -_LARGEST_SHARE)), 0.0)
         found = tuple(replace(h, fingerprint=part) for h, part in zip(hypotheses, parts, strict=True))
@@ -443,7 +405,6 @@ class Refitter:
         return Refitted(
             found,
             stderr,
-            fit,
             vectors,
             covariance,
             slopes,
@@ -457,15 +418,15 @@ class Refitter:
     def _shifts(
         self, hypotheses: tuple[Hypothesis, ...], vectors: FloatArray, covariance: Covariance
     ) -> FloatArray:
-        """Return by how much each effect has moved the statistics, shape (e, m).
-
-        As foreseen where that is within chance of what all together do: the shift of the refitted model is
-        its own, not that of the fingerprints.
-        """
+        """Return the shifts by each effect, shape (e, m): as foreseen where their sum is so within chance."""
         parts = np.array([h.fingerprint for h in hypotheses])
         error = np.sqrt(covariance.variances * (1.0 / len(vectors) + 1.0 / self.null.n_replicates))
         apart = vectors.mean(axis=0) - self.null.mean - parts.sum(axis=0)
-        return _spread(parts, beyond_chance(apart, error))
+        # shared among the effects by the squares of their shifts
+        weight = parts**2
+        total = weight.sum(axis=0)
+        share = np.where(total > 1e-12, weight / np.maximum(total, 1e-12), 1.0 / len(parts))
+        return np.asarray(parts + share * beyond_chance(apart, error))
 
     def _secants(
         self,
@@ -475,10 +436,9 @@ class Refitter:
         vectors: FloatArray,
         covariance: Covariance,
     ) -> FloatArray:
-        """Return how the statistics go with the logarithm of each factor, shape (e, m).
+        """Return the slopes of the statistics by the logarithms of the factors, shape (e, m), by secants.
 
-        At first in proportion to the shift; from one strength to the next, by a secant (Broyden 1965). What
-        is within chance of what was foreseen is taken as foreseen: a slope that holds the scatter of the
+        What is within chance of what was foreseen is taken as foreseen: a slope that holds the scatter of the
         replicates would be correlated with what they leave, and every strength would come out too low.
         """
         if before is None:
@@ -494,14 +454,16 @@ class Refitter:
         return np.asarray(slope * np.exp(step / 2.0)[:, None])
 
     def _covariance(self, vectors: FloatArray) -> Covariance:
-        """Return the covariance of the statistics: that of the null, and more where they scatter more.
-
-        Statistics that the effects neither move nor widen scatter as they did.
-        """
+        """Return the covariance of the statistics: that of the null, more where effects make them scatter."""
         null = self.null
         ratio = np.maximum(vectors.std(axis=0, ddof=1) / null.std, 1.0)
         ratio[~null.moved_by(vectors)] = 1.0
         return null.covariance.scaled(ratio)
+
+
+def tags_of(hypotheses: Iterable[Hypothesis]) -> str:
+    """Return the tags of a set in one line."""
+    return " + ".join(h.tag for h in hypotheses)
 
 
 def price(effects: Iterable[Effect]) -> float:
@@ -510,12 +472,12 @@ def price(effects: Iterable[Effect]) -> float:
 
 
 def is_expensive(effects: Iterable[Effect]) -> bool:
-    """Return whether a refit with effects takes long: those look for levels or a path in every pixel."""
+    """Return whether a refit with effects takes long: it looks for levels or a path in every pixel."""
     return any(type(effect).random_realisation for effect in effects)
 
 
 def _moved(hypotheses: Sequence[Hypothesis], step: FloatArray) -> tuple[Hypothesis, ...] | None:
-    """Return the hypotheses at other strengths, None where their limits do not let them move."""
+    """Return the hypotheses at other strengths; None where their limits do not let them move."""
     new = tuple(h.times(float(np.exp(s))) for h, s in zip(hypotheses, step, strict=True))
     return None if all(a.effect == b.effect for a, b in zip(new, hypotheses, strict=True)) else new
 
@@ -523,8 +485,7 @@ def _moved(hypotheses: Sequence[Hypothesis], step: FloatArray) -> tuple[Hypothes
 def _error_of_difference(vectors: FloatArray, before: FloatArray, std: FloatArray) -> FloatArray:
     """Return standard errors of the difference of the means of replicates at two strengths, shape (m,).
 
-    They share their random numbers, so that a difference is known far better than either; few of them do not
-    know that well for a single statistic: never below that of most, beside the scatter of each by chance.
+    They share their random numbers; few of them tell the error of one statistic badly: never below the usual.
     """
     if len(vectors) != len(before):
         return np.asarray(std * np.sqrt(1.0 / len(vectors) + 1.0 / len(before)))
@@ -543,22 +504,10 @@ def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:
 
 
 def lesser(slopes: FloatArray, parts: FloatArray) -> FloatArray:
-    """Return of what effects do, and of how that goes with their strengths, the lesser, shape (e, m).
-
-    A share of that is not held against them. An effect near a limit of its strength has slopes far above all
-    that it does: a share of those would be more than a weaker effect beside it does.
-    """
+    """Return the lesser of slopes and shifts, (e, m), of which a share is not held against effects."""
     return np.asarray(np.where(np.abs(slopes) < np.abs(parts), slopes, parts))
 
 
 def beyond_chance(difference: FloatArray, error: FloatArray) -> FloatArray:
     """Return differences of means where they are beyond chance, 0 elsewhere."""
     return np.asarray(np.where(np.abs(difference) > OUTLYING * error, difference, 0.0))
-
-
-def _spread(parts: FloatArray, rest: FloatArray) -> FloatArray:
-    """Give what the parts together do not account for to each, as they have moved a statistic."""
-    weight = parts**2
-    total = weight.sum(axis=0)
-    share = np.where(total > 1e-12, weight / np.maximum(total, 1e-12), 1.0 / len(parts))
-    return np.asarray(parts + share * rest)

@@ -31,9 +31,8 @@ class Contender:
     """An effect that could stand in the place of a chosen one.
 
     Attributes:
-        effect: itself.
         score: log score of the best set with it in that place, relative to the chosen set, nats.
-        stderr: of that score: how far the two predictions lie apart, nats.
+        stderr: of that score, nats.
         probability: among all that could stand there.
     """
 
@@ -45,33 +44,34 @@ class Contender:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Sets at their best fit.
+    """The best set and all, the best first, at their best fit.
 
-    Attributes:
-        chosen: the best.
-        tried: all, the best first.
-        by_histograms: by their tags, how far other sets are behind the chosen one by the likelihood of the
-            pixels' histograms, nats, and the error of that.
+    ``by_histograms`` says how far others (by tags) are behind the chosen one in the likelihood of the
+    histograms, nats, with the error.
     """
 
     chosen: Refitted
     tried: tuple[Refitted, ...]
     by_histograms: Mapping[frozenset[str], tuple[float, float]] = field(default_factory=dict)
 
+    def exchanged(self, added: Hypothesis) -> dict[str, tuple[Effect, Refitted]]:
+        """Return the effects, by tag, in the place of one of the chosen set, each with its best set."""
+        others = self.chosen.tags - {added.tag}
+        found: dict[str, tuple[Effect, Refitted]] = {}
+        for one in self.tried:
+            if others < one.tags and len(one.tags) == len(others) + 1:
+                new = next(h for h in one.hypotheses if h.tag not in others)
+                found.setdefault(new.tag, (new.effect, one))
+        return found
+
     def rivals_of(self, added: Hypothesis) -> tuple[Contender, ...]:
         """Return what could stand in the place of an effect of the chosen set, that one first."""
-        others = self.chosen.tags - {added.tag}
         found: dict[str, Contender] = {}
-        for one in self.tried:
-            new = one.tags - others
-            if not others <= one.tags or len(new) != 1 or new & found.keys():
+        for name, (new, one) in self.exchanged(added).items():
+            effect = added.effect if name == added.tag else new
+            # neither the same effect elsewhere nor what has no name is a rival
+            if name != added.tag and (effect.tag == added.effect.tag or type(effect).empirical):
                 continue
-            [name] = new
-            effect = next(h.effect for h in (added, *one.hypotheses) if h.tag == name)
-            if name != added.tag and effect.tag == added.effect.tag:
-                continue  # the same effect elsewhere
-            if name != added.tag and type(effect).empirical:
-                continue  # what has no name is no rival of a name
             if one.tags in self.by_histograms:
                 behind, error = self.by_histograms[one.tags]
                 # neither need be the very law of the samples
@@ -88,11 +88,7 @@ class Comparison:
 
 
 def chosen(search: Search) -> Comparison | None:
-    """Choose among the sets that were tried; None: none holds.
-
-    The best of which each effect is seen, or where the statistics tell two sets badly apart the one by which
-    the histograms of the pixels are likelier.
-    """
+    """Return the best set of which each effect is seen, or one as good by which histograms are likelier."""
     best = _best_seen(search)
     if best is None:
         return None
@@ -120,7 +116,7 @@ def _best_seen(search: Search) -> Refitted | None:
 def _by_histograms(
     chosen: Refitted, tried: Sequence[Refitted], likelihood: HistogramLikelihood
 ) -> dict[frozenset[str], tuple[float, float]]:
-    """Ask about the sets nearly as good as the chosen one that have another effect in the place of one."""
+    """Compare sets nearly as good as the chosen one that have another effect in the place of one."""
     found: dict[frozenset[str], tuple[float, float]] = {}
     for one in tried:
         swapped = len(one.tags - chosen.tags) == len(chosen.tags - one.tags) == 1
@@ -133,13 +129,7 @@ def _by_histograms(
 
 
 def own_statistics(own: FloatArray, others: FloatArray, noise: FloatArray) -> BoolArray:
-    """Return which statistics an effect moves, and others leave alone, (m,).
-
-    Args:
-        own: what the effect does, shape (m,).
-        others: what the others do, shape (e, m).
-        noise: standard deviations of the statistics with the others, shape (m,).
-    """
+    """Return which statistics an effect moves, (m,), and others, (e, m), leave alone, beyond noise (m,)."""
     touched = np.abs(others).max(axis=0, initial=0.0)
     return np.asarray((np.abs(own) > CLEAR * noise) & (touched < _UNTOUCHED * np.abs(own)))
 
@@ -147,8 +137,8 @@ def own_statistics(own: FloatArray, others: FloatArray, noise: FloatArray) -> Bo
 def _all_seen(search: Search, one: Refitted) -> bool:
     """Test whether each effect of a set is needed beside the best fit of the others.
 
-    Of a set that leaves something each must have a statistic of its own, which stands out without it. Of one
-    that leaves nothing it suffices that without it the set is far behind.
+    Each must have a statistic of its own, which stands out without it. Of a set that leaves nothing it
+    suffices that without it the set is far behind.
     """
     if len(one.tags) == 1:
         # the same effect in two places: without it nothing is left to compare with

@@ -43,6 +43,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.refits import (
     Steps,
     is_expensive,
     price,
+    tags_of,
 )
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
@@ -64,13 +65,9 @@ _MOST_GROWN = {1: 2, 2: 1}
 
 @dataclass(eq=False)
 class Trial:
-    """A set of effects, as far as it was simulated.
+    """A set of effects as proposed, the log score that their fingerprints promise, and its simulations.
 
-    Attributes:
-        members: the effects as proposed.
-        foreseen: log score that their fingerprints promise, nats.
-        way: to its best strengths, as far as it was gone; None: not simulated.
-        ended: whether no further step pays.
+    ``way`` has the steps to its best strengths (None: not simulated); ``ended``: no further step pays.
     """
 
     members: tuple[Hypothesis, ...]
@@ -108,9 +105,8 @@ class Search:
     """Sets of effects that are tried.
 
     Attributes:
-        refitter: simulates them.
         likelihood: of the pixels' histograms, which brings a set near its best.
-        trials: all of them.
+        trials: all sets.
         limit: what was next when the budget was used; None: it is not.
         rejected: sets that are not established.
         report: is given the tags of the best set after each step.
@@ -153,15 +149,12 @@ class Search:
             self.trials.append(Trial(tuple(members), self._foreseen(members)))
 
     def _trial_of(self, members: Sequence[Hypothesis]) -> Trial | None:
-        """Return the trial of the same effects at whatever strengths; None: there is none."""
+        """Return the trial of the same effects at any strengths, if there is one."""
         kinds = {h.kind for h in members}
         return next((each for each in self.trials if {h.kind for h in each.members} == kinds), None)
 
     def compare(self, sets: Iterable[Sequence[Hypothesis]]) -> None:
-        """Simulate sets, the most promising one a step further each time, until none is open.
-
-        Then the best one without some of its effects, and with other numbers.
-        """
+        """Simulate sets, the most promising one a step further each time, then simplify and tune the best."""
         for members in sets:
             self.add(members)
         while self.limit is None and (left := [trial for trial in self.trials if self._is_open(trial)]):
@@ -178,8 +171,7 @@ class Search:
         """Simulate a trial a step further."""
         try:
             if trial.way is None:
-                begun = self._started(trial.members)
-                trial.way = self.refitter.begin(self.likelihood.begun(begun))
+                trial.way = self.refitter.begin(self.likelihood.begun(self._started(trial.members)))
             else:
                 trial.ended = not self.refitter.step(trial.way)
         except EffortSpentError as spent:
@@ -188,44 +180,31 @@ class Search:
             trial.ended = True
         # an effect of a plug-in may raise anything: the others are compared all the same
         except Exception as error:
-            note_defect(self.refitter.defects, " + ".join(h.tag for h in trial.members), error)
+            note_defect(self.refitter.defects, tags_of(trial.members), error)
             trial.ended = True
         if self.best is not None:
-            self.report(" + ".join(h.tag for h in self.best.hypotheses))
+            self.report(self.best.words)
 
     def settle(self, trial: Trial, least: float = -np.inf) -> Refitted | None:
-        """Simulate a trial to its best strengths; None where it cannot be fitted.
-
-        Or until it cannot come to ``least`` nats, less the price of its effects.
-        """
+        """Simulate a trial to its best strengths, or until it cannot reach ``least`` nats; None: no fit."""
         while not trial.ended and _may_reach(trial, least):
             self.advance(trial)
         return None if trial.way is None else trial.way.best
 
     def at_best_fit(self, members: Sequence[Hypothesis], least: float = -np.inf) -> Refitted | None:
-        """Return a set of some effects at its best fit, at numbers of its own where these were tuned.
-
-        Or at strengths from where it cannot come to ``least`` nats, less the price of its effects.
-        """
+        """Return some effects at their best fit, tuned if that was done; see `settle` for ``least``."""
         tags = {h.tag for h in members}
-        tuned = next(
-            (
-                one
-                for one in sorted(self.tried, key=PENALISED, reverse=True)
-                if one.tuned and one.tags == tags
-            ),
-            None,
-        )
-        if tuned is not None:
-            return tuned
+        known = [one for one in self.tried if one.tuned and one.tags == tags]
+        if known:
+            return max(known, key=PENALISED)
         self.add(members)
         trial = self._trial_of(members)
         return None if trial is None else self.settle(trial, least)
 
     def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]]) -> None:
-        """Measure what is left without effects, then beside the best set; at the limit some is left out.
+        """Measure what is left without effects, then beside the best set, as far as the limit allows.
 
-        Unless that leaves nothing at no higher price than that of one measured part beside the same effects.
+        Unless that leaves nothing at no higher price than one measured part beside the same effects.
         """
         kept = () if self.best is None else self.best.hypotheses
         for beside in dict.fromkeys(((), kept)):
@@ -241,7 +220,7 @@ class Search:
                 self.limit = self.limit or spent
 
     def tune(self) -> None:
-        """Tune the numbers of the best set where it leaves something, then of those as good until then."""
+        """Tune the parameters of the best set where it leaves something, then of those as good until then."""
         gained = 0.0
         while (best := self.best) is not None and not self.complete:
             near = best.penalised_log_likelihood - gained
@@ -251,11 +230,11 @@ class Search:
             gained = max(gained, self._tune(max(close, key=PENALISED)))
 
     def _untuned(self, one: Refitted) -> bool:
-        """Test whether what a set leaves asks for other numbers, which were not sought yet."""
+        """Test whether what a set leaves asks for other parameters, and these were not tuned yet."""
         return one.tags not in self._tuned and may_be_tuned(self.refitter, one)
 
     def _tune(self, one: Refitted) -> float:
-        """Tune the numbers of a set; return the nats that it gained."""
+        """Tune the parameters of a set; return the nats that it gained."""
         self._tuned.add(one.tags)
         try:
             better = tuned(self.refitter, one)
@@ -270,9 +249,8 @@ class Search:
     def eliminate(self) -> None:
         """Try the best set without each of its effects, the weakest first, as long as that is better.
 
-        The others may have come in for wrong numbers of one that stays: these are tuned without them.
-        Where the set leaves something, only without those of which its best fit leaves no more than their
-        error.
+        The parameters of those that stay are tuned. Where the set leaves something, only effects not beyond
+        their error are left out.
         """
         best, scale = self.best, self.refitter.null.std
         if best is None or len(best.hypotheses) < 2 or self.limit is not None:
@@ -309,10 +287,7 @@ class Search:
         return fit_set(members, shift, noise).log_score(shift, noise)
 
     def _is_blind(self, members: Sequence[Hypothesis], best: Refitted) -> bool:
-        """Test whether a statistic stands out that a set hardly moves: a refit does not change that.
-
-        By the errors under the best set: an effect may scatter what it does not shift.
-        """
+        """Test whether a statistic stands out, by its error under the best set, that a set hardly moves."""
         shift = self.refitter.target - self.refitter.null.mean
         noise = replace(self.refitter.noise(best.covariance, len(best.vectors)), model_error=LOOSE)
         parts = fit_set(members, shift, noise).parts
@@ -320,10 +295,7 @@ class Search:
         return bool((left[np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift)] > CERTAIN).any())
 
     def _started(self, members: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-        """Return effects as the best trials have them that are a part of the set, or differ in one effect.
-
-        A strong effect alone is nearer to its strength in the set than its fingerprint can tell.
-        """
+        """Return effects at their strengths in the best trials of a part of the set, or with one other."""
         if len(members) == 1:
             return tuple(members)
         tags, common = {h.tag for h in members}, max(2, len(members) - 1)
@@ -354,10 +326,10 @@ def compare(
     """Try effects and sets, then with one effect more or fewer, as long as the best one becomes better.
 
     Args:
-        search: out: all that was tried.
+        search: all that was tried; out.
         hypotheses: all, the likeliest first.
         sets: of them, the likeliest by their fingerprints first.
-        beside: returns sets of new hypotheses by what they do beside a refitted set, the likeliest first.
+        beside: returns the likeliest sets of new hypotheses beside a refitted set.
         measured: measures what effects leave, and yields them with it at their best fit.
         rounds: of sets, at most.
     """
@@ -387,10 +359,7 @@ def _singles(hypotheses: Sequence[Hypothesis], best: Sequence[Hypothesis]) -> li
 
 
 def _grown(search: Search, beside: Callable[[Refitted], Sequence[SetFit]]) -> list[tuple[Hypothesis, ...]]:
-    """Return sets that hold one of the best so far and what stands out beside it.
-
-    One that is strong hides or distorts what the frames show of the others.
-    """
+    """Return sets that hold one of the best so far and what stands out beside it."""
     seeds: list[Refitted] = []
     for one in sorted(search.tried, key=PENALISED, reverse=True):
         best = seeds[0] if seeds else one
@@ -415,6 +384,6 @@ def _of_different_effects(sets: Iterable[tuple[Hypothesis, ...]]) -> list[tuple[
 
 
 def vanished(one: Refitted) -> set[str]:
-    """Return the tags of the effects of a set of which its best fit leaves no more than their error."""
+    """Return the tags of the effects of a set that are not beyond their error at its best fit."""
     gone = np.exp(one.change) < ESTABLISHED * one.stderr
     return {h.tag for h, is_gone in zip(one.hypotheses, gone, strict=True) if is_gone and h.effect.strength}

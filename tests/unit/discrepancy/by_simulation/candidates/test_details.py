@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -58,13 +56,13 @@ class World:
         self.parts = [mean + rng.standard_normal(M) for _ in range(2)]
         self.drawn = 0
 
-    def draw(self, effects: tuple[Effect, ...], count: int) -> tuple[Any, np.ndarray]:
+    def draw(self, effects: tuple[Effect, ...], count: int) -> np.ndarray:
         self.drawn += 1
         vectors = statistics(effects) + np.random.default_rng(7).standard_normal((count, M))
-        return SimpleNamespace(moved={}), vectors
+        return vectors
 
     def refitter(self) -> Refitter:
-        return Refitter(self.draw, self.null, (self.parts[0] + self.parts[1]) / 2.0, np.zeros(M))
+        return Refitter(self.draw, self.null, (self.parts[0] + self.parts[1]) / 2.0)
 
     def likely(self, hypotheses: list[Hypothesis]) -> list[SetFit]:
         refitter = self.refitter()
@@ -107,7 +105,7 @@ def test_standard_errors_are_those_of_a_fit_of_all_numbers_together() -> None:
         assert found[name] == pytest.approx(relative * getattr(taken, name), rel=0.25)
     alone = taken.fraction / np.linalg.norm(slopes[0] / noise)
     assert found["fraction"] > 1.5 * alone
-    [blind] = standard_errors(replace(world.refitter(), draw=lambda *_: (None, one.vectors)), one, np.ones(1))
+    [blind] = standard_errors(replace(world.refitter(), draw=lambda *_: one.vectors), one, np.ones(1))
     assert blind == {"fraction": pytest.approx(taken.fraction)}
 
 

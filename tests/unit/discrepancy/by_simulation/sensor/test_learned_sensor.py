@@ -246,7 +246,7 @@ def test_a_replicate_mistakes_as_many_biases_as_the_frames_do():
     truth = truth_of(maps).bias
 
     def mistaken(taken, seed):
-        found = Replicate("x", maps, (), seed, taken).evidence()[0].maps
+        found = next(Replicate("x", maps, (), seed, taken).observed())[2].maps
         return np.mean(np.abs(found.bias - truth)[found.usable] > 0.5 * 11)
 
     assert mistaken(known, 1) < 0.005

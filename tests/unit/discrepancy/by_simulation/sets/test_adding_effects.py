@@ -87,15 +87,15 @@ class World:
         mean = statistics(truth)
         self.z = Measured(*(mean + self.rng.standard_normal(M) for _ in range(3)))
 
-    def draw(self, effects: tuple[Effect, ...], count: int) -> tuple[Any, np.ndarray]:
+    def draw(self, effects: tuple[Effect, ...], count: int) -> np.ndarray:
         if self.unfit(effects):
             raise NotFittedError("hardly a pixel can be fitted with it")
         self.drawn += count
         vectors = statistics(effects) + np.random.default_rng(7).standard_normal((count, M))
-        return SimpleNamespace(moved={}), vectors
+        return vectors
 
     def refitter(self) -> Refitter:
-        return Refitter(self.draw, self.null, self.z.both, np.zeros(M))
+        return Refitter(self.draw, self.null, self.z.both)
 
     def likely(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> list[SetFit]:
         noise = self.refitter().noise(self.null.covariance, 40)
@@ -167,9 +167,9 @@ def test_slopes_that_are_too_steep_cost_few_steps(monkeypatch: pytest.MonkeyPatc
         way = np.log(factor(effects[0]) / best) if effects else -50.0
         return (np.arange(M) >= M // 2) * (40.0 + 3.0 * way) * (way > -50.0)
 
-    def draw(effects: tuple[Effect, ...], count: int) -> tuple[Any, np.ndarray]:
+    def draw(effects: tuple[Effect, ...], count: int) -> np.ndarray:
         world.drawn += count
-        return SimpleNamespace(moved={}), weak(effects) + world.rng.standard_normal((count, M))
+        return weak(effects) + world.rng.standard_normal((count, M))
 
     monkeypatch.setitem(globals(), "statistics", weak)
     world = World([effect("row_noise", 0.1)])
