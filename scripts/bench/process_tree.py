@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,12 +40,22 @@ class Took:
     largest: float
 
 
-def run_measured(command: Sequence[str], folder: Path | None = None) -> Took:
-    """Run a command to its end and return what it took."""
+def run_measured(
+    command: Sequence[str],
+    folder: Path | None = None,
+    environment: Mapping[str, str] | None = None,
+    *,
+    must_succeed: bool = False,
+) -> Took:
+    """Run a command to its end and return what it took.
+
+    Raises:
+        SystemExit: the command failed, and ``must_succeed``.
+    """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.perf_counter()
     process = subprocess.Popen(
-        command, cwd=folder, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        command, cwd=folder, env=environment, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     )
     highest = [0, 0]
     ended = threading.Event()
@@ -57,6 +67,8 @@ def run_measured(command: Sequence[str], folder: Path | None = None) -> Took:
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     wall = time.perf_counter() - start
+    if must_succeed and process.returncode:
+        raise SystemExit(f"{' '.join(command)} in {folder or Path.cwd()}:\n{words[-2000:]}")
     return Took(process.returncode, words[-2000:], wall, cpu, highest[0] / 1024, highest[1] / 1024)
 
 

@@ -23,12 +23,12 @@ import time
 from collections import Counter, defaultdict
 from pathlib import Path
 
-from kills import PCHEM, differences, results
+from kills import differences, results
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from helpers.cluster import cluster_processes, signal_group
-from running import STAGES, machine, write_stack
+from running import PCHEM, STAGES, machine, stage_records, write_stack
 
 from pchem_pipeline.compute.environment import prepare_environment
 
@@ -207,12 +207,6 @@ def show(watch: Watch, reads: Path, size: int) -> float:
     return sum(noted.values()) / size
 
 
-def seconds(store: Path) -> list[float]:
-    """Return the wall time of each stage."""
-    folder = store / ".pchem" / "stages"
-    return [json.loads((folder / f"{name}.json").read_text())["seconds"] for name in STAGES]
-
-
 def main() -> int:
     prepare_environment()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -235,8 +229,9 @@ def main() -> int:
         times = show(watch, folder / "reads", size)
         alone = sum(bytes_read(folder / "reads alone").values()) / size
         print(f"{'stage':<12}{'threads, s':>12}{'cluster, s':>12}")
-        for name, one, other in zip(STAGES, seconds(plain), seconds(store), strict=True):
-            print(f"{name:<12}{one:>12.1f}{other:>12.1f}")
+        records = stage_records(plain), stage_records(store)
+        for name in STAGES:
+            print(f"{name:<12}" + "".join(f"{each[name]['seconds']:>12.1f}" for each in records))
         expected = results(plain)
         wrong = differences(results(store), expected)
         print(f"{tiles} tiles, {len(expected)} results compared, different: {', '.join(wrong) or 'none'}")
