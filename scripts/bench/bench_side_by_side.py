@@ -103,13 +103,13 @@ def dask_histograms(frames: NDArray[np.uint16], rows: int) -> float:
 
 def optimisers(counts: NDArray[np.uint16], origin: NDArray[np.int32]) -> dict[str, float]:
     """Return the CPU seconds a pixel of general optimisers on histograms, from the same starts as ours."""
-    from bench_fit import Pixels, cpu, scipy_fit
+    from bench_fit import Drawn, cpu, scipy_fit
 
     from pchem_pipeline.model.fit.starts import starting_points
     from pchem_pipeline.model.law.pcd import log_pcd
 
-    pixels = Pixels(counts, origin.astype(np.int64), np.ones((len(counts), 4)))
-    scipy_fit(Pixels(counts[:1], pixels.origin[:1], np.ones((1, 4))))  # imports its libraries
+    pixels = Drawn(counts, origin.astype(np.int64), np.ones((len(counts), 4)))
+    scipy_fit(Drawn(*(each[:1] for each in pixels)))  # imports its libraries
     found = {"scipy L-BFGS-B on histograms": cpu(lambda: scipy_fit(pixels)) / len(counts)}
     try:
         from iminuit import Minuit
