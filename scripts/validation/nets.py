@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -25,7 +26,7 @@ import time
 import tomllib
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,13 +41,6 @@ Array = NDArray[Any]
 SPECTRA = sorted((Path(__file__).parents[2] / "tests" / "data" / "sipm").glob("*.csv"))
 PAGES = ("report.json", "discrepancy.json", "methods.json")
 
-#: Names that arrays got since the first net: old name, or its beginning, to what may stand in its place.
-RENAMED: Mapping[str, tuple[str, ...]] = {
-    "joint/": ("samples/", "fit/", "maps/"),
-    "fit/lobe_": ("fit/satellite_",),
-    "discrepancy/code_grown": ("discrepancy/code_extended",),
-    "maps/dark_current": ("maps/charge_rate",),
-}
 #: Not compared: what a kill-safe run notes for itself, and how many steps a fit took.
 NO_RESULT = ("n_iterations", "ensemble_tiles/", "summary/open_")
 
@@ -311,34 +305,27 @@ class Comparison:
 
     def nets(self, old: Path, new: Path) -> None:
         """Compare all files of two nets."""
-        for path in sorted(old.glob("*.npz")):
+        for path in (*sorted(old.glob("*.npz")), *sorted(old.glob("*.json"))):
             other = new / path.name
             if not other.exists():
                 self.say(path.name, "missing", wrong=True)
-                continue
-            with np.load(path) as left, np.load(other) as right:
-                self.run(path.stem, dict(left), dict(right))
-        for path in sorted(old.glob("*.json")):
-            other = new / path.name
-            if not other.exists():
-                self.say(path.name, "missing", wrong=True)
-                continue
-            self.page(path.name, json.loads(path.read_text()), json.loads(other.read_text()))
+            elif path.suffix == ".json":
+                self.page(path.name, json.loads(path.read_text()), json.loads(other.read_text()))
+            else:
+                with np.load(path) as left, np.load(other) as right:
+                    self.run(path.stem, dict(left), dict(right))
         if self.words > self.allowed_words:
             self.wrong.append(f"{self.words} status words differ")
 
     def run(self, run: str, old: dict[str, Array], new: dict[str, Array]) -> None:
         """Compare the arrays of one run."""
-        equal, seen = 0, set()
+        equal = 0
         rose = self.likelihood(run, old, new)
         for name, left in old.items():
-            found = counterpart(name, new)
-            if found is None:
+            right = new.get(name)
+            if right is None:
                 self.say(f"{run}:{name}", "missing", wrong=not skipped(name))
-                continue
-            seen.add(found)
-            right = new[found].reshape(left.shape) if new[found].size == left.size else new[found]
-            if left.shape != right.shape:
+            elif left.shape != right.shape:
                 self.say(f"{run}:{name}", f"shape {left.shape} is now {right.shape}", wrong=not skipped(name))
             elif left.tobytes() == right.tobytes() or np.array_equal(left, right, equal_nan=is_float(left)):
                 equal += 1
@@ -348,35 +335,30 @@ class Comparison:
                 self.parameter(f"{run}:{name}", left, right, old[f"{name}_stderr"], rose)
             else:
                 self.say(f"{run}:{name}", difference(left, right))
-        more = Counter(name.split("/")[0] for name in new.keys() - seen)
+        more = Counter(name.split("/")[0] for name in new.keys() - old.keys())
         added = ", ".join(f"{n} in {group}" for group, n in sorted(more.items())) or "none"
         print(f"  {run}: {equal} of {len(old)} arrays are equal to the bit; new: {added}")
 
     def likelihood(self, run: str, old: dict[str, Array], new: dict[str, Array]) -> Array | None:
         """Compare log-likelihoods; return where they rose, (y, x)."""
-        rose = None
-        for name in ("fit/log_likelihood", "joint/log_likelihood"):
-            found = counterpart(name, new)
-            if name not in old or found is None:
-                continue
-            change = new[found] - old[name]
-            with np.errstate(invalid="ignore"):
-                lower = change < -LOWER * np.abs(old[name])
-                rose = change > HIGHER
-            bias = "maps/bias" if "maps/bias" in old else "fit/bias"  # a net may end with the fit
-            nothing = lower & np.isnan(old[bias]) & np.isnan(new[bias])
-            if nothing.any():
-                words = f"lower in {int(nothing.sum())} pixels without a value before and after"
-                self.say(f"{run}:{name}", f"{words}: {places(nothing)}")
-            lower &= ~nothing
-            if lower.any():
-                worst = np.nanmin(change)
-                words = f"lower in {int(lower.sum())} pixels, by up to {-worst:.3g} nats: {places(lower)}"
-                self.say(f"{run}:{name}", words, wrong=True)
-            if rose.any():
-                best = np.nanmax(change)
-                words = f"higher in {int(rose.sum())} pixels, by up to {best:.3g} nats: {places(rose)}"
-                self.say(f"{run}:{name}", words)
+        name = "fit/log_likelihood"
+        if name not in old or name not in new:
+            return None
+        change = new[name] - old[name]
+        with np.errstate(invalid="ignore"):
+            lower = change < -LOWER * np.abs(old[name])
+            rose = np.asarray(change > HIGHER)
+        bias = "maps/bias" if "maps/bias" in old else "fit/bias"  # a net may end with the fit
+        nothing = lower & np.isnan(old[bias]) & np.isnan(new[bias])
+        lower &= ~nothing
+        for where, words in (
+            (nothing, "lower in {} pixels without a value before and after"),
+            (lower, f"lower in {{}} pixels, by up to {-np.nanmin(change, initial=0.0):.3g} nats"),
+            (rose, f"higher in {{}} pixels, by up to {np.nanmax(change, initial=0.0):.3g} nats"),
+        ):
+            if where.any():
+                text = f"{words.format(int(where.sum()))}: {places(where)}"
+                self.say(f"{run}:{name}", text, wrong=where is lower)
         return rose
 
     def status(self, where: str, old: Array, new: Array) -> None:
@@ -445,18 +427,6 @@ class Comparison:
             self.say(name, words, wrong=abs(now - gap[end]) > 0.1 * (high - low))
 
 
-def counterpart(name: str, arrays: Mapping[str, Array]) -> str | None:
-    """Return the name that an array of the old net has in the new one."""
-    if name in arrays:
-        return name
-    for old, candidates in RENAMED.items():
-        if name.startswith(old):
-            for each in candidates:
-                if each + name.removeprefix(old) in arrays:
-                    return each + name.removeprefix(old)
-    return None
-
-
 def skipped(name: str) -> bool:
     """Tell whether an array is no result."""
     return any(part in name for part in NO_RESULT)
@@ -464,20 +434,8 @@ def skipped(name: str) -> bool:
 
 def volatile(key: str) -> bool:
     """Tell whether an entry of a page changes from run to run or with every version."""
-    parts = (
-        "seconds",
-        "version",
-        "time",
-        "digest",
-        "path",
-        "environment",
-        "sentence",
-        "host",
-        "made",
-        "started",
-        "memory",
-    )
-    return any(part in key.lower() for part in parts)
+    parts = r"seconds|version|time|digest|path|environment|sentence|host|made|started|memory"
+    return re.search(parts, key, re.I) is not None
 
 
 def is_float(array: Array) -> bool:
@@ -522,7 +480,6 @@ def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def main() -> None:
-    """Freeze or compare."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
     freezing = commands.add_parser("freeze", help="do all runs and keep what they find")
