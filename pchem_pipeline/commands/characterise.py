@@ -115,11 +115,7 @@ def fit_counts(counts: NDArray[Any], origin: NDArray[Any] | int = 0, **options: 
 
 
 def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mapping[str, Any]]) -> Target:
-    """Return the run, its YAML beside the store.
-
-    Raises:
-        ConfigError: a setting is wrong, or the YAML is there with others.
-    """
+    """Return the run, its YAML beside the store; raise ConfigError where that has other settings."""
     path = settings_of(place)
     content: dict[str, Any] = {name: dict(section) for name, section in settings.items()}
     content["run"] = {**content.get("run", {}), "store": place.name}

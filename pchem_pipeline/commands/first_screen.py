@@ -34,13 +34,7 @@ def run_to_first_screen(
 
     Answers that are serious are one line of warning, also where the command is quiet.
 
-    Args:
-        target: the run.
-        stages: stages to run, in order; without the report only the store is printed.
-        command: what the command line asked for.
-        say: writes a line of results.
-        is_new: whether the YAML of the run is to be written first.
-        strict: answers that are serious are an error.
+    Without the stage ``report`` only the store is printed. Of a new run the YAML is written first.
 
     Raises:
         NotBelievedError: ``strict``, and an answer is serious.
@@ -93,12 +87,7 @@ def typed(target: Target) -> str:
 
 
 def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
-    """Return the first screen of a report as lines of text.
-
-    Args:
-        numbers: content of ``report.json``.
-        run: the run, as it is typed in a command.
-    """
+    """Return the first screen of a report, of ``report.json``, as lines; ``run``: its name in commands."""
     lines = [""]
     for answer in numbers["answers"]:
         lines.append(f"{answer['question']} {answer['word']}.")
@@ -108,8 +97,8 @@ def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
     shown = " ".join(answer["text"] for answer in numbers["answers"] if not answer["criteria"])
     for flag in numbers["flags"]:
         level = flag["level"]
-        told = level in ("serious", "caution") or (level == "note" and flag["about"] == "sensor")
-        if told and flag["text"] not in shown:
+        listed = level in ("serious", "caution") or (level == "note" and flag["about"] == "sensor")
+        if listed and flag["text"] not in shown:
             lines += _wrapped(f"{level.capitalize()}: {flag['text']}", "  ", "")
     lines.append("")
     for i, step in enumerate(numbers["next"]):

@@ -16,12 +16,7 @@ from pchem_pipeline.runner.session import run_status
 
 
 def rows(states: Sequence[StageState], progress: Mapping[str, Any] | None) -> list[str]:
-    """Return a line for each stage, and where a command works on one, how fast.
-
-    Args:
-        states: of the stages, in order.
-        progress: progress of that command, or None.
-    """
+    """Return a line for each stage, with the progress of a command that works on one."""
     label = "" if progress is None else one_line(str(progress.get("stage", "")))
     running = label.partition(":")[0]
     lines = []
@@ -81,14 +76,14 @@ def watch(
     terminal: bool = False,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Return how far a run is.
+    """Write how far a run is.
 
     Args:
         target: the run.
         write: takes a text of whole lines, the last without its end.
-        follow: go on until no command works on the run; Ctrl-C ends it, too.
+        follow: continue until no command works on the run; Ctrl-C ends it, too.
         as_json: JSON lines instead of rows.
-        terminal: rows may be drawn over; else only those that changed are written.
+        terminal: rows are drawn over; else only those that changed are written.
         sleep: waits between two looks.
     """
     shown: list[str] = []

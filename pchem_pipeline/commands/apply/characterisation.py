@@ -49,13 +49,13 @@ def read_calibration(
     extra_variance: FloatArray | None = None,
     limits: tuple[int | None, int | None] = (None, None),
 ) -> Calibration:
-    """Return the calibration of some rows.
+    """Return the calibration of some rows of a run.
 
     Args:
         store: the run.
         rows: of the sensor.
-        removed: tags of effects that the frames no longer have.
-        extra_variance: of what took them away, DN^2, of these rows (y, x); None: none.
+        removed: tags of effects whose offsets are subtracted from the frames.
+        extra_variance: of these offsets' estimates, DN^2, (y, x).
         limits: first and last code of the samples, DN; None: not known.
     """
     region = (rows, slice(None))
@@ -97,12 +97,7 @@ def doubtful_pixels(
     return np.asarray(loose & calibration.usable)
 
 
-def write_moments(
-    run: RunStore,
-    output: RunStore,
-    rows: slice,
-    settings: FitSettings,
-) -> None:
+def write_moments(run: RunStore, output: RunStore, rows: slice, settings: FitSettings) -> None:
     """Write the errors of g, mu and sigma of some rows, of doubtful pixels by their likelihood.
 
     Where peaks are apart its maxima are narrow, an electron from each other, and of one gain and read noise:

@@ -197,20 +197,14 @@ def convert_piece(piece: Piece, output: RunStore, *, job: Job) -> None:
 
 @dataclass(frozen=True)
 class _Tables:
-    """Electron numbers of the codes of some rows.
-
-    Attributes:
-        known: the pixels.
-        prior: exposure that is expected, e-, (y, x); None: none.
-        right_bias: probability that the bias is right, (y, x): one that is an electron off makes nearly all
-            numbers wrong.
-        tables: of the codes that occur.
-    """
+    """Electron numbers of the codes of some rows."""
 
     known: KnownPixels
-    prior: Any
-    right_bias: Any
-    tables: NumberTables
+    prior: Any  # expected exposure, e-, (y, x); or None
+    right_bias: (
+        Any  # probability of the right bias, (y, x): one an electron off makes nearly all numbers wrong
+    )
+    tables: NumberTables  # of the codes that occur
 
     def numbers(self, frames: NDArray[Any], codes: NDArray[Any], job: Job) -> Numbers:
         """Return the numbers of samples (frame, y, x), given with their codes.

@@ -52,15 +52,15 @@ def identity_of(store: RunStore, digest: str) -> str:
 def history_row(
     run: RunFacts, store: RunStore, states: PixelStates, label: str, folder: Path, pair: Pair | None
 ) -> HistoryRow:
-    """Return the line of a run in the history.
+    """Return the line of a run in the history of a folder.
 
     Args:
         run: the run.
-        store: of it.
-        states: of its pixels.
+        store: its store.
+        states: its pixels.
         label: of the run; empty: its date.
         folder: of the history.
-        pair: how it differs from the reference; None: it is the reference.
+        pair: the differences from the reference; None: it is the reference.
     """
     camera = SensorInfo.read(store).camera
     date = _date(store, camera)
