@@ -28,6 +28,7 @@ from kills import differences, results
 sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from helpers.cluster import cluster_processes, signal_group
+from process_tree import kilobytes, tree
 from running import PCHEM, STAGES, machine, stage_records, write_stack
 
 from pchem_pipeline.compute.environment import prepare_environment
@@ -78,23 +79,12 @@ class Watch:
     def _look(self) -> None:
         while not self._ended.wait(0.2):
             for root in list(self.roles):
-                for pid in _group(root):
+                for pid in tree(root):
                     with contextlib.suppress(OSError, IndexError):
                         io = Path(f"/proc/{pid}/io").read_text().split()
-                        status = Path(f"/proc/{pid}/status").read_text()
                         self.read[pid] = max(self.read[pid], int(io[1]))
-                        self.peak[pid] = int(status.partition("VmHWM:")[2].split()[0])
+                        self.peak[pid] = max(self.peak[pid], kilobytes(pid, "VmHWM"))
                         self.roles.setdefault(pid, self.roles[root])
-
-
-def _group(root: int) -> list[int]:
-    """Return the processes of a group."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        with contextlib.suppress(OSError, ValueError, IndexError):
-            if int((entry / "stat").read_text().rpartition(")")[2].split()[2]) == root:
-                found.append(int(entry.name))
-    return found
 
 
 def wait_for_marks(store: Path, stage: str, many: int) -> None:

@@ -39,9 +39,8 @@ ARRAYS = (
     "maps/bias",
     "maps/read_noise_e",
 )
-UNITS: tuple[
-    tuple[str, str, dict[str, str]], ...
-] = (  # keyword, comment, further cards of a header whose exposure time is in ms
+#: keyword, comment, further cards of a header whose exposure time is in ms
+UNITS: tuple[tuple[str, str, dict[str, str]], ...] = (
     ("EXPTIME", "exposure time in ms", {}),
     ("EXPTIME", "[ms] exposure", {}),
     ("EXPTIME", "exposure (ms)", {}),
@@ -94,15 +93,8 @@ def sensor(number: int, folder: Path, step_dn: float = 0.0) -> Case:
     exposure.flat[odd[: rng.integers(4)]] *= rng.choice([0.01, 12])
     noise = rng.uniform(0.12, 0.3) * rng.lognormal(0, 0.05, shape)
     bias = 10 * step.mean() + rng.normal(0, 0.3 * step.mean(), shape)
-    case = Case(
-        number,
-        folder,
-        rng,
-        {},
-        rng.poisson(exposure, (n, *shape)) + noise * rng.normal(size=(n, *shape)),
-        step,
-        np.empty(0),
-    )
+    electrons = rng.poisson(exposure, (n, *shape)) + noise * rng.normal(size=(n, *shape))
+    case = Case(number, folder, rng, {}, electrons, step, np.empty(0))
     case.truth = {"quanta_exposure": exposure, "bias": bias, "noise": noise}
     case.form = str(rng.choice(["tif", "npy", "fits", "zarr"]))
     digitise(case)
