@@ -32,9 +32,8 @@ def run_to_first_screen(
 ) -> None:
     """Bring stages up to date; print the report's summary on stderr and its path by ``say``.
 
-    Answers that are serious are one line of warning, also where the command is quiet.
-
-    Without the stage ``report`` only the store is printed. Of a new run the YAML is written first.
+    Answers that are serious are one line of warning, also where the command is quiet. Without the stage
+    ``report`` only the store is printed. Of a new run the YAML is written first.
 
     Raises:
         NotBelievedError: ``strict``, and an answer is serious.
@@ -99,11 +98,11 @@ def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
         level = flag["level"]
         listed = level in ("serious", "caution") or (level == "note" and flag["about"] == "sensor")
         if listed and flag["text"] not in shown:
-            lines += _wrapped(f"{level.capitalize()}: {flag['text']}", "  ", "")
+            lines += _wrapped(f"{level.capitalize()}: {flag['text']}")
     lines.append("")
     for i, step in enumerate(numbers["next"]):
         words = " ".join(run if word == "RUN" else word for word in step["command"].split(" "))
-        lines += _wrapped(f"{'Or' if i else 'Next'}: {step['why']}:", "  ", "")
+        lines += _wrapped(f"{'Or' if i else 'Next'}: {step['why']}:")
         lines.append(f"  {words}")
     return lines
 
@@ -113,9 +112,8 @@ def _one_line(answer: Mapping[str, Any]) -> str:
     return f"{answer['question']} {answer['word']}: {answer['text'].split('. ')[0].rstrip('.')}."
 
 
-def _wrapped(text: str, indent: str, first: str | None = None) -> list[str]:
-    start = indent if first is None else first
-    return textwrap.wrap(text, _WIDTH, initial_indent=start, subsequent_indent=indent)
+def _wrapped(text: str, first: str = "") -> list[str]:
+    return textwrap.wrap(text, _WIDTH, initial_indent=first, subsequent_indent="  ")
 
 
 def _criteria(rows: Sequence[Mapping[str, Any]]) -> list[str]:

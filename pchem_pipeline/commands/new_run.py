@@ -233,10 +233,9 @@ def find_joint(
                 raise ConfigError(f"--{name}: only with runs; {targets[0]} sets {option}, change it there")
         return found, False
     place = place_of(store or Path("joint.zarr")).resolve()
-    runs, folder = [*targets, *bias], settings_of(place).parent
-    samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, folder)} for each in runs]
-    for sample in samples[len(targets) :]:
-        sample["bias"] = True
+    folder = settings_of(place).parent
+    samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, folder)} for each in targets]
+    samples += [{"run": os.path.relpath(each, folder), "bias": True} for each in bias]
     if levels:
         against = against or "light_level"
         for sample, level in zip(samples, _light_levels(levels, len(targets), against), strict=False):
@@ -244,7 +243,7 @@ def find_joint(
     given: dict[str, Any] = {"samples": samples}
     if against is not None or len(targets) == 1:
         given["against"] = against or "none"  # a line needs two exposures
-    for each in runs:
+    for each in (*targets, *bias):
         find_run(each)
     return _stated_run(place, given, "joint"), True
 

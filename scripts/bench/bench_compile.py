@@ -15,15 +15,12 @@ import os
 import shutil
 import sys
 import tempfile
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 from process_tree import run_measured
 from running import machine
 
-# the command of any checkout, whatever module its pyproject.toml names
-PCHEM = [sys.executable, "-c", "import sys, importlib; importlib.import_module(sys.argv.pop(1)).main()"]
 RUN = """run: {{store: {name}.zarr}}
 input: {{files: [{name}/*.tif], integration_time: {exposure}, bit_depth: 14}}
 """
@@ -50,9 +47,8 @@ class Cost:
 def pchem(checkout: Path, cache: Path, folder: Path, arguments: list[str]) -> Cost:
     """Run a command of a checkout with a cache of kernels of its own."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "NUMBA_CACHE_DIR": str(cache)}
-    project = tomllib.loads((checkout / "pyproject.toml").read_text())["project"]
-    module = project["scripts"]["pchem"].partition(":")[0]
-    took = run_measured([*PCHEM, module, *arguments, "--quiet"], folder, environment, must_succeed=True)
+    command = [sys.executable, "-m", "pchem_pipeline", *arguments, "--quiet"]
+    took = run_measured(command, folder, environment, must_succeed=True)
     return Cost(took.wall, took.cpu, len(list(cache.rglob("*.nbc"))))
 
 

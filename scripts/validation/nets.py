@@ -16,14 +16,12 @@ more than N pixels), an array is missing, or a verdict is another.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import re
 import shutil
 import subprocess
 import sys
 import time
-import tomllib
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -147,23 +145,13 @@ class Folder:
     def pchem(self, *arguments: str) -> None:
         """Run the command of the package that is imported here: PYTHONPATH chooses it."""
         began = time.monotonic()
-        command = [sys.executable, "-c", entry(), *arguments, "--quiet"]
+        command = [sys.executable, "-m", "pchem_pipeline", *arguments, "--quiet"]
         done = subprocess.run(command, cwd=self.path, capture_output=True, text=True)
         print(f"  {time.monotonic() - began:6.1f} s  pchem {' '.join(arguments)}", flush=True)
         if done.returncode == 3:
             print(f"           {done.stderr.strip().splitlines()[-1]}", flush=True)
         if done.returncode not in (0, 3):
             raise SystemExit(f"pchem {' '.join(arguments)}: exit code {done.returncode}\n{done.stderr}")
-
-
-def entry() -> str:
-    """Return a program that is the command ``pchem`` of the tree whose package is imported here."""
-    found = importlib.util.find_spec("pchem_pipeline")
-    if found is None or found.origin is None:
-        raise SystemExit("no package pchem_pipeline: put its tree into PYTHONPATH")
-    project = tomllib.loads((Path(found.origin).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
-    module, function = project["project"]["scripts"]["pchem"].split(":")
-    return f"import sys; from {module} import {function}; sys.argv[0] = 'pchem'; sys.exit({function}())"
 
 
 def plain(at: Folder) -> None:
