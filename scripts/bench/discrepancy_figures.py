@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -14,6 +17,17 @@ Record = dict[str, Any]
 _LARGEST_SET = 3
 _STRONG = 4.0  # times s95
 _GOOD_SENSOR = 0.32  # e-, about the middle of the sensors that are drawn
+
+
+def read_results(path: Path) -> list[Record]:
+    """Return the records of a study; a last line that was cut off is left out."""
+    records = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError:
+            print(f"{path}: an incomplete line is left out", file=sys.stderr)
+    return records
 
 
 class Answer:

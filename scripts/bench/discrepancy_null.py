@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from discrepancy_figures import wilson
+from discrepancy_figures import read_results, wilson
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 RIGHT = ("consistent", "cannot_tell")
@@ -37,8 +37,7 @@ def results_of_seeds(
         one: makes the record of a seed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    lines = path.read_text().splitlines() if path.exists() else []
-    yield from (records := [json.loads(line) for line in lines])
+    yield from (records := read_results(path))
     done, start = {r["seed"] for r in records}, time.monotonic()
     with path.open("a") as file:
         for seed in itertools.count(first):
@@ -51,14 +50,10 @@ def results_of_seeds(
                 yield record
 
 
-def run_null_range(path: Path, first: int, minutes: float, most_samples: float) -> None:
+def run_null_range(folder: Path, first: int, minutes: float, most_samples: float) -> None:
     """Look for discrepancies in stacks without any until the time is over, and print the share of alarms.
 
-    Args:
-        path: file of the results, see `results_of_seeds`.
-        first: seed of the first sensor.
-        minutes: no stack begins later.
-        most_samples: frames x pixels of a stack.
+    The results are kept in ``null_range.jsonl``; a stack has at most so many samples (frames x pixels).
     """
 
     def one(seed: int) -> dict[str, Any]:
@@ -66,7 +61,7 @@ def run_null_range(path: Path, first: int, minutes: float, most_samples: float) 
         print(_line(record), flush=True)
         return record
 
-    print_null_range(list(results_of_seeds(path, first, minutes, one)))
+    print_null_range(list(results_of_seeds(folder / "null_range.jsonl", first, minutes, one)))
 
 
 def print_null_range(records: list[dict[str, Any]]) -> None:

@@ -27,10 +27,7 @@ OWN = "data"  # what comes of the measured stack, not of the simulated ones
 def run_null_tails(folder: Path, first: int, minutes: float) -> None:
     """Judge clean sensors until the time is over; print shares of small p-values by kind, and draw them.
 
-    Args:
-        folder: of the results, ``null_tails.jsonl`` and ``null_tails.png``.
-        first: seed of the first sensor.
-        minutes: no sensor begins later.
+    The folder of the results gets ``null_tails.jsonl`` and ``null_tails.png``.
     """
     results = results_of_seeds(folder / "null_tails.jsonl", first, minutes, judged_sensor)
     records = [r for r in results if "p" in r]

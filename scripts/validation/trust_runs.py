@@ -67,7 +67,6 @@ class Case:
     electrons: Array
     step: Array
     frames: NDArray[Any]
-    mishap: str = "none"
     form: str = "tif"
     header: fits.Header = field(default_factory=fits.Header)
     options: list[str] = field(default_factory=lambda: ["--mode", "copy"])
@@ -101,10 +100,10 @@ def sensor(number: int, folder: Path, step_dn: float = 0.0) -> Case:
     return case
 
 
-def digitise(case: Case, low: float = 0, high: float = TOP) -> None:
+def digitise(case: Case, high: float = TOP) -> None:
     """Round the samples to DN, and set the true maps that depend on the gain."""
     values = case.electrons * case.step + case.truth["bias"]
-    case.frames = np.rint(values).clip(low, high).astype(np.uint16)
+    case.frames = np.rint(values).clip(0, high).astype(np.uint16)
     case.truth["conversion_gain"] = 1 / case.step
     case.truth["read_noise_e"] = np.hypot(case.truth["noise"], 12**-0.5 / case.step)
 
@@ -306,7 +305,6 @@ def study_run(number: int, folder: Path, mishap: str | None = None) -> dict[str,
     """Do one run, and return what was said and what was wrong."""
     begin, mishap = time.process_time(), mishap or mishap_of(number)
     case = sensor(number, folder)
-    case.mishap = mishap
     MISHAPS[mishap][1](case)
     folder.mkdir(parents=True, exist_ok=True)
     store = folder / "run.zarr"
