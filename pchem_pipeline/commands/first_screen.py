@@ -91,8 +91,11 @@ def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
     for answer in numbers["answers"]:
         lines.append(f"{answer['question']} {answer['word']}.")
         lines += _criteria(answer["criteria"]) or _wrapped(answer["text"], "  ")
-    if numbers["headline"]:
-        lines += ["", *_headline(numbers["headline"])]
+    if rows := numbers["headline"]:
+        wide = max(len(row["label"]) for row in rows)
+        lines.append("")
+        for row in rows:
+            lines.append(f"median {row['label']:<{wide}}  {row['value']}   (5 to 95 %: {row['spread']})")
     shown = " ".join(answer["text"] for answer in numbers["answers"] if not answer["criteria"])
     for flag in numbers["flags"]:
         level = flag["level"]
@@ -123,9 +126,3 @@ def _criteria(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         f"  {'ok ' if row['met'] else 'NOT'} {row['words']:<{wide}}  {row['found']:>10}  ({row['limit']})"
         for row in rows
     ]
-
-
-def _headline(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the headline numbers with their errors, a line each."""
-    wide = max(len(row["label"]) for row in rows)
-    return [f"median {row['label']:<{wide}}  {row['value']}   (5 to 95 %: {row['spread']})" for row in rows]

@@ -110,7 +110,7 @@ def optimisers(counts: NDArray[np.uint16], origin: NDArray[np.int32]) -> dict[st
 
     pixels = Drawn(counts, origin.astype(np.int64), np.ones((len(counts), 4)))
     scipy_fit(Drawn(*(each[:1] for each in pixels)))  # imports its libraries
-    found = {"scipy L-BFGS-B on histograms": cpu(lambda: scipy_fit(pixels)) / len(counts)}
+    found = {"scipy L-BFGS-B on histograms": cpu(lambda: scipy_fit(pixels))[0] / len(counts)}
     try:
         from iminuit import Minuit
     except ImportError:
@@ -131,7 +131,7 @@ def optimisers(counts: NDArray[np.uint16], origin: NDArray[np.int32]) -> dict[st
             fit.migrad()
             fit.hesse()
 
-    found["iminuit (MIGRAD, HESSE) on histograms"] = cpu(minuit) / len(counts)
+    found["iminuit (MIGRAD, HESSE) on histograms"] = cpu(minuit)[0] / len(counts)
     return found
 
 

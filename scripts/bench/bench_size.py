@@ -27,9 +27,7 @@ def as_tiff(raw: Path, shape: tuple[int, int, int]) -> Path:
     import tifffile
 
     frames = np.memmap(raw, "<u2", "r", shape=shape)
-    with tifffile.TiffWriter(raw.with_suffix(".tif"), bigtiff=True) as writer:
-        for frame in frames:
-            writer.write(frame, photometric="minisblack", contiguous=True)
+    tifffile.imwrite(raw.with_suffix(".tif"), frames, bigtiff=True, photometric="minisblack")
     raw.unlink()
     return raw.with_suffix(".tif")
 
