@@ -102,8 +102,10 @@ def figures_of_run(
 
 def paper_files(figure: Figure, formats: Sequence[str], look: Look) -> dict[str, bytes]:
     """Draw a figure; return its files and those of its tables by name."""
-    drawing, facts = figure.draw(look), {"dpi": look.dpi, "title": figure.title}
-    files = {f"{figure.name}.{kind}": drawing_bytes(drawing, kind, **facts) for kind in formats}
+    drawing, dpi = figure.draw(look), look.dpi
+    files = {
+        f"{figure.name}.{kind}": drawing_bytes(drawing, kind, dpi=dpi, title=figure.title) for kind in formats
+    }
     for table in figure.tables:
         part = f"_{table.part}" if table.part else ""
         files[f"{figure.name}{part}.csv"] = csv_text(table).encode()

@@ -125,7 +125,6 @@ def ask(process: subprocess.Popen[str], case: str) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--old", type=Path, help="the other checkout")
     parser.add_argument("--only", nargs="*", default=[], help="of good, short, joint, extended, exact")

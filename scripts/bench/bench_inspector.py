@@ -125,7 +125,6 @@ def measure(page: Page, path: Path) -> dict[str, float]:
 
 
 def main(sizes: list[int]) -> None:
-    """Print a table for each size."""
     chromium = os.environ.get("PCHEM_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])

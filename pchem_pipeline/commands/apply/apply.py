@@ -18,6 +18,7 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.commands.apply.characterisation import (
     check_run,
     doubtful_pixels,
+    moments_piece,
     read_calibration,
     with_moments,
 )
@@ -32,13 +33,7 @@ from pchem_pipeline.commands.apply.source import (
     overscan_of,
     some_of,
 )
-from pchem_pipeline.commands.apply.tasks import (
-    N_SUMS,
-    convert_piece,
-    count_piece,
-    moments_piece,
-    offsets_piece,
-)
+from pchem_pipeline.commands.apply.tasks import N_SUMS, convert_piece, count_piece, offsets_piece
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.identity import quick_identity

@@ -15,11 +15,12 @@ from pchem_pipeline.model.fit.status import moves_gain
 from pchem_pipeline.model.maps.maps import electron_shifts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_satellites
+from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration, covariance_of
 
 if TYPE_CHECKING:
+    from pchem_pipeline.commands.apply.settings import Job, Piece
     from pchem_pipeline.model.fit.settings import FitSettings
-    from pchem_pipeline.store.run_store import RunStore
 
 #: Gap below which a rival counts, nats; read noise and standard error of the bias from which on, e-, the
 #: curvature of the likelihood at its maximum does not tell how far it reaches: where either is less, or the
@@ -97,7 +98,7 @@ def doubtful_pixels(
     return np.asarray(loose & calibration.usable)
 
 
-def write_moments(run: RunStore, output: RunStore, rows: slice, settings: FitSettings) -> None:
+def moments_piece(piece: Piece, output: RunStore, *, job: Job, settings: FitSettings) -> None:
     """Write the errors of g, mu and sigma of some rows, of doubtful pixels by their likelihood.
 
     Where peaks are apart its maxima are narrow, an electron from each other, and of one gain and read noise:
@@ -105,6 +106,7 @@ def write_moments(run: RunStore, output: RunStore, rows: slice, settings: FitSet
     """
     from pchem_pipeline.model.fit.api import likelihood_moments  # the fit is much to load
 
+    run, rows = RunStore.open(job.run), slice(piece.y0, piece.y1)
     region, sensor = (rows, slice(None)), SensorInfo.read(run)
     calibration = read_calibration(run, rows)
     names = [*PARAMETERS, "likelihood_gap", "outlier_share"]
@@ -144,7 +146,7 @@ def write_moments(run: RunStore, output: RunStore, rows: slice, settings: FitSet
 
 
 def with_moments(calibration: Calibration, output: RunStore, rows: slice = slice(None)) -> Calibration:
-    """Return a calibration of some rows with the errors that `write_moments` wrote."""
+    """Return a calibration of some rows with the errors that `moments_piece` wrote."""
     region = (rows, *[slice(None)] * 3)
     return replace(
         calibration,

@@ -99,7 +99,7 @@ class Job:
         offset_variance: variance of the offsets' estimates, DN^2, (y, x); None without offsets.
         row_sums: of the mean of each row less its bias over the frames, and of its square, DN and DN^2, with
             the offsets and without: shape (2, 2, y).
-        moments: whether the errors of the calibration are in the output, by `write_moments`.
+        moments: whether the errors of the calibration are in the output, by `moments_piece`.
         parts: codes in a DN.
         lift: DN by which codes are raised so that none is negative; no offset is larger.
         reached: whether samples lie at the first and at the last code of the ADC.
