@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -88,7 +88,10 @@ def watch(
     """
     shown: list[str] = []
     try:
-        for states, progress in _snapshots(target, follow, sleep):
+        while True:
+            # before the states: what is complete when no command works stays complete
+            progress = read_progress(target.store)
+            states = run_status(target)
             lines = [json_line(states, progress)] if as_json else rows(states, progress)
             if as_json or not shown:
                 write("\n".join(lines))
@@ -97,19 +100,9 @@ def watch(
                 write(f"\x1b[{len(shown)}A\x1b[J" + "\n".join(lines))
             elif changed := [line for line in lines if line not in shown]:
                 write("\n".join(changed))
+            if not follow or progress is None:
+                return
             shown = lines
+            sleep(1.0)
     except KeyboardInterrupt:
         return
-
-
-def _snapshots(
-    target: Target, follow: bool, sleep: Callable[[float], None]
-) -> Iterator[tuple[list[StageState], dict[str, Any] | None]]:
-    """Yield the state of the run, once or until its command ends."""
-    while True:
-        # before the states: what is done when nobody works is done for good
-        progress = read_progress(target.store)
-        yield run_status(target), progress
-        if not follow or progress is None:
-            return
-        sleep(1.0)

@@ -63,10 +63,11 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
 
 def _sums(output: RunStore) -> FloatArray:
     """Return the sums over all frames, segment by segment in their order."""
-    array = output.array("applied_parts/sums")
-    total: FloatArray = output.read("applied_parts/sums", (slice(0, 1), *[slice(None)] * 3))[0]
-    for number in range(1, array.shape[0]):
-        part = output.read("applied_parts/sums", (slice(number, number + 1), *[slice(None)] * 3))[0]
+    number = output.array("applied_parts/sums").shape[0]
+    places = ((slice(i, i + 1), *[slice(None)] * 3) for i in range(number))
+    parts = (output.read("applied_parts/sums", place)[0] for place in places)
+    total: FloatArray = next(parts)
+    for part in parts:
         total[:4] += part[:4]
         total[4] = np.minimum(total[4], part[4])
         total[5] = np.maximum(total[5], part[5])
