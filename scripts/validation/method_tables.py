@@ -88,7 +88,7 @@ def plan_table(options: argparse.Namespace) -> None:
             continue
         found = verify([target], point, exposures, frames, options.pixels, options.seed)
         error = f"{100 * found.checks[0].rmse:.3f} +- {100 * found.checks[0].rmse_stderr:.3f}"
-        print(f"{noise:>16g}{name:>18}{found.n_frames:>12,}{error:>22}")
+        print(f"{noise:>16g}{name:>18}{sum(frames):>12,}{error:>22}")
 
 
 def main() -> None:
