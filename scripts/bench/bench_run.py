@@ -17,9 +17,9 @@ import os
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 from process_tree import Took, run_measured
 from running import PCHEM, machine, read_once, stage_records
@@ -39,21 +39,13 @@ os.fsync = counted
 """
 
 
-@dataclass(frozen=True)
-class Synced:
-    """What a run took that waits for the disk, or does not.
+class Synced(NamedTuple):
+    """What a run took that waits for the disk, or does not."""
 
-    Attributes:
-        wall: seconds of the command.
-        cpu: CPU seconds of all its processes.
-        syncs: calls of ``os.fsync``.
-        written: seconds, of those after the command, until all it wrote is on the disk.
-    """
-
-    wall: float
-    cpu: float
-    syncs: int
-    written: float
+    wall: float  # s
+    cpu: float  # s, of all its processes
+    syncs: float  # calls of ``os.fsync``
+    written: float  # s, after the command, until all it wrote is on the disk
 
 
 def run(store: Path, options: argparse.Namespace, environment: Mapping[str, str] | None = None) -> Took:
@@ -90,11 +82,8 @@ def cost_of_syncs(options: argparse.Namespace) -> None:
         both = {sync: run_synced(options, sync) for sync in order}
         pairs.append((both[True], both[False]))
         show_pair(str(i + 1), both[True], both[False])
-    names = [field.name for field in fields(Synced)]
-    show_pair(
-        "median",
-        *(Synced(*(median(getattr(pair[i], name) for pair in pairs) for name in names)) for i in (0, 1)),
-    )
+    medians = [Synced(*map(median, zip(*runs, strict=True))) for runs in zip(*pairs, strict=True)]
+    show_pair("median", *medians)
     ratios = sorted(on.wall / off.wall for on, off in pairs)
     print(f"ratio of a pair: median {median(ratios):.3f}, {ratios[0]:.3f} to {ratios[-1]:.3f}")
 

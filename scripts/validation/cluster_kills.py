@@ -23,13 +23,13 @@ import time
 from collections import Counter, defaultdict
 from pathlib import Path
 
-from kills import differences, results
+from kills import differences, results, started
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from helpers.cluster import cluster_processes, signal_group
 from process_tree import kilobytes, tree
-from running import PCHEM, STAGES, machine, stage_records, write_stack
+from running import STAGES, machine, stage_records, write_stack
 
 from pchem_pipeline.compute.environment import prepare_environment
 
@@ -118,19 +118,6 @@ def bytes_read(log: Path) -> Counter[int]:
     return found
 
 
-def run(store: Path, environment: dict[str, str]) -> "subprocess.Popen[str]":
-    """Start a run in a process group of its own."""
-    return subprocess.Popen(
-        [PCHEM, "run", "run.yaml", "--quiet"],
-        cwd=store.parent,
-        env=environment,
-        text=True,
-        start_new_session=True,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-    )
-
-
 def write_config(folder: Path, compute: dict[str, object]) -> Path:
     """Write the YAML of a run into a new folder; return where its store will be."""
     content = {"run": {"store": "run.zarr"}, "compute": compute}
@@ -145,7 +132,7 @@ def write_config(folder: Path, compute: dict[str, object]) -> Path:
     return folder / "run.zarr"
 
 
-def ended(process: "subprocess.Popen[str]") -> None:
+def ended(process: subprocess.Popen[str]) -> None:
     """Wait for a run, which must end well."""
     _, words = process.communicate(timeout=3600)
     if process.returncode:
@@ -167,7 +154,7 @@ def on_the_cluster(folder: Path, given: argparse.Namespace, tiles: int) -> tuple
         watch.roles |= {worker.pid: f"worker, {name}" for worker, name in zip(workers, names, strict=True)}
         watch.roles[scheduler.pid] = "scheduler"
         start = time.monotonic()
-        process = run(store, environment)
+        process = started(store.parent, "run", "run.yaml", environment=environment)
         watch.roles[process.pid] = "pchem run"
         try:
             wait_for_marks(store, "fit", max(1, tiles // 10))
@@ -213,7 +200,7 @@ def main() -> int:
         print(
             f"{machine()}\n{given.frames} frames of {given.side} x {given.side} pixels, {size / 1e9:.1f} GB"
         )
-        ended(run(plain, {**os.environ, **counted}))
+        ended(started(plain.parent, "run", "run.yaml", environment={**os.environ, **counted}))
         tiles = len(list((plain / ".pchem" / "done" / "fit").rglob("*.json")))
         watch, store = on_the_cluster(folder, given, tiles)
         times = show(watch, folder / "reads", size)

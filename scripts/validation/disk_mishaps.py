@@ -11,8 +11,8 @@ line a case, and ends with 1 where one differs, cannot go on, or ended in any ot
 import argparse
 import errno
 import hashlib
+import multiprocessing
 import os
-import pickle
 import random
 import re
 import shutil
@@ -40,22 +40,14 @@ NUMBERS = (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 def in_a_child(task: Callable[[], Any]) -> Any:
     """Return what a function returns in a forked process, which knows nothing of stores that were open."""
-    here, there = os.pipe()
-    child = os.fork()
-    if child == 0:
-        code = 1
-        try:
-            os.close(here)
-            with os.fdopen(there, "wb") as pipe:
-                pickle.dump(task(), pipe)
-            code = 0
-        finally:
-            os._exit(code)
-    os.close(there)
-    with os.fdopen(here, "rb") as pipe:
-        found = pipe.read()
-    os.waitpid(child, 0)
-    return pickle.loads(found)
+    fork = multiprocessing.get_context("fork")
+    here, there = fork.Pipe(duplex=False)
+    child = fork.Process(target=lambda: there.send(task()))
+    child.start()
+    there.close()
+    found = here.recv()
+    child.join()
+    return found
 
 
 def done(bench: Bench, work: Work) -> tuple[int, str]:
