@@ -185,11 +185,10 @@ def _refusal(method: str, target: str, headers: Mapping[str, str], port: int) ->
     hosts = {f"{name}:{port}" for name in (ADDRESS, "localhost")}
     if headers.get("host") not in hosts:
         return _text(HTTPStatus.FORBIDDEN, "this server answers to its own address only")
-    origin = headers.get("origin")
-    if origin is not None and origin not in {f"http://{host}" for host in hosts}:
-        return _text(HTTPStatus.FORBIDDEN, "this server answers to its own pages only")
-    foreign = headers.get("sec-fetch-site", "none") not in ("none", "same-origin")
-    if foreign and target.startswith("/api/"):
+    foreign = headers.get("origin") not in (None, *(f"http://{host}" for host in hosts))
+    if target.startswith("/api/"):
+        foreign |= headers.get("sec-fetch-site", "none") not in ("none", "same-origin")
+    if foreign:
         return _text(HTTPStatus.FORBIDDEN, "this server answers to its own pages only")
     return None
 

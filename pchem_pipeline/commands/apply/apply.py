@@ -201,14 +201,19 @@ def _make_job(
 
 
 def _is_done(output: Path, content: dict[str, Any], command: Command) -> bool:
-    """Return whether a folder of files is what is wanted; raise ConfigError where it is something else."""
+    """Return whether a folder of files is what is wanted."""
     if not output.exists() or (output.is_dir() and not any(output.iterdir())):
         return False
-    found = (read_json(output / "provenance.json") if output.is_dir() else None) or {}
-    if found == content and not command.force:
+    found = read_json(output / "provenance.json") if output.is_dir() else None
+    return _is_wanted(output, found or {}, content, force=command.force)
+
+
+def _is_wanted(output: Path, found: dict[str, Any], content: dict[str, Any], *, force: bool) -> bool:
+    """Return whether an output is the wanted one; raise ConfigError unless it is, or may be replaced."""
+    if found == content and not force:
         return True
     ours = found.get("product") == _PRODUCT
-    if not (command.force and ours):
+    if not (force and ours):
         raise _exists(output, ours=ours)
     return False
 
@@ -226,16 +231,11 @@ def _output_store(place: Path, content: dict[str, Any], *, force: bool) -> tuple
     if "zarr.json" not in begun and (begun or (place.exists() and not place.is_dir())):
         raise _exists(place, ours=False)
     if not begun <= {"zarr.json", ".pchem"}:
-        try:
+        found: dict[str, Any] = {}
+        with contextlib.suppress(StoreError):
             found = RunStore.open(place).attributes("applied").get("provenance", {})
-        except StoreError:
-            raise _exists(place, ours=False) from None
-        if found.get("product") != _PRODUCT:
-            raise _exists(place, ours=False)
-        if found == content and not force:
+        if _is_wanted(place, found, content, force=force):
             return RunStore.open(place, writable=True), False
-        if not force:
-            raise _exists(place, ours=True)
     store = RunStore.create(place)
     for group in ("applied", "applied_parts"):
         store.delete(group)
