@@ -92,18 +92,13 @@ class RunView:
             raise StoreError(f"{self.store.path} is incomplete or stale; {cure}")
         return page
 
-    def _is_current(self, stage: str) -> bool:
-        """Return whether a stage is finished, and rests on those before it as they are now."""
+    def _is_current(self, stage: str, fingerprint: str | None = None) -> bool:
+        """Return whether a stage is finished, as stated, and rests on those before it as they are now."""
         record = self.store.records.read(stage)
-        if record is None or not record.finished:
+        if record is None or not record.finished or fingerprint not in (None, record.fingerprint):
             return False
-        for name, fingerprint in record.content.get("upstream", {}).items():
-            above = self.store.records.read(name)
-            if above is None or above.fingerprint != fingerprint.partition("+")[0]:
-                return False
-            if not self._is_current(name):
-                return False
-        return True
+        upstream = record.content.get("upstream", {}).items()
+        return all(self._is_current(name, stated.partition("+")[0]) for name, stated in upstream)
 
     def answer(self, method: str, target: str, headers: Mapping[str, str], port: int) -> Answer:
         """Answer one request for a path with its query; headers are given by lower-case name."""
