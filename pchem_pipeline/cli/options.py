@@ -110,7 +110,7 @@ def takes_command(
     """Decorate a command of a run: it takes the common options too, as one argument ``command``.
 
     Args:
-        without: names of common options that the command does not have, or has in a wording of its own.
+        without: names of common options that the command does not have, or words differently.
         reads_files: it takes the options of camera files too, as one argument ``given``.
     """
     common = [each for each in _COMMON if each[0] not in without]

@@ -231,7 +231,7 @@ class Run:
 
     @property
     def samples(self) -> xr.Dataset:
-        """What each of several exposures has of its own; the coordinate ``sample`` names their runs.
+        """Arrays of each of several exposures; the coordinate ``sample`` names their runs.
 
         Raises:
             StoreError: the run has one sample only.

@@ -24,7 +24,7 @@ from pchem_pipeline.compute.environment import prepare_environment
 prepare_environment()
 
 from pchem_pipeline.report.data import ReportData  # noqa: E402
-from pchem_pipeline.report.inspector import (  # noqa: E402  # noqa: E402
+from pchem_pipeline.report.inspector import (  # noqa: E402
     InspectorData,
     MapEntry,
     PixelSample,

@@ -23,7 +23,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from kills import WORKS, Bench, Work, differences, results
@@ -35,17 +35,18 @@ from helpers.disk_mishaps import FailingDisk, ForgetfulDisk, materialised
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.cli.app import main as pchem
 
+T = TypeVar("T")
 NUMBERS = (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
-def in_a_child(task: Callable[[], Any]) -> Any:
+def in_a_child(task: Callable[[], T]) -> T:
     """Return what a function returns in a forked process, which knows nothing of stores that were open."""
     fork = multiprocessing.get_context("fork")
     here, there = fork.Pipe(duplex=False)
     child = fork.Process(target=lambda: there.send(task()))
     child.start()
     there.close()
-    found = here.recv()
+    found: T = here.recv()
     child.join()
     return found
 
@@ -82,7 +83,7 @@ def found(bench: Bench, work: Work) -> dict[str, Any]:
         except StoreError as error:
             return {"refused": str(error)}
 
-    return dict(in_a_child(task))
+    return in_a_child(task)
 
 
 def failed(bench: Bench, work: Work, at: int | None, number: int) -> tuple[int, int, str]:
@@ -94,8 +95,7 @@ def failed(bench: Bench, work: Work, at: int | None, number: int) -> tuple[int, 
         code, words = done(bench, work)
         return failing.count, code, words
 
-    result: tuple[int, int, str] = in_a_child(task)
-    return result
+    return in_a_child(task)
 
 
 def logged(bench: Bench, work: Work) -> list[Any]:
@@ -107,7 +107,7 @@ def logged(bench: Bench, work: Work) -> list[Any]:
         assert code in (0, 3), words
         return forgetful.log
 
-    return list(in_a_child(task))
+    return in_a_child(task)
 
 
 def fail_once(bench: Bench, work: Work, total: int, rng: random.Random) -> tuple[str, str]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.model.fit.settings import FitSettings
 
 #: Gap below which a rival counts, nats; read noise and standard error of the bias from which on, e-, the
-#: curvature of the likelihood at its maximum does not tell how far it reaches: where either is less, or the
+#: curvature of the likelihood at its maximum does not give its width: where either is less, or the
 #: gap larger, errors by the curvature are less than 5 % too small, at 0.45 e- and 4,000 frames 20 % and more.
 _NEAR_RIVAL, _NOISY_E, _LOOSE_E = 10.0, 0.33, 0.02
 #: Pixels whose likelihood is walked at once.

@@ -30,7 +30,7 @@ _AT_LIMIT = "applied/at_adc_limit"
 _FRAMES = ("frame", "y", "x")
 #: of the coordinates, which files do without
 _AXES = tuple((axis,) for axis in _FRAMES)
-#: bits of DQ: overlapping peaks concern electron numbers, of which an image of its own has the probability
+#: bits of DQ: overlapping peaks concern electron numbers, whose probability is a separate image
 _DQ = {name: flag for name, flag in FLAGS.items() if name != "peaks_overlap"}
 
 
@@ -215,7 +215,7 @@ def _bits(flags: Mapping[str, tuple[int, str]]) -> list[tuple[str, str]]:
 
 
 def _provenance(content: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return what the values were made of; long texts go on in further cards."""
+    """Return the provenance as cards; long texts continue in further cards."""
     names = {"PCHEMVER": "program", "PCHEMRUN": "run", "PCHEMSHA": "run_digest", "PCHEMMOD": "model"}
     found = {card: str(content[name]).encode("ascii", "replace").decode() for card, name in names.items()}
     return [*found.items(), ("HISTORY", "pchem apply: DN to physical units by the calibration of PCHEMRUN")]

@@ -266,7 +266,7 @@ def _median(content: dict[str, Any]) -> tuple[float, float, float]:
 
 
 def _data_digest(store: RunStore, sensor: SensorInfo) -> str:
-    """Return what tells the frames of a run: content of the files, and what was taken of them."""
+    """Return what identifies the frames of a run: content of the files, and the part taken of them."""
     record = store.records.read("ingest")
     settings = {} if record is None else record.content.get("settings", {})
     taken = [settings.get(f"input.{name}") for name in ("dataset", "roi", "frame_range", "bit_shift")]

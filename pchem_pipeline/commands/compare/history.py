@@ -44,7 +44,7 @@ _MEDIANS = tuple(name for name in _NAMES if f"{name}_stderr" in _NAMES)
 
 
 def identity_of(store: RunStore, digest: str) -> str:
-    """Return what tells one run from another: its frames, and how they were characterised."""
+    """Return a digest of the frames of a run, and of how they were characterised."""
     record = store.records.read("maps")
     return hashlib.sha256(f"{digest} {record and record.fingerprint}".encode()).hexdigest()[:12]
 
@@ -123,7 +123,7 @@ def read_history(path: Path) -> list[HistoryRow]:
 
 
 def append_history(path: Path, rows: Sequence[HistoryRow]) -> None:
-    """Add lines to a history; those that are there stay as they are.
+    """Add lines to a history; existing ones stay as they are.
 
     Raises:
         StoreError: the file cannot be written.
