@@ -468,12 +468,6 @@ def _not_imported(error: Exception) -> str:
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
-def _without_stdout(error: OSError) -> NoReturn:
-    """End where the results could not be written to stdout; what is left of them goes nowhere."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    _fail(f"cannot write to stdout ({error.strerror}); check where it goes", ExitCode.INPUT)
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line; ends the process with the exit codes of :class:`ExitCode`."""
     from pchem_pipeline.compute.environment import keep_standard_streams, prepare_environment
@@ -493,7 +487,8 @@ def main(arguments: list[str] | None = None) -> None:
     except OSError as error:
         if error.errno not in _DISK or error.filename is not None:
             raise
-        _without_stdout(error)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the rest of the results goes nowhere
+        _fail(f"cannot write to stdout ({error.strerror}); check where it goes", ExitCode.INPUT)
     except MemoryError:
         _fail("out of memory; use fewer --workers or --max-memory", ExitCode.INTERNAL)
     except KeyboardInterrupt:

@@ -6,7 +6,7 @@ import functools
 import inspect
 import re
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -110,7 +110,7 @@ def takes_command(
     """Decorate a command of a run: it takes the common options too, as one argument ``command``.
 
     Args:
-        without: names of common options that the command does not have, or has in a wording of its own.
+        without: names of common options that the command does not have, or words differently.
         reads_files: it takes the options of camera files too, as one argument ``given``.
     """
     common = [each for each in _COMMON if each[0] not in without]
@@ -131,9 +131,7 @@ def takes_command(
             command = Command(**{**options, "roi": region_of(options.get("roi"))})
             function(**given, command=command)
 
-        hints = typing.get_type_hints(
-            function, localns={"Command": object, "Mapping": Mapping}, include_extras=True
-        )
+        hints = typing.get_type_hints(function, localns={"Command": object}, include_extras=True)
         kind = inspect.Parameter.KEYWORD_ONLY
         own = [
             parameter.replace(annotation=hints[name], kind=kind)
@@ -154,11 +152,7 @@ def takes_command(
 
 
 def _settings_of_input(options: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of the section ``input`` that options state.
-
-    Raises:
-        ConfigError: ``--frames`` is not written as first:end.
-    """
+    """Return the settings of the section ``input`` that options state."""
     given = {name: value for name, value in options.items() if value is not None}
     if (text := given.pop("frames", None)) is not None:
         found = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text)
@@ -171,11 +165,7 @@ def _settings_of_input(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def region_of(text: str | None) -> tuple[int, int, int, int] | None:
-    """Return the region that ``--roi`` names.
-
-    Raises:
-        ConfigError: it is not written as y0:y1,x0:x1.
-    """
+    """Return the region of ``--roi``; raise ConfigError unless it is written as y0:y1,x0:x1."""
     if text is None:
         return None
     try:

@@ -37,19 +37,14 @@ if TYPE_CHECKING:
     from pchem_pipeline.run.stage import StageContext
     from pchem_pipeline.run.target import Target
 
-#: there from the moment when the arrays are neither of the old nor of all frames until they are of all
+#: exists while the arrays are neither of the old nor of all frames
 _BEGUN = ".pchem/appending.json"
 
 
 def append_frames(target: Target, command: Command) -> list[StageState]:
-    """Add the frames of new files to a finished run.
+    """Add the frames of new files to a finished run; return the states of ``ingest`` and ``histogram``.
 
-    Args:
-        target: the run; its ``input.files`` name the old files and, after them, the new ones.
-        command: what the command line asked for.
-
-    Returns:
-        The states of ``ingest`` and ``histogram``.
+    ``input.files`` of the run name the old files and, after them, the new ones.
 
     Raises:
         InputError: the old files are not the files of the run, or the new frames do not fit them.
@@ -111,7 +106,8 @@ def _added(
     before = known["quick"]["files"]
     now = quick["files"][: len(before)]
     same = now == before
-    if not same and [_fact(file) for file in now] == [_fact(file) for file in before]:
+    facts = [[(file["name"], file["size"]) for file in files] for files in (now, before)]
+    if not same and facts[0] == facts[1]:
         # touched, or copied elsewhere: their content counts
         same = known_identity(context)["files"][: len(before)] == known["identity"]["files"]
     if not same:
@@ -121,10 +117,6 @@ def _added(
             f"{quoted(context.store.path)}"
         )
     return paths[len(before) :], known["identity"]
-
-
-def _fact(file: dict[str, Any]) -> tuple[str, int]:
-    return file["name"], file["size"]
 
 
 def _check_frames(context: StageContext, frames: FrameSequence, added: list[Path]) -> None:

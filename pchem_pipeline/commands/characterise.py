@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import tempfile
@@ -74,21 +75,19 @@ def characterise(
     """
     require_xarray("characterise")
     frames = stack_of(frames, least=2)
-    temporary = None if store is not None else Path(tempfile.mkdtemp(prefix="pchem-"))
-    try:
-        place = (Path(store) if store is not None else temporary / "run.zarr").resolve()  # type: ignore[operator]
+    with contextlib.ExitStack() as removal:
+        if store is None:
+            folder = tempfile.mkdtemp(prefix="pchem-")
+            removal.callback(shutil.rmtree, folder, ignore_errors=True)
+            store = Path(folder, "run.zarr")
+        place = Path(store).resolve()
         given = {"integration_time": integration_time, "bit_depth": bit_depth, "kind": kind}
         target = _target(place, given, settings or {})
         write_stack(target.base_dir / target.config.input.files[0], frames)
         stages = up_to(until, pipeline_of(target.config))
         run_stages(target, stages, Command(workers=workers, progress=progress, quiet=progress == "off"))
         run = open_run(place)
-    except BaseException:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
-        raise
-    if temporary is not None:
-        weakref.finalize(run, shutil.rmtree, temporary, ignore_errors=True)
+        weakref.finalize(run, removal.pop_all().close)
     return run
 
 
@@ -115,11 +114,7 @@ def fit_counts(counts: NDArray[Any], origin: NDArray[Any] | int = 0, **options: 
 
 
 def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mapping[str, Any]]) -> Target:
-    """Return the run, its YAML beside the store.
-
-    Raises:
-        ConfigError: a setting is wrong, or the YAML is there with others.
-    """
+    """Return the run, its YAML beside the store; raise ConfigError where that has other settings."""
     path = settings_of(place)
     content: dict[str, Any] = {name: dict(section) for name, section in settings.items()}
     content["run"] = {**content.get("run", {}), "store": place.name}

@@ -37,14 +37,8 @@ def run_demo(
 ) -> str:
     """Simulate a sensor of ``size`` x ``size`` pixels to TIFF, run every stage, and return a text.
 
-    Args:
-        output: folder for the frames, the YAML and the store.
-        size: rows and columns.
-        n_frames: number of frames.
-        seed: root of the random numbers.
-        hidden: tag of an effect in the frames, to be found by the search; with ``@`` and a place or a time:
-            it acts only there.
-        quiet: say warnings only.
+    Frames, YAML and store are written to the folder ``output``. The search has to find the effect ``hidden``
+    in the frames, see `hidden_effect`.
 
     Raises:
         ConfigError: the folder holds something else, or the effect is unknown or has no typical strength.
@@ -82,12 +76,8 @@ def run_demo(
 def hidden_effect(asked: str, size: int, n_frames: int) -> Effect:
     """Return an effect of the library at its typical strength.
 
-    Args:
-        asked: its tag; with ``@`` and a place or a time in one line: ``row_noise@columns=40:50``. The
-            strength there is larger by one over the root of the share of the samples, so that it is as
-            significant as everywhere.
-        size: rows and columns.
-        n_frames: number of frames.
+    It is given by its tag, with ``@`` and a place or a time as ``row_noise@columns=40:50``. The strength
+    there is larger by one over the root of the share of the samples: as significant as everywhere.
 
     Raises:
         ConfigError: there is no such effect, place or typical strength.

@@ -25,7 +25,7 @@ def find_and_add(target: Target, command: Command, *, refit: bool, effort: float
         command: from the command line.
         refit: make the verdict's model a version, unless ``discrepancy.add`` is off, and bring fit, maps,
             ensemble and report up to date where they were done before; else model and YAML stay.
-        effort: in place of the configuration's ``discrepancy.effort``; None: as that has it.
+        effort: replaces ``discrepancy.effort`` of the configuration.
 
     Raises:
         PchEmError: a stage cannot be done.

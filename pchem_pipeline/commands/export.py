@@ -43,15 +43,7 @@ _COLUMNS = (
 
 
 def export_run(path: Path, folder: Path, formats: Sequence[str]) -> list[Path]:
-    """Write the maps of a run to files.
-
-    Args:
-        path: the run's store, or the YAML that made it.
-        folder: where to write; made if needed.
-        formats: any of ``FORMATS``.
-
-    Returns:
-        The files written.
+    """Write the maps of a run, given by its store or YAML, in any of ``FORMATS``; return the files.
 
     Raises:
         ConfigError: an unknown format, or none.
@@ -100,14 +92,8 @@ def _write_csv(folder: Path, store: RunStore) -> list[Path]:
     percentiles = list(next(iter(summary.values()))["percentiles"])
     rows: list[list[Any]] = [["map", "unit", *_COLUMNS, *(f"percentile_{p}" for p in percentiles)]]
     for name, content in summary.items():
-        rows.append(
-            [
-                name,
-                units[name],
-                *(content[c] for c in _COLUMNS),
-                *(content["percentiles"][p] for p in percentiles),
-            ]
-        )
+        cells = [name, units[name], *(content[column] for column in _COLUMNS)]
+        rows.append([*cells, *(content["percentiles"][p] for p in percentiles)])
     meanings = {"ok": "good fit", **{str(bit.name).lower(): text for bit, text in MEANINGS.items()}}
     reasons = [["fit_status", "pixels", "meaning"]]
     reasons += [[name, n, meanings.get(name, "")] for name, n in attributes["fit_status"].items()]

@@ -41,11 +41,7 @@ def millimetres(text: str) -> float:
 
 
 def check_formats(given: Sequence[str], known: Sequence[str], done: str) -> None:
-    """Refuse formats that are not known, or none.
-
-    Raises:
-        ConfigError: there are such, or none at all.
-    """
+    """Raise ConfigError where formats are unknown, or none is given."""
     unknown = [name for name in given if name not in known]
     if unknown or not given:
         what = f"{', '.join(unknown)} cannot be {done}" if unknown else "no format"
@@ -72,20 +68,17 @@ def figures_of_run(
     style: str = "",
     progress: ProgressMode = "auto",
 ) -> list[Path]:
-    """Write the figures of a run and their numbers.
+    """Write the figures of a run, given by its store or YAML, and their numbers; return the files.
 
     Args:
-        path: the run's store, or the YAML that made it.
+        path: the run.
         folder: where to write; made if needed.
         formats: pdf, svg, png.
         width: such as ``88mm`` or ``3.5in``; None: each figure's own.
         only: names of figures; empty: all.
         dpi: resolution of PNG, and of maps inside the other formats, dots per inch.
         style: style sheet of matplotlib, a name or a file; empty: none.
-        progress: auto | on | off.
-
-    Returns:
-        The files written, figure by figure.
+        progress: auto, on or off.
 
     Raises:
         ConfigError: an unknown format, width, figure or style.
@@ -108,7 +101,7 @@ def figures_of_run(
 
 
 def paper_files(figure: Figure, formats: Sequence[str], look: Look) -> dict[str, bytes]:
-    """Draw a figure and return its files and the files of its tables by name; pure."""
+    """Draw a figure; return its files and those of its tables by name."""
     drawing, dpi = figure.draw(look), look.dpi
     files = {
         f"{figure.name}.{kind}": drawing_bytes(drawing, kind, dpi=dpi, title=figure.title) for kind in formats

@@ -32,15 +32,8 @@ def run_to_first_screen(
 ) -> None:
     """Bring stages up to date; print the report's summary on stderr and its path by ``say``.
 
-    Answers that are serious are one line of warning, also where the command is quiet.
-
-    Args:
-        target: the run.
-        stages: stages to run, in order; without the report only the store is printed.
-        command: what the command line asked for.
-        say: writes a line of results.
-        is_new: whether the YAML of the run is to be written first.
-        strict: answers that are serious are an error.
+    Answers that are serious are one line of warning, also where the command is quiet. Without the stage
+    ``report`` only the store is printed. Of a new run the YAML is written first.
 
     Raises:
         NotBelievedError: ``strict``, and an answer is serious.
@@ -93,28 +86,26 @@ def typed(target: Target) -> str:
 
 
 def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
-    """Return the first screen of a report as lines of text.
-
-    Args:
-        numbers: content of ``report.json``.
-        run: the run, as it is typed in a command.
-    """
+    """Return the first screen of a report, of ``report.json``, as lines; ``run``: its name in commands."""
     lines = [""]
     for answer in numbers["answers"]:
         lines.append(f"{answer['question']} {answer['word']}.")
         lines += _criteria(answer["criteria"]) or _wrapped(answer["text"], "  ")
-    if numbers["headline"]:
-        lines += ["", *_headline(numbers["headline"])]
+    if rows := numbers["headline"]:
+        wide = max(len(row["label"]) for row in rows)
+        lines.append("")
+        for row in rows:
+            lines.append(f"median {row['label']:<{wide}}  {row['value']}   (5 to 95 %: {row['spread']})")
     shown = " ".join(answer["text"] for answer in numbers["answers"] if not answer["criteria"])
     for flag in numbers["flags"]:
         level = flag["level"]
-        told = level in ("serious", "caution") or (level == "note" and flag["about"] == "sensor")
-        if told and flag["text"] not in shown:
-            lines += _wrapped(f"{level.capitalize()}: {flag['text']}", "  ", "")
+        listed = level in ("serious", "caution") or (level == "note" and flag["about"] == "sensor")
+        if listed and flag["text"] not in shown:
+            lines += _wrapped(f"{level.capitalize()}: {flag['text']}")
     lines.append("")
     for i, step in enumerate(numbers["next"]):
         words = " ".join(run if word == "RUN" else word for word in step["command"].split(" "))
-        lines += _wrapped(f"{'Or' if i else 'Next'}: {step['why']}:", "  ", "")
+        lines += _wrapped(f"{'Or' if i else 'Next'}: {step['why']}:")
         lines.append(f"  {words}")
     return lines
 
@@ -124,9 +115,8 @@ def _one_line(answer: Mapping[str, Any]) -> str:
     return f"{answer['question']} {answer['word']}: {answer['text'].split('. ')[0].rstrip('.')}."
 
 
-def _wrapped(text: str, indent: str, first: str | None = None) -> list[str]:
-    start = indent if first is None else first
-    return textwrap.wrap(text, _WIDTH, initial_indent=start, subsequent_indent=indent)
+def _wrapped(text: str, first: str = "") -> list[str]:
+    return textwrap.wrap(text, _WIDTH, initial_indent=first, subsequent_indent="  ")
 
 
 def _criteria(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -136,9 +126,3 @@ def _criteria(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         f"  {'ok ' if row['met'] else 'NOT'} {row['words']:<{wide}}  {row['found']:>10}  ({row['limit']})"
         for row in rows
     ]
-
-
-def _headline(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the headline numbers with their errors, a line each."""
-    wide = max(len(row["label"]) for row in rows)
-    return [f"median {row['label']:<{wide}}  {row['value']}   (5 to 95 %: {row['spread']})" for row in rows]

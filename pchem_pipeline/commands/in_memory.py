@@ -58,11 +58,7 @@ def write_stack(path: Path, frames: Any) -> Path:
 
 
 def _stored_type(frames: Any) -> np.dtype[Any]:
-    """Return the unsigned type that holds the frames.
-
-    Raises:
-        ConfigError: a DN is negative or too large.
-    """
+    """Return the unsigned type that holds the frames; raise ConfigError where none does."""
     dtype = np.dtype(frames.dtype)
     if dtype.kind == "u" and dtype.itemsize <= 4:
         return np.dtype(f"u{dtype.itemsize}")

@@ -17,10 +17,7 @@ from pchem_pipeline.stages.methods import METHODS_FILE, open_other_runs, read_me
 def compare_methods(target: Target, command: Command, given: Mapping[str, Any]) -> str:
     """Run the stage, refresh the report where there is one, and return the table in words.
 
-    Args:
-        target: the run.
-        command: from the command line.
-        given: settings of the section ``methods`` from the command line; paths refer to the present folder.
+    ``given`` are settings of the section ``methods``; paths refer to the present folder.
 
     Raises:
         PchEmError: the comparison cannot be made.

@@ -35,9 +35,6 @@ def _listed(target: Target) -> list[tuple[ModelVersion, bool, list[str]]]:
     """Return each version, whether it is in force, and the stages whose results rest on it.
 
     One that is in the YAML but not in the run yet comes last.
-
-    Raises:
-        StoreError: there is no run, or it is damaged.
     """
     store = target.stored()
     current = model_in_force(store, target.config.model)
@@ -82,10 +79,6 @@ def _effect_words(effect: Effect) -> str:
 def use_model(target: Target, number: int) -> str:
     """Put a version of the model in force; return which results are stale.
 
-    Args:
-        target: the run.
-        number: of the version.
-
     Raises:
         ConfigError: there is no such version, or the YAML is no configuration.
         LockedError: another process works on the run.
@@ -122,11 +115,7 @@ def _stale_lines(target: Target) -> list[str]:
 
 
 def _yaml_of(target: Target) -> Path | None:
-    """Return the YAML of a run, if it exists and is of this run; a copied store names the YAML of the first.
-
-    Raises:
-        ConfigError: it is no configuration.
-    """
+    """Return the YAML of a run, if it exists and is of this run; a copied store names that of the first."""
     path = target.config_path
     if path is None or not path.exists():
         return None
@@ -155,11 +144,7 @@ def _put_in_force(store: RunStore, target: Target, version: ModelVersion) -> tup
 def adopt_verdict(target: Target) -> tuple[Target, str]:
     """Make the model of a run's verdict a version, and put it in force, in the store and for the YAML.
 
-    Args:
-        target: a run whose search is complete.
-
-    Returns:
-        The run with that model; what changed and how to go back, empty where the verdict changes nothing.
+    Returns the run with that model; what changed and how to go back, empty where the verdict changes nothing.
 
     Raises:
         ConfigError: the YAML is no configuration.

@@ -122,15 +122,10 @@ def settings_of(store: Path) -> Path:
 
 
 def settings_there(path: Path, stated: Mapping[str, Any], ways: str) -> RunConfig:
-    """Return the settings of a YAML file, which must agree with those that are stated; others are its own.
-
-    Args:
-        path: the YAML file.
-        stated: sections with the settings that the command line or the caller states.
-        ways: what to do where they disagree.
+    """Return the settings of a YAML file, which must agree with the sections that are stated.
 
     Raises:
-        ConfigError: the YAML is wrong, or says otherwise; in one line what differs, and the ways out.
+        ConfigError: the YAML is wrong, or differs; in one line how, and ``ways`` to resolve it.
     """
     there = load_config(path)
     content = _laid_over(yaml_content(dump_config(there), str(path)), stated)
@@ -170,9 +165,7 @@ def first_try(target: Target) -> Iterator[None]:
         with nothing_left_of_a_refusal(target.store):
             yield
     except (ConfigError, InputError, StoreError) as error:
-        if had_run or (target.store / ".pchem").is_dir():
-            raise
-        if had_yaml or path is None:
+        if had_run or had_yaml or path is None or (target.store / ".pchem").is_dir():
             raise
         path.unlink(missing_ok=True)
         named = re.search(rf"\b(?:{'|'.join(RunConfig.model_fields)})\.[a-z_]+", str(error))
@@ -240,10 +233,9 @@ def find_joint(
                 raise ConfigError(f"--{name}: only with runs; {targets[0]} sets {option}, change it there")
         return found, False
     place = place_of(store or Path("joint.zarr")).resolve()
-    runs, folder = [*targets, *bias], settings_of(place).parent
-    samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, folder)} for each in runs]
-    for sample in samples[len(targets) :]:
-        sample["bias"] = True
+    folder = settings_of(place).parent
+    samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, folder)} for each in targets]
+    samples += [{"run": os.path.relpath(each, folder), "bias": True} for each in bias]
     if levels:
         against = against or "light_level"
         for sample, level in zip(samples, _light_levels(levels, len(targets), against), strict=False):
@@ -251,17 +243,13 @@ def find_joint(
     given: dict[str, Any] = {"samples": samples}
     if against is not None or len(targets) == 1:
         given["against"] = against or "none"  # a line needs two exposures
-    for each in runs:
+    for each in (*targets, *bias):
         find_run(each)
     return _stated_run(place, given, "joint"), True
 
 
 def _light_levels(levels: Sequence[str], n: int, against: str) -> list[float]:
-    """Return the light levels of n runs.
-
-    Raises:
-        ConfigError: they are no numbers, not as many as the runs, or not wanted.
-    """
+    """Return the light levels of n runs; raise ConfigError unless they are as many numbers, and wanted."""
     if against != "light_level":
         raise ConfigError(f"--level: only with --against light_level, not {against}; omit one of them")
     if len(levels) != n:

@@ -175,11 +175,8 @@ class Run:
         Raises:
             StoreError: the run does not have it.
         """
-        if name not in self._groups:
-            self._groups[name] = self._opened(name)
-        return self._groups[name]
-
-    def _opened(self, name: str) -> xr.Dataset:
+        if name in self._groups:
+            return self._groups[name]
         if not self._store.has(name):
             raise StoreError(
                 f"{self.path} has no {name} yet; for the state of the run: pchem status {quoted(self.path)}"
@@ -188,7 +185,7 @@ class Run:
             for file in record.files:
                 if file.startswith(f"{name}/") and "." in file and not (self.path / file).exists():
                     raise StoreError(f"{self.path / file} is missing; {self._store.cure(name)}")
-        return self._lazy(self._store, name)
+        return self._groups.setdefault(name, self._lazy(self._store, name))
 
     def _lazy(self, store: RunStore, group: str) -> xr.Dataset:
         """Return a group of a store; arrays over the whole sensor get coordinates."""
@@ -234,7 +231,7 @@ class Run:
 
     @property
     def samples(self) -> xr.Dataset:
-        """What each of several exposures has of its own; the coordinate ``sample`` names their runs.
+        """Arrays of each of several exposures; the coordinate ``sample`` names their runs.
 
         Raises:
             StoreError: the run has one sample only.

@@ -75,10 +75,7 @@ def make_plan(
 
 
 def _median_pixel(run: Path) -> tuple[dict[str, float], str]:
-    """Return the medians of a run's maps, and the effects of its model.
-
-    ``noise_e`` is the noise of a sample at a given electron number: the read noise and what the effects add.
-    """
+    """Return the medians of a run's maps, with ``noise_e`` that of a sample, and the effects of its model."""
     from pchem_pipeline.commands.apply.characterisation import read_calibration
     from pchem_pipeline.effects.framework.compose import effect_words
     from pchem_pipeline.run.model_versions import model_of

@@ -31,7 +31,7 @@ def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int]
     Args:
         target: the run.
         redraw: seed with which the maps are drawn within their errors; None: the estimates themselves.
-        shape: rows and columns of another sensor of the same make; None: this one.
+        shape: rows and columns of another sensor of the same type; None: this one.
 
     Raises:
         StoreError: the run is not finished as far as its fit.
@@ -88,12 +88,12 @@ def write_twin(
     Args:
         target: the run.
         output: the YAML.
-        scene: a number, e- per frame, or a file with an image or a sequence; None: what the run saw.
+        scene: a number, e- per frame, or a file with an image or a sequence; None: the exposure of the run.
         frames: number of frames; None: as many as the run has.
         seed: of the frames.
         redraw: see `twin_of`.
         shape: see `twin_of`.
-        force: replace files that are there.
+        force: replace existing files.
 
     Raises:
         ConfigError: a file exists, or the scene does not fit.

@@ -75,45 +75,34 @@ class RunView:
     def _maps(self) -> dict[str, MapEntry]:
         return {each.path: each for each in listed_maps(self.store, self._shape)}
 
-    def check(self) -> None:
-        """Make sure that there is something to show.
+    def page(self) -> str:
+        """Return the report with its inspector.
 
         Raises:
-            StoreError: the run has no report, or one without an inspector.
+            StoreError: the run has no report, or one without an inspector, or one that is not up to date.
         """
-        page = self.store.path / "report.html"
+        path = self.store.path / "report.html"
         cure = f"run: pchem report {quoted(self.store.path)}"
-        if not page.is_file():
+        if not path.is_file():
             raise StoreError(f"{self.store.path} has no report yet; {cure}")
-        if served_page(page.read_text(encoding="utf-8")) is None:
-            raise StoreError(f"{page} is from an earlier version without inspector; {cure}")
+        page = served_page(path.read_text(encoding="utf-8"))
+        if page is None:
+            raise StoreError(f"{path} is from an earlier version without inspector; {cure}")
         if not self._is_current("report"):
             raise StoreError(f"{self.store.path} is incomplete or stale; {cure}")
+        return page
 
-    def _is_current(self, stage: str) -> bool:
-        """Return whether a stage is finished, and rests on those before it as they are now."""
+    def _is_current(self, stage: str, fingerprint: str | None = None) -> bool:
+        """Return whether a stage is finished, as stated, and rests on those before it as they are now."""
         record = self.store.records.read(stage)
-        if record is None or not record.finished:
+        if record is None or not record.finished or fingerprint not in (None, record.fingerprint):
             return False
-        for name, fingerprint in record.content.get("upstream", {}).items():
-            above = self.store.records.read(name)
-            if above is None or above.fingerprint != fingerprint.partition("+")[0]:
-                return False
-            if not self._is_current(name):
-                return False
-        return True
+        upstream = record.content.get("upstream", {}).items()
+        return all(self._is_current(name, stated.partition("+")[0]) for name, stated in upstream)
 
     def answer(self, method: str, target: str, headers: Mapping[str, str], port: int) -> Answer:
-        """Answer one request.
-
-        Args:
-            method: of HTTP.
-            target: path and query, as sent.
-            headers: by lower-case name.
-            port: on which the server listens.
-        """
-        refusal = _refusal(method, target, headers, port)
-        if refusal is not None:
+        """Answer one request for a path with its query; headers are given by lower-case name."""
+        if (refusal := _refusal(method, target, headers, port)) is not None:
             return refusal
         if not self._is_current("report"):
             return _busy()
@@ -125,7 +114,7 @@ class RunView:
         url = urlsplit(target)
         try:
             if url.path in ("/", "/report.html"):
-                return self._page()
+                return Answer(HTTPStatus.OK, self.page().encode(), "text/html; charset=utf-8")
             if url.path in _FILES:
                 return self._file(url.path)
             if url.path == "/api/pixel":
@@ -135,11 +124,6 @@ class RunView:
         except PchEmError as error:
             return _text(HTTPStatus.INTERNAL_SERVER_ERROR, str(error))
         return _text(HTTPStatus.NOT_FOUND, "there is nothing at this path")
-
-    def _page(self) -> Answer:
-        self.check()
-        page = served_page((self.store.path / "report.html").read_text(encoding="utf-8"))
-        return Answer(HTTPStatus.OK, (page or "").encode(), "text/html; charset=utf-8")
 
     def _file(self, path: str) -> Answer:
         try:
@@ -196,11 +180,10 @@ def _refusal(method: str, target: str, headers: Mapping[str, str], port: int) ->
     hosts = {f"{name}:{port}" for name in (ADDRESS, "localhost")}
     if headers.get("host") not in hosts:
         return _text(HTTPStatus.FORBIDDEN, "this server answers to its own address only")
-    origin = headers.get("origin")
-    if origin is not None and origin not in {f"http://{host}" for host in hosts}:
-        return _text(HTTPStatus.FORBIDDEN, "this server answers to its own pages only")
-    foreign = headers.get("sec-fetch-site", "none") not in ("none", "same-origin")
-    if foreign and target.startswith("/api/"):
+    foreign = headers.get("origin") not in (None, *(f"http://{host}" for host in hosts))
+    if target.startswith("/api/"):
+        foreign |= headers.get("sec-fetch-site", "none") not in ("none", "same-origin")
+    if foreign:
         return _text(HTTPStatus.FORBIDDEN, "this server answers to its own pages only")
     return None
 
@@ -257,18 +240,14 @@ class _Server(ThreadingHTTPServer):
 
 
 def make_server(path: Path, port: int = 0) -> tuple[ThreadingHTTPServer, str]:
-    """Return a server for one run, listening already, and the address to open.
-
-    Args:
-        path: the run's store, or the YAML that made it.
-        port: on which to listen; 0 for any that is free.
+    """Return a server for one run (its store or YAML), listening already, and the address to open.
 
     Raises:
         ConfigError: the port is taken.
         StoreError: there is no run, or none with a report that can be inspected.
     """
     view = RunView(find_run(path).stored())
-    view.check()
+    view.page()
     handler = type("_RunHandler", (_Handler,), {"run_view": view})
     try:
         server = _Server((ADDRESS, port), handler)
@@ -280,12 +259,7 @@ def make_server(path: Path, port: int = 0) -> tuple[ThreadingHTTPServer, str]:
 
 
 def serve(path: Path, port: int, ready: Callable[[str], None]) -> None:
-    """Serve one run until the user stops it with Ctrl-C.
-
-    Args:
-        path: as for :func:`make_server`.
-        port: as for :func:`make_server`.
-        ready: is given the address once the server listens.
+    """Serve one run until Ctrl-C; ``ready`` is called with the address once the server listens.
 
     Raises:
         ConfigError: the port is taken.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -16,12 +16,7 @@ from pchem_pipeline.runner.session import run_status
 
 
 def rows(states: Sequence[StageState], progress: Mapping[str, Any] | None) -> list[str]:
-    """Return a line for each stage, and where a command works on one, how fast.
-
-    Args:
-        states: of the stages, in order.
-        progress: progress of that command, or None.
-    """
+    """Return a line for each stage, with the progress of a command that works on one."""
     label = "" if progress is None else one_line(str(progress.get("stage", "")))
     running = label.partition(":")[0]
     lines = []
@@ -81,19 +76,22 @@ def watch(
     terminal: bool = False,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Return how far a run is.
+    """Write how far a run is.
 
     Args:
         target: the run.
         write: takes a text of whole lines, the last without its end.
-        follow: go on until no command works on the run; Ctrl-C ends it, too.
+        follow: continue until no command works on the run; Ctrl-C ends it, too.
         as_json: JSON lines instead of rows.
-        terminal: rows may be drawn over; else only those that changed are written.
+        terminal: rows are drawn over; else only those that changed are written.
         sleep: waits between two looks.
     """
     shown: list[str] = []
     try:
-        for states, progress in _snapshots(target, follow, sleep):
+        while True:
+            # before the states: what is complete when no command works stays complete
+            progress = read_progress(target.store)
+            states = run_status(target)
             lines = [json_line(states, progress)] if as_json else rows(states, progress)
             if as_json or not shown:
                 write("\n".join(lines))
@@ -102,19 +100,9 @@ def watch(
                 write(f"\x1b[{len(shown)}A\x1b[J" + "\n".join(lines))
             elif changed := [line for line in lines if line not in shown]:
                 write("\n".join(changed))
+            if not follow or progress is None:
+                return
             shown = lines
+            sleep(1.0)
     except KeyboardInterrupt:
         return
-
-
-def _snapshots(
-    target: Target, follow: bool, sleep: Callable[[float], None]
-) -> Iterator[tuple[list[StageState], dict[str, Any] | None]]:
-    """Yield the state of the run, once or until its command ends."""
-    while True:
-        # before the states: what is done when nobody works is done for good
-        progress = read_progress(target.store)
-        yield run_status(target), progress
-        if not follow or progress is None:
-            return
-        sleep(1.0)

@@ -9,16 +9,15 @@ memory must not grow with them. All read the same TIFF file.
 from __future__ import annotations
 
 import argparse
-import os
-import resource
 import shutil
-import subprocess
 import sys
 import tempfile
-import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from process_tree import Took, run_measured
+from running import PCHEM
 
 _NUMPY = """
 import sys, numpy as np, tifffile, zarr
@@ -42,7 +41,7 @@ def simulate(path: Path, size: int, n: int, exposure: float, seed: int) -> None:
     bias = np.random.default_rng(2).normal(100.0, 4.0, (size, size))
     rng = np.random.default_rng(seed)
 
-    def blocks():  # type: ignore[no-untyped-def]
+    def blocks() -> Iterator[np.ndarray]:
         for _ in range(n):
             electrons = rng.poisson(exposure, (size, size)) + 0.25 * rng.standard_normal((size, size))
             yield np.rint(bias + electrons / gain).astype(np.uint16)
@@ -50,39 +49,26 @@ def simulate(path: Path, size: int, n: int, exposure: float, seed: int) -> None:
     tifffile.imwrite(path, blocks(), shape=(n, size, size), dtype=np.uint16, bigtiff=True)
 
 
-def timed(command: list[str]) -> tuple[float, float]:
-    """Return wall time (s) and largest resident set (MiB) of a command."""
-    start = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    _, status, used = os.wait4(process.pid, 0)
-    if status:
-        raise SystemExit(f"{' '.join(command)} ended with {status}")
-    return time.perf_counter() - start, used.ru_maxrss / 1024
-
-
 def measure(folder: Path, size: int, n: int, workers: int, rounds: int) -> None:
     """Print a row for each way."""
     frames = folder / f"night{n}.tif"
     simulate(frames, size, n, 0.8, 7)
-    pchem = [sys.executable, "-m", "pchem_pipeline.cli.app", "apply", str(folder / "run.zarr"), str(frames)]
-    pchem += ["--workers", str(workers), "--progress", "off", "--output", str(folder / "out.zarr"), "--what"]
+    pchem = [PCHEM, "apply", str(folder / "run.zarr"), str(frames), "--workers", str(workers)]
+    pchem += ["--progress", "off", "--output", str(folder / "out.zarr"), "--what"]
     places = [str(frames), str(folder / "run.zarr"), str(folder / "out.zarr")]
     ways = {
         "numpy (x - mu) * g": [sys.executable, "-c", _NUMPY, *places],
-        "electrons": [*pchem, "electrons"],
-        "numbers": [*pchem, "numbers"],
-        "exposure": [*pchem, "exposure"],
-        "all": [*pchem, "all"],
-    }  # fmt: skip
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
+        **{what: [*pchem, what] for what in ("electrons", "numbers", "exposure", "all")},
+    }
+    found: dict[str, list[Took]] = {name: [] for name in ways}
     for _ in range(rounds):
         for name, command in ways.items():
             shutil.rmtree(folder / "out.zarr", ignore_errors=True)
-            found[name].append(timed(command))
-    base = min(seconds for seconds, _ in found["numpy (x - mu) * g"])
+            found[name].append(run_measured(command, must_succeed=True))
+    base = min(took.wall for took in found["numpy (x - mu) * g"])
     print(f"{n} frames of {size} x {size}, {workers} workers, best of {rounds}")
     for name, each in found.items():
-        seconds, memory = min(s for s, _ in each), max(m for _, m in each)
+        seconds, memory = min(took.wall for took in each), max(took.largest for took in each)
         rate = n * size * size / seconds / 1e6
         print(
             f"  {name:20} {seconds:7.2f} s  {rate:7.1f} Msamples/s  {seconds / base:5.2f} x  "
@@ -92,7 +78,6 @@ def measure(folder: Path, size: int, n: int, workers: int, rounds: int) -> None:
 
 
 def main() -> None:
-    """Measure at a number of frames and at four times as many."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--frames", type=int, default=1000)
@@ -102,21 +87,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         simulate(folder / "dark.tif", given.size, 400, 1.5, 3)
-        run = [
-            sys.executable,
-            "-m",
-            "pchem_pipeline.cli.app",
-            "run",
-            str(folder / "dark.tif"),
-            "--until",
-            "fit",
-        ]
-        subprocess.run(
-            [*run, "--store", str(folder / "run.zarr"), "--bit-depth", "14", "--quiet"], check=False
-        )
+        run = [PCHEM, "run", str(folder / "dark.tif"), "--until", "fit", "--bit-depth", "14", "--quiet"]
+        run_measured([*run, "--store", str(folder / "run.zarr")])
         for factor in (1, 4):
             measure(folder, given.size, given.frames * factor, given.workers, given.rounds)
-    print(f"this process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
 
 
 if __name__ == "__main__":

@@ -12,20 +12,15 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import shutil
-import subprocess
 import sys
 import tempfile
-import time
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
+from process_tree import run_measured
 from running import machine
 
-# the command of any checkout, whatever module its pyproject.toml names
-PCHEM = [sys.executable, "-c", "import sys, importlib; importlib.import_module(sys.argv.pop(1)).main()"]
 RUN = """run: {{store: {name}.zarr}}
 input: {{files: [{name}/*.tif], integration_time: {exposure}, bit_depth: 14}}
 """
@@ -52,18 +47,9 @@ class Cost:
 def pchem(checkout: Path, cache: Path, folder: Path, arguments: list[str]) -> Cost:
     """Run a command of a checkout with a cache of kernels of its own."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "NUMBA_CACHE_DIR": str(cache)}
-    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    project = tomllib.loads((checkout / "pyproject.toml").read_text())["project"]
-    module = project["scripts"]["pchem"].partition(":")[0]
-    done = subprocess.run(
-        [*PCHEM, module, *arguments], cwd=folder, env=environment, capture_output=True, text=True
-    )
-    wall = time.perf_counter() - start
-    if done.returncode:
-        raise SystemExit(f"pchem {' '.join(arguments)} in {checkout}:\n{done.stderr}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return Cost(wall, cpu, len(list(cache.rglob("*.nbc"))))
+    command = [sys.executable, "-m", "pchem_pipeline", *arguments, "--quiet"]
+    took = run_measured(command, folder, environment, must_succeed=True)
+    return Cost(took.wall, took.cpu, len(list(cache.rglob("*.nbc"))))
 
 
 def prepare(checkout: Path, folder: Path, options: argparse.Namespace) -> None:
@@ -74,17 +60,16 @@ def prepare(checkout: Path, folder: Path, options: argparse.Namespace) -> None:
             name=name, exposure=exposure, side=options.side, frames=options.frames, seed=options.seed
         )
         (folder / f"{name}.yaml").write_text(text)
-        pchem(checkout, cache, folder, ["simulate", f"{name}.yaml", "--quiet"])
-        given = RUN.format(name=name, exposure=exposure)
-        (folder / f"{name}-run.yaml").write_text(given)
+        pchem(checkout, cache, folder, ["simulate", f"{name}.yaml"])
+        (folder / f"{name}-run.yaml").write_text(RUN.format(name=name, exposure=exposure))
         if set(options.commands) != {"run"}:
-            pchem(checkout, cache, folder, ["run", f"{name}-run.yaml", "--quiet"])
+            pchem(checkout, cache, folder, ["run", f"{name}-run.yaml"])
 
 
 COMMANDS = {
-    "run": (["run", "frames-run.yaml", "--quiet"], "frames.zarr", False),
-    "discrepancy": (["discrepancy", "frames-run.yaml", "--quiet"], "frames.zarr", True),
-    "joint": (["joint", "frames.zarr", "brighter.zarr", "--quiet"], "joint.zarr", False),
+    "run": (["run", "frames-run.yaml"], "frames.zarr", False),
+    "discrepancy": (["discrepancy", "frames-run.yaml"], "frames.zarr", True),
+    "joint": (["joint", "frames.zarr", "brighter.zarr"], "joint.zarr", False),
 }
 
 
@@ -125,14 +110,8 @@ def main() -> None:
                 base, cache = Path(place) / label, Path(place) / f"cache-{label}-{command}"
                 cold = measure(checkout, base, command, cache)
                 warm = measure(checkout, base, command, cache)
-                numbers = (
-                    cold.wall,
-                    warm.wall,
-                    cold.wall - warm.wall,
-                    cold.cpu,
-                    warm.cpu,
-                    cold.cpu - warm.cpu,
-                )
+                pairs = (cold.wall, warm.wall), (cold.cpu, warm.cpu)
+                numbers = [each for one, other in pairs for each in (one, other, one - other)]
                 row = "".join(f"{number:>16.1f}" for number in numbers)
                 print(f"{command + ' ' + label:<18}{row}{cold.files:>16}", flush=True)
 

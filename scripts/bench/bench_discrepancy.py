@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import sys
 import time
 import zlib
 from collections.abc import Iterable, Iterator
@@ -29,7 +28,7 @@ from typing import Any
 
 from discrepancy_cases import EFFECTS, Case, Plan, remaining, table_cases
 from discrepancy_command import run_commands
-from discrepancy_figures import Answer, print_figures
+from discrepancy_figures import Answer, print_figures, read_results
 from discrepancy_null import MOST_SAMPLES, run_null_range
 from discrepancy_table import print_table
 from discrepancy_tails import run_null_tails
@@ -38,17 +37,6 @@ from discrepancy_worker import run_case
 from pchem_pipeline.compute.environment import prepare_environment
 
 RESULTS = "results.jsonl"
-
-
-def read_results(path: Path) -> list[dict[str, Any]]:
-    """Return the records of a study; a last line that was cut off is left out."""
-    records = []
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            records.append(json.loads(line))
-        except json.JSONDecodeError:
-            print(f"{path}: an incomplete line is left out", file=sys.stderr)
-    return records
 
 
 def source_state() -> str:
@@ -164,14 +152,12 @@ def parse() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Run what is missing, and print the figures."""
     prepare_environment()
     options = parse()
     path = options.folder / RESULTS
     shape = (options.shape[0], options.shape[1], options.shape[2])
     if options.null_range:
-        results = options.folder / "null_range.jsonl"
-        run_null_range(results, options.first, options.minutes, options.most_samples)
+        run_null_range(options.folder, options.first, options.minutes, options.most_samples)
         return
     if options.null_tails:
         run_null_tails(options.folder, options.first, options.minutes)

@@ -15,9 +15,9 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,28 +25,20 @@ from scipy.optimize import minimize
 from scipy.special import gammaln, logsumexp
 
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+from helpers.drawn_pixels import Drawn
 from helpers.plain_law import pcd_mass
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 NAMES = ("H", "g", "mu", "sigma")
 
 
-@dataclass(frozen=True)
-class Pixels:
-    """Histograms and their true (H, g, mu, sigma)."""
-
-    counts: NDArray[np.uint16]
-    origin: NDArray[np.int64]
-    truth: Array
-
-
-def draw(rng: np.random.Generator, exposure: Array, step: Array, noise: Array, n_frames: int) -> Pixels:
+def draw(rng: np.random.Generator, exposure: Array, step: Array, noise: Array, n_frames: int) -> Drawn:
     """Draw histograms; ``step = 1/g`` in DN, ``noise`` in e- with quantisation."""
     n = exposure.size
     bias = rng.uniform(95, 105, n)
@@ -59,7 +51,7 @@ def draw(rng: np.random.Generator, exposure: Array, step: Array, noise: Array, n
         x = origin[part, None] + np.arange(width)
         mass = pcd_mass(x, exposure[part, None], 1 / step[part, None], bias[part, None], analog[part, None])
         counts[part] = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True))
-    return Pixels(counts, origin, np.stack([exposure, 1 / step, bias, noise * step], axis=1))
+    return Drawn(counts, origin, np.stack([exposure, 1 / step, bias, noise * step], axis=1))
 
 
 def draw_range(
@@ -70,15 +62,10 @@ def draw_range(
     n_frames: int,
     step: tuple[float, float] = (8, 14),
     log_exposure: bool = True,
-) -> Pixels:
+) -> Drawn:
     """Draw pixels all over a range of H (log-uniform or uniform), 1/g and s_e (uniform)."""
     h = np.exp(rng.uniform(*np.log(exposure), n)) if log_exposure else rng.uniform(*exposure, n)
     return draw(rng, h, rng.uniform(*step, n), rng.uniform(*noise, n), n_frames)
-
-
-def estimates(result: FitResult) -> Array:
-    """Return (H, g, mu, sigma) by pixel."""
-    return result.columns
 
 
 def is_wrong(answer: Array, truth: Array) -> NDArray[np.bool_]:
@@ -87,14 +74,14 @@ def is_wrong(answer: Array, truth: Array) -> NDArray[np.bool_]:
     return ~(near & (np.abs(answer[:, 1] / truth[:, 1] - 1) < 0.25))
 
 
-def cpu(function: Callable[[], object]) -> float:
-    """Return the CPU seconds of a call."""
+def cpu(function: Callable[[], T]) -> tuple[float, T]:
+    """Return the CPU seconds of a call, and what it returns."""
     start = time.process_time()
-    function()
-    return time.process_time() - start
+    found = function()
+    return time.process_time() - start, found
 
 
-def numpy_em(pixels: Pixels, tolerance: float = 1e-6, most: int = 2000) -> tuple[Array, NDArray[np.int64]]:
+def numpy_em(pixels: Drawn, tolerance: float = 1e-6, most: int = 2000) -> tuple[Array, NDArray[np.int64]]:
     """Plain EM, eqs. (update_eqns) to (gamma_nk), on histograms, all pixels at once; stops on the step."""
     theta = starting_points(pixels.counts, pixels.origin)[:, 0, :].copy()
     used = np.zeros(len(theta), np.int64)
@@ -122,7 +109,7 @@ def numpy_em(pixels: Pixels, tolerance: float = 1e-6, most: int = 2000) -> tuple
     return theta, used
 
 
-def scipy_fit(pixels: Pixels) -> Array:
+def scipy_fit(pixels: Drawn) -> Array:
     """Minimise each pixel's negative log-likelihood with L-BFGS-B from the same start."""
     starts = starting_points(pixels.counts, pixels.origin)[:, 0, :]
     answers = np.empty_like(starts)
@@ -149,30 +136,25 @@ def bench_speed(rng: np.random.Generator, n: int, n_peer: int, n_frames: int) ->
     """Print pixels per second of the fit and of its two peers."""
     pixels = draw_range(rng, n, (0.5, 8), (0.22, 0.42), n_frames, log_exposure=False)
     fit_histograms(pixels.counts[:8], pixels.origin[:8])  # compile, or load what was compiled
-    seconds = min(cpu(lambda: fit_histograms(pixels.counts, pixels.origin)) for _ in range(3))
-    result = fit_histograms(pixels.counts, pixels.origin)
-    few = Pixels(pixels.counts[:n_peer], pixels.origin[:n_peer], pixels.truth[:n_peer])
+    turns = [cpu(lambda: fit_histograms(pixels.counts, pixels.origin)) for _ in range(3)]
+    seconds, result = min(turn[0] for turn in turns), turns[0][1]
+    few = Drawn(*(each[:n_peer] for each in pixels))
     print(f"\nSpeed: H 0.5..8, 1/g 8..14 DN, s_e 0.22..0.42 e-, N = {n_frames}; one core, CPU time")
     print(f"{'method':34s}{'pixels':>8s}{'pixels/s':>11s}{'evaluations':>13s}{'wrong or none':>15s}")
-    bad = np.count_nonzero(is_wrong(estimates(result), pixels.truth))
+    bad = np.count_nonzero(is_wrong(result.columns, pixels.truth))
     rate = n / seconds
     print(f"{'fit_histograms':34s}{n:8d}{rate:11.0f}{result.n_iterations.mean():13.1f}{bad:15d}")
-    store: dict[str, Array] = {}
-
-    def em() -> None:
-        store["em"], store["used"] = numpy_em(few)
-
-    em_seconds = cpu(em)
-    bad = np.count_nonzero(is_wrong(store["em"], few.truth))
+    em_seconds, (em, used) = cpu(lambda: numpy_em(few))
+    bad = np.count_nonzero(is_wrong(em, few.truth))
     name = "plain EM, numpy, step < 1e-6"
-    print(f"{name:34s}{n_peer:8d}{n_peer / em_seconds:11.1f}{store['used'].mean():13.1f}{bad:15d}")
-    scipy_seconds = cpu(lambda: store.update(scipy=scipy_fit(few)))
-    bad = np.count_nonzero(is_wrong(store["scipy"], few.truth))
+    print(f"{name:34s}{n_peer:8d}{n_peer / em_seconds:11.1f}{used.mean():13.1f}{bad:15d}")
+    scipy_seconds, by_scipy = cpu(lambda: scipy_fit(few))
+    bad = np.count_nonzero(is_wrong(by_scipy, few.truth))
     name = "scipy L-BFGS-B, compiled density"
     print(f"{name:34s}{n_peer:8d}{n_peer / scipy_seconds:11.1f}{'-':>13s}{bad:15d}")
     stderr = np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2))[:n_peer]
-    for name in ("em", "scipy"):
-        gap = np.abs((store[name] - estimates(result)[:n_peer]) / stderr).max(axis=1)
+    for name, answer in (("em", em), ("scipy", by_scipy)):
+        gap = np.abs((answer - result.columns[:n_peer]) / stderr).max(axis=1)
         print(f"  {name}: median {np.median(gap):.1e}, largest {gap.max():.1e} s.e. from fit_histograms")
 
 
@@ -199,9 +181,9 @@ def bench_rounding(rng: np.random.Generator, n: int) -> None:
         for settings in ways:
             fit = partial(fit_histograms, pixels.counts, pixels.origin, settings=settings)
             found.append(fit())
-            rates.append(n / min(cpu(fit) for _ in range(3)))
+            rates.append(n / min(cpu(fit)[0] for _ in range(3)))
         moved = np.mean(found[0].n_iterations != found[1].n_iterations)
-        wrong = [is_wrong(estimates(each), pixels.truth).mean() for each in found]
+        wrong = [is_wrong(each.columns, pixels.truth).mean() for each in found]
         ranges = (
             f"{step[0]:g}..{step[1]:g}",
             f"{exposure[0]:g}..{exposure[1]:g}",
@@ -229,13 +211,11 @@ def bench_maxima(rng: np.random.Generator, n: int, n_frames: int) -> None:
     ]
     for size, exposure, noise in ranges:
         pixels = draw_range(rng, size, exposure, noise, n_frames)
-        start = time.process_time()
-        result = fit_histograms(pixels.counts, pixels.origin)
-        rate = size / (time.process_time() - start)
-        bad, word = is_wrong(estimates(result), pixels.truth), result.fit_status != 0
+        seconds, result = cpu(partial(fit_histograms, pixels.counts, pixels.origin))
+        bad, word = is_wrong(result.columns, pixels.truth), result.fit_status != 0
         cases = [np.count_nonzero(case) for case in (bad & ~word, bad & word, ~bad & word)]
         name = f"{exposure[0]:5g}..{exposure[1]:<5g}{noise[0]:6g}..{noise[1]:<5g}{size:7d}"
-        print(name + "".join(f"{case:16d}" for case in cases) + f"{rate:16.0f}")
+        print(name + "".join(f"{case:16d}" for case in cases) + f"{size / seconds:16.0f}")
 
 
 def bench_efficiency(rng: np.random.Generator, n: int, n_pulls: int, n_frames: int) -> None:
@@ -252,7 +232,7 @@ def bench_efficiency(rng: np.random.Generator, n: int, n_pulls: int, n_frames: i
         for noise in (0.15, 0.25, 0.35):
             pixels = draw(rng, np.full(n, h), np.full(n, 11.0), np.full(n, noise), n_frames)
             result = fit_histograms(pixels.counts, pixels.origin)
-            error = estimates(result) - pixels.truth
+            error = result.columns - pixels.truth
             pulls = (error / np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2)))[:n_pulls]
             bound = np.sqrt(np.diagonal(cramer_rao(h, 1 / 11, noise * 11, n_frames)))
             ratios.append(np.sqrt((error**2).mean(0)) / bound)
@@ -277,7 +257,6 @@ def bench_efficiency(rng: np.random.Generator, n: int, n_pulls: int, n_frames: i
 
 
 def main() -> None:
-    """Run the benchmarks."""
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
     parser.add_argument("--pixels", type=int, default=20_000, help="pixels of the speed test")

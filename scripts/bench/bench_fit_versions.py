@@ -43,10 +43,9 @@ def histograms(
         noise = np.sqrt(truth["noise"][i] ** 2 + spread**2 * k) * rng.standard_normal(n_frames)
         values[i] = np.rint(truth["bias"][i] + truth["step"][i] * (k + noise))
     origin = values.min(axis=1) - 1
-    counts = np.zeros((n, int((values.max(axis=1) - origin).max()) + 2), np.uint16)
-    for i in range(n):
-        found = np.bincount(values[i] - origin[i], minlength=counts.shape[1])
-        counts[i] = found
+    width = int((values.max(axis=1) - origin).max()) + 2
+    rows = [np.bincount(row, minlength=width) for row in values - origin[:, None]]
+    counts = np.array(rows, np.uint16)
     return counts, origin.astype(np.int64)
 
 
@@ -126,7 +125,6 @@ def ask(process: subprocess.Popen[str], case: str) -> tuple[float, float]:
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--old", type=Path, help="the other checkout")
     parser.add_argument("--only", nargs="*", default=[], help="of good, short, joint, extended, exact")

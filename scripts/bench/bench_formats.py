@@ -4,22 +4,27 @@ Some frames of a raw file are written as TIFF (zlib), HDF5 (bitshuffle with LZ4)
 in whole frames: by the library itself on one thread, by ours on one thread, and by ours with the hash of the
 bytes on several threads, as ``pchem run`` does.
 
-    python scripts/bench/bench_formats.py /data/full/frames/frames.raw --frames 200 --output formats
+    python scripts/bench/bench_formats.py /data/full/frames/frames.raw --frames 200
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
-import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from timeit import repeat
 
 import numpy as np
 from numpy.typing import NDArray
-from running import machine, save_figure
+from running import machine
 
 from pchem_pipeline.compute.environment import prepare_environment
+from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.sequence import FrameSequence
+from pchem_pipeline.frames.settings import InputSettings
+from pchem_pipeline.frames.stream import HashedFrameStream
 
 Stack = NDArray[np.uint16]
 
@@ -70,33 +75,17 @@ def _fits(path: Path, stack: Stack) -> Callable[[], object]:
 FORMATS = {"stack.tif": _tiff, "stack.h5": _hdf5, "stack.fits": _fits}
 
 
-def seconds(call: Callable[[], object]) -> float:
-    """Return the smaller of two wall times."""
-    times = []
-    for _ in range(2):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
-def draw(folder: Path, found: dict[str, list[float]], threads: int) -> None:
-    """Draw the speeds side by side."""
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(5.5, 3), layout="constrained")
-    labels = ("bare decoder", "ours", f"ours with hash, {threads} threads")
-    for place, (label, colour) in enumerate(zip(labels, ("0.65", "tab:blue", "tab:orange"), strict=True)):
-        values = [speeds[place] for speeds in found.values()]
-        axes.bar(np.arange(len(found)) + 0.27 * (place - 1), values, 0.25, label=label, color=colour)
-    axes.set_xticks(range(len(found)), list(found))
-    axes.set_ylabel("MB/s of decoded samples")
-    axes.legend(frameon=False, fontsize=8)
-    save_figure(figure, folder, "formats")
+def hashed(frames: FrameSequence, path: Path, threads: int) -> None:
+    """Read all frames with the hash of their bytes."""
+    with HashedFrameStream(
+        frames, [(0, frames.shape[1])], frames.shape[0], files=[path], threads=threads
+    ) as stream:
+        for _ in stream:
+            pass
+        stream.identity()
 
 
 def main() -> None:
-    """Measure, print and draw."""
     prepare_environment()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -104,47 +93,22 @@ def main() -> None:
     parser.add_argument("raw", type=Path, help="raw file, uint16, with its sidecar")
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--output", type=Path, default=Path("bench-formats"), help="folder of the figure")
     given = parser.parse_args()
-
-    from pchem_pipeline.frames.open import open_frames
-    from pchem_pipeline.frames.settings import InputSettings
-    from pchem_pipeline.frames.stream import HashedFrameStream
-
     reader = open_frames(InputSettings(files=(str(given.raw.resolve()),)), Path())
     stack = reader.read(0, min(given.frames, reader.shape[0]))
     print(machine())
     print(f"{stack.shape[0]} frames of {stack.shape[1]} x {stack.shape[2]}; MB/s of decoded samples")
     print(f"{'file':<12}{'bare':>8}{'ours':>8}{'ours + hash':>13}  ({given.threads} threads)")
-    found: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory(prefix="bench-formats-") as folder:
         for name, write in FORMATS.items():
             path = Path(folder) / name
             bare = write(path, stack)
             frames = open_frames(InputSettings(files=(str(path),)), Path())
             np.testing.assert_array_equal(frames.read(), stack)
-            buffer = np.empty_like(stack)
-
-            def ours(frames: object = frames, buffer: Stack = buffer) -> None:
-                frames.read_into(buffer, 0, len(stack))  # type: ignore[attr-defined]
-
-            def hashed(frames: object = frames, path: Path = path) -> None:
-                n, rows = stack.shape[:2]
-                with HashedFrameStream(
-                    frames,  # type: ignore[arg-type]
-                    [(0, rows)],
-                    n,
-                    files=[path],
-                    threads=given.threads,
-                ) as stream:
-                    for _ in stream:
-                        pass
-                    stream.identity()
-
-            speeds = [stack.nbytes / 1e6 / seconds(call) for call in (bare, ours, hashed)]
-            found[name] = speeds
+            ours = partial(frames.read_into, np.empty_like(stack), 0, len(stack))
+            calls = (bare, ours, partial(hashed, frames, path, given.threads))
+            speeds = [stack.nbytes / 1e6 / min(repeat(call, number=1, repeat=2)) for call in calls]
             print(f"{name:<12}{speeds[0]:>8.0f}{speeds[1]:>8.0f}{speeds[2]:>13.0f}")
-    draw(given.output, found, given.threads)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from pchem_pipeline.compute.environment import prepare_environment
 prepare_environment()
 
 from pchem_pipeline.report.data import ReportData  # noqa: E402
-from pchem_pipeline.report.inspector import (  # noqa: E402  # noqa: E402
+from pchem_pipeline.report.inspector import (  # noqa: E402
     InspectorData,
     MapEntry,
     PixelSample,
@@ -125,7 +125,6 @@ def measure(page: Page, path: Path) -> dict[str, float]:
 
 
 def main(sizes: list[int]) -> None:
-    """Print a table for each size."""
     chromium = os.environ.get("PCHEM_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])

@@ -85,7 +85,6 @@ def best_of_grid(counts: NDArray[np.uint16], origin: NDArray[np.int64], found: F
 
 
 def main() -> None:
-    """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--pixels", type=int, default=2000, help="of each kind")
     parser.add_argument("--checked", type=int, default=200, help="of those, compared with the grid")

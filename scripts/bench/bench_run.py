@@ -13,19 +13,16 @@ nothing, by turns, and what it costs to be safe from power cuts is printed inste
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import resource
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
-from running import STAGES, machine, read_once
+from process_tree import Took, run_measured
+from running import PCHEM, machine, read_once, stage_records
 
 #: takes the place of ``os.fsync`` in every process of a run; the file SYNCS gets a byte a call
 _FSYNC = """
@@ -42,37 +39,21 @@ os.fsync = counted
 """
 
 
-@dataclass(frozen=True)
-class Synced:
-    """What a run took that waits for the disk, or does not.
+class Synced(NamedTuple):
+    """What a run took that waits for the disk, or does not."""
 
-    Attributes:
-        wall: seconds of the command.
-        cpu: CPU seconds of all its processes.
-        syncs: calls of ``os.fsync``.
-        written: seconds, of those after the command, until all it wrote is on the disk.
-    """
-
-    wall: float
-    cpu: float
-    syncs: int
-    written: float
+    wall: float  # s
+    cpu: float  # s, of all its processes
+    syncs: float  # calls of ``os.fsync``
+    written: float  # s, after the command, until all it wrote is on the disk
 
 
-def run(
-    frames: Path, store: Path, options: argparse.Namespace, environment: Mapping[str, str] | None = None
-) -> tuple[float, float, float]:
-    """Run the pipeline in a process of its own; return wall seconds, CPU seconds and peak MiB."""
-    command = [str(Path(sys.executable).with_name("pchem")), "run", str(frames), "--store", str(store)]
-    command += ["--mode", options.mode, "--workers", str(options.workers), "--backend", options.backend]
+def run(store: Path, options: argparse.Namespace, environment: Mapping[str, str] | None = None) -> Took:
+    """Run the pipeline in a process of its own."""
+    command = [PCHEM, "run", str(options.frames), "--store", str(store), "--mode", options.mode]
+    command += ["--workers", str(options.workers), "--backend", options.backend]
     command += ["--integration-time", "4.87", "--bit-depth", "14", "--quiet"]
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    start = time.perf_counter()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
-    wall = time.perf_counter() - start
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return wall, cpu, after.ru_maxrss / 1024
+    return run_measured(command, environment=environment, must_succeed=True)
 
 
 def run_synced(options: argparse.Namespace, sync: bool) -> Synced:
@@ -83,10 +64,10 @@ def run_synced(options: argparse.Namespace, sync: bool) -> Synced:
         syncs, path = folder / "syncs", os.pathsep.join([made, os.environ.get("PYTHONPATH", "")])
         environment = {**os.environ, "PYTHONPATH": path, "SYNCS": str(syncs), "DO_SYNC": str(int(sync))}
         os.sync()
-        wall, cpu, _ = run(options.frames, folder / "bench.zarr", options, environment)
+        took = run(folder / "bench.zarr", options, environment)
         start = time.perf_counter()
         os.sync()
-        return Synced(wall, cpu, syncs.stat().st_size, time.perf_counter() - start)
+        return Synced(took.wall, took.cpu, syncs.stat().st_size, time.perf_counter() - start)
 
 
 def cost_of_syncs(options: argparse.Namespace) -> None:
@@ -101,11 +82,8 @@ def cost_of_syncs(options: argparse.Namespace) -> None:
         both = {sync: run_synced(options, sync) for sync in order}
         pairs.append((both[True], both[False]))
         show_pair(str(i + 1), both[True], both[False])
-    names = [field.name for field in fields(Synced)]
-    show_pair(
-        "median",
-        *(Synced(*(median(getattr(pair[i], name) for pair in pairs) for name in names)) for i in (0, 1)),
-    )
+    medians = [Synced(*map(median, zip(*runs, strict=True))) for runs in zip(*pairs, strict=True)]
+    show_pair("median", *medians)
     ratios = sorted(on.wall / off.wall for on, off in pairs)
     print(f"ratio of a pair: median {median(ratios):.3f}, {ratios[0]:.3f} to {ratios[-1]:.3f}")
 
@@ -139,19 +117,17 @@ def main() -> None:
     size = options.frames.stat().st_size
     with tempfile.TemporaryDirectory(prefix="bench-run-") as folder:
         store = options.store or Path(folder) / "bench.zarr"
-        wall, cpu, peak = run(options.frames, store, options)
-        records = [json.loads((store / ".pchem" / "stages" / f"{name}.json").read_text()) for name in STAGES]
+        took = run(store, options)
+        records = stage_records(store)
     floor = read_once(options.frames)
     print(f"{options.frames.name}: {size / 1e9:.2f} GB, mode {options.mode}, {options.workers} workers")
     print(f"{'stage':<12}{'wall s':>9}{'CPU s':>9}{'GB/s':>9}{'peak MiB so far':>17}")
-    for record in records:
-        reads = record["stage"] in ("ingest", "histogram")
-        speed = f"{size / 1e9 / record['seconds']:.2f}" if reads else ""
-        peak_mib = record["peak_rss_bytes"] / 2**20
-        print(
-            f"{record['stage']:<12}{record['seconds']:>9.1f}{record['cpu_seconds']:>9.1f}{speed:>9}{peak_mib:>17.0f}"
-        )
-    print(f"{'pchem run':<12}{wall:>9.1f}{cpu:>9.1f}{size / 1e9 / wall:>9.2f}{peak:>17.0f}")
+    for name, record in records.items():
+        speed = f"{size / 1e9 / record['seconds']:.2f}" if name in ("ingest", "histogram") else ""
+        row = f"{name:<12}{record['seconds']:>9.1f}{record['cpu_seconds']:>9.1f}{speed:>9}"
+        print(f"{row}{record['peak_rss_bytes'] / 2**20:>17.0f}")
+    wall = took.wall
+    print(f"{'pchem run':<12}{wall:>9.1f}{took.cpu:>9.1f}{size / 1e9 / wall:>9.2f}{took.largest:>17.0f}")
     ratio = f"   (the run takes {wall / floor:.1f} x)"
     print(f"{'readinto':<12}{floor:>9.1f}{'':>9}{size / 1e9 / floor:>9.2f}{ratio}")
 

@@ -6,7 +6,7 @@ iminuit is installed) on the histograms of a sample of pixels, scaled; and the h
 them in an afternoon (map_blocks with one bincount a pixel), on some rows and scaled. Before each reading the
 file is dropped from the memory of the operating system.
 
-    python scripts/bench/bench_side_by_side.py /data/full/frames/frames.raw --workers 2 --output side-by-side
+    python scripts/bench/bench_side_by_side.py /data/full/frames/frames.raw --workers 2
     python scripts/bench/bench_side_by_side.py small.raw --pixels 20 --rows 2 --no-report     # a look
 """
 
@@ -22,7 +22,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from running import Outcome, evict, machine, read_once, run_pchem, save_figure
+from process_tree import Took, run_measured
+from running import PCHEM, evict, machine, read_once, stage_records
 
 from pchem_pipeline.compute.environment import prepare_environment
 
@@ -102,14 +103,14 @@ def dask_histograms(frames: NDArray[np.uint16], rows: int) -> float:
 
 def optimisers(counts: NDArray[np.uint16], origin: NDArray[np.int32]) -> dict[str, float]:
     """Return the CPU seconds a pixel of general optimisers on histograms, from the same starts as ours."""
-    from bench_fit import Pixels, cpu, scipy_fit
+    from bench_fit import Drawn, cpu, scipy_fit
 
     from pchem_pipeline.model.fit.starts import starting_points
     from pchem_pipeline.model.law.pcd import log_pcd
 
-    pixels = Pixels(counts, origin.astype(np.int64), np.ones((len(counts), 4)))
-    scipy_fit(Pixels(counts[:1], pixels.origin[:1], np.ones((1, 4))))  # imports its libraries
-    found = {"scipy L-BFGS-B on histograms": cpu(lambda: scipy_fit(pixels)) / len(counts)}
+    pixels = Drawn(counts, origin.astype(np.int64), np.ones((len(counts), 4)))
+    scipy_fit(Drawn(*(each[:1] for each in pixels)))  # imports its libraries
+    found = {"scipy L-BFGS-B on histograms": cpu(lambda: scipy_fit(pixels))[0] / len(counts)}
     try:
         from iminuit import Minuit
     except ImportError:
@@ -130,32 +131,31 @@ def optimisers(counts: NDArray[np.uint16], origin: NDArray[np.int32]) -> dict[st
             fit.migrad()
             fit.hesse()
 
-    found["iminuit (MIGRAD, HESSE) on histograms"] = cpu(minuit) / len(counts)
+    found["iminuit (MIGRAD, HESSE) on histograms"] = cpu(minuit)[0] / len(counts)
     return found
 
 
-def our_run(raw: Path, folder: Path, workers: int, report: bool) -> tuple[Outcome, Path]:
-    """Run the pipeline, the file not in memory; return what it took, and the store."""
-    config = folder / "run.yaml"
+def our_run(raw: Path, folder: Path, workers: int, until: str) -> Took:
+    """Run the pipeline, the file not in memory; its store is ``run.zarr``."""
     content = {
         "run": {"store": "run.zarr", "allowed_failed_pixels": 1.0},
         "input": {"files": [str(raw.resolve())], "integration_time": 4.87},
         "compute": {"workers": workers},
     }
-    config.write_text(json.dumps(content))
+    (folder / "run.yaml").write_text(json.dumps(content))
     evict(raw)
-    took = run_pchem(config, () if report else ("ingest", "histogram", "fit", "maps"))
-    return took, folder / "run.zarr"
+    return run_measured([PCHEM, "run", "run.yaml", "--until", until, "--quiet"], folder, must_succeed=True)
 
 
 def compare(raw: Path, folder: Path, given: argparse.Namespace) -> list[Row]:
     """Measure everything."""
     from pchem_pipeline.store.run_store import RunStore
 
-    took, place = our_run(raw, folder, given.workers, given.report)
-    seconds = took.seconds
-    fit = took.cpu["fit"] / given.workers  # CPU time, like that of the peers
-    store = RunStore.open(place)
+    took = our_run(raw, folder, given.workers, "report" if given.report else "maps")
+    records = stage_records(folder / "run.zarr")
+    seconds = {name: record["seconds"] for name, record in records.items()}
+    fit = records["fit"]["cpu_seconds"] / given.workers  # CPU time, like that of the peers
+    store = RunStore.open(folder / "run.zarr")
     sensor = store.attributes("frames")["sensor"]
     n, ny, nx = sensor["n_frames"], sensor["ny"], sensor["nx"]
     pixels = ny * nx
@@ -205,29 +205,7 @@ def show(rows: list[Row]) -> None:
         print(f"| {row.what:<40} | {spent:>9} | {ratio:>10.3g} | {row.measured} |")
 
 
-def draw(rows: list[Row], folder: Path, title: str) -> None:
-    """Draw the table."""
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(8, 0.42 * len(rows) + 1.2), layout="constrained")
-    names = [row.what for row in rows]
-    colours = ["tab:blue" if name.startswith("pchem") else "0.65" for name in names]
-    bars = axes.barh(names, [row.seconds for row in rows], color=colours)
-    axes.bar_label(
-        bars,
-        [f" {row.seconds:,.3g} s" if row.seconds < 100 else f" {row.seconds:,.0f} s" for row in rows],
-        fontsize=8,
-    )
-    axes.set_xscale("log")
-    axes.set_xlim(right=axes.get_xlim()[1] * 10)
-    axes.invert_yaxis()
-    axes.set_xlabel("seconds for the whole stack")
-    axes.set_title(title, fontsize=9)
-    save_figure(figure, folder, "side_by_side")
-
-
 def main() -> None:
-    """Measure, print and draw."""
     prepare_environment()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -239,15 +217,12 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--no-report", dest="report", action="store_false", help="stop at the maps")
     parser.add_argument("--folder", type=Path, help="where the store is written [a temporary folder]")
-    parser.add_argument("--output", type=Path, default=Path("bench-side-by-side"), help="of the figure")
     given = parser.parse_args()
     size = given.frames.stat().st_size
-    title = f"{given.frames.name}, {size / 1e9:.2f} GB, {given.workers} workers"
-    print(f"{machine()}\n{title}")
+    print(f"{machine()}\n{given.frames.name}, {size / 1e9:.2f} GB, {given.workers} workers")
     with tempfile.TemporaryDirectory(prefix="bench-side-", dir=given.folder) as place:
         rows = compare(given.frames, Path(place), given)
     show(rows)
-    draw(rows, given.output, title)
 
 
 if __name__ == "__main__":

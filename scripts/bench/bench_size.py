@@ -11,17 +11,15 @@ written as one raw file or one BigTIFF, and removed again. Memory is counted ove
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 from process_tree import run_measured
-from running import STAGES, machine, write_stack
+from running import PCHEM, machine, stage_records, write_stack
 
 from pchem_pipeline.compute.environment import prepare_environment
-from pchem_pipeline.stages.table import STAGES as DECLARED
+from pchem_pipeline.stages.table import STAGES
 
 
 def as_tiff(raw: Path, shape: tuple[int, int, int]) -> Path:
@@ -29,9 +27,7 @@ def as_tiff(raw: Path, shape: tuple[int, int, int]) -> Path:
     import tifffile
 
     frames = np.memmap(raw, "<u2", "r", shape=shape)
-    with tifffile.TiffWriter(raw.with_suffix(".tif"), bigtiff=True) as writer:
-        for frame in frames:
-            writer.write(frame, photometric="minisblack", contiguous=True)
+    tifffile.imwrite(raw.with_suffix(".tif"), frames, bigtiff=True, photometric="minisblack")
     raw.unlink()
     return raw.with_suffix(".tif")
 
@@ -61,7 +57,7 @@ def main() -> None:
         write_stack(raw, given.frames, (given.rows, given.columns))
         if given.format == "tiff":
             raw = as_tiff(raw, (given.frames, given.rows, given.columns))
-        command = [str(Path(sys.executable).with_name("pchem")), "run", str(raw), "--store", str(store)]
+        command = [PCHEM, "run", str(raw), "--store", str(store)]
         command += ["--mode", given.mode, "--workers", str(given.workers), "--until", given.until, "--quiet"]
         command += ["--bit-depth", "14", "--integration-time", "1"]
         if given.max_memory:
@@ -69,15 +65,12 @@ def main() -> None:
         print(f"{given.frames} x {given.rows} x {given.columns}, {raw.stat().st_size / 1e9:.2f} GB")
         took = run_measured(command)
         print("stage      seconds    CPU s   peak MiB    files")
-        for stage in STAGES:
-            path = store / ".pchem" / "stages" / f"{stage}.json"
-            if path.exists():
-                record = json.loads(path.read_text())
-                folders = [*(store / each for each in DECLARED[stage].writes), store / ".pchem/done" / stage]
-                print(
-                    f"{stage:10}{record['seconds']:8.1f} {record['cpu_seconds']:8.1f} "
-                    f"{record['peak_rss_bytes'] / 2**20:10.0f} {sum(map(files_below, folders)):8d}"
-                )
+        for stage, record in stage_records(store).items():
+            folders = [*(store / each for each in STAGES[stage].writes), store / ".pchem/done" / stage]
+            print(
+                f"{stage:10}{record['seconds']:8.1f} {record['cpu_seconds']:8.1f} "
+                f"{record['peak_rss_bytes'] / 2**20:10.0f} {sum(map(files_below, folders)):8d}"
+            )
         print(f"all       {took.wall:8.1f} {took.cpu:8.1f} {took.tree:10.0f} {files_below(store):8d}")
         if took.code:
             print(took.words)

@@ -135,27 +135,32 @@ class Plan:
 
     def cases(self) -> list[Case]:
         """Return all cases; of each kind and level, every beginning holds its fair part."""
-        again = range(self.first, self.first + self.seeds)
+
+        def again(count: int) -> range:
+            return range(self.first, self.first + count)
+
         groups = [
-            [Case("single", (e,), level, i, self.shape) for i in again for e in self._shuffled(i, level)]
+            [
+                Case("single", (e,), level, i, self.shape)
+                for i in again(self.seeds)
+                for e in self._shuffled(i, level)
+            ]
             for level in self.levels
         ]
-        groups.append([Case("null", (), 0.0, self.first + i, self.shape) for i in range(self.nulls)])
-        groups.append(
-            [Case("pair", pair, 4.0, self.first, self.shape) for pair in self._several(2, self.pairs)]
-        )
-        groups.append([Case("pair", s, 4.0, self.first, self.shape) for s in self._several(3, self.triples)])
-        left = range(self.first, self.first + self.leave_out)
-        groups.append(
-            [Case("left_out", (e,), 4.0, i, self.shape, (e,)) for i in left for e in self._shuffled(i, -1.0)]
-        )
-        for kind, tags in (("untestable", UNTESTABLE), ("outside", OUTSIDE)):
-            other = range(self.first, self.first + self.others)
-            groups.append([Case(kind, (tag,), 4.0, i, self.shape) for i in other for tag in tags])
-        for kind, tags, count in (("decoy", TRIED, self.decoys), ("sealed", SEALED, self.sealed)):
-            for level in self.levels:
-                other = range(self.first, self.first + count)
-                groups.append([Case(kind, (tag,), level, i, self.shape) for i in other for tag in tags])
+        groups.append([Case("null", (), 0.0, i, self.shape) for i in again(self.nulls)])
+        for size, count in ((2, self.pairs), (3, self.triples)):
+            sets = self._several(size, count)
+            groups.append([Case("pair", tags, 4.0, self.first, self.shape) for tags in sets])
+        left_out = [(i, e) for i in again(self.leave_out) for e in self._shuffled(i, -1.0)]
+        groups.append([Case("left_out", (e,), 4.0, i, self.shape, (e,)) for i, e in left_out])
+        for kind, tags, levels, count in (
+            ("untestable", UNTESTABLE, (4.0,), self.others),
+            ("outside", OUTSIDE, (4.0,), self.others),
+            ("decoy", TRIED, self.levels, self.decoys),
+            ("sealed", SEALED, self.levels, self.sealed),
+        ):
+            for level in levels:
+                groups.append([Case(kind, (e,), level, i, self.shape) for i in again(count) for e in tags])
         placed = [
             ((i + 0.5) / len(group), n, case)
             for n, group in enumerate(groups)
@@ -172,10 +177,7 @@ class Plan:
         while len(chosen) < count and len(self.effects) >= size:
             ranked = sorted(self.effects, key=lambda tag: _digest(f"{tag}/{size}/{number}"))
             # twins together are not two effects that anyone could tell from one
-            if (
-                not any(set(twins) <= set(ranked[:size]) for twins in TWINS)
-                and tuple(ranked[:size]) not in chosen
-            ):
+            if not _has_twins(ranked[:size]) and tuple(ranked[:size]) not in chosen:
                 chosen.append(tuple(ranked[:size]))
             number += 1
             if number > self.first + 100 * (count + 1):
@@ -223,9 +225,13 @@ def _together(index: int) -> tuple[str, ...]:
     size = 3 if index % 4 == 3 else 2
     for attempt in itertools.count():
         ranked = sorted(EFFECTS, key=lambda tag: _digest(f"{tag}/{index}/{attempt}"))[:size]
-        if not any(set(twins) <= set(ranked) for twins in TWINS):
+        if not _has_twins(ranked):
             return tuple(ranked)
     raise AssertionError
+
+
+def _has_twins(tags: Sequence[str]) -> bool:
+    return any(set(twins) <= set(tags) for twins in TWINS)
 
 
 def _one_of(tags: Sequence[str], text: str) -> str:

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import resource
 import shutil
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +11,9 @@ import numpy as np
 from discrepancy_cases import EFFECTS, Case, make
 from discrepancy_figures import Answer
 from numpy.typing import NDArray
+from process_tree import Took, run_measured
+from running import PCHEM
 
-PCHEM = Path(sys.executable).with_name("pchem")
 RUN = """run: {{store: run.zarr}}
 compute: {{workers: {workers}}}
 input: {{files: [frames.npy], integration_time: 1.0}}
@@ -31,16 +27,16 @@ def command_verdict(frames: NDArray[np.uint16], folder: Path) -> dict[str, Any]:
     np.save(place / "frames.npy", frames)
     (place / "run.yaml").write_text(RUN.format(workers=1))
     _timed(place, "run", "--until", "fit")
-    wall, cpu, _ = _timed(place, "discrepancy", "--no-refit")
+    took = _timed(place, "discrepancy", "--no-refit")
     verdict = json.loads((place / "run.zarr" / "discrepancy.json").read_text())
-    return {"seconds": wall, "cpu_seconds": cpu, "verdict": verdict}
+    return {"seconds": took.wall, "cpu_seconds": took.cpu, "verdict": verdict}
 
 
 def run_commands(count: int, first: int, shape: tuple[int, int, int], folder: Path, workers: int) -> None:
     """Print verdict, wall and CPU time of ``pchem run`` and ``pchem discrepancy`` on hidden stacks."""
     print(
         f"{'hidden':26s}{'said':40s}{'run, s':>9s}{'discrepancy, s':>16s}"
-        f"{'wall':>8s}{'CPU':>8s}{'memory, MB':>12s}"
+        f"{'wall':>8s}{'CPU':>8s}{'memory, MiB':>12s}"
     )
     ratios = []
     for i in range(count):
@@ -53,10 +49,10 @@ def run_commands(count: int, first: int, shape: tuple[int, int, int], folder: Pa
         search = _timed(place, "discrepancy")
         verdict = json.loads((place / "run.zarr" / "discrepancy.json").read_text())
         answer = Answer({"case": case.to_json(), "verdict": verdict})
-        ratios.append(search[0] / run[0])
+        ratios.append(search.wall / run.wall)
         print(
-            f"{case.hidden[0]:26s}{answer.names[:39]:40s}{run[0]:9.1f}{search[0]:16.1f}{ratios[-1]:7.1f}x"
-            f"{search[1] / run[1]:7.1f}x{search[2]:12.0f}",
+            f"{case.hidden[0]:26s}{answer.names[:39]:40s}{run.wall:9.1f}{search.wall:16.1f}{ratios[-1]:7.1f}x"
+            f"{search.cpu / run.cpu:7.1f}x{search.largest:12.0f}",
             flush=True,
         )
     print(
@@ -65,19 +61,5 @@ def run_commands(count: int, first: int, shape: tuple[int, int, int], folder: Pa
     )
 
 
-def _timed(place: Path, stage: str, *options: str) -> tuple[float, float, float]:
-    """Return wall seconds, CPU seconds and peak memory (MB, of all such commands so far) of a command."""
-    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    done = subprocess.run(
-        [str(PCHEM), stage, "run.yaml", *options],
-        cwd=place,
-        env=os.environ,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    if done.returncode:
-        raise SystemExit(f"pchem {stage} in {place}: {done.stderr.strip().splitlines()[-1:]}")
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return time.perf_counter() - start, cpu, after.ru_maxrss / 1024
+def _timed(place: Path, stage: str, *options: str) -> Took:
+    return run_measured([PCHEM, stage, "run.yaml", *options], place, must_succeed=True)

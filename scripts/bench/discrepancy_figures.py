@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import sys
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -14,6 +17,17 @@ Record = dict[str, Any]
 _LARGEST_SET = 3
 _STRONG = 4.0  # times s95
 _GOOD_SENSOR = 0.32  # e-, about the middle of the sensors that are drawn
+
+
+def read_results(path: Path) -> list[Record]:
+    """Return the records of a study; a last line that was cut off is left out."""
+    records = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            records.append(json.loads(line))
+        except json.JSONDecodeError:
+            print(f"{path}: an incomplete line is left out", file=sys.stderr)
+    return records
 
 
 class Answer:
@@ -117,11 +131,14 @@ def print_figures(records: Iterable[Record]) -> None:
     answers = [Answer(record) for record in records]
     _confusion(answers)
     _naming(answers)
-    _by_read_noise(records, answers)
-    _strengths([(r, a) for r, a in zip(records, answers, strict=True) if a.kind == "single"])
-    _gaps([(r, a) for r, a in zip(records, answers, strict=True) if a.kind == "single"])
-    compared = [(r, a) for r, a in zip(records, answers, strict=True) if r.get("bias")]
-    _bias_titles()
+    pairs = list(zip(records, answers, strict=True))
+    single = [(r, a) for r, a in pairs if a.kind == "single"]
+    _by_read_noise(single)
+    _strengths(single)
+    _gaps(single)
+    compared = [(r, a) for r, a in pairs if r.get("bias")]
+    print("\nBias of the maps by the effect, in standard errors of a pixel, mean over the pixels it touches,")
+    print("against the plain fit of the same stack without the effect; without -> with the named effects")
     _biases("all", [r for r, _ in compared], 6)
     _biases("named alone", [r for r, a in compared if a.alone], 0)
     _times(records)
@@ -222,15 +239,13 @@ def pulls(record: Record) -> list[float]:
     return [(found["value"] - hidden["strength"]) / found["stderr"]]
 
 
-def _by_read_noise(records: Sequence[Record], answers: Sequence[Answer]) -> None:
+def _by_read_noise(pairs: Sequence[tuple[Record, Answer]]) -> None:
     """Print how naming depends on the sensor: the hidden strengths are those of a typical one."""
     print(f"\nSingle effects by the read noise of the sensor (above or below {_GOOD_SENSOR:g} e-)")
     for level in (4.0, 1.5):
         for title, low, high in (("below", 0.0, _GOOD_SENSOR), ("above", _GOOD_SENSOR, math.inf)):
             group = [
-                a
-                for r, a in zip(records, answers, strict=True)
-                if a.kind == "single" and a.level == level and low <= r.get("read_noise_e", math.nan) < high
+                a for r, a in pairs if a.level == level and low <= r.get("read_noise_e", math.nan) < high
             ]
             for words, true in (("named or in a set of <= 3", "within"), ("nothing said", "silent")):
                 hits = sum(getattr(a, true) for a in group)
@@ -261,19 +276,11 @@ def _better_than_runner_up(step: dict[str, Any]) -> bool:
     return bool(step["gap_after"] < step["rivals"][0]["gap_after"] or step["gap_after"] <= step["gap_floor"])
 
 
-def _bias_titles() -> None:
-    print("\nBias of the maps by the effect, in standard errors of a pixel, mean over the pixels it touches,")
-    print("against the plain fit of the same stack without the effect; without -> with the named effects")
-
-
 def _biases(which: str, records: Sequence[Record], most: int) -> None:
     """Print how often a bias was cut, and the largest ones."""
     for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_e"):
         rows = [(r["case"], r["bias"][name]) for r in records]
-        for limit, title in (
-            (1.0, "one s.e. of a pixel"),
-            (None, "5 s.e. of the mean of all"),
-        ):
+        for limit, title in ((1.0, "one s.e. of a pixel"), (None, "5 s.e. of the mean of all")):
             large = [
                 (case, b)
                 for case, b in rows

@@ -8,43 +8,60 @@ pixels and frames are simulated, so that many sensors fit into the time.
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from discrepancy_figures import wilson
+from discrepancy_figures import read_results, wilson
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 RIGHT = ("consistent", "cannot_tell")
 MOST_SAMPLES = 3e6  # frames x pixels of a stack
 
 
-def run_null_range(path: Path, first: int, minutes: float, most_samples: float) -> None:
-    """Look for discrepancies in stacks without any until the time is over, and print the share of alarms.
+def results_of_seeds(
+    path: Path, first: int, minutes: float, one: Callable[[int], dict[str, Any]]
+) -> Iterator[dict[str, Any]]:
+    """Yield the records of a file, a line each, and those of the seeds that it lacks until the time is over.
 
     Args:
-        path: file of the results, a line a stack; seeds that it holds are not done again.
-        first: seed of the first sensor.
-        minutes: no stack begins later.
-        most_samples: frames x pixels of a stack.
+        path: file, to which each new record is added as soon as it is there.
+        first: the first seed.
+        minutes: no seed begins later.
+        one: makes the record of a seed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    lines = path.read_text().splitlines() if path.exists() else []
-    records = [json.loads(line) for line in lines]
-    done, start, seed = {r["seed"] for r in records}, time.monotonic(), first
+    yield from (records := read_results(path))
+    done, start = {r["seed"] for r in records}, time.monotonic()
     with path.open("a") as file:
-        while time.monotonic() - start < 60.0 * minutes:
+        for seed in itertools.count(first):
+            if time.monotonic() - start >= 60.0 * minutes:
+                return
             if seed not in done:
-                records.append(one_of_range(seed, most_samples))
-                file.write(json.dumps(records[-1]) + "\n")
+                record = one(seed)
+                file.write(json.dumps(record) + "\n")
                 file.flush()
-                print(_line(records[-1]), flush=True)
-            seed += 1
-    print_null_range(records)
+                yield record
+
+
+def run_null_range(folder: Path, first: int, minutes: float, most_samples: float) -> None:
+    """Look for discrepancies in stacks without any until the time is over, and print the share of alarms.
+
+    The results are kept in ``null_range.jsonl``; a stack has at most so many samples (frames x pixels).
+    """
+
+    def one(seed: int) -> dict[str, Any]:
+        record = one_of_range(seed, most_samples)
+        print(_line(record), flush=True)
+        return record
+
+    print_null_range(list(results_of_seeds(folder / "null_range.jsonl", first, minutes, one)))
 
 
 def print_null_range(records: list[dict[str, Any]]) -> None:

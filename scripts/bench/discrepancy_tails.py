@@ -7,8 +7,6 @@ of the sensor) shows in the data of each sensor alone, which are judged as well.
 
 from __future__ import annotations
 
-import json
-import time
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from discrepancy_figures import wilson
+from discrepancy_null import results_of_seeds
 from numpy.typing import NDArray
 
 LEVELS = (1e-2, 1e-3, 1e-4)
@@ -26,26 +25,12 @@ OWN = "data"  # what comes of the measured stack, not of the simulated ones
 
 
 def run_null_tails(folder: Path, first: int, minutes: float) -> None:
-    """Acceptance clean sensors until the time is over; print shares of small p-values by kind, and draw them.
+    """Judge clean sensors until the time is over; print shares of small p-values by kind, and draw them.
 
-    Args:
-        folder: holds ``null_tails.jsonl`` (a line a sensor; seeds that it holds are not done again) and gets
-            ``null_tails.png``.
-        first: seed of the first sensor.
-        minutes: no sensor begins later.
+    The folder of the results gets ``null_tails.jsonl`` and ``null_tails.png``.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "null_tails.jsonl"
-    records = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    done, start, seed = {r["seed"] for r in records}, time.monotonic(), first
-    with path.open("a") as file:
-        while time.monotonic() - start < 60.0 * minutes:
-            if seed not in done:
-                records.append(judged_sensor(seed))
-                file.write(json.dumps(records[-1]) + "\n")
-                file.flush()
-            seed += 1
-    records = [r for r in records if "p" in r]
+    results = results_of_seeds(folder / "null_tails.jsonl", first, minutes, judged_sensor)
+    records = [r for r in results if "p" in r]
     print_tails(records)
     draw_tails(records, folder / "null_tails.png")
 

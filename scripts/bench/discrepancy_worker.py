@@ -84,6 +84,8 @@ def fit_maps(
     Returns:
         Maps of H, g, mu and s_e, their standard errors (``*_stderr``), and ``good``.
     """
+    from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
+    from pchem_pipeline.model.checks.shrinkage import noise_of
     from pchem_pipeline.model.fit.api import fit_histograms
     from pchem_pipeline.model.fit.status import FAILED
     from pchem_pipeline.model.histogram.count import histogram_frames
@@ -93,38 +95,25 @@ def fit_maps(
     flat = [a.ravel() for a in (histograms.origin, histograms.under, histograms.over)]
     result = fit_histograms(counts, *flat)
     if effects:
-        result = _extended(result, counts, flat[0], effects, added)
+        law = sample_law(effects, pixel_maps(result.maps, (result.fit_status & FAILED) == 0), added)
+        result = fit_histograms(counts, flat[0], law=law, start=result)
     shape = frames.shape[1:]
-    g, sigma = result.conversion_gain, result.read_noise_dn
-    variance = np.diagonal(result.covariance, axis1=1, axis2=2)
-    noise_variance = (
-        sigma**2 * variance[:, 1] + g**2 * variance[:, 3] + 2 * g * sigma * result.covariance[:, 1, 3]
-    )
+    g, sigma, covariance = result.conversion_gain, result.read_noise_dn, result.covariance
+    stderr = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    together = covariance[:, 1, 3] / (stderr[:, 1] * stderr[:, 3])
+    noise, noise_stderr = noise_of(g, sigma, stderr[:, 1], stderr[:, 3], together)
     maps = {
         "quanta_exposure": result.quanta_exposure,
         "conversion_gain": g,
         "bias": result.bias,
-        "read_noise_e": g * sigma,
-        "quanta_exposure_stderr": np.sqrt(variance[:, 0]),
-        "conversion_gain_stderr": np.sqrt(variance[:, 1]),
-        "bias_stderr": np.sqrt(variance[:, 2]),
-        "read_noise_e_stderr": np.sqrt(np.maximum(noise_variance, 0)),
+        "read_noise_e": noise,
+        "quanta_exposure_stderr": stderr[:, 0],
+        "conversion_gain_stderr": stderr[:, 1],
+        "bias_stderr": stderr[:, 2],
+        "read_noise_e_stderr": noise_stderr,
         "good": (result.fit_status & FAILED) == 0,
     }
     return {name: np.asarray(values).reshape(shape) for name, values in maps.items()}
-
-
-def _extended(
-    plain: Any, counts: NDArray[Any], origin: NDArray[Any], effects: tuple[Any, ...], added: Any
-) -> Any:
-    """Fit again with the law that the effects make of the PCD."""
-    from pchem_pipeline.effects.framework.compose import pixel_maps, sample_law
-    from pchem_pipeline.model.fit.api import fit_histograms
-    from pchem_pipeline.model.fit.status import FAILED
-
-    parameters = plain.maps
-    model = sample_law(effects, pixel_maps(parameters, (plain.fit_status & FAILED) == 0), added)
-    return fit_histograms(counts, origin, law=model, start=plain)
 
 
 def _compared(case: Case, frames: NDArray[np.uint16], found: Any, key: Path) -> dict[str, Any]:
@@ -157,10 +146,7 @@ def _bias(
         n = max(int(use.sum()), 1)
         # a few lost pixels must not decide over the mean of all
         low, high = (np.clip((m / error)[use], -50, 50) for m in moved)
-        bias[name] = {
-            "before": float(low.mean()) if use.any() else 0.0,
-            "after": float(high.mean()) if use.any() else 0.0,
-            "chance": float(high.std() / np.sqrt(n)) if use.any() else 0.0,
-            "pixels": n,
-        }
+        means = [float(each.mean()) if use.any() else 0.0 for each in (low, high)]
+        chance = float(high.std() / np.sqrt(n)) if use.any() else 0.0
+        bias[name] = {"before": means[0], "after": means[1], "chance": chance, "pixels": n}
     return bias

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,35 +40,47 @@ class Took:
     largest: float
 
 
-def run_measured(command: Sequence[str], folder: Path | None = None) -> Took:
-    """Run a command to its end and return what it took."""
+def run_measured(
+    command: Sequence[str],
+    folder: Path | None = None,
+    environment: Mapping[str, str] | None = None,
+    *,
+    must_succeed: bool = False,
+) -> Took:
+    """Run a command to its end and return what it took.
+
+    Raises:
+        SystemExit: the command failed, and ``must_succeed``.
+    """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.perf_counter()
     process = subprocess.Popen(
-        command, cwd=folder, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        command, cwd=folder, env=environment, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     )
     highest = [0, 0]
     ended = threading.Event()
     watch = threading.Thread(target=_watch, args=(process.pid, highest, ended))
     watch.start()
     _, words = process.communicate()
+    wall = time.perf_counter() - start
     ended.set()
     watch.join()
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    wall = time.perf_counter() - start
+    if must_succeed and process.returncode:
+        raise SystemExit(f"{' '.join(command)} in {folder or Path.cwd()}:\n{words[-2000:]}")
     return Took(process.returncode, words[-2000:], wall, cpu, highest[0] / 1024, highest[1] / 1024)
 
 
 def _watch(root: int, highest: list[int], ended: threading.Event) -> None:
     """Keep the largest sum over the tree, and the largest resident set of a process, kB."""
     while not ended.wait(_EVERY):
-        tree = _tree(root)
-        highest[0] = max(highest[0], sum(_kilobytes(pid, "VmRSS") for pid in tree))
-        highest[1] = max([highest[1], *(_kilobytes(pid, "VmHWM") for pid in tree)])
+        pids = tree(root)
+        highest[0] = max(highest[0], sum(kilobytes(pid, "VmRSS") for pid in pids))
+        highest[1] = max([highest[1], *(kilobytes(pid, "VmHWM") for pid in pids)])
 
 
-def _tree(root: int) -> list[int]:
+def tree(root: int) -> list[int]:
     """Return a process and all that it has started, and they in turn."""
     parents: dict[int, list[int]] = {}
     for entry in Path("/proc").iterdir():
@@ -84,7 +96,8 @@ def _tree(root: int) -> list[int]:
     return found
 
 
-def _kilobytes(pid: int, name: str) -> int:
+def kilobytes(pid: int, name: str) -> int:
+    """Return an entry of ``/proc/PID/status``, kB; 0 where the process has ended."""
     try:
         match = re.search(rf"^{name}:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text(), re.M)
     except OSError:

@@ -1,4 +1,4 @@
-"""What the benchmarks of whole runs share: starting them, reading their records, saying on what machine."""
+"""What the benchmarks of whole runs share: a stack, the records of a run, the machine."""
 
 from __future__ import annotations
 
@@ -6,35 +6,17 @@ import json
 import os
 import platform
 import re
-import subprocess
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 _SIMULATED, _AT_ONCE = 1000, 100  # frames of `write_stack`
+PCHEM = str(Path(sys.executable).with_name("pchem"))
 STAGES = ("ingest", "histogram", "fit", "maps", "ensemble", "report")
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a run took.
-
-    Attributes:
-        wall: seconds of the command, start-up included.
-        seconds: of each stage.
-        cpu: CPU seconds of each stage.
-        peak: largest resident memory of each stage's process so far, MiB.
-    """
-
-    wall: float
-    seconds: dict[str, float]
-    cpu: dict[str, float]
-    peak: dict[str, float]
 
 
 def machine() -> str:
@@ -95,43 +77,7 @@ def read_once(path: Path) -> float:
     return time.perf_counter() - start
 
 
-_SOME_STAGES = """
-import sys
-from pathlib import Path
-from typing import Any
-from pchem_pipeline.compute.environment import prepare_environment
-prepare_environment()
-from pchem_pipeline.runner.session import Command, run_stages
-from pchem_pipeline.run.target import find_run
-run_stages(find_run(Path(sys.argv[1])), sys.argv[2:], Command(quiet=True))
-"""
-
-
-def run_pchem(config: Path, stages: Sequence[str] = ()) -> Outcome:
-    """Run ``pchem run``, or some stages, in a process of its own; the store is ``<stem>.zarr`` beside it."""
-    command = [str(Path(sys.executable).with_name("pchem")), "run", str(config), "--quiet"]
-    if stages:
-        command = [sys.executable, "-c", _SOME_STAGES, str(config), *stages]
-    start = time.perf_counter()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    wall = time.perf_counter() - start
-    folder = config.with_suffix(".zarr") / ".pchem" / "stages"
-    records = {}
-    for name in STAGES:
-        if (folder / f"{name}.json").exists():
-            records[name] = json.loads((folder / f"{name}.json").read_text())
-    return Outcome(
-        wall,
-        {name: record["seconds"] for name, record in records.items()},
-        {name: record["cpu_seconds"] for name, record in records.items()},
-        {name: record["peak_rss_bytes"] / 2**20 for name, record in records.items()},
-    )
-
-
-def save_figure(figure: object, folder: Path, name: str) -> None:
-    """Save a figure as PNG and SVG, with the machine below it, and say where."""
-    figure.text(0.0, -0.02, machine(), fontsize=6, color="0.4", va="top")  # type: ignore[attr-defined]
-    folder.mkdir(parents=True, exist_ok=True)
-    for suffix in ("png", "svg"):
-        figure.savefig(folder / f"{name}.{suffix}", dpi=150, bbox_inches="tight")  # type: ignore[attr-defined]
-    print(f"figure: {folder / name}.png")
+def stage_records(store: Path) -> dict[str, dict[str, Any]]:
+    """Return what a run has noted of each stage that it did."""
+    paths = {name: store / ".pchem" / "stages" / f"{name}.json" for name in STAGES}
+    return {name: json.loads(path.read_text()) for name, path in paths.items() if path.exists()}

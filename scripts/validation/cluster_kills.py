@@ -23,12 +23,13 @@ import time
 from collections import Counter, defaultdict
 from pathlib import Path
 
-from kills import PCHEM, differences, results
+from kills import differences, results, started
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from helpers.cluster import cluster_processes, signal_group
-from running import STAGES, machine, write_stack
+from process_tree import kilobytes, tree
+from running import STAGES, machine, stage_records, write_stack
 
 from pchem_pipeline.compute.environment import prepare_environment
 
@@ -78,23 +79,12 @@ class Watch:
     def _look(self) -> None:
         while not self._ended.wait(0.2):
             for root in list(self.roles):
-                for pid in _group(root):
+                for pid in tree(root):
                     with contextlib.suppress(OSError, IndexError):
                         io = Path(f"/proc/{pid}/io").read_text().split()
-                        status = Path(f"/proc/{pid}/status").read_text()
                         self.read[pid] = max(self.read[pid], int(io[1]))
-                        self.peak[pid] = int(status.partition("VmHWM:")[2].split()[0])
+                        self.peak[pid] = max(self.peak[pid], kilobytes(pid, "VmHWM"))
                         self.roles.setdefault(pid, self.roles[root])
-
-
-def _group(root: int) -> list[int]:
-    """Return the processes of a group."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        with contextlib.suppress(OSError, ValueError, IndexError):
-            if int((entry / "stat").read_text().rpartition(")")[2].split()[2]) == root:
-                found.append(int(entry.name))
-    return found
 
 
 def wait_for_marks(store: Path, stage: str, many: int) -> None:
@@ -128,19 +118,6 @@ def bytes_read(log: Path) -> Counter[int]:
     return found
 
 
-def run(store: Path, environment: dict[str, str]) -> "subprocess.Popen[str]":
-    """Start a run in a process group of its own."""
-    return subprocess.Popen(
-        [PCHEM, "run", "run.yaml", "--quiet"],
-        cwd=store.parent,
-        env=environment,
-        text=True,
-        start_new_session=True,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-    )
-
-
 def write_config(folder: Path, compute: dict[str, object]) -> Path:
     """Write the YAML of a run into a new folder; return where its store will be."""
     content = {"run": {"store": "run.zarr"}, "compute": compute}
@@ -155,7 +132,7 @@ def write_config(folder: Path, compute: dict[str, object]) -> Path:
     return folder / "run.zarr"
 
 
-def ended(process: "subprocess.Popen[str]") -> None:
+def ended(process: subprocess.Popen[str]) -> None:
     """Wait for a run, which must end well."""
     _, words = process.communicate(timeout=3600)
     if process.returncode:
@@ -177,7 +154,7 @@ def on_the_cluster(folder: Path, given: argparse.Namespace, tiles: int) -> tuple
         watch.roles |= {worker.pid: f"worker, {name}" for worker, name in zip(workers, names, strict=True)}
         watch.roles[scheduler.pid] = "scheduler"
         start = time.monotonic()
-        process = run(store, environment)
+        process = started(store.parent, "run", "run.yaml", environment=environment)
         watch.roles[process.pid] = "pchem run"
         try:
             wait_for_marks(store, "fit", max(1, tiles // 10))
@@ -207,12 +184,6 @@ def show(watch: Watch, reads: Path, size: int) -> float:
     return sum(noted.values()) / size
 
 
-def seconds(store: Path) -> list[float]:
-    """Return the wall time of each stage."""
-    folder = store / ".pchem" / "stages"
-    return [json.loads((folder / f"{name}.json").read_text())["seconds"] for name in STAGES]
-
-
 def main() -> int:
     prepare_environment()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -229,14 +200,15 @@ def main() -> int:
         print(
             f"{machine()}\n{given.frames} frames of {given.side} x {given.side} pixels, {size / 1e9:.1f} GB"
         )
-        ended(run(plain, {**os.environ, **counted}))
+        ended(started(plain.parent, "run", "run.yaml", environment={**os.environ, **counted}))
         tiles = len(list((plain / ".pchem" / "done" / "fit").rglob("*.json")))
         watch, store = on_the_cluster(folder, given, tiles)
         times = show(watch, folder / "reads", size)
         alone = sum(bytes_read(folder / "reads alone").values()) / size
         print(f"{'stage':<12}{'threads, s':>12}{'cluster, s':>12}")
-        for name, one, other in zip(STAGES, seconds(plain), seconds(store), strict=True):
-            print(f"{name:<12}{one:>12.1f}{other:>12.1f}")
+        records = stage_records(plain), stage_records(store)
+        for name in STAGES:
+            print(f"{name:<12}" + "".join(f"{each[name]['seconds']:>12.1f}" for each in records))
         expected = results(plain)
         wrong = differences(results(store), expected)
         print(f"{tiles} tiles, {len(expected)} results compared, different: {', '.join(wrong) or 'none'}")

@@ -11,8 +11,8 @@ line a case, and ends with 1 where one differs, cannot go on, or ended in any ot
 import argparse
 import errno
 import hashlib
+import multiprocessing
 import os
-import pickle
 import random
 import re
 import shutil
@@ -23,7 +23,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from kills import WORKS, Bench, Work, differences, results
@@ -35,27 +35,20 @@ from helpers.disk_mishaps import FailingDisk, ForgetfulDisk, materialised
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.cli.app import main as pchem
 
+T = TypeVar("T")
 NUMBERS = (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
-def in_a_child(task: Callable[[], Any]) -> Any:
+def in_a_child(task: Callable[[], T]) -> T:
     """Return what a function returns in a forked process, which knows nothing of stores that were open."""
-    here, there = os.pipe()
-    child = os.fork()
-    if child == 0:
-        code = 1
-        try:
-            os.close(here)
-            with os.fdopen(there, "wb") as pipe:
-                pickle.dump(task(), pipe)
-            code = 0
-        finally:
-            os._exit(code)
-    os.close(there)
-    with os.fdopen(here, "rb") as pipe:
-        found = pipe.read()
-    os.waitpid(child, 0)
-    return pickle.loads(found)
+    fork = multiprocessing.get_context("fork")
+    here, there = fork.Pipe(duplex=False)
+    child = fork.Process(target=lambda: there.send(task()))
+    child.start()
+    there.close()
+    found: T = here.recv()
+    child.join()
+    return found
 
 
 def done(bench: Bench, work: Work) -> tuple[int, str]:
@@ -90,7 +83,7 @@ def found(bench: Bench, work: Work) -> dict[str, Any]:
         except StoreError as error:
             return {"refused": str(error)}
 
-    return dict(in_a_child(task))
+    return in_a_child(task)
 
 
 def failed(bench: Bench, work: Work, at: int | None, number: int) -> tuple[int, int, str]:
@@ -102,8 +95,7 @@ def failed(bench: Bench, work: Work, at: int | None, number: int) -> tuple[int, 
         code, words = done(bench, work)
         return failing.count, code, words
 
-    result: tuple[int, int, str] = in_a_child(task)
-    return result
+    return in_a_child(task)
 
 
 def logged(bench: Bench, work: Work) -> list[Any]:
@@ -115,7 +107,7 @@ def logged(bench: Bench, work: Work) -> list[Any]:
         assert code in (0, 3), words
         return forgetful.log
 
-    return list(in_a_child(task))
+    return in_a_child(task)
 
 
 def fail_once(bench: Bench, work: Work, total: int, rng: random.Random) -> tuple[str, str]:

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 from pchem_pipeline.compute.environment import prepare_environment
 
@@ -34,20 +33,6 @@ EXPOSURES = (0.5, 3.0, 12.0)
 STEP, BIAS = 10.0, 100.3
 
 
-class Row(NamedTuple):
-    """Results at one read noise; errors of g relative to g."""
-
-    noise: float
-    bound: float
-    of_all: tuple[float, ...]
-    of_good: tuple[float, ...]
-    pulls: float
-    good: float
-    single_bound: float
-    single_error: float
-    single_good: float
-
-
 def draw(rng, exposure, noise, n_pixels, n_frames):
     """Return histograms and their first DN, drawn from the exact law."""
     analog = np.sqrt(noise**2 - 1 / (12 * STEP**2))
@@ -59,7 +44,7 @@ def draw(rng, exposure, noise, n_pixels, n_frames):
 
 
 def row(noise, n_pixels, n_frames):
-    """Simulate and fit at one read noise."""
+    """Return a row of the table: simulated and fitted at one read noise; errors of g relative to g."""
     rng = np.random.default_rng(int(1000 * noise))
     exposures = (*EXPOSURES, 0.0)
     drawn = [draw(rng, exposure, noise, n_pixels, n_frames) for exposure in exposures]
@@ -84,45 +69,29 @@ def row(noise, n_pixels, n_frames):
     single = fit_histograms(*draw(rng, EXPOSURES[1], noise, n_pixels, total))
     error = single.conversion_gain * STEP - 1
     known = error[np.isfinite(error)]
-    return Row(
-        noise,
-        float(bound[j]) * STEP,
-        of_all,
-        of_good,
-        float(pulls.std()),
-        float(good.mean()),
-        float(np.sqrt(one[1, 1])) * STEP,
-        float(np.sqrt((known**2).mean())) if known.size else float("nan"),
-        float(((single.fit_status & ~np.uint16(64)) == 0).mean()),
-    )
+    rmse = float(np.sqrt((known**2).mean())) if known.size else float("nan")
+    good_alone = ((single.fit_status & ~np.uint16(64)) == 0).mean()
+    alone = [100 * each for each in (np.sqrt(one[1, 1]) * STEP, rmse, good_alone)]
+    return 100 * bound[j] * STEP, *of_all, *of_good, pulls.std(), 100 * good.mean(), *alone
 
 
-def main(arguments=None):
-    """Print the table."""
+def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pixels", type=int, default=300)
     parser.add_argument("--frames", type=int, default=4000, help="of each sample")
-    options = parser.parse_args(arguments)
-    write = sys.stdout.write
-    write(
+    options = parser.parse_args()
+    print(
         f"samples H = {EXPOSURES} e- and a bias, {options.frames} frames each, {options.pixels} pixels, "
         f"{STEP:g} DN/e-; one sample: H = {EXPOSURES[1]:g} with all {4 * options.frames} frames\n"
         f"a ratio is known to {1 / np.sqrt(2 * options.pixels):.3f}\n"
         "          joint bound   RMSE / bound, all pixels       good pixels                 pull   good |"
         " one sample: bound   RMSE   good\n"
         "   s_e     sd(g)/g %      g     mu  sigma     H3      g     mu  sigma     H3    sd(g)      % |"
-        "       sd(g)/g %      %      %\n"
+        "       sd(g)/g %      %      %"
     )
-    rows = []
+    layout = "{:6.2f} {:13.3f} " + 8 * "{:6.3f} " + "{:8.3f} {:6.1f} | {:15.3f} {:6.2f} {:6.1f}"
     for noise in NOISES:
-        rows.append(row(noise, options.pixels, options.frames))
-        r = rows[-1]
-        ratios = " ".join(f"{value:6.3f}" for value in (*r.of_all, *r.of_good))
-        write(
-            f"{r.noise:6.2f} {100 * r.bound:13.3f} {ratios} {r.pulls:8.3f} {100 * r.good:6.1f} | "
-            f"{100 * r.single_bound:15.3f} {100 * r.single_error:6.2f} {100 * r.single_good:6.1f}\n"
-        )
-        sys.stdout.flush()
+        print(layout.format(noise, *row(noise, options.pixels, options.frames)), flush=True)
 
 
 if __name__ == "__main__":

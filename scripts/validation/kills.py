@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,21 @@ WORKS = (
 )
 
 
+def started(
+    folder: Path, *arguments: str, environment: Mapping[str, str] | None = None
+) -> subprocess.Popen[str]:
+    """Start a command of ``pchem`` in a process group of its own."""
+    return subprocess.Popen(
+        [PCHEM, *arguments, "--quiet"],
+        cwd=folder,
+        env=environment,
+        text=True,
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+
+
 class Bench:
     """A folder in which commands run, and copies of its states."""
 
@@ -104,15 +120,8 @@ class Bench:
         self._states: dict[tuple[Any, ...], Path] = {}
 
     def pchem(self, *arguments: str) -> subprocess.Popen[str]:
-        """Start a command in a process group of its own."""
-        return subprocess.Popen(
-            [PCHEM, *arguments, "--quiet"],
-            cwd=self.case,
-            text=True,
-            start_new_session=True,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-        )
+        """Start a command."""
+        return started(self.case, *arguments)
 
     def ok(self, *arguments: str) -> float:
         """Run a command to its end, which must be good; return its seconds."""

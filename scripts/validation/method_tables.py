@@ -86,18 +86,12 @@ def plan_table(options: argparse.Namespace) -> None:
         except ConfigError:
             print(f"{noise:>16g}{name:>18}  out of reach")
             continue
-        row(noise, name, verify([target], point, exposures, frames, options.pixels, options.seed))
-
-
-def row(noise: float, exposures: str, found: object) -> None:
-    """Print a row of the table of plans."""
-    check = found.checks[0]  # type: ignore[attr-defined]
-    error = f"{100 * check.rmse:.3f} +- {100 * check.rmse_stderr:.3f}"
-    print(f"{noise:>16g}{exposures:>18}{found.n_frames:>12,}{error:>22}")  # type: ignore[attr-defined]
+        found = verify([target], point, exposures, frames, options.pixels, options.seed)
+        error = f"{100 * found.checks[0].rmse:.3f} +- {100 * found.checks[0].rmse_stderr:.3f}"
+        print(f"{noise:>16g}{name:>18}{sum(frames):>12,}{error:>22}")
 
 
 def main() -> None:
-    """Read the options and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--exposure", type=float, nargs="*", default=[0.5, 2.0, 6.0], help="H, e-")
     parser.add_argument("--frames", type=int, default=4000, help="frames of a pixel, all samples together")

@@ -16,16 +16,15 @@ more than N pixels), an array is missing, or a verdict is another.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
+import re
 import shutil
 import subprocess
 import sys
 import time
-import tomllib
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,13 +39,6 @@ Array = NDArray[Any]
 SPECTRA = sorted((Path(__file__).parents[2] / "tests" / "data" / "sipm").glob("*.csv"))
 PAGES = ("report.json", "discrepancy.json", "methods.json")
 
-#: Names that arrays got since the first net: old name, or its beginning, to what may stand in its place.
-RENAMED: Mapping[str, tuple[str, ...]] = {
-    "joint/": ("samples/", "fit/", "maps/"),
-    "fit/lobe_": ("fit/satellite_",),
-    "discrepancy/code_grown": ("discrepancy/code_extended",),
-    "maps/dark_current": ("maps/charge_rate",),
-}
 #: Not compared: what a kill-safe run notes for itself, and how many steps a fit took.
 NO_RESULT = ("n_iterations", "ensemble_tiles/", "summary/open_")
 
@@ -153,23 +145,13 @@ class Folder:
     def pchem(self, *arguments: str) -> None:
         """Run the command of the package that is imported here: PYTHONPATH chooses it."""
         began = time.monotonic()
-        command = [sys.executable, "-c", entry(), *arguments, "--quiet"]
+        command = [sys.executable, "-m", "pchem_pipeline", *arguments, "--quiet"]
         done = subprocess.run(command, cwd=self.path, capture_output=True, text=True)
         print(f"  {time.monotonic() - began:6.1f} s  pchem {' '.join(arguments)}", flush=True)
         if done.returncode == 3:
             print(f"           {done.stderr.strip().splitlines()[-1]}", flush=True)
         if done.returncode not in (0, 3):
             raise SystemExit(f"pchem {' '.join(arguments)}: exit code {done.returncode}\n{done.stderr}")
-
-
-def entry() -> str:
-    """Return a program that is the command ``pchem`` of the tree whose package is imported here."""
-    found = importlib.util.find_spec("pchem_pipeline")
-    if found is None or found.origin is None:
-        raise SystemExit("no package pchem_pipeline: put its tree into PYTHONPATH")
-    project = tomllib.loads((Path(found.origin).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
-    module, function = project["project"]["scripts"]["pchem"].split(":")
-    return f"import sys; from {module} import {function}; sys.argv[0] = 'pchem'; sys.exit({function}())"
 
 
 def plain(at: Folder) -> None:
@@ -311,34 +293,27 @@ class Comparison:
 
     def nets(self, old: Path, new: Path) -> None:
         """Compare all files of two nets."""
-        for path in sorted(old.glob("*.npz")):
+        for path in (*sorted(old.glob("*.npz")), *sorted(old.glob("*.json"))):
             other = new / path.name
             if not other.exists():
                 self.say(path.name, "missing", wrong=True)
-                continue
-            with np.load(path) as left, np.load(other) as right:
-                self.run(path.stem, dict(left), dict(right))
-        for path in sorted(old.glob("*.json")):
-            other = new / path.name
-            if not other.exists():
-                self.say(path.name, "missing", wrong=True)
-                continue
-            self.page(path.name, json.loads(path.read_text()), json.loads(other.read_text()))
+            elif path.suffix == ".json":
+                self.page(path.name, json.loads(path.read_text()), json.loads(other.read_text()))
+            else:
+                with np.load(path) as left, np.load(other) as right:
+                    self.run(path.stem, dict(left), dict(right))
         if self.words > self.allowed_words:
             self.wrong.append(f"{self.words} status words differ")
 
     def run(self, run: str, old: dict[str, Array], new: dict[str, Array]) -> None:
         """Compare the arrays of one run."""
-        equal, seen = 0, set()
+        equal = 0
         rose = self.likelihood(run, old, new)
         for name, left in old.items():
-            found = counterpart(name, new)
-            if found is None:
+            right = new.get(name)
+            if right is None:
                 self.say(f"{run}:{name}", "missing", wrong=not skipped(name))
-                continue
-            seen.add(found)
-            right = new[found].reshape(left.shape) if new[found].size == left.size else new[found]
-            if left.shape != right.shape:
+            elif left.shape != right.shape:
                 self.say(f"{run}:{name}", f"shape {left.shape} is now {right.shape}", wrong=not skipped(name))
             elif left.tobytes() == right.tobytes() or np.array_equal(left, right, equal_nan=is_float(left)):
                 equal += 1
@@ -348,35 +323,30 @@ class Comparison:
                 self.parameter(f"{run}:{name}", left, right, old[f"{name}_stderr"], rose)
             else:
                 self.say(f"{run}:{name}", difference(left, right))
-        more = Counter(name.split("/")[0] for name in new.keys() - seen)
+        more = Counter(name.split("/")[0] for name in new.keys() - old.keys())
         added = ", ".join(f"{n} in {group}" for group, n in sorted(more.items())) or "none"
         print(f"  {run}: {equal} of {len(old)} arrays are equal to the bit; new: {added}")
 
     def likelihood(self, run: str, old: dict[str, Array], new: dict[str, Array]) -> Array | None:
         """Compare log-likelihoods; return where they rose, (y, x)."""
-        rose = None
-        for name in ("fit/log_likelihood", "joint/log_likelihood"):
-            found = counterpart(name, new)
-            if name not in old or found is None:
-                continue
-            change = new[found] - old[name]
-            with np.errstate(invalid="ignore"):
-                lower = change < -LOWER * np.abs(old[name])
-                rose = change > HIGHER
-            bias = "maps/bias" if "maps/bias" in old else "fit/bias"  # a net may end with the fit
-            nothing = lower & np.isnan(old[bias]) & np.isnan(new[bias])
-            if nothing.any():
-                words = f"lower in {int(nothing.sum())} pixels without a value before and after"
-                self.say(f"{run}:{name}", f"{words}: {places(nothing)}")
-            lower &= ~nothing
-            if lower.any():
-                worst = np.nanmin(change)
-                words = f"lower in {int(lower.sum())} pixels, by up to {-worst:.3g} nats: {places(lower)}"
-                self.say(f"{run}:{name}", words, wrong=True)
-            if rose.any():
-                best = np.nanmax(change)
-                words = f"higher in {int(rose.sum())} pixels, by up to {best:.3g} nats: {places(rose)}"
-                self.say(f"{run}:{name}", words)
+        name = "fit/log_likelihood"
+        if name not in old or name not in new:
+            return None
+        change = new[name] - old[name]
+        with np.errstate(invalid="ignore"):
+            lower = change < -LOWER * np.abs(old[name])
+            rose = np.asarray(change > HIGHER)
+        bias = "maps/bias" if "maps/bias" in old else "fit/bias"  # a net may end with the fit
+        nothing = lower & np.isnan(old[bias]) & np.isnan(new[bias])
+        lower &= ~nothing
+        for where, words in (
+            (nothing, "lower in {} pixels without a value before and after"),
+            (lower, f"lower in {{}} pixels, by up to {-np.nanmin(change, initial=0.0):.3g} nats"),
+            (rose, f"higher in {{}} pixels, by up to {np.nanmax(change, initial=0.0):.3g} nats"),
+        ):
+            if where.any():
+                text = f"{words.format(int(where.sum()))}: {places(where)}"
+                self.say(f"{run}:{name}", text, wrong=where is lower)
         return rose
 
     def status(self, where: str, old: Array, new: Array) -> None:
@@ -445,18 +415,6 @@ class Comparison:
             self.say(name, words, wrong=abs(now - gap[end]) > 0.1 * (high - low))
 
 
-def counterpart(name: str, arrays: Mapping[str, Array]) -> str | None:
-    """Return the name that an array of the old net has in the new one."""
-    if name in arrays:
-        return name
-    for old, candidates in RENAMED.items():
-        if name.startswith(old):
-            for each in candidates:
-                if each + name.removeprefix(old) in arrays:
-                    return each + name.removeprefix(old)
-    return None
-
-
 def skipped(name: str) -> bool:
     """Tell whether an array is no result."""
     return any(part in name for part in NO_RESULT)
@@ -464,20 +422,8 @@ def skipped(name: str) -> bool:
 
 def volatile(key: str) -> bool:
     """Tell whether an entry of a page changes from run to run or with every version."""
-    parts = (
-        "seconds",
-        "version",
-        "time",
-        "digest",
-        "path",
-        "environment",
-        "sentence",
-        "host",
-        "made",
-        "started",
-        "memory",
-    )
-    return any(part in key.lower() for part in parts)
+    parts = r"seconds|version|time|digest|path|environment|sentence|host|made|started|memory"
+    return re.search(parts, key, re.I) is not None
 
 
 def is_float(array: Array) -> bool:
@@ -522,7 +468,6 @@ def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def main() -> None:
-    """Freeze or compare."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     commands = parser.add_subparsers(dest="command", required=True)
     freezing = commands.add_parser("freeze", help="do all runs and keep what they find")

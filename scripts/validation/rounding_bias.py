@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 from pchem_pipeline.compute.environment import prepare_environment
 
@@ -30,20 +29,11 @@ STEPS = (0.7, 0.85, 1.0, 1.2, 1.5, 1.8, 2.2, 2.7, 3.3, 4.0, 5.0, 7.0, 10.0, 14.0
 NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 
 
-class Row(NamedTuple):
-    """Results at one number of DN per electron, in standard errors."""
-
-    step: float
-    predicted: float
-    density: float
-    exact: float
-    density_known: float
-    exact_known: float
-    flagged: float
-
-
 def row(step, exposure, noise, n_pixels, n_frames):
-    """Simulate and fit at one number of DN per electron; ``noise`` is analog, e-."""
+    """Return biases (predicted, of both fits) and shares (fitted, good, named, %) at one number of DN per e-.
+
+    The read noise is analog, e-.
+    """
     rng = np.random.default_rng(int(1000 * step))
     bias = 100.0 + (np.arange(n_pixels) + 0.5) / n_pixels
     x = np.arange(int(95 - 9 * noise * step), int(106 + (exposure + 9 * np.sqrt(exposure) + 9) * step) + 5)
@@ -70,37 +60,27 @@ def row(step, exposure, noise, n_pixels, n_frames):
         shifts.append(float(np.max(np.abs(medians))))
     known = np.isfinite(plain.conversion_gain)
     named = biased_by_rounding([getattr(plain, name) for name in NAMES], frames)
-    return Row(
-        step, float(np.median(predicted)), shifts[0], shifts[1], float(known.mean()), float(good.mean()),
-        float(named.sum() / max(known.sum(), 1)),
-    )  # fmt: skip
+    shares = known.mean(), good.mean(), named.sum() / max(known.sum(), 1)
+    return np.median(predicted), *shifts, *(100 * share for share in shares)
 
 
-def main(arguments=None):
-    """Print the table."""
+def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pixels", type=int, default=400)
     parser.add_argument("--frames", type=int, default=17_750)
     parser.add_argument("--exposure", type=float, default=2.0, help="H, e-")
     parser.add_argument("--read-noise", type=float, default=0.3, help="analog, e-")
-    options = parser.parse_args(arguments)
-    write = sys.stdout.write
-    write(
+    options = parser.parse_args()
+    print(
         f"H = {options.exposure:g} e-, analog read noise {options.read_noise:g} e-, {options.frames} frames, "
         f"{options.pixels} pixels; largest of the four median biases, in standard errors of a pixel "
         f"(noise: {2.2 * 1.2533 / np.sqrt(options.pixels):.2f})\n"
         "   1/g   density    density     exact   density    exact   named\n"
-        "  DN/e- predicted    fitted    fitted   fitted %  good %  biased %\n"
+        "  DN/e- predicted    fitted    fitted   fitted %  good %  biased %"
     )
-    rows = []
     for step in STEPS:
-        rows.append(row(step, options.exposure, options.read_noise, options.pixels, options.frames))
-        r = rows[-1]
-        write(
-            f"{r.step:7.2f} {r.predicted:9.3g} {r.density:9.3g} {r.exact:9.3g} {100 * r.density_known:10.1f} "
-            f"{100 * r.exact_known:7.1f} {100 * r.flagged:9.1f}\n"
-        )
-        sys.stdout.flush()
+        biases = row(step, options.exposure, options.read_noise, options.pixels, options.frames)
+        print("{:7.2f} {:9.3g} {:9.3g} {:9.3g} {:10.1f} {:7.1f} {:9.1f}".format(step, *biases), flush=True)
 
 
 if __name__ == "__main__":

@@ -50,7 +50,6 @@ def results(order: str) -> str:
 
 
 def main() -> None:
-    """Run the processes and compare."""
     if len(sys.argv) > 1:
         print(results(sys.argv[1]))
         return

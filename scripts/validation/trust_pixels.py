@@ -268,5 +268,4 @@ def judge(pixel: Pixel, values: Array, stderr: Array, good: NDArray[np.bool_]) -
 
 def good_words(words: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Tell which quantities (pixel, 4) of which pixels are called good."""
-    flags_of = getattr(status, "flags_of", lambda name: status.FLAGGED)
-    return np.column_stack([(words & int(status.FAILED | flags_of(name))) == 0 for name in NAMES])
+    return np.column_stack([(words & int(status.FAILED | status.flags_of(name))) == 0 for name in NAMES])

@@ -39,9 +39,8 @@ ARRAYS = (
     "maps/bias",
     "maps/read_noise_e",
 )
-UNITS: tuple[
-    tuple[str, str, dict[str, str]], ...
-] = (  # keyword, comment, further cards of a header whose exposure time is in ms
+#: keyword, comment, further cards of a header whose exposure time is in ms
+UNITS: tuple[tuple[str, str, dict[str, str]], ...] = (
     ("EXPTIME", "exposure time in ms", {}),
     ("EXPTIME", "[ms] exposure", {}),
     ("EXPTIME", "exposure (ms)", {}),
@@ -68,7 +67,6 @@ class Case:
     electrons: Array
     step: Array
     frames: NDArray[Any]
-    mishap: str = "none"
     form: str = "tif"
     header: fits.Header = field(default_factory=fits.Header)
     options: list[str] = field(default_factory=lambda: ["--mode", "copy"])
@@ -94,25 +92,18 @@ def sensor(number: int, folder: Path, step_dn: float = 0.0) -> Case:
     exposure.flat[odd[: rng.integers(4)]] *= rng.choice([0.01, 12])
     noise = rng.uniform(0.12, 0.3) * rng.lognormal(0, 0.05, shape)
     bias = 10 * step.mean() + rng.normal(0, 0.3 * step.mean(), shape)
-    case = Case(
-        number,
-        folder,
-        rng,
-        {},
-        rng.poisson(exposure, (n, *shape)) + noise * rng.normal(size=(n, *shape)),
-        step,
-        np.empty(0),
-    )
+    electrons = rng.poisson(exposure, (n, *shape)) + noise * rng.normal(size=(n, *shape))
+    case = Case(number, folder, rng, {}, electrons, step, np.empty(0))
     case.truth = {"quanta_exposure": exposure, "bias": bias, "noise": noise}
     case.form = str(rng.choice(["tif", "npy", "fits", "zarr"]))
     digitise(case)
     return case
 
 
-def digitise(case: Case, low: float = 0, high: float = TOP) -> None:
+def digitise(case: Case, high: float = TOP) -> None:
     """Round the samples to DN, and set the true maps that depend on the gain."""
     values = case.electrons * case.step + case.truth["bias"]
-    case.frames = np.rint(values).clip(low, high).astype(np.uint16)
+    case.frames = np.rint(values).clip(0, high).astype(np.uint16)
     case.truth["conversion_gain"] = 1 / case.step
     case.truth["read_noise_e"] = np.hypot(case.truth["noise"], 12**-0.5 / case.step)
 
@@ -314,7 +305,6 @@ def study_run(number: int, folder: Path, mishap: str | None = None) -> dict[str,
     """Do one run, and return what was said and what was wrong."""
     begin, mishap = time.process_time(), mishap or mishap_of(number)
     case = sensor(number, folder)
-    case.mishap = mishap
     MISHAPS[mishap][1](case)
     folder.mkdir(parents=True, exist_ok=True)
     store = folder / "run.zarr"
@@ -376,20 +366,11 @@ def said(content: dict[str, Any]) -> str:
     return "\n".join([*remarks, *(note for stage in content["stages"] for note in stage["notes"])])
 
 
-def medians(store: Path) -> dict[str, float]:
+def medians(store: Path) -> dict[str, float | None]:
     """Return the medians in the report, by quantity; none without one."""
     path = store / "report.json"
-    return (
-        {name: each["median"] for name, each in json.loads(path.read_text())["summary"].items()}
-        if path.exists()
-        else {}
-    )
-
-
-def told_median(content: dict[str, Any], name: str) -> float | None:
-    """Return the median of a quantity in a report, None where it gives none."""
-    median: float | None = content["summary"].get(name, {}).get("median")
-    return median
+    summary = json.loads(path.read_text())["summary"] if path.exists() else {}
+    return {name: each["median"] for name, each in summary.items()}
 
 
 def check(case: Case, store: Path, content: dict[str, Any]) -> dict[str, Any]:
@@ -397,10 +378,10 @@ def check(case: Case, store: Path, content: dict[str, Any]) -> dict[str, Any]:
     maps = zarr.open_group(store, mode="r")
     words = np.asarray(maps["fit/fit_status"]).astype(int)
     wrong, beyond, pixels = [], 0, 0
+    stated = medians(store)
     for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_e"):
-        flags = getattr(status, "flags_of", lambda _: status.FLAGGED)(name)
-        good = (words & int(status.FAILED | flags)) == 0
-        if not good.any() or told_median(content, name) is None:
+        good = (words & int(status.FAILED | status.flags_of(name))) == 0
+        if not good.any() or (found := stated.get(name)) is None:
             continue
         truth, values, stderr = (
             np.asarray(each)[good]
@@ -410,17 +391,17 @@ def check(case: Case, store: Path, content: dict[str, Any]) -> dict[str, Any]:
         beyond += int((np.abs(values - truth) > ERRORS * stderr + floor).sum())
         pixels += int(good.sum())
         limit = np.median(floor) + ERRORS * 1.2533 * np.median(stderr) / good.sum() ** 0.5
-        found, shift = told_median(content, name), np.median(values - truth)
+        shift = np.median(values - truth)
         if abs(shift) > limit or abs(found - np.median(values)) > limit:
             wrong.append(f"{name} {found:.4g} for {np.median(truth):.4g}")
-    rate, exposure = told_median(content, "dark_current"), told_median(content, "quanta_exposure")
+    rate, exposure = stated.get("dark_current"), stated.get("quanta_exposure")
     if rate is not None and exposure is not None:
         expected = exposure / (case.seconds or np.nan)
         wrong += [] if abs(rate / expected - 1) < 0.05 else [f"rate {rate:.4g} for {expected:.4g}"]
     good = (words & int(status.FAILED | status.FLAGGED)) == 0
     counts = content["fit_status"]
-    told = counts["n_pixels"] - sum(counts[name] for name in ("n_flagged", "n_failed", "n_unfitted"))
-    wrong += [] if told == good.sum() else [f"good pixels {told} for {good.sum()}"]
+    number = counts["n_pixels"] - sum(counts[name] for name in ("n_flagged", "n_failed", "n_unfitted"))
+    wrong += [] if number == good.sum() else [f"good pixels {number} for {good.sum()}"]
     return {"wrong": wrong, "beyond": beyond, "pixels": pixels, "good": float(good.mean())}
 
 

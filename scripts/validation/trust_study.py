@@ -19,7 +19,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -92,31 +92,18 @@ def _row(
 def summary(name: str, rows: list[dict[str, Any]]) -> list[str]:
     """Return the cells of one line of the table of pixels."""
     judged = [row for row in rows if row["part"]]
-    wrong = sum(bool(row["kind"]) for row in judged)
-    shares = [
-        f"{100 * sum(map(test, rows)) / max(len(rows), 1):.0f} %" for test in (_good, _flagged, _failed)
-    ]
-    beyond = sum(bool(row["beyond"]) for row in judged)
-    flagged = list(filter(_flagged, rows))
+    flagged = [row for row in rows if not row["good"] and not row["failed"]]
+    numbers = (sum(row["good"] for row in rows), len(flagged), sum(row["failed"] for row in rows))
+    shares = [f"{100 * n / max(len(rows), 1):.0f} %" for n in numbers]
     right = f"{100 * sum(row['right'] for row in flagged) / max(len(flagged), 1):.0f} %"
+    wrong, beyond = (sum(bool(row[name]) for row in judged) for name in ("kind", "beyond"))
     counts = [f"{wrong} of {len(judged)}", interval(wrong, len(judged)), str(beyond)]
     return [name, str(len(rows)), *shares, right, *counts]
 
 
-def _good(row: dict[str, Any]) -> bool:
-    return bool(row["good"])
-
-
-def _flagged(row: dict[str, Any]) -> bool:
-    return not row["good"] and not row["failed"]
-
-
-def _failed(row: dict[str, Any]) -> bool:
-    return bool(row["failed"])
-
-
-def _within(key: str, low: float, high: float) -> Callable[[dict[str, Any]], bool]:
-    return lambda row: low <= row[key] < high * (1 + 1e-9)
+def within(rows: list[dict[str, Any]], key: str, low: float, high: float) -> list[dict[str, Any]]:
+    """Return the rows with a number in a range."""
+    return [row for row in rows if low <= row[key] < high * (1 + 1e-9)]
 
 
 def pixel_tables(rows: list[dict[str, Any]]) -> str:
@@ -126,18 +113,14 @@ def pixel_tables(rows: list[dict[str, Any]]) -> str:
     lines = [summary("all", rows)]
     for key, edges in EDGES.items():
         for low, high in pairwise(edges):
-            lines.append(
-                summary(f"{TITLES[key]}: {low:g} to {high:g}", list(filter(_within(key, low, high), rows)))
-            )
+            lines.append(summary(f"{TITLES[key]}: {low:g} to {high:g}", within(rows, key, low, high)))
     for end in ("", "low", "high"):
         lines.append(summary(f"clipped: {end or 'no'}", [row for row in rows if row["clipped"] == end]))
     cross = []
     for low, high in pairwise(EDGES["H"]):
         cells = [f"{low:g} to {high:g}"]
         for bottom, top in pairwise(EDGES["noise"]):
-            inside = [
-                row for row in rows if _within("H", low, high)(row) and _within("noise", bottom, top)(row)
-            ]
+            inside = within(within(rows, "H", low, high), "noise", bottom, top)
             judged = [row for row in inside if row["part"]]
             cells.append(f"{sum(bool(row['kind']) for row in judged)} of {len(judged)} ({len(inside)})")
         cross.append(cells)
@@ -148,34 +131,15 @@ def pixel_tables(rows: list[dict[str, Any]]) -> str:
 
 def wrong_pixels(rows: list[dict[str, Any]]) -> str:
     """Return the wrong pixels, each with the number that draws it again."""
-    head = [
-        "--only",
-        "kind",
-        "H",
-        "noise",
-        "DN/e-",
-        "frames",
-        "clipped",
-        "nats",
-        "H, g, mu, sigma over truth",
-        "beyond",
-    ]
+    head = ["--only", "kind", "H", "noise", "DN/e-", "frames", "clipped", "nats"]
+    head += ["H, g, mu, sigma over truth", "beyond"]
     lines = []
     for row in rows:
         if row["kind"]:
             numbers = [f"{row[key]:.3g}" for key in ("H", "noise", "step")]
+            cells = [str(row["number"]), row["kind"], *numbers, str(row["frames"]), row["clipped"]]
             ratio = " ".join(f"{each:.3f}" for each in row["ratio"])
-            lines.append(
-                [
-                    str(row["number"]),
-                    row["kind"],
-                    *numbers,
-                    str(row["frames"]),
-                    row["clipped"],
-                    f"{row['best']:.1f}",
-                ]
-            )
-            lines[-1] += [ratio, ", ".join(row["beyond"])]
+            lines.append([*cells, f"{row['best']:.1f}", ratio, ", ".join(row["beyond"])])
     return table(head, lines)
 
 
@@ -201,13 +165,13 @@ def run_line(title: str, rows: list[dict[str, Any]]) -> list[str]:
 
 def odd_runs(rows: list[dict[str, Any]]) -> str:
     """Return the runs that are wrong, silent or end badly, each with the number that repeats it."""
-    head = ["--only-run", "what happened", "exit code", "answer", "wrong", "besides"]
+    head = ["--only-run", "what happened", "exit code", "answer", "wrong", "further"]
     lines = []
     for row in rows:
-        besides = [name for name in ("silent", "uncured", "traceback") if row[name]]
-        if besides or (row["wrong"] and not row["no"]):
+        further = [name for name in ("silent", "uncured", "traceback") if row[name]]
+        if further or (row["wrong"] and not row["no"]):
             cells = [row["number"], row["mishap"], row["code"], row["answer"], "; ".join(row["wrong"])]
-            lines.append([*map(str, cells), ", ".join(besides)])
+            lines.append([*map(str, cells), ", ".join(further)])
     return table(head, lines)
 
 
@@ -258,8 +222,7 @@ def write_docs(path: Path, text: str) -> None:
     path.write_text(page[: begin + len(MARKS[0])] + "\n" + text + page[end:])
 
 
-def arguments() -> argparse.Namespace:
-    """Read the command line."""
+def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -270,12 +233,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--only-run", type=int, help="number of one run, shown in full")
     parser.add_argument("--json", type=Path, default=Path("trust_study.json"), help="every pixel and run")
     parser.add_argument("--write-docs", type=Path, help="page whose block of tables is replaced")
-    return parser.parse_args()
-
-
-def main() -> None:
-    """Run what the command line asks for."""
-    options = arguments()
+    options = parser.parse_args()
     if options.only is not None:
         show_pixel(options.only)
     if options.only_run is not None:

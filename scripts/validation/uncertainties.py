@@ -24,7 +24,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,7 @@ from pchem_pipeline.compute.environment import prepare_environment
 prepare_environment()
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
+from helpers.drawn_pixels import Drawn  # noqa: E402
 from helpers.plain_law import pcd_mass  # noqa: E402
 
 from pchem_pipeline.model.checks.multiple_testing import false_discovery  # noqa: E402
@@ -53,26 +54,21 @@ GRID = tuple(itertools.product((0.1, 0.5, 2.0, 8.0), (0.2, 0.3, 0.4, 0.48), (2_0
 GUARD_OFF = FitSettings(tail_guard=0)
 
 
-def judge_together(fit: FitResult) -> FitResult:
-    """Return the fit of a sensor's pixels with the word of those that are weakly identified."""
+def electron_noise(fit: FitResult) -> tuple[Array, Array]:
+    """Return s_e = g sigma of each pixel and its standard error, e-."""
     of_gain, of_sigma = np.sqrt(fit.covariance[:, 1, 1]), np.sqrt(fit.covariance[:, 3, 3])
     together = fit.covariance[:, 1, 3] / (of_gain * of_sigma)
-    noise, stderr = noise_of(fit.conversion_gain, fit.read_noise_dn, of_gain, of_sigma, together)
-    pixels = Judged(noise, stderr, fit.likelihood_gap)
+    return noise_of(fit.conversion_gain, fit.read_noise_dn, of_gain, of_sigma, together)
+
+
+def judge_together(fit: FitResult) -> FitResult:
+    """Return the fit of a sensor's pixels with the word of those that are weakly identified."""
+    pixels = Judged(*electron_noise(fit), fit.likelihood_gap)
     pool = NoisePool.of(pixels)
     if pool is None:
         return fit
     word = np.where(np.logical_or(*pool.reasons(pixels, FitSettings())), int(FitStatus.WEAKLY_IDENTIFIED), 0)
     return replace(fit, fit_status=fit.fit_status | word.astype(np.uint16))
-
-
-@dataclass(frozen=True)
-class Pixels:
-    """Histograms and true (H, g, mu, sigma)."""
-
-    counts: NDArray[np.uint32]
-    origin: NDArray[np.int64]
-    truth: Array
 
 
 def draw(
@@ -82,7 +78,7 @@ def draw(
     noise: ArrayLike,
     n_frames: int,
     spread: tuple[float, ...] = (1.0,),
-) -> Pixels:
+) -> Drawn:
     """Draw pixels of one kind whose bias lies anywhere between two DN.
 
     ``exposure`` and ``noise`` are in e-, one or (n,), quantisation included; ``spread`` holds factors of the
@@ -100,20 +96,7 @@ def draw(
     mass = np.mean(parts, axis=0)
     counts = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True)).astype(np.uint32)
     truth = np.column_stack([light, np.full(n, 1.0 / STEP), bias, noises * STEP])
-    return Pixels(counts, np.full(n, first, np.int64), truth)
-
-
-def estimates(fit: FitResult) -> Array:
-    """Return (H, g, mu, sigma) by pixel."""
-    return fit.columns
-
-
-def with_noise_e(values: Array, covariance: Array) -> tuple[Array, Array]:
-    """Append sigma_e- = g sigma; return values and standard errors, shape (n, 5) each."""
-    g, sigma = values[:, 1], values[:, 3]
-    error = sigma**2 * covariance[:, 1, 1] + 2 * g * sigma * covariance[:, 1, 3] + g**2 * covariance[:, 3, 3]
-    variances = np.column_stack([np.diagonal(covariance, axis1=1, axis2=2), error])
-    return np.column_stack([values, g * sigma]), np.sqrt(variances)
+    return Drawn(counts, np.full(n, first, np.int64), truth)
 
 
 def inside(truth: Array, low: Array, high: Array) -> NDArray[np.bool_]:
@@ -121,12 +104,14 @@ def inside(truth: Array, low: Array, high: Array) -> NDArray[np.bool_]:
     return (low <= truth) & (truth <= high)
 
 
-def coverage(pixels: Pixels, fit: FitResult) -> tuple[int, Array]:
+def coverage(pixels: Drawn, fit: FitResult) -> tuple[int, Array]:
     """Return the number of good pixels and the covered shares by kind (normal, profile), level, quantity."""
     good = fit.fit_status == 0
     if not good.any():
         return 0, np.full((2, len(LEVELS), len(NAMES)), np.nan)
-    values, errors = with_noise_e(estimates(fit)[good], fit.covariance[good])
+    noise, stderr = electron_noise(fit)
+    values = np.column_stack([fit.columns, noise])[good]
+    errors = np.column_stack([np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)), stderr])[good]
     truth = np.column_stack([pixels.truth, pixels.truth[:, 1] * pixels.truth[:, 3]])[good]
     found = np.empty((2, len(LEVELS), len(NAMES)))
     for place, level in enumerate(LEVELS):
@@ -212,7 +197,7 @@ def print_errors(rng: np.random.Generator, n: int) -> None:
     for words, spread in (("of a PCD", (1.0,)), ("of two exposures, 1.2 and 2.8 e-", (0.6, 1.4))):
         pixels = draw(rng, n, 2.0, 0.3, 17_750, spread)
         fit = fit_histograms(pixels.counts, pixels.origin, settings=GUARD_OFF)
-        values = estimates(fit)
+        values = fit.columns
         values[:, 2] -= pixels.truth[:, 2]
         scatter = values.std(axis=0)
         settings = GUARD_OFF.model_copy(update={"errors": "sandwich"})
@@ -258,14 +243,12 @@ def print_guard(rng: np.random.Generator, n: int) -> None:
         on = fit_histograms(pixels.counts, pixels.origin)
         off = fit_histograms(pixels.counts, pixels.origin, settings=GUARD_OFF)
         errors = np.sqrt(np.diagonal(off.covariance, axis1=1, axis2=2))
-        mean_square = [
-            np.nanmean(((estimates(fit) - pixels.truth) / errors) ** 2, axis=0) for fit in (on, off)
-        ]
+        mean_square = [np.nanmean(((fit.columns - pixels.truth) / errors) ** 2, axis=0) for fit in (on, off)]
         cost = 100.0 * (mean_square[0] / mean_square[1] - 1.0).max()
         hit, good = spoiled(rng, pixels), off.fit_status == 0
         shifts = []
         for settings, clean in ((FitSettings(), on), (GUARD_OFF, off)):
-            moved = estimates(fit_histograms(hit.counts, hit.origin, settings=settings)) - estimates(clean)
+            moved = fit_histograms(hit.counts, hit.origin, settings=settings).columns - clean.columns
             shifts.append(np.nanquantile(np.abs(moved / errors)[good], 0.99, axis=0))
         cells = [" ".join(f"{v:7.3f}" for v in row) for row in shifts]
         share = np.mean(on.outlier_share > 0)
@@ -275,7 +258,7 @@ def print_guard(rng: np.random.Generator, n: int) -> None:
     print("parameter; guard on and off: shift by the outliers that 99 % of the good pixels stay below, s.e.")
 
 
-def spoiled(rng: np.random.Generator, pixels: Pixels) -> Pixels:
+def spoiled(rng: np.random.Generator, pixels: Drawn) -> Drawn:
     """Add 5 frames anywhere up to 400 DN beyond either end of each histogram."""
     n, width = pixels.counts.shape
     counts = np.zeros((n, width + 800), np.uint32)
@@ -283,11 +266,10 @@ def spoiled(rng: np.random.Generator, pixels: Pixels) -> Pixels:
     for row in counts:
         places = np.concatenate([rng.integers(0, 380, 2), rng.integers(width + 420, width + 800, 3)])
         np.add.at(row, places, 1)
-    return Pixels(counts, pixels.origin - 400, pixels.truth)
+    return Drawn(counts, pixels.origin - 400, pixels.truth)
 
 
 def main() -> None:
-    """Print all tables."""
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
     parser.add_argument("--pixels", type=int, default=10_000, help="pixels of the coverage study")

@@ -18,6 +18,7 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.commands.apply.characterisation import (
     check_run,
     doubtful_pixels,
+    moments_piece,
     read_calibration,
     with_moments,
 )
@@ -32,13 +33,7 @@ from pchem_pipeline.commands.apply.source import (
     overscan_of,
     some_of,
 )
-from pchem_pipeline.commands.apply.tasks import (
-    N_SUMS,
-    convert_piece,
-    count_piece,
-    moments_piece,
-    offsets_piece,
-)
+from pchem_pipeline.commands.apply.tasks import N_SUMS, convert_piece, count_piece, offsets_piece
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.frames.identity import quick_identity
@@ -48,7 +43,7 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Command, StageContext, Task
 from pchem_pipeline.runner.session import at_work, with_overrides
 from pchem_pipeline.stages.overscan import overscan_samples
-from pchem_pipeline.store.files import fingerprint_of
+from pchem_pipeline.store.files import fingerprint_of, read_json
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import local_path, place_of
 from pchem_pipeline.store.run_store import RunStore
@@ -70,7 +65,7 @@ _PRODUCT = "calibrated frames"
 _CHUNK_SAMPLES, _CHUNK_ROWS, _CHUNK_COLUMNS, _CHUNK_FRAMES = 1 << 20, 64, 256, 256
 _SEGMENT_SAMPLES = 1 << 27
 _BLOCK_SAMPLES = 1 << 26
-#: Frames that tell the scene, or the variances of the offsets in the overscan.
+#: Frames from which the scene, or the variances of the offsets in the overscan, are estimated.
 _SCENE_FRAMES = 256
 #: Share of the samples at a limit of the ADC beyond which offsets are not known: with 6 % of them the stated
 #: probabilities of electron numbers are as right as without, with 32 % they are 0.1 too high.
@@ -80,19 +75,10 @@ _MOST_CUT = 0.2
 def apply_to_frames(
     target: Target, files: Sequence[str | Path], output: Path, wanted: ApplySettings, command: Command
 ) -> list[Path]:
-    """Write other frames of the sensor of a run in physical units.
+    """Write other frames of the sensor of a run in physical units; return what was written.
 
-    A command that was stopped goes on where it was, and gives the same.
-
-    Args:
-        target: the run.
-        files: camera files, globs, folders or URLs.
-        output: a zarr store, or a folder of TIFF or FITS files, see `write_files`.
-        wanted: what to write.
-        command: of the command line; ``force`` replaces an output that is there.
-
-    Returns:
-        What was written.
+    The output is a zarr store, or a folder of TIFF or FITS files, see `write_files`; ``command.force``
+    replaces one that exists. A command that was stopped continues where it was, and gives the same.
 
     Raises:
         InputError: the frames do not fit the run.
@@ -132,7 +118,7 @@ def apply_to_frames(
 def _offsets_to_remove(
     effects: Sequence[Effect], target: Target, frames: FrameSequence, reference: str
 ) -> tuple[CommonModes, Overscan | None]:
-    """Return the offsets that are subtracted, and the overscan where that tells them."""
+    """Return the offsets that are subtracted, and the overscan where they are measured there."""
     modes = CommonModes() if reference == "none" else CommonModes.of_model(effects, frames.shape[1:])
     if reference != "overscan":
         return modes, None
@@ -161,7 +147,7 @@ def _make_job(
     if kept:
         modes = CommonModes()
     calibration = read_calibration(run, limits=limits or (None, None), removed=modes.removed)
-    # a bias that moved is told by the overscan
+    # a bias that moved is measured in the overscan
     drift = 0.0 if overscan is None else float(np.nanmean(some.mean(axis=0) - overscan.bias))
     remarks = check_camera(frames, sensor) + check_level(some - drift, calibration, frames.paths[0])
     if kept:
@@ -196,7 +182,7 @@ def _make_job(
         depth=depth,
         expected=numbers and overlap > 0,
     )
-    # outputs of versions that did not know it are gone on with
+    # outputs of versions without this setting are continued
     settings = {name: value for name, value in asdict(wanted).items() if name != "dataset" or value}
     content = {
         "product": _PRODUCT,
@@ -215,22 +201,20 @@ def _make_job(
 
 
 def _is_done(output: Path, content: dict[str, Any], command: Command) -> bool:
-    """Return whether a folder of files is what is wanted.
-
-    Raises:
-        ConfigError: it is something else.
-    """
-    if not output.exists():
+    """Return whether a folder of files is what is wanted."""
+    if not output.exists() or (output.is_dir() and not any(output.iterdir())):
         return False
-    from pchem_pipeline.store.files import read_json
+    found = read_json(output / "provenance.json") if output.is_dir() else None
+    return _is_wanted(output, found or {}, content, force=command.force)
 
-    if output.is_dir() and not any(output.iterdir()):
-        return False
-    there = read_json(output / "provenance.json") if output.is_dir() else None
-    if there == content and not command.force:
+
+def _is_wanted(output: Path, found: dict[str, Any], content: dict[str, Any], *, force: bool) -> bool:
+    """Return whether an output is the wanted one; raise ConfigError unless it is, or may be replaced."""
+    if found == content and not force:
         return True
-    if not command.force or (there or {}).get("product") != _PRODUCT:
-        raise _exists(output, ours=(there or {}).get("product") == _PRODUCT)
+    ours = found.get("product") == _PRODUCT
+    if not (force and ours):
+        raise _exists(output, ours=ours)
     return False
 
 
@@ -241,26 +225,17 @@ def _exists(output: Path, *, ours: bool) -> ConfigError:
 
 
 def _output_store(place: Path, content: dict[str, Any], *, force: bool) -> tuple[RunStore, bool]:
-    """Return the store that is written, and whether it is begun anew.
-
-    Raises:
-        ConfigError: it holds something else, or other frames.
-    """
+    """Return the store that is written, and whether it is begun anew; raise ConfigError for another one."""
     names = {each.name for each in place.iterdir()} if place.is_dir() else set()
     begun = {name for name in names if not name.startswith(".zarr.json.")}  # not what a killed process left
     if "zarr.json" not in begun and (begun or (place.exists() and not place.is_dir())):
         raise _exists(place, ours=False)
     if not begun <= {"zarr.json", ".pchem"}:
-        try:
-            there = RunStore.open(place).attributes("applied").get("provenance", {})
-        except StoreError:
-            raise _exists(place, ours=False) from None
-        if there.get("product") != _PRODUCT:
-            raise _exists(place, ours=False)
-        if there == content and not force:
+        found: dict[str, Any] = {}
+        with contextlib.suppress(StoreError):
+            found = RunStore.open(place).attributes("applied").get("provenance", {})
+        if _is_wanted(place, found, content, force=force):
             return RunStore.open(place, writable=True), False
-        if not force:
-            raise _exists(place, ours=True)
     store = RunStore.create(place)
     for group in ("applied", "applied_parts"):
         store.delete(group)
@@ -307,11 +282,7 @@ def _create_converted(context: StageContext, job: Job, n_segments: int) -> None:
 
 
 def _do(context: StageContext, job: Job, calibration: Calibration) -> None:
-    """Bring the output up to date.
-
-    Raises:
-        IncompleteRunError: pieces failed; the others are kept.
-    """
+    """Bring the output up to date."""
     record = context.store.records.read(STAGE)
     if record is not None and record.finished and not context.fresh:
         context.store.delete("applied_parts")  # what a failure after the last step may have left
@@ -334,11 +305,7 @@ def _do(context: StageContext, job: Job, calibration: Calibration) -> None:
 def _do_pieces(
     context: StageContext, pieces: Sequence[Piece], task: Task[Piece], **how: Any
 ) -> dict[str, dict[str, Any]]:
-    """Do the pieces as `StageContext.run_units` does.
-
-    Raises:
-        IncompleteRunError: some failed; the others are kept.
-    """
+    """Do the pieces as `StageContext.run_units` does; raise IncompleteRunError where some failed."""
     done = context.run_units(pieces, task, **how)
     if context.failed:
         key, reason = next(iter(context.failed.items()))

@@ -15,14 +15,15 @@ from pchem_pipeline.model.fit.status import moves_gain
 from pchem_pipeline.model.maps.maps import electron_shifts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_satellites
+from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration, covariance_of
 
 if TYPE_CHECKING:
+    from pchem_pipeline.commands.apply.settings import Job, Piece
     from pchem_pipeline.model.fit.settings import FitSettings
-    from pchem_pipeline.store.run_store import RunStore
 
 #: Gap below which a rival counts, nats; read noise and standard error of the bias from which on, e-, the
-#: curvature of the likelihood at its maximum does not tell how far it reaches: where either is less, or the
+#: curvature of the likelihood at its maximum does not give its width: where either is less, or the
 #: gap larger, errors by the curvature are less than 5 % too small, at 0.45 e- and 4,000 frames 20 % and more.
 _NEAR_RIVAL, _NOISY_E, _LOOSE_E = 10.0, 0.33, 0.02
 #: Pixels whose likelihood is walked at once.
@@ -49,13 +50,13 @@ def read_calibration(
     extra_variance: FloatArray | None = None,
     limits: tuple[int | None, int | None] = (None, None),
 ) -> Calibration:
-    """Return the calibration of some rows.
+    """Return the calibration of some rows of a run.
 
     Args:
         store: the run.
         rows: of the sensor.
-        removed: tags of effects that the frames no longer have.
-        extra_variance: of what took them away, DN^2, of these rows (y, x); None: none.
+        removed: tags of effects whose offsets are subtracted from the frames.
+        extra_variance: of these offsets' estimates, DN^2, (y, x).
         limits: first and last code of the samples, DN; None: not known.
     """
     region = (rows, slice(None))
@@ -97,12 +98,7 @@ def doubtful_pixels(
     return np.asarray(loose & calibration.usable)
 
 
-def write_moments(
-    run: RunStore,
-    output: RunStore,
-    rows: slice,
-    settings: FitSettings,
-) -> None:
+def moments_piece(piece: Piece, output: RunStore, *, job: Job, settings: FitSettings) -> None:
     """Write the errors of g, mu and sigma of some rows, of doubtful pixels by their likelihood.
 
     Where peaks are apart its maxima are narrow, an electron from each other, and of one gain and read noise:
@@ -110,6 +106,7 @@ def write_moments(
     """
     from pchem_pipeline.model.fit.api import likelihood_moments  # the fit is much to load
 
+    run, rows = RunStore.open(job.run), slice(piece.y0, piece.y1)
     region, sensor = (rows, slice(None)), SensorInfo.read(run)
     calibration = read_calibration(run, rows)
     names = [*PARAMETERS, "likelihood_gap", "outlier_share"]
@@ -149,7 +146,7 @@ def write_moments(
 
 
 def with_moments(calibration: Calibration, output: RunStore, rows: slice = slice(None)) -> Calibration:
-    """Return a calibration of some rows with the errors that `write_moments` wrote."""
+    """Return a calibration of some rows with the errors that `moments_piece` wrote."""
     region = (rows, *[slice(None)] * 3)
     return replace(
         calibration,

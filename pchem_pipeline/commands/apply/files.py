@@ -30,22 +30,17 @@ _AT_LIMIT = "applied/at_adc_limit"
 _FRAMES = ("frame", "y", "x")
 #: of the coordinates, which files do without
 _AXES = tuple((axis,) for axis in _FRAMES)
-#: bits of DQ: overlapping peaks concern electron numbers, of which an image of its own has the probability
+#: bits of DQ: overlapping peaks concern electron numbers, whose probability is a separate image
 _DQ = {name: flag for name, flag in FLAGS.items() if name != "peaks_overlap"}
 
 
 def write_files(
     store: RunStore, folder: Path, kind: str, frames: FrameSequence, content: dict[str, Any]
 ) -> list[Path]:
-    """Write images as files, and what they were made of.
+    """Write the images of the group ``applied`` as files, and their provenance ``content`` as JSON.
 
-    Args:
-        store: with the group ``applied``.
-        folder: made if needed.
-        kind: tiff (a file for each array) or fits (a file for each input file, for the exposure, and for each
-            other array).
-        frames: that were calibrated.
-        content: provenance, as JSON data.
+    The kind is tiff (a file for each array) or fits (a file for each input file of ``frames``, for the
+    exposure, and for each other array).
 
     Raises:
         StoreError: the folder cannot be written.
@@ -150,10 +145,7 @@ def _write_fits(
 def _stack_images(
     store: RunStore, stacks: Sequence[Variable], quality: NDArray[np.uint32]
 ) -> Callable[[int, int], list[FitsImage]]:
-    """Return what gives the images of some frames: SCI, ERR of electrons, DQ, and the other arrays.
-
-    Where limits of the ADC are known, DQ of a frame states which of its samples are at one.
-    """
+    """Return a function that makes the images of frames ``start:end``: SCI, ERR, DQ, and the other arrays."""
     path = stacks[0].path
     depth = store.array(path).chunks[0]
     with_errors = stacks[0].name == "electrons"
@@ -171,7 +163,7 @@ def _stack_images(
             yield block(path, number)[max(start - before, 0) : end - before]
 
     def images_of(start: int, end: int) -> list[FitsImage]:
-        shape = _shape(end - start, quality)
+        shape = quality.shape if end - start == 1 else (end - start, *quality.shape)
         sci, *others = (_image(store, each, blocks(each.path, start, end), shape) for each in stacks)
         images = [_named("SCI", sci)]
         if with_errors:
@@ -187,10 +179,6 @@ def _stack_images(
         return [*images, _quality(marks, shape), *others]
 
     return images_of
-
-
-def _shape(n: int, image: NDArray[Any]) -> tuple[int, ...]:
-    return image.shape if n == 1 else (n, *image.shape)
 
 
 def _quality(frames: Iterable[NDArray[np.uint32]], shape: tuple[int, ...]) -> FitsImage:
@@ -227,7 +215,7 @@ def _bits(flags: Mapping[str, tuple[int, str]]) -> list[tuple[str, str]]:
 
 
 def _provenance(content: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return what the values were made of; long texts go on in further cards."""
+    """Return the provenance as cards; long texts continue in further cards."""
     names = {"PCHEMVER": "program", "PCHEMRUN": "run", "PCHEMSHA": "run_digest", "PCHEMMOD": "model"}
     found = {card: str(content[name]).encode("ascii", "replace").decode() for card, name in names.items()}
     return [*found.items(), ("HISTORY", "pchem apply: DN to physical units by the calibration of PCHEMRUN")]

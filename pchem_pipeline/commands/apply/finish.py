@@ -11,7 +11,6 @@ import numpy as np
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.commands.apply.settings import Job
 from pchem_pipeline.model.fit.status import MEANINGS
-from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
@@ -40,7 +39,8 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
     for name, length in (("frame", n), ("y", ny), ("x", nx)):
         output.write_array(f"applied/{name}", np.arange(length, dtype=np.int64))
     sums = _sums(output) if job.converts else None
-    calibration = replace(calibration, law=_law(calibration, job))
+    if (extra := job.offset_variance) is not None:  # what stays unknown of the offsets
+        calibration = replace(calibration, law=calibration.law.with_variance(dn2=extra.ravel()))
     if sums is not None and job.removed:
         _write_noise(output, calibration, sums, n, job, reporter)
         sums[0] = sums[2]  # the offsets may have a mean: a bias that moved
@@ -63,10 +63,11 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
 
 def _sums(output: RunStore) -> FloatArray:
     """Return the sums over all frames, segment by segment in their order."""
-    array = output.array("applied_parts/sums")
-    total: FloatArray = output.read("applied_parts/sums", (slice(0, 1), *[slice(None)] * 3))[0]
-    for number in range(1, array.shape[0]):
-        part = output.read("applied_parts/sums", (slice(number, number + 1), *[slice(None)] * 3))[0]
+    number = output.array("applied_parts/sums").shape[0]
+    places = ((slice(i, i + 1), *[slice(None)] * 3) for i in range(number))
+    parts = (output.read("applied_parts/sums", place)[0] for place in places)
+    total: FloatArray = next(parts)
+    for part in parts:
         total[:4] += part[:4]
         total[4] = np.minimum(total[4], part[4])
         total[5] = np.maximum(total[5], part[5])
@@ -83,12 +84,6 @@ def _write_errors(output: RunStore, calibration: Calibration, sums: FloatArray, 
     output.write_array("applied/electrons_stderr_read", read_stderr(calibration).astype(np.float32))
     output.write_array("applied/calibration_variance", variance, {"power_of_signal": [0, 1, 2]})
     output.write_array("applied/electrons_stderr_calibration", stderr_at(variance, signal).astype(np.float32))
-
-
-def _law(calibration: Calibration, job: Job) -> SampleLaw:
-    """Return the law of the samples without the offsets, with what stays unknown of them."""
-    extra = job.offset_variance
-    return calibration.law if extra is None else calibration.law.with_variance(dn2=extra.ravel())
 
 
 def _write_noise(
@@ -125,12 +120,9 @@ def _variance(sums: FloatArray, n: int) -> FloatArray:
 
 
 def _row_words(means: FloatArray, pixels: FloatArray, usable: BoolArray) -> str:
-    """Return the standard deviation that rows share beyond the noise of their pixels, with its error, DN.
+    """Return the noise that the pixels of a row share, with its error, DN.
 
-    Args:
-        means: variances of the means of the rows, DN^2, shape (y,).
-        pixels: variances of the samples, DN^2, shape (y, x).
-        usable: pixels that the means are of, shape (y, x).
+    Variances over frames are given of the row means (y,) of usable pixels and of samples (y, x), DN^2.
     """
     number = usable.sum(axis=1)
     several = number > 1
@@ -145,12 +137,7 @@ def _row_words(means: FloatArray, pixels: FloatArray, usable: BoolArray) -> str:
 
 
 def _noise_words(excess: FloatArray, expected: FloatArray) -> str:
-    """Return the root of the mean excess of the pixels over shot noise, with its error, e-.
-
-    Args:
-        excess: variances less their shot noise, e-^2, shape (y, x); NaN where there is none.
-        expected: whole variances by the calibration, whose squares say how far those scatter.
-    """
+    """Return the root of the mean excess of variances over shot noise, e-, weighted by expected variances."""
     known = np.isfinite(excess)
     weight = expected[known] ** -2.0
     mean = float(np.average(excess[known], weights=weight))

@@ -13,8 +13,6 @@ from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.store.run_store import RunStore, stored_config
 
-_DAY = 86_400.0  # s
-
 
 def finished_runs(folder: Path) -> dict[Path, SensorInfo]:
     """Return the sensor of each run with a fit in a folder and in its folders, without damaged ones."""
@@ -31,12 +29,7 @@ def run_for(target: Path, files: Sequence[str], max_age: float | None) -> tuple[
     """Return the run for some frames, and why it is that one: of a folder of runs; else ``target`` itself.
 
     Of the runs of the same camera, setting, temperature and pixels, the last before the frames were taken;
-    else the first after.
-
-    Args:
-        target: a run, or a folder with the stores of runs, or with folders that have them.
-        files: camera files, globs or folders.
-        max_age: days that may lie between run and frames; None: any number.
+    else the first after. At most ``max_age`` days may lie between run and frames.
 
     Raises:
         ConfigError: ``max_age`` without a folder of runs.
@@ -74,7 +67,7 @@ def run_for(target: Path, files: Sequence[str], max_age: float | None) -> tuple[
     age, path = max((each for each in dated if each[0] <= 0.0), default=min(dated))
     if len(same := [other.name for other_age, other in dated if other_age == age]) > 1:
         raise InputError(f"{' and '.join(same)} in {target} were taken at the same time; name one")
-    days = abs(age) / _DAY
+    days = abs(age) / 86_400.0
     words = f"{days:.1f} days {'before' if age <= 0.0 else 'after'} the frames"
     if max_age is not None and days > max_age:
         raise InputError(

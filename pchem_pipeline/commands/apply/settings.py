@@ -34,8 +34,8 @@ class ApplySettings:
         kinds: any of `KINDS`.
         prior: exposure that the electron numbers are expected to have: ``frames`` (estimated from these
             frames), ``flat`` (none) or ``run`` (of the characterisation).
-        reference: pixels that tell the offsets of frames, rows and columns, which are subtracted: ``pixels``
-            (all, of the offsets in the model of the run), ``overscan`` or ``none``.
+        reference: pixels from which the subtracted offsets of frames, rows and columns are estimated:
+            ``pixels`` (all, for the offsets in the model of the run), ``overscan`` or ``none``.
         format: of the output: zarr, tiff or fits.
         dataset: which frames inside an HDF5, zarr or FITS file; None: as the run has it.
     """
@@ -94,12 +94,12 @@ class Job:
         pool: what the exposures of these frames have in common, where they are the prior.
         limits: first and last code of the ADC, DN; None: not known.
         modes: offsets that are taken from the frames; none: the frames as they come.
-        overscan: that tells the offsets; None: all pixels do.
-        scene: exposure to expect while these tell them (y, x), e-.
+        overscan: in which the offsets are measured; None: in all pixels.
+        scene: expected exposure while they are measured in all pixels, (y, x), e-.
         offset_variance: variance of the offsets' estimates, DN^2, (y, x); None without offsets.
         row_sums: of the mean of each row less its bias over the frames, and of its square, DN and DN^2, with
             the offsets and without: shape (2, 2, y).
-        moments: whether the errors of the calibration are in the output, by `write_moments`.
+        moments: whether the errors of the calibration are in the output, by `moments_piece`.
         parts: codes in a DN.
         lift: DN by which codes are raised so that none is negative; no offset is larger.
         reached: whether samples lie at the first and at the last code of the ADC.

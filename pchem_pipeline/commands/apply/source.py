@@ -33,13 +33,9 @@ MOST_WARMER = 2.0
 def open_like_run(
     target: Target, sensor: SensorInfo, files: Sequence[str | Path], dataset: str | None = None
 ) -> FrameSequence:
-    """Open other frames with what the run says of its own: format, dataset, region, bits.
+    """Open other frames with the settings of the run: format, dataset (unless given), region, bits.
 
-    Args:
-        target: the run.
-        sensor: of the run.
-        files: camera files, globs, folders or URLs; relative to the present folder.
-        dataset: of the frames in the files, in place of the run's.
+    Files are relative to the present folder.
 
     Raises:
         InputError: the frames do not fit the pixels of the run.
@@ -47,7 +43,7 @@ def open_like_run(
     """
     if sensor.kind == "histograms":
         raise ConfigError(f"{target.store} was made from ready-made histograms; a run of frames is needed")
-    settings = _settings(target).model_copy(
+    settings = _first_sample(target).config.input.model_copy(
         update={"files": tuple(str(each) for each in files), "frame_range": None, "mask": None, "samples": ()}
     )
     if dataset is not None:
@@ -76,19 +72,13 @@ def open_like_run(
     return frames
 
 
-def _settings(target: Target) -> InputSettings:
-    """Return how the run reads its files; of several exposures how the first does."""
-    if target.config.input.samples:
-        return sample_targets(target.config, target.base_dir)[0].config.input
-    return target.config.input
+def _first_sample(target: Target) -> Target:
+    """Return the run itself, or the first one of a run of several exposures."""
+    return (*sample_targets(target.config, target.base_dir), target)[0]
 
 
 def _with_region(settings: InputSettings, region: list[int], sensor: SensorInfo, run: str) -> InputSettings:
-    """Return the settings that take the run's region of whole frames, or all of frames of that region alone.
-
-    Raises:
-        InputError: the frames are of another size than both.
-    """
+    """Return the settings that take the run's region of whole frames, or all of frames of that region."""
     whole = settings.model_copy(update={"roi": None, "overscan": None})
     frames = open_frames(whole, Path.cwd(), check_duplicates=False, least=1)
     shape, name = frames.whole_shape, frames.paths[0]
@@ -112,8 +102,7 @@ def overscan_of(target: Target, frames: FrameSequence) -> Overscan:
     Raises:
         InputError: the run has none, or the frames have none.
     """
-    samples = sample_targets(target.config, target.base_dir)
-    run = (samples[0] if samples else target).store
+    run = _first_sample(target).store
     found = read_overscan(RunStore.open(run))
     bias = None if found is None else np.where(frames.overscan_pixels, found.bias, np.nan)
     if found is None or bias is None or np.isnan(bias).all():
@@ -153,11 +142,7 @@ def warmer(here: CameraFacts, there: CameraFacts) -> float:
 
 
 def check_camera(frames: FrameSequence, sensor: SensorInfo) -> list[str]:
-    """Return remarks on frames of another camera or temperature, as far as the files say; none where alike.
-
-    Args:
-        frames: to be calibrated.
-        sensor: of the run.
+    """Return remarks on frames of another camera or temperature than the run's, as far as the files say.
 
     Raises:
         InputError: both state a serial number, gain, readout mode or binning, and these differ.
@@ -184,12 +169,7 @@ def some_of(frames: FrameSequence) -> NDArray[np.unsignedinteger[Any]]:
 
 
 def check_level(some: NDArray[Any], calibration: Calibration, name: Path) -> list[str]:
-    """Return remarks on a mean level that does not fit the characterisation; none where it does.
-
-    Args:
-        some: of the frames to be calibrated, (frame, y, x), DN.
-        calibration: of all pixels.
-        name: of their first file.
+    """Return remarks where the mean level of frames (frame, y, x), DN, does not fit the characterisation.
 
     Raises:
         InputError: the mean is too far below the bias for frames of these pixels.

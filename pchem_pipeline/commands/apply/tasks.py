@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Float32Array
-from pchem_pipeline.commands.apply.characterisation import read_calibration, with_moments, write_moments
+from pchem_pipeline.commands.apply.characterisation import read_calibration, with_moments
 from pchem_pipeline.commands.apply.settings import Job, Piece, at_limit
 from pchem_pipeline.frames.stream import FrameStream
-from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
 from pchem_pipeline.use.common_modes import Offsets, Reference, estimate_offsets
@@ -54,14 +53,6 @@ def _calibration(
 def _codes(frames: NDArray[Any], job: Job, offsets: Float32Array) -> NDArray[Any]:
     """Return the codes of samples: DN, or parts of a DN without the offsets."""
     return whole_parts(frames, offsets, job.parts, job.lift) if job.removed else frames
-
-
-# -- errors of the calibration ---------------------------------------------------------------------
-
-
-def moments_piece(piece: Piece, output: RunStore, *, job: Job, settings: FitSettings) -> None:
-    """Write the errors of the calibration of some rows."""
-    write_moments(RunStore.open(job.run), output, slice(piece.y0, piece.y1), settings)
 
 
 # -- offsets of frames, rows and columns -----------------------------------------------------------
@@ -197,20 +188,14 @@ def convert_piece(piece: Piece, output: RunStore, *, job: Job) -> None:
 
 @dataclass(frozen=True)
 class _Tables:
-    """Electron numbers of the codes of some rows.
-
-    Attributes:
-        known: the pixels.
-        prior: exposure that is expected, e-, (y, x); None: none.
-        right_bias: probability that the bias is right, (y, x): one that is an electron off makes nearly all
-            numbers wrong.
-        tables: of the codes that occur.
-    """
+    """Electron numbers of the codes of some rows."""
 
     known: KnownPixels
-    prior: Any
-    right_bias: Any
-    tables: NumberTables
+    prior: Any  # expected exposure, e-, (y, x); or None
+    right_bias: (
+        Any  # probability of the right bias, (y, x): one an electron off makes nearly all numbers wrong
+    )
+    tables: NumberTables  # of the codes that occur
 
     def numbers(self, frames: NDArray[Any], codes: NDArray[Any], job: Job) -> Numbers:
         """Return the numbers of samples (frame, y, x), given with their codes.

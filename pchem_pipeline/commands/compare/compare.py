@@ -96,11 +96,11 @@ def compare_runs(
         paths: stores, or the YAML files that made them; two or more.
         folder: where to write; made if needed.
         tolerance: relative difference that counts as rounding, where the frames are the same.
-        labels: of the runs, in their order, such as setpoints, which the history draws them against by the
-            numbers that these begin with; none: the dates.
+        labels: of the runs, such as setpoints: the numbers that they begin with are the axis of the history;
+            none: the dates.
         rate: false-discovery rate at which a pixel counts as changed.
-        limits: ``name=value`` of the section ``compare``; they replace those of the first run.
-        progress: auto | on | off.
+        limits: ``name=value`` of the section ``compare``, in place of those of the first run.
+        progress: auto, on or off.
         quiet: write nothing where nothing changed.
         write: takes each line of what changed.
 
@@ -152,7 +152,7 @@ def comparison_of(
     rows = {row["id"]: row for row in kept if row["reference"] == first.facts.identity}
     before = _before(given, rows, folder, reporter)
     sides = [*given[:-1], *([] if before is None or before in given else [before]), last]
-    names = _told_apart([side.store.path for side in sides])
+    names = _shortest_names([side.store.path for side in sides])
     for side, letter, name in zip(sides, _letters(len(sides)), names, strict=True):
         side.facts = replace(side.facts, label=letter, name=name)
     pairs = [between(first, side, "reference") for side in given[1:]]
@@ -222,8 +222,8 @@ def _letters(n: int) -> list[str]:
     return [(singles[i // 26 - 1] if i >= 26 else "") + singles[i % 26] for i in range(n)]
 
 
-def _told_apart(paths: Sequence[Path]) -> list[str]:
-    """Return the names of the stores, with as many of their folders as tell them apart."""
+def _shortest_names(paths: Sequence[Path]) -> list[str]:
+    """Return the names of stores, preceded by as many of their folders as make them differ."""
     parts = [path.resolve().parts for path in paths]
     for depth in range(1, max(map(len, parts)) + 1):
         names = ["/".join(part[-depth:]) for part in parts]
@@ -266,7 +266,7 @@ def _median(content: dict[str, Any]) -> tuple[float, float, float]:
 
 
 def _data_digest(store: RunStore, sensor: SensorInfo) -> str:
-    """Return what tells the frames of a run: content of the files, and what was taken of them."""
+    """Return what identifies the frames of a run: content of the files, and the part taken of them."""
     record = store.records.read("ingest")
     settings = {} if record is None else record.content.get("settings", {})
     taken = [settings.get(f"input.{name}") for name in ("dataset", "roi", "frame_range", "bit_shift")]
@@ -393,17 +393,7 @@ def _array_words(row: ArrayRow) -> str:
 
 
 def _compared_arrays(one: RunStore, other: RunStore, tolerance: float, reporter: Reporter) -> list[ArrayRow]:
-    """Compare all arrays that either store has.
-
-    Args:
-        one: a run.
-        other: a run on the same frames.
-        tolerance: difference that counts as rounding, relative to the largest value of an array.
-        reporter: hears of each array.
-
-    Returns:
-        A row for each array, in the order of the registry.
-    """
+    """Compare all arrays that either of two runs on the same frames has, a row for each."""
     # frames have the same digest, electrons follow from them and the maps, sums depend on the tiling
     left_out = ("frames", "electrons", "ensemble_tiles")
     names = [

@@ -44,7 +44,7 @@ _MEDIANS = tuple(name for name in _NAMES if f"{name}_stderr" in _NAMES)
 
 
 def identity_of(store: RunStore, digest: str) -> str:
-    """Return what tells one run from another: its frames, and how they were characterised."""
+    """Return a digest of the frames of a run, and of how they were characterised."""
     record = store.records.read("maps")
     return hashlib.sha256(f"{digest} {record and record.fingerprint}".encode()).hexdigest()[:12]
 
@@ -52,15 +52,15 @@ def identity_of(store: RunStore, digest: str) -> str:
 def history_row(
     run: RunFacts, store: RunStore, states: PixelStates, label: str, folder: Path, pair: Pair | None
 ) -> HistoryRow:
-    """Return the line of a run in the history.
+    """Return the line of a run in the history of a folder.
 
     Args:
         run: the run.
-        store: of it.
-        states: of its pixels.
+        store: its store.
+        states: its pixels.
         label: of the run; empty: its date.
         folder: of the history.
-        pair: how it differs from the reference; None: it is the reference.
+        pair: the differences from the reference; None: it is the reference.
     """
     camera = SensorInfo.read(store).camera
     date = _date(store, camera)
@@ -123,7 +123,7 @@ def read_history(path: Path) -> list[HistoryRow]:
 
 
 def append_history(path: Path, rows: Sequence[HistoryRow]) -> None:
-    """Add lines to a history; those that are there stay as they are.
+    """Add lines to a history; existing ones stay as they are.
 
     Raises:
         StoreError: the file cannot be written.

@@ -61,9 +61,7 @@ def _text(value: Any) -> str:
 
 def _readers(name: str) -> tuple[str, ...]:
     """Return the stages that read a setting, itself or its section."""
-    if name in _BESIDE:
-        return _BESIDE[name]
-    return tuple(
+    return _BESIDE.get(name) or tuple(
         name_of_stage
         for name_of_stage, stage in STAGES.items()
         if any(name == key or name.startswith(f"{key}.") for key in stage.settings)
