@@ -1,8 +1,7 @@
 """Ready-made histograms: many laboratories keep only those.
 
 A file holds digital numbers and counts: CSV (two columns ``DN, count`` or ``Energy, Count``; more count
-columns are
-more channels; a header line is optional), npy (two columns, or channels x bins with bin 0 at DN 0), or npz
+columns are more channels; a header line is optional), npy (two columns, or channels x bins with bin 0 at DN 0), or npz
 (``dn`` and ``counts``). Each channel becomes a pixel of a sensor of one row.
 """
 
@@ -11,9 +10,9 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,14 +53,13 @@ class HistogramInput:
         return 1, len(self.names)
 
 
-@dataclass
-class _Channel:
+class _Channel(NamedTuple):
     """One histogram with its leading and trailing zeros cut off."""
 
     name: str
     origin: int
     counts: IntArray
-    notes: list[str] = field(default_factory=list)
+    notes: list[str]
 
 
 def is_histogram_input(settings: InputSettings, base_dir: Path) -> bool:
@@ -85,10 +83,6 @@ def is_histogram_input(settings: InputSettings, base_dir: Path) -> bool:
 
 def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
     """Read all histograms of ``input.files`` onto axes of equal length.
-
-    Args:
-        settings: the section ``input``.
-        base_dir: folder to which relative paths refer.
 
     Raises:
         InputError: files that cannot be read, or that are no histograms, all in one message.
@@ -127,20 +121,14 @@ def _read(path: Path) -> list[_Channel]:
     if suffix not in HISTOGRAM_SUFFIXES:
         raise InputError(f"{path}: give histograms as .csv, .txt, .npy or .npz")
     try:
-        if suffix in (".npy", ".npz"):
-            dn, columns, names = _read_numpy(path)
-        else:
-            dn, columns, names = _read_text(path)
+        dn, columns, names = (_read_numpy if suffix in (".npy", ".npz") else _read_text)(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
     except csv.Error as error:
         raise InputError(
             f"{path}: no table of numbers ({error}); histograms have columns DN, count"
         ) from error
-    if len(names) == 1:
-        names = [path.stem]
-    else:
-        names = [f"{path.stem}:{name}" for name in names]
+    names = [path.stem] if len(names) == 1 else [f"{path.stem}:{name}" for name in names]
     channels: list[_Channel] = []
     for name, column in zip(names, columns, strict=True):
         channels.append(_channel(path, name, dn, column))
@@ -220,18 +208,13 @@ def _read_text(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]
     width = len(header or rows[0])
     if width < 2:
         raise InputError(f"{path}: needs two or more columns, DN and count")
-    table = np.empty((len(rows), width))
     for number, row in enumerate(rows, 1 + (header is not None)):
         if len(row) != width or not all(_is_number(cell) for cell in row):
             raise InputError(
                 f"{path}: row {number} ({mark.join(row)[:40]}) is not {width} numbers; correct it"
             )
-        table[number - 1 - (header is not None)] = [float(cell) for cell in row]
-    names = (
-        [name or str(i) for i, name in enumerate(header[1:])]
-        if header
-        else [str(i) for i in range(width - 1)]
-    )
+    table = np.array([[float(cell) for cell in row] for row in rows]).reshape(-1, width)
+    names = [name or str(i) for i, name in enumerate((header or [""] * width)[1:])]
     return table[:, 0], list(table[:, 1:].T), names
 
 
@@ -259,8 +242,7 @@ def _channel(path: Path, name: str, dn: NDArray[Any], counts: NDArray[Any]) -> _
         raise InputError(f"{where}DN not in increasing order (at DN {axis[1:][steps < 0][0]}); sort them")
     if not values.any():
         raise InputError(f"{where}all counts are zero; omit it")
-    filled = np.flatnonzero(values)
-    first, last = filled[0], filled[-1]
+    first, last = np.flatnonzero(values)[[0, -1]]
     low, high = int(axis[first]), int(axis[last])
     if high - low >= _MOST_BINS or not -(2**31) <= low <= high < 2**31:
         raise InputError(f"{where}DN from {low} to {high}, more than any ADC; correct the DN column")

@@ -102,12 +102,8 @@ def _load(point: EntryPoint) -> type[FrameReader]:
 
 def frame_suffixes(name: str = "auto") -> dict[str, str]:
     """Return suffix -> format name, of one format or of all."""
-    names = reader_names() if name == "auto" else [name]
-    table: dict[str, str] = {}
-    for each in names:
-        for suffix in reader_class(each).suffixes:
-            table.setdefault(suffix, each)
-    return table
+    names = reversed(reader_names()) if name == "auto" else [name]  # of several readers the first counts
+    return {suffix: each for each in names for suffix in reader_class(each).suffixes}
 
 
 def detect_format(path: Path) -> str:
@@ -116,8 +112,11 @@ def detect_format(path: Path) -> str:
     Raises:
         InputError: the file is missing, empty, or of no known format.
     """
+    head = b""
     try:
-        head = b"" if path.is_dir() else _head(path)
+        if not path.is_dir():
+            with path.open("rb") as stream:
+                head = stream.read(64)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
@@ -140,19 +139,10 @@ def detect_format(path: Path) -> str:
 
 
 def check_unpacked(path: Path, head: bytes) -> None:
-    """Refuse a file that holds another one: libraries may unpack it, but its bytes are not where they say.
-
-    Raises:
-        InputError: its first bytes are those of a program that packs files.
-    """
+    """Refuse a packed file: libraries may unpack it, but its bytes are not where they say."""
     for magic, program in _PACKED.items():
         if head.startswith(magic):
             raise InputError(f"{path}: compressed with {program}; unpack it first")
-
-
-def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(64)
 
 
 def require(module: str, extra: str, what: str) -> None:

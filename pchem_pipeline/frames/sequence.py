@@ -27,7 +27,7 @@ class FrameSequence(FrameReader):
         report: what was found in the files and what was done about it.
         excluded: pixels (y, x) whose samples are replaced by one that is the same in all frames; None: none.
         insensitive: pixels (y, x) outside of the light-sensitive area.
-        overscan_pixels: those of them that tell the bias, (y, x).
+        overscan_pixels: those of them that show the bias, (y, x).
         exclusions: why pixels are excluded.
         stated_integration_time: s, as the files say, whatever the settings say; None if they do not agree.
     """
@@ -127,7 +127,7 @@ class FrameSequence(FrameReader):
         if all(each is not None for each in stamps):
             self.timestamps = np.concatenate([each for each in stamps if each is not None])[self._first : end]
         _check_same_camera(readers)
-        self.camera, moved = shared_facts(reader.camera for reader in readers)
+        self.camera, moved = shared_facts([reader.camera for reader in readers])
         self.notes = (*shared_notes(readers), *([moved] if moved else []))
 
     @classmethod
@@ -172,8 +172,7 @@ class FrameSequence(FrameReader):
     def stored(self, t0: int, t1: int, y0: int, y1: int) -> NDArray[Any]:
         """Return frames t0..t1 and rows y0..y1 (frame, y, x) as they are in the files."""
         buffer = np.empty((t1 - t0, y1 - y0, self.shape[2]), self.dtype)
-        for _ in self._parts(buffer, t0, t1, (y0, y1)):
-            pass
+        list(self._parts(buffer, t0, t1, (y0, y1)))
         return buffer
 
     def _parts(
@@ -243,12 +242,10 @@ class FrameSequence(FrameReader):
             part[t - t0 : stop - t0] = scratch[: stop - t, :, self._x0 : self._x1]
 
     def check_bits(self, reader: FrameReader, part: NDArray[Any], y0: int) -> None:
-        """Replace excluded samples; shift left-justified ones, refusing to lose bits; check the bit depth.
+        """Replace excluded samples in part of a file (frame, y, x), from row ``y0`` on; undo the bit shift.
 
-        Args:
-            reader: of the file.
-            part: frames of it, (frame, y, x).
-            y0: their first row.
+        Raises:
+            InputError: a bit would be lost, or a value does not fit the bit depth.
         """
         if self.excluded is not None:
             ys, xs = self._places
@@ -303,10 +300,7 @@ def _where(paths: Sequence[Path]) -> str:
 
 
 def _check_same_camera(readers: Sequence[FrameReader]) -> None:
-    """Refuse files of different cameras or settings: their frames are no samples of one distribution.
-
-    A serial number that differs in each of many files counts files, not cameras.
-    """
+    """Refuse files of different cameras or settings: their frames are no samples of one distribution."""
     for name in dict.fromkeys(name for reader in readers for name in reader.camera.setup):
         values = {
             each.paths[0].name: each.camera.setup[name] for each in readers if name in each.camera.setup
@@ -318,6 +312,7 @@ def _check_same_camera(readers: Sequence[FrameReader]) -> None:
             )
     serials = {reader.paths[0].name: reader.camera.serial for reader in readers if reader.camera.serial}
     distinct = set(serials.values())
+    # a number that differs in each of many files counts files
     if len(distinct) > 1 and not 2 < len(readers) == len(distinct):
         shown = _first_of_each(serials, "serial number ")
         raise InputError(f"the files are from different cameras: {shown}; give those of one at a time")

@@ -13,7 +13,6 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -38,29 +37,21 @@ class FrameSource(Protocol):
     @property
     def shape(self) -> tuple[int, int, int]:
         """Frames, rows, columns."""
-        ...
 
     @property
     def dtype(self) -> np.dtype[Any]:
         """Type of the samples."""
-        ...
 
     @property
     def rows_per_read(self) -> int:
         """Rows that are decoded together, and so come at no more cost than one."""
-        ...
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """Fill ``buffer`` (frame, y, x) with frames t0..t1 and rows y0..y1, ends excluded."""
-        ...
 
 
 class FrameStream:
-    """The frames of a stack by blocks: to be opened with ``with``, and iterated once.
-
-    Attributes:
-        bands: first row and end of each band of a block.
-    """
+    """The frames of a stack by blocks: to be opened with ``with``, and iterated once."""
 
     def __init__(
         self,
@@ -76,9 +67,9 @@ class FrameStream:
         Args:
             source: the frames.
             bands: the rows that are wanted, by bands.
-            step: frames in a block; blocks end at multiples of it, the last one may be shorter.
+            step: frames in a block; blocks end at multiples of it.
             frames: first frame and end of those that are wanted; None: all.
-            threads: threads that share the reading of a block (coded files cost time to decode).
+            threads: that share the reading of a block (coded files cost time to decode).
         """
         self.bands = bands
         self._source, self._threads = source, threads
@@ -94,9 +85,7 @@ class FrameStream:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *unused: object) -> None:
         self._reader.shutdown()
 
     @property
@@ -159,18 +148,16 @@ class HashedFrameStream(FrameStream):
 
         Args:
             stack: the frames.
-            bands: bands that cover all rows, from top to bottom.
+            bands: that cover all rows, from top to bottom.
             step: see `FrameStream`.
-            files: all files that decide what is read, in reading order; among them those of the frames from
-                ``first`` on.
+            files: all that decide what is read, in reading order; among them those of the frames used.
             first: frame to begin with, the first one of a file.
-            threads: threads that decode, where there is something to decode.
-            advance: told of the number of bytes that were hashed.
+            threads: that decode, where there is something to decode.
+            advance: called with numbers of bytes that were hashed.
         """
         super().__init__(stack, bands, step, frames=(first, stack.shape[0]), threads=threads)
         self._stack = stack
         self._hashers = {path: FileHasher(path, advance) for path in files}
-        self._sizes: dict[Path, int] = {}
 
     def identity(self) -> dict[str, Any]:
         """Hash what is left of the files, and return their identity; see `content_identity`.
@@ -181,19 +168,14 @@ class HashedFrameStream(FrameStream):
         return identity_of_hashes({path: hasher.hexdigest() for path, hasher in self._hashers.items()})
 
     def _fill(self, parts: Sequence[NDArray[Any]], t0: int, t1: int) -> None:
-        """Read the next frames, each once, and hash the bytes of their files up to there.
-
-        Raises:
-            InputError: a file vanished, changed or cannot be read.
-        """
+        """Read the next frames, each once, and hash the bytes of their files up to there."""
         decode: list[tuple[int, int]] = []
         for reader, first, end, offset in self._stack.pieces(t0, t1):
             hasher, n_frames = self._hashers[reader.paths[0]], reader.shape[0]
             if self._is_plain(reader):
                 self._take(reader, hasher, (first, end), [part[offset:] for part in parts])
             else:
-                size = self._sizes.setdefault(hasher.path, file_size(hasher.path))
-                hasher.read_to(size * end // n_frames)
+                hasher.read_to(file_size(hasher.path) * end // n_frames)
                 decode.append((t0 + offset, t0 + offset + end - first))
             if end == n_frames:
                 hasher.read_to()
@@ -224,10 +206,10 @@ class HashedFrameStream(FrameStream):
                 for part, (y0, y1) in zip(parts, self.bands, strict=True):
                     part[t] = frame[y0:y1]
         for part, (y0, _) in zip(parts, self.bands, strict=True):
-            own = part[: end - first]
-            unstore(own, layout.stored, layout.offset, hasher.path)
-            reader.put_right(own, first, y0)
-            self._stack.check_bits(reader, own, y0)
+            read = part[: end - first]
+            unstore(read, layout.stored, layout.offset, hasher.path)
+            reader.put_right(read, first, y0)
+            self._stack.check_bits(reader, read, y0)
 
     def _decode(self, parts: Sequence[NDArray[Any]], t0: int, ranges: Sequence[tuple[int, int]]) -> None:
         """Decode ranges of frames, shared among the threads, each frame once."""
