@@ -46,7 +46,7 @@ def first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
     try:
         parts = [frames.stored(t, t + few, first, first + height) for t in starts]
     except InputError:
-        return []  # it is told where the frames are read
+        return []  # reading the frames will say so
     values = np.concatenate(parts)
     name = frames.paths[0]
     if settings.byte_order is None and settings.bit_shift is None:

@@ -1,8 +1,8 @@
 """Ready-made histograms: many laboratories keep only those.
 
 A file holds digital numbers and counts: CSV (two columns ``DN, count`` or ``Energy, Count``; more count
-columns are more channels; a header line is optional), npy (two columns, or channels x bins with bin 0 at DN 0), or npz
-(``dn`` and ``counts``). Each channel becomes a pixel of a sensor of one row.
+columns are more channels; a header line is optional), npy (two columns, or channels x bins with bin 0 at DN
+0), or npz (``dn`` and ``counts``). Each channel becomes a pixel of a sensor of one row.
 """
 
 from __future__ import annotations

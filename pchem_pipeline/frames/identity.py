@@ -26,7 +26,7 @@ def _parts(path: Path) -> list[Path]:
 
 
 class FileHasher:
-    """The hash of `hash_file`, taken piece by piece in the order of the bytes, of which ``done`` are hashed."""
+    """The hash of `hash_file`, piece by piece in the order of the bytes, of which ``done`` are hashed."""
 
     def __init__(self, path: Path, advance: Callable[[int], None] | None = None) -> None:
         self.path = path

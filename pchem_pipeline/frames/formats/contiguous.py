@@ -146,7 +146,7 @@ class OpenedFile:
 
 
 class ContiguousReader(FrameReader):
-    """A reader that needs nothing but a `Layout`; of files without one it decodes by `decode_into`."""
+    """A reader that needs nothing but a `Layout`; of files without one it decodes by `_decode_into`."""
 
     #: what a file is called that cannot be opened
     kind: ClassVar[str] = "file"
@@ -158,11 +158,11 @@ class ContiguousReader(FrameReader):
         """See `FrameReader.open`."""
         reader = cls()
         with sound(path, cls.kind):
-            reader.inspect(path, settings)
+            reader._inspect(path, settings)
         reader.notes += axes_notes(path, reader._full)
         return reader
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         """Take from a file all that a reader says of it; any error becomes one line."""
         raise NotImplementedError
 
@@ -211,7 +211,7 @@ class ContiguousReader(FrameReader):
         layout, path = self.layout, self.paths[0]
         if layout is None:
             try:
-                self.decode_into(buffer, t0, t1, y0, y1)
+                self._decode_into(buffer, t0, t1, y0, y1)
             except FileNotFoundError as error:
                 raise changed(path, "the file disappeared") from error
             except InputError:
@@ -247,7 +247,7 @@ class ContiguousReader(FrameReader):
     def put_right(self, buffer: NDArray[Any], t0: int, y0: int) -> None:
         """Put samples right that are not where the layout says, in frames from t0 and rows from y0 on."""
 
-    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+    def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """Fill the buffer from a file without a layout, with samples as they are stored."""
         raise NotImplementedError
 

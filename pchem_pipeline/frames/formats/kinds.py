@@ -224,7 +224,7 @@ def windows(
 
 
 def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: str | None) -> str:
-    """Return which of the datasets to read: the wanted one, else the only one of three axes or more, else of two.
+    """Return the dataset to read: the wanted one, else the only one of three axes or more, else of two.
 
     Raises:
         InputError: not there, or not the only one; the message lists the candidates.

@@ -28,8 +28,7 @@ class Nd2Reader(ContiguousReader):
     suffixes: ClassVar[tuple[str, ...]] = (".nd2",)
     magic: ClassVar[tuple[bytes, ...]] = (b"\xda\xce\xbe\x0a", b"\0\0\0\x0cjP  ")
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         require("nd2", "nd2", "ND2 files")
         import nd2
 
@@ -62,8 +61,7 @@ class Nd2Reader(ContiguousReader):
         if others := [axis for axis in axes if axis not in "TYX"]:
             self.notes += (f"{path.name}: its frames differ in {', '.join(others)}; read in turn",)
 
-    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
-        """See `ContiguousReader.decode_into`."""
+    def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         import nd2
 
         path = self.paths[0]

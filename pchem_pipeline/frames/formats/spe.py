@@ -52,8 +52,7 @@ class SpeReader(ContiguousReader):
     kind = "SPE file"
     suffixes: ClassVar[tuple[str, ...]] = (".spe",)
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         with path.open("rb") as stream:
             head, size = stream.read(_HEADER_BYTES), path.stat().st_size
         if len(head) < _HEADER_BYTES:
@@ -89,20 +88,21 @@ class SpeReader(ContiguousReader):
 
     def _read_stamps(self, footer: Any) -> None:
         """Read the numbers behind the frames: when their exposure began, and the camera's count."""
-        n, frame_bytes, at = self.shape[0], self.layout.frame_bytes if self.layout else 0, 0
+        n, at = self.shape[0], 0
         places: dict[str, tuple[int, Any]] = {}
         for element in (part for block in _all(footer, "MetaBlock") for part in block):
             places.setdefault(element.get("event") or _name(element), (at, element))
             at += int(element.get("bitDepth", 0)) // 8
-        offsets = self._layout.offsets + frame_bytes
+        offsets = self._layout.offsets + self._layout.frame_bytes
         if not at or not n or int(offsets[-1]) + at > self._size:
             return
-        numbers: dict[str, Any] = {}
         with OpenedFile(self.paths[0], self._size) as file:
             data = [file.read_bytes(offset, at) for offset in offsets.tolist()]
-        for name, (place, element) in places.items():
-            if element.get("type") == "Int64" and element.get("bitDepth") == "64":
-                numbers[name] = np.array([struct.unpack_from("<q", each, place)[0] for each in data])
+        numbers = {
+            name: np.array([struct.unpack_from("<q", each, place)[0] for each in data])
+            for name, (place, element) in places.items()
+            if element.get("type") == "Int64" and element.get("bitDepth") == "64"
+        }
         self.frame_stamps = numbers.get("FrameTrackingNumber")
         begun = numbers.get("ExposureStarted")
         if begun is not None:

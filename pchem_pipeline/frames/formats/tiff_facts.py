@@ -53,7 +53,7 @@ def check_chain(path: Path, size: int) -> None:
     """Walk from directory to directory: the library stops silently at one that is damaged, or never.
 
     Raises:
-        InputError: no TIFF file, a directory that is not within the file, or a chain that runs in a circle.
+        InputError: no TIFF file, a directory that is not within the file, or a circular chain.
     """
     with path.open("rb") as stream:
         head = stream.read(16)
@@ -73,14 +73,13 @@ def check_chain(path: Path, size: int) -> None:
                 raise InputError(
                     f"{path}: damaged: after {len(seen)} pages the list of pages is circular; copy it again"
                 )
-            here = following
-            stream.seek(here)
+            seen.add(following)
+            stream.seek(following)
             tags = int.from_bytes(stream.read(kind.count_size), order)
-            stream.seek(here + kind.count_size + min(tags, _MOST_TAGS) * kind.tag)
+            stream.seek(following + kind.count_size + min(tags, _MOST_TAGS) * kind.tag)
             data = stream.read(kind.pointer)
             if tags > _MOST_TAGS or len(data) < kind.pointer:
-                raise _broken_chain(path, len(seen), size)
-            seen.add(here)
+                raise _broken_chain(path, len(seen) - 1, size)
             following = int.from_bytes(data, order)
         if not seen:
             raise _broken_chain(path, 0, size)
