@@ -78,11 +78,11 @@ def plan_one_sample(
 
     Args:
         targets: what is wanted; may be empty with a budget.
-        point: the pixel; its exposure counts if it was given.
-        exposure_given: else the best exposure is taken.
+        point: the pixel.
+        exposure_given: take the exposure of the point, not the best one.
         budget: frames there are, or None.
         max_exposure: largest exposure allowed, e-.
-        max_frames: more frames than these are as good as never.
+        max_frames: more frames than these are refused.
 
     Raises:
         ConfigError: a target that no number of frames reaches.
@@ -145,24 +145,21 @@ def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
 def _best(
     targets: Sequence[Target], point: Point, max_exposure: float, max_frames: float
 ) -> tuple[float, float]:
-    """Return the exposure at which simulated pixels reach the targets soonest, few flagged in any quantity.
-
-    Exposures are simulated in the order of their bounds, as long as these promise anything.
-    """
+    """Return exposure and frames with which simulated pixels reach the targets, few of them flagged."""
     low = min(0.02, 0.1 * max_exposure)
     first, fewest = best_exposure((*targets, _SEEN), point, low, max_exposure)
     if not np.isfinite(first):
         return first, fewest
     tried = [first, *np.geomspace(low, max_exposure, _TRIED).tolist()]
     points = [replace(point, quanta_exposure=h) for h in tried]
-    promises = [(max(frames_needed(target, there) for target in targets), there) for there in points]
+    bounds = [(max(frames_needed(target, each) for target in targets), each) for each in points]
     best, frames = first, float("inf")
-    for bound, there in sorted(promises, key=lambda each: each[0]):
-        if bound >= frames:
+    for bound, exposed in sorted(bounds, key=lambda each: each[0]):
+        if bound >= frames:  # nor can the next ones, of larger bounds, need fewer
             break
-        needed = _needed(targets, there, min(frames, max_frames), every_flag=True)
+        needed = _needed(targets, exposed, min(frames, max_frames), every_flag=True)
         if needed < frames:
-            best, frames = there.quanta_exposure, needed
+            best, frames = exposed.quanta_exposure, needed
     return best, frames
 
 
@@ -183,7 +180,7 @@ def plan_samples(
         point: read noise and gain of the pixel.
         budget: frames in total, or None for as many as the targets need.
         max_exposure: largest exposure to choose, e-.
-        max_frames: more frames than these are as good as never.
+        max_frames: more frames than these are refused.
 
     Raises:
         ConfigError: a target that no number of frames reaches.

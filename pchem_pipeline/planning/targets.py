@@ -29,13 +29,7 @@ _EXAMPLE = {"%": "1%", "e-": "0.02e-", "DN": "0.2DN", "e-/DN": "0.001e-/DN"}
 
 @dataclass(frozen=True)
 class Target:
-    """A precision: one standard deviation of a parameter of one pixel.
-
-    Attributes:
-        name: of :data:`TARGET_NAMES`.
-        value: the number, in its unit.
-        unit: ``%``, ``e-``, ``DN`` or ``e-/DN``.
-    """
+    """A precision: one standard deviation of a parameter of one pixel, see :data:`TARGET_NAMES`."""
 
     name: str
     value: float
@@ -51,13 +45,10 @@ class Target:
         return self.name not in ("quanta_exposure", *CHARGE_RATES)
 
     def gradient(self, point: Point) -> FloatArray:
-        """Return the derivative of the parameter by the coordinates of the information, shape (4,).
-
-        Relative for all but the bias, which is in e-.
-        """
+        """Return the derivative by the coordinates of the information, (4,): relative, of the bias in e-."""
+        if not self.shared:
+            return np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0])
         return {
-            "quanta_exposure": np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0]),
-            **dict.fromkeys(CHARGE_RATES, np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0])),
             "conversion_gain": np.array([0.0, 1.0, 0.0, 0.0]),
             "bias": np.array([0.0, 0.0, 1.0, 0.0]),
             "read_noise_dn": np.array([0.0, 0.0, 0.0, 1.0]),
