@@ -66,8 +66,12 @@ def _section(model: type[BaseModel], path: str, given: dict[str, Any], depth: in
         if isinstance(value, BaseModel) and section is not None and type(value) is section:
             lines += [f"{pad}{name}:", *_section(section, f"{path}.{key}", given, depth + 1)]
         else:
-            data = to_jsonable_python(value, by_alias=True)
-            options = {"sort_keys": False, "allow_unicode": True, "default_flow_style": True, "width": 10**6}
-            text = yaml.safe_dump(data, **options).removesuffix("...\n").strip()
-            lines.append(f"{pad}{name}: {text}")
+            text = yaml.safe_dump(
+                to_jsonable_python(value, by_alias=True),
+                sort_keys=False,
+                allow_unicode=True,
+                default_flow_style=True,
+                width=10**6,
+            )
+            lines.append(f"{pad}{name}: {text.removesuffix('...' + chr(10)).strip()}")
     return lines

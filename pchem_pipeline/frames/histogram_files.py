@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,7 +44,7 @@ class HistogramInput:
     origin: NDArray[np.int32]
     names: tuple[str, ...]
     paths: tuple[Path, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -96,11 +95,7 @@ def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
         except InputError as error:
             entry.problem = str(error).removeprefix(f"{entry.path}: ")
     report.raise_if_refused(settings.on_bad_file)
-    left_out = [report.message()] if report.bad else []
-    return _assemble(channels, [entry.path for entry in report.good], left_out)
-
-
-def _assemble(channels: Sequence[_Channel], paths: Sequence[Path], notes: Sequence[str]) -> HistogramInput:
+    paths = tuple(entry.path for entry in report.good)
     bins = max(channel.counts.size for channel in channels)
     if bins * len(channels) > _MOST_BINS_OF_ALL:
         raise InputError(
@@ -111,8 +106,9 @@ def _assemble(channels: Sequence[_Channel], paths: Sequence[Path], notes: Sequen
     for i, channel in enumerate(channels):
         counts[0, i, : channel.counts.size] = channel.counts
     origin = np.asarray([[channel.origin for channel in channels]], np.int32)
-    remarks = (*notes, *(note for channel in channels for note in channel.notes))
-    return HistogramInput(counts, origin, tuple(channel.name for channel in channels), tuple(paths), remarks)
+    left_out = [report.message()] if report.bad else []
+    notes = (*left_out, *(note for channel in channels for note in channel.notes))
+    return HistogramInput(counts, origin, tuple(channel.name for channel in channels), paths, notes)
 
 
 def _read(path: Path) -> list[_Channel]:

@@ -34,7 +34,6 @@ class FileHasher:
         self._hasher = xxhash.xxh3_128()
         self._advance = advance
         self._parts: list[Path] | None = None
-        self._begun = False
         self._offset = 0
 
     def read_to(self, count: int | None = None) -> None:
@@ -49,7 +48,7 @@ class FileHasher:
             while self._parts and (count is None or self.done < count):
                 if self._read_part(self._parts[0], count):
                     del self._parts[0]
-                    self._begun, self._offset = False, 0
+                    self._offset = 0
         except OSError as error:
             raise self._unreadable(error) from error
 
@@ -76,9 +75,8 @@ class FileHasher:
     def _read_part(self, part: Path, count: int | None) -> bool:
         """Hash one file from where it was left; tell whether it came to its end."""
         size = part.stat().st_size
-        if part is not self.path and not self._begun:
+        if part is not self.path and not self._offset:
             self._hasher.update(f"{part.relative_to(self.path).as_posix()}\0{size}\0".encode())
-        self._begun = True
         view = memoryview(bytearray(max(1, min(SCRATCH_BYTES, size - self._offset))))
         with part.open("rb", buffering=0) as stream:
             stream.seek(self._offset)

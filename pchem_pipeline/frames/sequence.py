@@ -65,7 +65,6 @@ class FrameSequence(FrameReader):
         self._first, end = _frame_range(settings, total, least)
         rows, columns = readers[0].shape[1:]
         self._y0, y1, self._x0, self._x1 = _region(settings, rows, columns)
-        self._columns = columns
         self.shape = (end - self._first, y1 - self._y0, self._x1 - self._x0)
         self.dtype = readers[0].dtype
         self.rows_per_read = max(reader.rows_per_read for reader in readers)
@@ -230,12 +229,13 @@ class FrameSequence(FrameReader):
         self, reader: FrameReader, part: NDArray[Any], t0: int, t1: int, rows: tuple[int, int]
     ) -> None:
         """Read from one file, through a bounded scratch buffer if only some columns are wanted."""
-        if (self._x0, self._x1) == (0, self._columns):
+        columns = self.whole_shape[1]
+        if (self._x0, self._x1) == (0, columns):
             reader.read_into(part, t0, t1, *rows)
             return
         height = rows[1] - rows[0]
-        step = max(1, SCRATCH_BYTES // max(1, height * self._columns * self.dtype.itemsize))
-        scratch = np.empty((min(step, t1 - t0), height, self._columns), self.dtype)
+        step = max(1, SCRATCH_BYTES // max(1, height * columns * self.dtype.itemsize))
+        scratch = np.empty((min(step, t1 - t0), height, columns), self.dtype)
         for t in range(t0, t1, step):
             stop = min(t + step, t1)
             reader.read_into(scratch[: stop - t], t, stop, *rows)

@@ -74,9 +74,10 @@ class FrameStream:
         self.bands = bands
         self._source, self._threads = source, threads
         n_frames, _, columns = source.shape
-        self._first, self._end = frames or (0, n_frames)
-        self._step, self._skipped = step, self._first // step
-        longest = min(step, self._end - self._first)
+        first, end = frames or (0, n_frames)
+        cuts = [first, *range((first // step + 1) * step, end, step), end]
+        self._ranges = [*itertools.pairwise(cuts)] if first < end else []
+        longest = min(step, end - first)
         self._buffers = [
             [np.empty((longest, y1 - y0, columns), source.dtype) for y0, y1 in bands] for _ in range(2)
         ]
@@ -88,33 +89,24 @@ class FrameStream:
     def __exit__(self, *unused: object) -> None:
         self._reader.shutdown()
 
-    @property
-    def n_blocks(self) -> int:
-        """Number of blocks."""
-        return -(-self._end // self._step) - self._skipped if self._end > self._first else 0
-
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks; each is overwritten after the next one was asked for."""
-        pending = self._request(0)
-        for number in range(self.n_blocks):
-            parts, reading = pending
+        requests = map(self._request, self._ranges, itertools.cycle(self._buffers))
+        pending = next(requests, None)
+        while pending is not None:
+            t0, parts, reading = pending
             reading.result()
-            if number + 1 < self.n_blocks:
-                pending = self._request(number + 1)
-            yield self._frames(number)[0], parts
+            pending = next(requests, None)
+            yield t0, parts
             del parts
-        del pending
         self._buffers = []
 
-    def _request(self, number: int) -> tuple[list[NDArray[Any]], Future[None]]:
-        t0, t1 = self._frames(number)
-        parts = [band[: t1 - t0] for band in self._buffers[number % 2]]
-        return parts, self._reader.submit(self._fill, parts, t0, t1)
-
-    def _frames(self, number: int) -> tuple[int, int]:
-        """Return the first frame of a block, and its end."""
-        start = (number + self._skipped) * self._step
-        return max(start, self._first), min(start + self._step, self._end)
+    def _request(
+        self, frames: tuple[int, int], buffers: Sequence[NDArray[Any]]
+    ) -> tuple[int, list[NDArray[Any]], Future[None]]:
+        t0, t1 = frames
+        parts = [band[: t1 - t0] for band in buffers]
+        return t0, parts, self._reader.submit(self._fill, parts, t0, t1)
 
     def _fill(self, parts: Sequence[NDArray[Any]], t0: int, t1: int) -> None:
         """Read frames t0..t1 into the parts, one for each band."""

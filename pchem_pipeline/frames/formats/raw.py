@@ -194,7 +194,7 @@ class RawReader(ContiguousReader):
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
     """Write frames as bytes, with a sidecar ``<path>.json``; see `frames.writing.write_frames`."""
     write_plain(path, b"", blocks, stack.dtype.newbyteorder("<"))
-    record = {"shape": list(stack.shape), "dtype": stack.dtype.name}
+    record: dict[str, Any] = {"shape": stack.shape, "dtype": stack.dtype.name}
     record |= {"byte_order": "little", "header_bytes": 0, **stack.stated}
     with whole_file(path.with_name(path.name + ".json")) as part:
         part.write_text(json.dumps(record) + "\n", encoding="utf-8")
