@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.identity import file_size, hash_file, sample_hash
 from pchem_pipeline.frames.reader import FrameReader, shared_notes
 from pchem_pipeline.frames.registry import detect_format, reader_class
@@ -91,14 +91,11 @@ def _open(entry: FileReport, settings: InputSettings) -> FrameReader | None:
     try:
         name = settings.format if settings.format != "auto" else detect_format(entry.path)
         reader = reader_class(name).open(entry.path, settings)
-    except ConfigError:
-        raise
     except InputError as error:
         entry.problem = str(error).removeprefix(f"{entry.path}: ")
         return None
     if 0 in reader.shape:
         entry.problem = "has no frames; omit it"
-        return None
     return reader
 
 

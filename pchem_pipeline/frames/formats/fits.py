@@ -87,16 +87,14 @@ class FitsReader(ContiguousReader):
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         require("astropy.io.fits", "fits", "FITS files")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # truncation and sloppy headers are reported below
-            with path.open("rb") as stream:
-                check_unpacked(path, stream.read(8))
-            self._inspect_images(path, path.stat().st_size, settings)
-
-    def _inspect_images(self, path: Path, size: int, settings: InputSettings) -> None:
         from astropy.io import fits
 
-        with fits.open(path, memmap=False, do_not_scale_image_data=True, lazy_load_hdus=True) as hdus:
+        size = path.stat().st_size
+        with path.open("rb") as stream:
+            check_unpacked(path, stream.read(8))
+        options = {"memmap": False, "do_not_scale_image_data": True, "lazy_load_hdus": True}
+        # truncation and sloppy headers are reported below
+        with warnings.catch_warnings(action="ignore"), fits.open(path, **options) as hdus:
             self._numbers = _images(path, hdus, settings)
             hdu, several = hdus[self._numbers[0]], len(self._numbers) > 1
             header, primary = hdu.header, hdus[0].header
@@ -152,8 +150,7 @@ class FitsReader(ContiguousReader):
         """See `FrameReader.cards`."""
         from astropy.io import fits
 
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # as above
+        with warnings.catch_warnings(action="ignore"):  # as above
             with fits.open(self.paths[0], memmap=False, lazy_load_hdus=True) as hdus:
                 header = hdus[self._numbers[0]].header.copy(strip=True)
                 if self._numbers[0]:

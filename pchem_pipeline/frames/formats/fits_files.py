@@ -111,8 +111,8 @@ def write_images(path: Path, images: Sequence[FitsImage]) -> None:
     require("astropy.io.fits", "fits", "FITS files")
     from astropy.io import fits
 
-    with whole_file(path) as part, part.open("wb") as stream, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # cards of cameras may have to be mended
+    quiet = warnings.catch_warnings(action="ignore")  # cards of cameras may have to be mended
+    with whole_file(path) as part, part.open("wb") as stream, quiet:
         for number, (blocks, shape, dtype, cards) in enumerate(images):
             bits = 8 * dtype.itemsize
             zero = UNSIGNED_ZERO.get(bits, 0) if dtype.kind == "u" else 0

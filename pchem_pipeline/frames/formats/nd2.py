@@ -32,13 +32,12 @@ class Nd2Reader(ContiguousReader):
         require("nd2", "nd2", "ND2 files")
         import nd2
 
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of metadata that are not used here
-            with nd2.ND2File(path) as file:
-                if file.is_legacy:
-                    raise InputError(f"{path}: ND2 of the old kind (JPEG 2000); export it as TIFF")
-                about, axes, dtype = file.attributes, dict(file.sizes), np.dtype(file.dtype)
-                words = file.text_info.get("capturing", "")
+        # of metadata that are not used here
+        with warnings.catch_warnings(action="ignore"), nd2.ND2File(path) as file:
+            if file.is_legacy:
+                raise InputError(f"{path}: ND2 of the old kind (JPEG 2000); export it as TIFF")
+            about, axes, dtype = file.attributes, dict(file.sizes), np.dtype(file.dtype)
+            words = file.text_info.get("capturing", "")
         if about.componentCount != 1:
             raise InputError(
                 f"{path}: {about.componentCount} channels or colours; export one channel as TIFF"

@@ -173,8 +173,7 @@ def _channel_notes(path: Path, axes: Sequence[str], shape: Sequence[int]) -> tup
 
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of other files among the arrays
+    with warnings.catch_warnings(action="ignore"):  # of other files among the arrays
         members = list(group.members(max_depth=None))
     return {name: tuple(node.shape) for name, node in members if hasattr(node, "shape")}
 
