@@ -16,20 +16,8 @@ from pchem_pipeline.frames.reader import FrameReader
 
 ENTRY_POINT_GROUP = "pchem_pipeline.readers"
 
-#: module and class of each of our readers; raw comes last since any bytes could be raw
-_OURS = {
-    "npy": ("npy", "NpyReader"),
-    "tiff": ("tiff", "TiffReader"),
-    "fits": ("fits", "FitsReader"),
-    "hdf5": ("hdf5", "Hdf5Reader"),
-    "zarr": ("omezarr", "ZarrReader"),
-    "ser": ("ser", "SerReader"),
-    "dcimg": ("dcimg", "DcimgReader"),
-    "spe": ("spe", "SpeReader"),
-    "sif": ("sif", "SifReader"),
-    "nd2": ("nd2", "Nd2Reader"),
-    "raw": ("raw", "RawReader"),
-}
+#: our formats: ``formats/npy.py`` has the class ``NpyReader``; raw comes last since any bytes could be raw
+_OURS = ("npy", "tiff", "fits", "hdf5", "zarr", "ser", "dcimg", "spe", "sif", "nd2", "raw")
 #: first bytes of files that hold others -> what made them
 _PACKED = {
     b"\x1f\x8b": "gzip",
@@ -71,10 +59,8 @@ def reader_class(name: str) -> type[FrameReader]:
         ConfigError: no such format, or a plug-in that is not a reader.
     """
     if name in _OURS:
-        module, cls = _OURS[name]
-        found: type[FrameReader] = getattr(
-            importlib.import_module(f"pchem_pipeline.frames.formats.{module}"), cls
-        )
+        module = importlib.import_module(f"pchem_pipeline.frames.formats.{name}")
+        found: type[FrameReader] = getattr(module, f"{name.capitalize()}Reader")
         return found
     plugins = _plugins()
     if name not in plugins:
@@ -94,8 +80,7 @@ def _load(point: EntryPoint) -> type[FrameReader]:
     if not (isinstance(cls, type) and issubclass(cls, FrameReader)) or cls.format_name != point.name:
         raise ConfigError(
             f"the reader {point.name!r} ({point.value}) must be a FrameReader with format_name = "
-            f"{point.name!r}; "
-            "repair or uninstall that package"
+            f"{point.name!r}; repair or uninstall that package"
         )
     return cls
 

@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.formats.omezarr import is_zarr
 from pchem_pipeline.frames.formats.raw import SIDECARS, RawReader, find_sidecar
+from pchem_pipeline.frames.formats.zarr import is_zarr
 from pchem_pipeline.frames.registry import frame_suffixes
 from pchem_pipeline.frames.remote import fetch, is_remote
 from pchem_pipeline.frames.settings import InputSettings
