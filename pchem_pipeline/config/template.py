@@ -32,13 +32,9 @@ def json_schema() -> str:
 
 
 def commented_config(name: str, *, files: list[str], simulated: bool = False, schema: bool = False) -> str:
-    """Return a YAML text with every setting, its default and what it means.
+    """Return the YAML text of a file with every setting, its default and what it means.
 
-    Args:
-        name: file name, for the comment on top.
-        files: ``input.files``.
-        simulated: include the section ``simulate``.
-        schema: name the schema beside it, as the language server of YAML reads it.
+    With ``schema`` it names the schema beside it, as the language server of YAML reads it.
     """
     stem = name.rsplit(".", 1)[0]
     given = {"input.files": files, "run.store": f"{stem}.zarr", "simulate.output": f"{stem}-frames"}

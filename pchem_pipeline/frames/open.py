@@ -24,11 +24,7 @@ def open_frames(
 ) -> FrameSequence:
     """Open all camera files as one stack, with bit shift, region of interest and frame range applied.
 
-    Args:
-        settings: the section ``input``.
-        base_dir: folder to which relative paths refer.
-        check_duplicates: also look for files with the same content, and at some samples.
-        least: frames that there must be.
+    With ``check_duplicates``, also look for files with the same content, and at some samples.
 
     Raises:
         InputError: bad files (all in one message), too few frames, or a region outside of the frames.

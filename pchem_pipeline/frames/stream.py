@@ -138,14 +138,9 @@ class HashedFrameStream(FrameStream):
     ) -> None:
         """Take the memory; nothing is read yet.
 
-        Args:
-            stack: the frames.
-            bands: that cover all rows, from top to bottom.
-            step: see `FrameStream`.
-            files: all that decide what is read, in reading order; among them those of the frames used.
-            first: frame to begin with, the first one of a file.
-            threads: that decode, where there is something to decode.
-            advance: called with numbers of bytes that were hashed.
+        The bands cover all rows, from top to bottom. All files that decide what is read are hashed, in
+        reading order; frames begin with ``first``, the first one of a file. For bytes that are hashed,
+        ``advance`` is called with their number.
         """
         super().__init__(stack, bands, step, frames=(first, stack.shape[0]), threads=threads)
         self._stack = stack

@@ -44,14 +44,9 @@ def write_frames(
 ) -> Path:
     """Write a stream of frames, and return its file, which appears only when it is whole.
 
-    Args:
-        format: of :data:`WRITERS`.
-        path: the file; without a suffix the format's own is added.
-        blocks: arrays (any number of frames, rows, columns), in order, together ``shape``.
-        shape: (frames, rows, columns).
-        dtype: uint8, uint16 or uint32.
-        integration_time: s, recorded where the format has a place for it.
-        bit_depth: bits of the ADC, recorded likewise.
+    Blocks (any number of frames, rows, columns) of uint8, uint16 or uint32 make up the shape (frames, rows,
+    columns). A path without a suffix gets the format's own. Integration time (s) and bits of the ADC are
+    recorded where the format has a place for them.
 
     Raises:
         ConfigError: an unknown format, or an optional library is missing.

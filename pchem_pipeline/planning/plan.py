@@ -74,18 +74,12 @@ def plan_one_sample(
     max_exposure: float,
     max_frames: float,
 ) -> Plan:
-    """Return the plan of one sample.
+    """Return the plan of one sample, with the exposure of the point if it is given, else with the best one.
 
-    Args:
-        targets: what is wanted; may be empty with a budget.
-        point: the pixel.
-        exposure_given: take the exposure of the point, not the best one.
-        budget: frames there are, or None.
-        max_exposure: largest exposure allowed, e-.
-        max_frames: more frames than these are refused.
+    With a budget of frames there may be no targets. Exposures above ``max_exposure``, e-, are not tried.
 
     Raises:
-        ConfigError: a target that no number of frames reaches.
+        ConfigError: a target that no number of frames up to ``max_frames`` reaches.
     """
     aims = tuple(targets) or (Target("conversion_gain", 1.0, "%"),)
     best, best_frames = _best(aims, point, max_exposure, max_frames)
@@ -172,18 +166,12 @@ def plan_samples(
     max_exposure: float,
     max_frames: float,
 ) -> SamplesPlan:
-    """Return how to divide frames over several samples.
+    """Return how to divide frames over samples of given exposures, e-, or chosen ones up to ``max_exposure``.
 
-    Args:
-        targets: gain, bias or read noise.
-        exposures: H of the samples, e-; None to choose them.
-        point: read noise and gain of the pixel.
-        budget: frames in total, or None for as many as the targets need.
-        max_exposure: largest exposure to choose, e-.
-        max_frames: more frames than these are refused.
+    The frames in total are the budget, or as many as the targets (gain, bias or read noise) need.
 
     Raises:
-        ConfigError: a target that no number of frames reaches.
+        ConfigError: a target that no number of frames up to ``max_frames`` reaches.
     """
     aims = (*targets, _SEEN)
     if exposures is None:

@@ -185,14 +185,9 @@ class ContiguousReader(FrameReader):
         settings: InputSettings | None,
         what: str,
     ) -> None:
-        """Set the shape of the stack and the type of its samples; refuse what cannot be frames.
+        """Set the stack's shape and type from those of the stored array; refuse what cannot be frames.
 
-        Args:
-            path: the file.
-            full: shape as the file states it.
-            stored: type of the samples in the file.
-            settings: the section ``input``; None: the file says itself what its signed samples mean.
-            what: the array, for the message.
+        Without settings, the file says itself what its signed samples mean. Messages call the array ``what``.
         """
         self._offset = None if settings is None else check_samples(path, stored, settings)
         self.paths, self.shape = (path,), stack_shape(path, full, what)
@@ -260,13 +255,9 @@ def _runs(offsets: IntArray, frame_bytes: int) -> list[tuple[int, int]]:
 
 
 def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, path: Path) -> None:
-    """Turn stored bytes into native unsigned samples, in place.
+    """Turn stored bytes in a buffer of unsigned samples into these, in place.
 
-    Args:
-        buffer: unsigned native type of the size of ``stored``, holding the bytes of the file.
-        stored: type in the file, with its byte order; floats hold whole numbers.
-        offset: what is added to signed samples, 0 to 2**(bits - 1); None: they are unsigned.
-        path: the file.
+    Floats hold whole numbers; an offset, 0 to 2**(bits - 1), is added to signed samples; None: unsigned.
 
     Raises:
         InputError: a sample is negative, with the offset, or no whole number.

@@ -115,7 +115,9 @@ class Hdf5Reader(ContiguousReader):
         if dataset.is_virtual:
             held = sum(part.stat().st_size for part in virtual_files(path, dataset))
             check_coded(path, self.shape, self.shape[1:], self.dtype.itemsize, size + held)
-        self.notes = check_sources(path, dataset) + _reversed_axes(path, dataset)
+        self.notes = check_sources(path, dataset)
+        if "MATLAB_class" in dataset.attrs:  # it writes axes in reverse order
+            self.notes += (f"{path.name}: written by MATLAB: last axis read as frames, columns as rows",)
         if dataset.chunks is not None:
             check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
             _check_chunks(path, dataset)
@@ -251,10 +253,3 @@ def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
                 beside[name] = np.ravel(other[()])[0]
                 units[name] = other.attrs.get("units", other.attrs.get("unit"))
     return facts_from_names({**beside, **values}, units)
-
-
-def _reversed_axes(path: Path, dataset: Any) -> tuple[str, ...]:
-    """Say how the axes of an array of MATLAB are read, which writes them in reverse order."""
-    if "MATLAB_class" not in dataset.attrs or dataset.ndim < 2:
-        return ()
-    return (f"{path.name}: written by MATLAB: last axis read as frames, columns as rows",)

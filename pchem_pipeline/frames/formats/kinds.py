@@ -118,14 +118,7 @@ def mosaic_note(path: Path, pattern: str) -> str:
 def check_coded(
     path: Path, shape: tuple[int, int, int], piece: Sequence[int], itemsize: int, size: int
 ) -> None:
-    """Check that coded frames can be what their header says, before memory is taken for them.
-
-    Args:
-        path: the file.
-        shape: (frames, rows, columns).
-        piece: shape of a chunk, tile or strip, which is decoded at once.
-        itemsize: bytes of a sample.
-        size: bytes of the file or folder.
+    """Check that frames coded in pieces of a shape can be in ``size`` bytes, before memory is taken for them.
 
     Raises:
         InputError: the frames are too many for so few bytes, or a piece is far larger than they all.
@@ -143,13 +136,9 @@ def check_coded(
 
 
 def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, codecs: Sequence[str]) -> None:
-    """Check that coded pieces hold no more than their shape says, before the library unpacks them whole.
+    """Check that coded pieces hold no more than the expected bytes, before the library unpacks them whole.
 
-    Args:
-        path: the file.
-        pieces: coded bytes.
-        expected: bytes of a piece by shape and type.
-        codecs: names of those in use; those that do not compress are ignored.
+    Of the codecs in use those that do not compress are ignored.
 
     Raises:
         InputError: one holds more, or is compressed twice.

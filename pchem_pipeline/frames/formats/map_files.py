@@ -89,12 +89,8 @@ def write_tiff_cube(
 ) -> None:
     """Write a page for each image: an ImageJ stack, or BigTIFF where that is too small.
 
-    Args:
-        path: the file.
-        blocks: arrays (any number of images, rows, columns), in order.
-        shape: (images, rows, columns) of all together.
-        dtype: type of the samples.
-        about: what the images are, as JSON data.
+    Blocks (any number of images, rows, columns) make up the shape (images, rows, columns); ``about`` says
+    what the images are, as JSON data.
 
     Raises:
         StoreError: the folder cannot be written.

@@ -157,7 +157,9 @@ def stated_facts(file: Any, page: Any) -> StatedFacts:
         duration_of("Exposure-ms", record.get("Exposure-ms"), "ms"),
     )
     bits = page.bitspersample  # which say nothing where they are those of a whole type
-    depths = (_ome_depth(_ome(file)), own.bit_depth, None if bits in (8, 16, 32) else bits_of(bits))
+    significant = re.search(r'SignificantBits="(\d+)"', _ome(file))
+    stated = bits_of(int(significant[1])) if significant else None
+    depths = (stated, own.bit_depth, None if bits in (8, 16, 32) else bits_of(bits))
     names = [each.name for each in fields(CameraFacts)]
     camera = CameraFacts(*(first_of(getattr(each, name) for each in cameras) for name in names))
     return StatedFacts(camera, agreed_duration(times), first_of(depths))
@@ -183,11 +185,6 @@ def _ome_time(text: str) -> Duration | None:
     plane = re.search(r'<[^<>]*\sExposureTime="[^<>]*>', text)
     unit = _attribute(plane, "ExposureTimeUnit") or "s"  # as OME has it
     return duration_of("ExposureTime of OME", _attribute(plane, "ExposureTime"), unit)
-
-
-def _ome_depth(text: str) -> int | None:
-    match = re.search(r'SignificantBits="(\d+)"', text)
-    return bits_of(int(match[1])) if match else None
 
 
 def _ratio(value: Any) -> Duration | None:
