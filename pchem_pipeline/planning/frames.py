@@ -10,8 +10,7 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
-from pchem_pipeline.planning.point import Point
-from pchem_pipeline.planning.targets import TARGET_NAMES, Target
+from pchem_pipeline.planning.targets import TARGET_NAMES, Point, Target
 
 
 @functools.lru_cache(maxsize=8192)

@@ -15,8 +15,7 @@ import numpy as np
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.model.errors.expected_information import shared_information
-from pchem_pipeline.planning.point import Point
-from pchem_pipeline.planning.targets import Target
+from pchem_pipeline.planning.targets import Point, Target
 
 _STEPS = 4000
 _LEAST_SHARE = 0.01

@@ -1,4 +1,4 @@
-"""What is wanted: a parameter and how well it shall be known."""
+"""A pixel, and what is wanted of it: a parameter and how well it shall be known."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.base.variables import CHARGE_RATES
-from pchem_pipeline.planning.point import Point
 
 #: Parameters that can be planned for, with the units in which a precision can be given.
 TARGET_NAMES: dict[str, tuple[str, ...]] = {
@@ -25,6 +25,40 @@ TARGET_NAMES: dict[str, tuple[str, ...]] = {
     "read_noise_e": ("%", "e-"),
 }
 _EXAMPLE = {"%": "1%", "e-": "0.02e-", "DN": "0.2DN", "e-/DN": "0.001e-/DN"}
+
+
+@dataclass(frozen=True)
+class Point:
+    """A pixel under one exposure.
+
+    Attributes:
+        quanta_exposure: H, e-.
+        read_noise_e: s_e, e-, quantisation included.
+        conversion_gain: g, e-/DN; matters for rounding and for units of DN only.
+
+    Raises:
+        ConfigError: a number is out of range, or the read noise is below that of rounding.
+    """
+
+    quanta_exposure: float
+    read_noise_e: float
+    conversion_gain: float
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "--exposure": (self.quanta_exposure, 1e-6, 1e4, "e-"),
+            "--read-noise": (self.read_noise_e, 1e-3, 100.0, "e-"),
+            "--gain": (self.conversion_gain, 1e-6, 1e2, "e-/DN"),
+        }
+        for option, (value, low, high, unit) in ranges.items():
+            if not low <= value <= high:
+                raise ConfigError(f"{option} {value:g}: give a number from {low:g} to {high:g} {unit}")
+        rounding = self.conversion_gain * np.sqrt(QUANTISATION_VARIANCE)
+        if self.read_noise_e < rounding:
+            raise ConfigError(
+                f"--read-noise {self.read_noise_e:g}: below the rounding noise of {rounding:.3g} e- at "
+                f"{self.conversion_gain:g} e-/DN, which the read noise includes"
+            )
 
 
 @dataclass(frozen=True)

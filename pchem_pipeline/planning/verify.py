@@ -18,8 +18,7 @@ from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, flags_of
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
-from pchem_pipeline.planning.point import Point
-from pchem_pipeline.planning.targets import Target
+from pchem_pipeline.planning.targets import Point, Target
 
 _PIXELS = 200  # simulated for a number of frames; 5 % of them have a standard error of 1.5 %
 _FLAGGED = 0.05  # largest share of pixels without a value or flagged
