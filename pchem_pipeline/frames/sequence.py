@@ -72,7 +72,7 @@ class FrameSequence(FrameReader):
         self.seen_limits: tuple[int | None, int | None] = (None, None)
         self._set_areas(settings)
         self.unwritten = any(reader.unwritten for reader in readers)
-        self._set_facts(readers, settings)
+        self._set_facts(readers, settings, end)
 
     def _set_areas(self, settings: InputSettings) -> None:
         """Set overscan and other insensitive pixels of the region; none where no other pixel is in it."""
@@ -98,8 +98,8 @@ class FrameSequence(FrameReader):
             self.insensitive, dark = np.zeros((2, *self.shape[1:]), np.bool_)
         self.overscan_pixels = dark
 
-    def _set_facts(self, readers: Sequence[FrameReader], settings: InputSettings) -> None:
-        """Take bit shift, bit depth and integration time from the settings, else from the files."""
+    def _set_facts(self, readers: Sequence[FrameReader], settings: InputSettings, end: int) -> None:
+        """Take bit shift, bit depth, integration time and times from the settings, else from the files."""
         shift = settings.bit_shift
         self.bit_shift = _agreed(readers, "bit_shift") or 0 if shift is None else shift
         size = 8 * self.dtype.itemsize
@@ -122,6 +122,9 @@ class FrameSequence(FrameReader):
         time = settings.integration_time
         self.integration_time = _agreed(readers, "integration_time") if time is None else time
         self.time_words = _time_words(readers[0], self.integration_time)
+        stamps = [reader.timestamps for reader in readers if reader.timestamps is not None]
+        if len(stamps) == len(readers):
+            self.timestamps = np.concatenate(stamps)[self._first : end]
         _check_same_camera(readers)
         self.camera, moved = shared_facts([reader.camera for reader in readers])
         self.notes = (*shared_notes(readers), *([moved] if moved else []))

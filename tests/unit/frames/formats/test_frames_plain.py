@@ -269,6 +269,8 @@ def test_ser_times(tmp_path):
     times = SerReader.open(path, InputSettings()).timestamps
     np.testing.assert_allclose(np.diff(times), 0.5, atol=1e-6)
     assert np.datetime64(int(times[0]), "s").astype(str).startswith("2019-07-2")
+    both = opened(tmp_path / "a.ser", frame_range=(2, 5))
+    np.testing.assert_array_equal(both.timestamps, times[2:5])
 
 
 @pytest.mark.parametrize(
