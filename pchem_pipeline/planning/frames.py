@@ -36,11 +36,8 @@ def precision(point: Point, n_frames: float) -> dict[str, float]:
     They are relative, of the bias in e-; NaN if undetermined.
     """
     covariance = _bound(point) / n_frames
-    found = {}
-    for name, units in TARGET_NAMES.items():
-        gradient = Target(name, 1.0, units[0]).gradient(point)
-        found[name] = float(np.sqrt(gradient @ covariance @ gradient))
-    return found
+    gradients = {name: Target(name, 1.0, units[0]).gradient(point) for name, units in TARGET_NAMES.items()}
+    return {name: float(np.sqrt(each @ covariance @ each)) for name, each in gradients.items()}
 
 
 def best_exposure(targets: Sequence[Target], point: Point, low: float, high: float) -> tuple[float, float]:

@@ -229,27 +229,20 @@ def _words(page: Any) -> str:
 
 def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) -> IntArray | None:
     """Return the offset of each frame if all are stored plainly, else None."""
-    first = pages[0]
-    dtype = np.dtype(first.dtype)
+    itemsize, planes = np.dtype(pages[0].dtype).itemsize, pages[0].samplesperpixel
+    frame = math.prod(pages[0].shape[-2:]) * itemsize
     for page in pages:
         codings = int(page.compression), int(page.fillorder), page.predictor
-        if codings != (1, 1, 1) or page.bitspersample != 8 * dtype.itemsize or page.is_tiled:
+        if codings != (1, 1, 1) or page.bitspersample != 8 * itemsize or page.is_tiled:
             return None
         if 0 in page.databytecounts:  # never written: nothing lies at their offsets
             return None
-    rows, columns = first.shape[-2:]
-    frame = rows * columns * dtype.itemsize
-    planes = first.samplesperpixel
-    if len(pages) == 1 and planes == 1 and (first.is_contiguous or _adjoining(first, frame)):
-        start = int(first.dataoffsets[0])
-        return even_offsets(path, images_behind_one_page(file), frame, size, start=start)
-    offsets = []
-    for page in pages:
         if not page.is_contiguous and not _adjoining(page, frame * planes):
             return None
-        start = int(page.dataoffsets[0])
-        offsets += [start + plane * frame for plane in range(planes)]
-    return np.asarray(offsets, np.int64)
+    starts = np.array([page.dataoffsets[0] for page in pages], np.int64)
+    if len(pages) == 1 and planes == 1:
+        return even_offsets(path, images_behind_one_page(file), frame, size, start=int(starts[0]))
+    return (starts[:, None] + frame * np.arange(planes)).ravel()
 
 
 def _adjoining(page: Any, total: int) -> bool:
