@@ -7,7 +7,7 @@ Nothing is written that is not listed here; the attributes in the store come fro
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 #: The four parameters of the PCD, in the order of every (…, parameter) axis.
 PARAMETERS = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
@@ -52,7 +52,7 @@ class Variable:
     unit: str
     long_name: str
     symbol: str = ""
-    fill: int = 0
+    fill: int = field(default=0, kw_only=True)
 
     @property
     def group(self) -> str:

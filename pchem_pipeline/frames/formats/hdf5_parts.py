@@ -181,10 +181,8 @@ def opened(path: Path) -> Any:
 
     try:
         return h5py.File(path, "r")
-    except BlockingIOError:
-        raise
     except OSError as error:
-        if "unable to lock file" not in str(error):
+        if isinstance(error, BlockingIOError) or "unable to lock file" not in str(error):
             raise
         return h5py.File(path, "r", locking=False)
 

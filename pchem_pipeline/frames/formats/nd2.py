@@ -32,7 +32,7 @@ class Nd2Reader(ContiguousReader):
         require("nd2", "nd2", "ND2 files")
         import nd2
 
-        # of metadata that are not used here
+        # the warnings are of metadata that are not used here
         with warnings.catch_warnings(action="ignore"), nd2.ND2File(path) as file:
             if file.is_legacy:
                 raise InputError(f"{path}: ND2 of the old kind (JPEG 2000); export it as TIFF")
