@@ -239,10 +239,11 @@ def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) 
             return None
         if not page.is_contiguous and not _adjoining(page, frame * planes):
             return None
-    starts: IntArray = np.array([page.dataoffsets[0] for page in pages], np.int64)
+    starts = np.array([page.dataoffsets[0] for page in pages], np.int64)
     if len(pages) == 1 and planes == 1:
         return even_offsets(path, images_behind_one_page(file), frame, size, start=int(starts[0]))
-    return np.add.outer(starts, frame * np.arange(planes, dtype=np.int64)).ravel()
+    offsets: IntArray = np.add.outer(starts, frame * np.arange(planes)).ravel()
+    return offsets
 
 
 def _adjoining(page: Any, total: int) -> bool:
