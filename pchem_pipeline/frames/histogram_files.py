@@ -138,20 +138,18 @@ def _read(path: Path) -> list[_Channel]:
 
 def _read_numpy(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]:
     """Read npy or npz: DN, the counts of each channel, and names of the channels."""
+    split = _split_npz if path.suffix.lower() == ".npz" else _split_npy
     try:
         with path.open("rb") as stream:
-            loaded = np.load(stream, allow_pickle=False)
-            dn, table = (
-                _split_npz(path, loaded) if path.suffix.lower() == ".npz" else _split_npy(path, loaded)
-            )
+            dn, table = split(path, np.load(stream, allow_pickle=False))
     except (ValueError, EOFError, KeyError) as error:
         raise InputError(
             f"{path}: not a valid {path.suffix[1:]} file of plain numbers (pickles are never opened); save "
             "it again"
         ) from error
+    except (OSError, InputError):
+        raise
     except Exception as error:  # a damaged zip archive raises its own kind
-        if isinstance(error, OSError | InputError):
-            raise
         raise InputError(f"{path}: damaged ({error}); copy it again") from error
     if dn.ndim != 1 or table.ndim != 2 or table.shape[1] != dn.size:
         raise InputError(
