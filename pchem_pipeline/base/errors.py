@@ -1,7 +1,7 @@
 """What can go wrong for the whole run, each kind with the exit code that the shell sees.
 
-A message is one line that says what happened, where, and the cure. A single bad
-pixel is never an exception: it gets a word in ``fit_status``.
+A message is one line that says what happened, where, and the cure. A single bad pixel is never an exception:
+it gets a word in ``fit_status``.
 """
 
 from __future__ import annotations

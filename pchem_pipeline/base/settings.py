@@ -1,8 +1,7 @@
 """The base of every YAML section.
 
-A section lives beside the code that it configures (``frames``, ``simulate``, ``model``,
-``compute``, ``render``); ``config`` assembles the sections into the tree of a run. The description of
-each field is the comment that ``pchem init`` writes.
+A section lives beside the code that it configures; ``config`` assembles the sections into the tree of a run.
+The description of each field is the comment that ``pchem init`` writes.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class Variable:
         dims: names of the dimensions, slowest first.
         dtype: numpy type, or ``"*"`` where the data decide (for example the frames).
         unit: physical unit; ``"1"`` where there is none.
-        long_name: one sentence for people.
+        long_name: one sentence.
         symbol: the symbol of the paper, if it has one.
         fill: value of pixels that no tile was done for; of floating-point arrays it is NaN.
     """
@@ -69,7 +69,6 @@ class Variable:
         return (*(slice(None),) * self.dims.index("y"), *region)
 
 
-_MAP = ("y", "x")
 #: Values of pixels that no tile was done for, where they are not 0: a fit that was not made, and no value.
 _FILLS = {"fit/fit_status": 16384, "maps/quality": 2}
 
@@ -100,28 +99,27 @@ def _table(text: str) -> list[Variable]:
     ]
 
 
-def _parameter(group: str, name: str, words: str = "") -> Variable:
+def _parameter(group: str, name: str, words: str = "", suffix: str = "") -> Variable:
+    """Return a parameter, or, with a suffix, what the words say of it."""
     unit, sentence, symbol = _PARAMETER_WORDS[name]
-    return Variable(f"{group}/{name}", _MAP, "float64", unit, words + sentence, symbol)
-
-
-def _stderr(group: str, name: str) -> Variable:
-    unit, sentence, _ = _PARAMETER_WORDS[name]
-    return Variable(f"{group}/{name}_stderr", _MAP, "float64", unit, f"standard error of the {sentence}")
+    symbol = "" if suffix else symbol
+    return Variable(f"{group}/{name}{suffix}", ("y", "x"), "float64", unit, words + sentence, symbol)
 
 
 def _both(group: str, names: tuple[str, ...]) -> list[Variable]:
-    return [make(group, name) for name in names for make in (_parameter, _stderr)]
+    """Return parameters, each with its standard error."""
+    made = ("", ""), ("standard error of the ", "_stderr")
+    return [_parameter(group, name, *each) for name in names for each in made]
 
 
 def _ends(group: str, names: tuple[str, ...]) -> list[Variable]:
-    found = []
-    for name in names:
-        unit, sentence, _ = _PARAMETER_WORDS[name]
-        for end, path in zip(("lower", "upper"), interval_names(name), strict=True):
-            words = f"{end} end of the profile-likelihood interval of the {sentence}"
-            found.append(Variable(f"{group}/{path}", _MAP, "float64", unit, words))
-    return found
+    """Return the ends of the profile intervals of parameters."""
+    ends = [*zip(("lower", "upper"), interval_names(""), strict=True)]
+    return [
+        _parameter(group, name, f"{end} end of the profile-likelihood interval of the ", suffix)
+        for name in names
+        for end, suffix in ends
+    ]
 
 
 _ALL: list[Variable] = [

@@ -130,13 +130,7 @@ def power_of_ten(exponent: int) -> str:
 
 
 def measured(value: float, error: float, unit: str = "") -> str:
-    """Return ``value ± error unit``, rounded to two digits of the error.
-
-    Args:
-        value: estimate; NaN gives ``not known``.
-        error: its standard error; NaN or 0 leaves the error out.
-        unit: unit as people write it.
-    """
+    """Return ``value ± error unit``, rounded to two digits of the error; NaN or 0 leaves the error out."""
     tail = f" {unit}" if unit else ""
     if not math.isfinite(value):
         return "not known"

@@ -11,8 +11,7 @@ import numpy as np
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.planning.plan import Plan, SamplesPlan, plan_one_sample, plan_samples
-from pchem_pipeline.planning.point import Point
-from pchem_pipeline.planning.targets import Target, parse_target
+from pchem_pipeline.planning.targets import Point, Target, parse_target
 from pchem_pipeline.store.files import write_json
 
 

@@ -110,14 +110,9 @@ def found_model(path: Path) -> FoundModel | None:
 
 
 def write_model(path: Path, model: ModelSettings) -> Path:
-    """Make a model the one of a YAML file, which stays as it is.
+    """Make a model the one of a YAML file, which stays as it is; return the file that holds the model now.
 
-    Args:
-        path: of the YAML.
-        model: kept in ``RUN.effects.yaml``, which goes where this is the YAML's own model.
-
-    Returns:
-        The file that holds the model now.
+    It is kept in ``RUN.effects.yaml``, which is removed where the YAML states the same model.
 
     Raises:
         ConfigError: the YAML is no configuration.
@@ -160,12 +155,9 @@ def _text(path: Path) -> str:
 
 
 def parse_config(text: str, name: str = "config", folder: Path | None = None) -> RunConfig:
-    """Return the configuration in a YAML text.
+    """Return the configuration in a YAML text, which messages call ``name``.
 
-    Args:
-        text: YAML.
-        name: used in messages.
-        folder: to which the paths of files that are read with the YAML refer; None: the working directory.
+    Paths of files that are read with the YAML refer to the folder; None: the working directory.
 
     Raises:
         ConfigError: the text is not YAML or a setting is wrong.

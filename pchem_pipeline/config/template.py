@@ -8,7 +8,6 @@ from typing import Any
 
 import yaml
 from pydantic import BaseModel
-from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined, to_jsonable_python
 
 from pchem_pipeline.base.wording import typeset
@@ -33,13 +32,9 @@ def json_schema() -> str:
 
 
 def commented_config(name: str, *, files: list[str], simulated: bool = False, schema: bool = False) -> str:
-    """Return a YAML text with every setting, its default and what it means.
+    """Return the YAML text of a file with every setting, its default and what it means.
 
-    Args:
-        name: file name, for the comment on top.
-        files: what to write as ``input.files``.
-        simulated: include the section ``simulate``.
-        schema: name the schema beside it, as the language server of YAML reads it.
+    With ``schema`` it names the schema beside it, as the language server of YAML reads it.
     """
     stem = name.rsplit(".", 1)[0]
     given = {"input.files": files, "run.store": f"{stem}.zarr", "simulate.output": f"{stem}-frames"}
@@ -59,22 +54,20 @@ def _section(model: type[BaseModel], path: str, given: dict[str, Any], depth: in
     lines: list[str] = []
     for key, field in model.model_fields.items():
         name = field.alias or key
-        value = given.get(f"{path}.{key}", _default(field))
+        default = field.get_default(call_default_factory=True, validated_data={})
+        value = given.get(f"{path}.{key}", None if default is PydanticUndefined else default)
         width = max(40, 100 - len(pad))
         lines += [f"{pad}# {line}" for line in textwrap.wrap(typeset(field.description or ""), width)]
         section = section_of(field)
         if isinstance(value, BaseModel) and section is not None and type(value) is section:
             lines += [f"{pad}{name}:", *_section(section, f"{path}.{key}", given, depth + 1)]
         else:
-            lines += _entry(name, to_jsonable_python(value, by_alias=True), pad)
+            text = yaml.safe_dump(
+                to_jsonable_python(value, by_alias=True),
+                sort_keys=False,
+                allow_unicode=True,
+                default_flow_style=True,
+                width=10**6,
+            )
+            lines.append(f"{pad}{name}: {text.removesuffix('...' + chr(10)).strip()}")
     return lines
-
-
-def _entry(name: str, value: Any, pad: str) -> list[str]:
-    text = yaml.safe_dump(value, sort_keys=False, allow_unicode=True, default_flow_style=True, width=10**6)
-    return [f"{pad}{name}: {text.removesuffix('...' + chr(10)).strip()}"]
-
-
-def _default(field: FieldInfo) -> Any:
-    value = field.get_default(call_default_factory=True, validated_data={})
-    return None if value is PydanticUndefined else value

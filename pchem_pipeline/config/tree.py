@@ -43,11 +43,7 @@ class RunSettings(Section):
 
 
 class RunConfig(Section):
-    """The configuration of a run.
-
-    Raises:
-        pydantic.ValidationError: a key is unknown, a value is out of range, or there is no input.
-    """
+    """The configuration of a run."""
 
     run: RunSettings = Field(default_factory=RunSettings, description="the run as a whole")
     simulate: SimulateSettings | None = Field(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from numbers import Integral
@@ -75,7 +75,6 @@ class CameraFacts:
 
     Attributes:
         name: make and model.
-        serial: serial number.
         temperature: of the sensor, degrees Celsius.
         taken: when the first frame was taken, s since 1970-01-01 UTC (a time without a zone counts as UTC).
         setup: how the camera was set, by the names that the file has for it (gain, readout mode, binning).
@@ -96,12 +95,7 @@ class CameraFacts:
 
 
 class Duration(NamedTuple):
-    """An integration time as a file states it.
-
-    Attributes:
-        seconds: s; None where its unit is in doubt.
-        words: what the file states.
-    """
+    """An integration time, s (None where its unit is in doubt), and how the file states it."""
 
     seconds: float | None
     words: str
@@ -109,13 +103,7 @@ class Duration(NamedTuple):
 
 @dataclass(frozen=True)
 class StatedFacts:
-    """What a file says beside its frames; None where it does not.
-
-    Attributes:
-        camera: that took the frames.
-        duration: the integration time.
-        bit_depth: bits of the ADC.
-    """
+    """What a file says beside its frames, the bits of the ADC among it; None where it does not."""
 
     camera: CameraFacts = CameraFacts()
     duration: Duration | None = None
@@ -145,9 +133,7 @@ def texts_of(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, str]:
 def celsius(value: Any, unit: Any = "C") -> float | None:
     """Return a temperature in degrees Celsius; None where it is no number, or no temperature of a sensor.
 
-    Args:
-        value: the number.
-        unit: kelvin if it is ``K`` or begins with ``kelvin``; degrees Celsius, or none that is known.
+    The unit is kelvin (``K``), degrees Celsius, or one that is not known, which also gives None.
     """
     try:
         number = float(value)
@@ -176,13 +162,8 @@ def seconds_of(value: Any) -> float | None:
 def duration_of(name: str, value: Any, *units: Any, comment: str = "") -> Duration | None:
     """Return a duration; None where the value is no positive number. Without a unit it is s.
 
-    Args:
-        name: of the value.
-        value: the number; a text may have its unit behind it.
-        units: of the value, None or empty where there is none.
-        comment: words beside it, which may state a unit.
-
-    The seconds are None where the units contradict each other, or one is not known.
+    A text may have the unit behind its number, and the comment may state one. The seconds are None where
+    units contradict each other, or one is not known.
     """
     if isinstance(value, bool):
         return None
@@ -224,10 +205,10 @@ def _scales(text: str) -> set[float | None]:
 
 def agreed_duration(found: Iterable[Duration | None]) -> Duration | None:
     """Return the first duration that is known; unknown where there is none, or another contradicts it."""
-    there = [each for each in found if each is not None]
-    known = [(each.seconds, each.words) for each in there if each.seconds is not None]
+    stated = [each for each in found if each is not None]
+    known = [(each.seconds, each.words) for each in stated if each.seconds is not None]
     if not known:
-        return there[0] if there else None
+        return stated[0] if stated else None
     seconds, words = known[0]
     for other, other_words in known[1:]:
         if abs(other - seconds) > _ROUNDING * seconds:
@@ -241,17 +222,11 @@ def bits_of(value: Any) -> int | None:
     return int(value) if whole and 1 <= int(value) <= 32 else None
 
 
-def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] | None = None) -> StatedFacts:
-    """Return the facts from values under the names that most programs use (HDF5, zarr, sidecars, JSON).
-
-    Args:
-        values: attributes.
-        units: of them, by name.
-    """
-    given = units or {}
+def facts_from_names(values: Mapping[str, Any], units: Mapping[str, Any] = {}) -> StatedFacts:
+    """Return the facts from values, with their units, under the names that most programs use."""
 
     def units_of(name: str) -> list[Any]:
-        return [given.get(name), *(values.get(name + suffix) for suffix in _UNIT_SUFFIXES)]
+        return [units.get(name), *(values.get(name + suffix) for suffix in _UNIT_SUFFIXES)]
 
     temperatures = (celsius(values.get(name), first_of(units_of(name))) for name in _TEMPERATURES)
     # those first whose unit is known by their name; integration_time is in s as sidecars have it
@@ -284,13 +259,8 @@ def first_of(found: Iterable[Any]) -> Any:
     return next((each for each in found if each is not None), None)
 
 
-def shared_facts(each: Iterable[CameraFacts]) -> tuple[CameraFacts, str]:
-    """Return what all files of a stack say alike, their mean temperature, and a remark if it moved.
-
-    Args:
-        each: of the files, in their order.
-    """
-    facts = list(each)
+def shared_facts(facts: Sequence[CameraFacts]) -> tuple[CameraFacts, str]:
+    """Return what all files of a stack say alike, their mean temperature, and a remark if it moved."""
     known = [one.temperature for one in facts if one.temperature is not None]
     times = [one.taken for one in facts if one.taken is not None]
     whole = bool(facts) and len(known) == len(facts)
@@ -301,12 +271,12 @@ def shared_facts(each: Iterable[CameraFacts]) -> tuple[CameraFacts, str]:
         min(times, default=None),
         {name: value for one in facts for name, value in one.setup.items()},
     )
-    if whole and max(known) - min(known) > 1.0:
-        return shared, (
-            f"sensor temperature {min(known):.4g} to {max(known):.4g} °C in the files: offset, gain and dark "
-            "current may have changed"
-        )
-    return shared, ""
+    if not whole or max(known) - min(known) <= 1.0:
+        return shared, ""
+    return shared, (
+        f"sensor temperature {min(known):.4g} to {max(known):.4g} °C in the files: offset, gain and dark "
+        "current may have changed"
+    )
 
 
 def _alike(values: Iterable[str | None]) -> str | None:

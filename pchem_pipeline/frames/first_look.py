@@ -31,9 +31,8 @@ _OCTAVES = 1.5  # by which steps shrink on average in the right byte order; in t
 def first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
     """Return remarks on left-justified samples, and on a stack whose last axis looks like time.
 
-    Args:
-        frames: the stack; out: the codes at which its samples seem to be cut off.
-        settings: the section ``input``; what it states is not looked for.
+    What the settings state is not looked for. ``frames.seen_limits`` becomes the codes at which its samples
+    seem to be cut off.
 
     Raises:
         InputError: the samples look byte-swapped, and no byte order is set.
@@ -47,7 +46,7 @@ def first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
     try:
         parts = [frames.stored(t, t + few, first, first + height) for t in starts]
     except InputError:
-        return []  # it is told where the frames are read
+        return []  # reading the frames will say so
     values = np.concatenate(parts)
     name = frames.paths[0]
     if settings.byte_order is None and settings.bit_shift is None:
@@ -72,11 +71,7 @@ def first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
 
 
 def _check_byte_order(values: NDArray[Any], where: str, order: str | None) -> None:
-    """Refuse samples that differ far less along time with their bytes swapped.
-
-    Raises:
-        InputError: they do.
-    """
+    """Refuse samples that differ far less along time with their bytes swapped."""
     unused = _unused_bits(values)
     # of left-justified samples; a high byte in the place of the low one has low bits
     if values.dtype.itemsize == 1 or 4 <= unused < 8:
@@ -109,8 +104,8 @@ def limits_seen(first: int, samples: NDArray[Any], pixels: tuple[int, int]) -> t
 
     Args:
         first: the lowest code, DN.
-        samples: how many there are of each code from the lowest to the highest.
-        pixels: how many have samples of the lowest, and of the highest code.
+        samples: number of each code from the lowest to the highest.
+        pixels: number with samples of the lowest, and of the highest code.
     """
     last, few = first + samples.size - 1, _FEWEST + 1
     found: list[int | None] = []
@@ -150,11 +145,7 @@ def _is_time_last(values: NDArray[Any]) -> bool:
 
 
 def _common_variance(values: FloatArray) -> tuple[float, float]:
-    """Return the covariance along the last axis of the means of two halves of the second, and its error.
-
-    Args:
-        values: shape (m, n, k); averaged over m.
-    """
+    """Return the covariance over k of the means over two halves of n, averaged over m, and its error."""
     one, other = values[:, ::2].mean(axis=1), values[:, 1::2].mean(axis=1)
     one, other = (each - each.mean(axis=1, keepdims=True) for each in (one, other))
     products = one * other

@@ -1,19 +1,17 @@
 """Ready-made histograms: many laboratories keep only those.
 
 A file holds digital numbers and counts: CSV (two columns ``DN, count`` or ``Energy, Count``; more count
-columns are
-more channels; a header line is optional), npy (two columns, or channels x bins with bin 0 at DN 0), or npz
-(``dn`` and ``counts``). Each channel becomes a pixel of a sensor of one row.
+columns are more channels; a header line is optional), npy (two columns, or channels x bins with bin 0 at DN
+0), or npz (``dn`` and ``counts``). Each channel becomes a pixel of a sensor of one row.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +44,7 @@ class HistogramInput:
     origin: NDArray[np.int32]
     names: tuple[str, ...]
     paths: tuple[Path, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -54,14 +52,13 @@ class HistogramInput:
         return 1, len(self.names)
 
 
-@dataclass
-class _Channel:
+class _Channel(NamedTuple):
     """One histogram with its leading and trailing zeros cut off."""
 
     name: str
     origin: int
     counts: IntArray
-    notes: list[str] = field(default_factory=list)
+    notes: list[str]
 
 
 def is_histogram_input(settings: InputSettings, base_dir: Path) -> bool:
@@ -86,10 +83,6 @@ def is_histogram_input(settings: InputSettings, base_dir: Path) -> bool:
 def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
     """Read all histograms of ``input.files`` onto axes of equal length.
 
-    Args:
-        settings: the section ``input``.
-        base_dir: folder to which relative paths refer.
-
     Raises:
         InputError: files that cannot be read, or that are no histograms, all in one message.
     """
@@ -102,11 +95,7 @@ def read_histograms(settings: InputSettings, base_dir: Path) -> HistogramInput:
         except InputError as error:
             entry.problem = str(error).removeprefix(f"{entry.path}: ")
     report.raise_if_refused(settings.on_bad_file)
-    left_out = [report.message()] if report.bad else []
-    return _assemble(channels, [entry.path for entry in report.good], left_out)
-
-
-def _assemble(channels: Sequence[_Channel], paths: Sequence[Path], notes: Sequence[str]) -> HistogramInput:
+    paths = tuple(entry.path for entry in report.good)
     bins = max(channel.counts.size for channel in channels)
     if bins * len(channels) > _MOST_BINS_OF_ALL:
         raise InputError(
@@ -117,8 +106,9 @@ def _assemble(channels: Sequence[_Channel], paths: Sequence[Path], notes: Sequen
     for i, channel in enumerate(channels):
         counts[0, i, : channel.counts.size] = channel.counts
     origin = np.asarray([[channel.origin for channel in channels]], np.int32)
-    remarks = (*notes, *(note for channel in channels for note in channel.notes))
-    return HistogramInput(counts, origin, tuple(channel.name for channel in channels), tuple(paths), remarks)
+    left_out = [report.message()] if report.bad else []
+    notes = (*left_out, *(note for channel in channels for note in channel.notes))
+    return HistogramInput(counts, origin, tuple(channel.name for channel in channels), paths, notes)
 
 
 def _read(path: Path) -> list[_Channel]:
@@ -127,20 +117,14 @@ def _read(path: Path) -> list[_Channel]:
     if suffix not in HISTOGRAM_SUFFIXES:
         raise InputError(f"{path}: give histograms as .csv, .txt, .npy or .npz")
     try:
-        if suffix in (".npy", ".npz"):
-            dn, columns, names = _read_numpy(path)
-        else:
-            dn, columns, names = _read_text(path)
+        dn, columns, names = (_read_numpy if suffix in (".npy", ".npz") else _read_text)(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
     except csv.Error as error:
         raise InputError(
             f"{path}: no table of numbers ({error}); histograms have columns DN, count"
         ) from error
-    if len(names) == 1:
-        names = [path.stem]
-    else:
-        names = [f"{path.stem}:{name}" for name in names]
+    names = [path.stem] if len(names) == 1 else [f"{path.stem}:{name}" for name in names]
     channels: list[_Channel] = []
     for name, column in zip(names, columns, strict=True):
         channels.append(_channel(path, name, dn, column))
@@ -154,20 +138,18 @@ def _read(path: Path) -> list[_Channel]:
 
 def _read_numpy(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]:
     """Read npy or npz: DN, the counts of each channel, and names of the channels."""
+    split = _split_npz if path.suffix.lower() == ".npz" else _split_npy
     try:
         with path.open("rb") as stream:
-            loaded = np.load(stream, allow_pickle=False)
-            dn, table = (
-                _split_npz(path, loaded) if path.suffix.lower() == ".npz" else _split_npy(path, loaded)
-            )
+            dn, table = split(path, np.load(stream, allow_pickle=False))
     except (ValueError, EOFError, KeyError) as error:
         raise InputError(
             f"{path}: not a valid {path.suffix[1:]} file of plain numbers (pickles are never opened); save "
             "it again"
         ) from error
+    except (OSError, InputError):
+        raise
     except Exception as error:  # a damaged zip archive raises its own kind
-        if isinstance(error, OSError | InputError):
-            raise
         raise InputError(f"{path}: damaged ({error}); copy it again") from error
     if dn.ndim != 1 or table.ndim != 2 or table.shape[1] != dn.size:
         raise InputError(
@@ -220,18 +202,13 @@ def _read_text(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]
     width = len(header or rows[0])
     if width < 2:
         raise InputError(f"{path}: needs two or more columns, DN and count")
-    table = np.empty((len(rows), width))
     for number, row in enumerate(rows, 1 + (header is not None)):
         if len(row) != width or not all(_is_number(cell) for cell in row):
             raise InputError(
                 f"{path}: row {number} ({mark.join(row)[:40]}) is not {width} numbers; correct it"
             )
-        table[number - 1 - (header is not None)] = [float(cell) for cell in row]
-    names = (
-        [name or str(i) for i, name in enumerate(header[1:])]
-        if header
-        else [str(i) for i in range(width - 1)]
-    )
+    table = np.array([[float(cell) for cell in row] for row in rows]).reshape(-1, width)
+    names = [name or str(i) for i, name in enumerate((header or [""] * width)[1:])]
     return table[:, 0], list(table[:, 1:].T), names
 
 
@@ -259,8 +236,7 @@ def _channel(path: Path, name: str, dn: NDArray[Any], counts: NDArray[Any]) -> _
         raise InputError(f"{where}DN not in increasing order (at DN {axis[1:][steps < 0][0]}); sort them")
     if not values.any():
         raise InputError(f"{where}all counts are zero; omit it")
-    filled = np.flatnonzero(values)
-    first, last = filled[0], filled[-1]
+    first, last = np.flatnonzero(values)[[0, -1]]
     low, high = int(axis[first]), int(axis[last])
     if high - low >= _MOST_BINS or not -(2**31) <= low <= high < 2**31:
         raise InputError(f"{where}DN from {low} to {high}, more than any ADC; correct the DN column")

@@ -26,12 +26,7 @@ def _parts(path: Path) -> list[Path]:
 
 
 class FileHasher:
-    """The hash of `hash_file`, taken piece by piece in the order of the bytes.
-
-    Attributes:
-        path: the file or folder.
-        done: bytes hashed so far; of a file: the offset of the next one.
-    """
+    """The hash of `hash_file`, piece by piece in the order of the bytes, of which ``done`` are hashed."""
 
     def __init__(self, path: Path, advance: Callable[[int], None] | None = None) -> None:
         self.path = path
@@ -39,7 +34,6 @@ class FileHasher:
         self._hasher = xxhash.xxh3_128()
         self._advance = advance
         self._parts: list[Path] | None = None
-        self._begun = False
         self._offset = 0
 
     def read_to(self, count: int | None = None) -> None:
@@ -54,7 +48,7 @@ class FileHasher:
             while self._parts and (count is None or self.done < count):
                 if self._read_part(self._parts[0], count):
                     del self._parts[0]
-                    self._begun, self._offset = False, 0
+                    self._offset = 0
         except OSError as error:
             raise self._unreadable(error) from error
 
@@ -74,16 +68,15 @@ class FileHasher:
         return data
 
     def hexdigest(self) -> str:
-        """Hash what is left, and return the hash of all."""
+        """Hash the rest, and return the hash of all."""
         self.read_to()
         return self._hasher.hexdigest()
 
     def _read_part(self, part: Path, count: int | None) -> bool:
         """Hash one file from where it was left; tell whether it came to its end."""
         size = part.stat().st_size
-        if part is not self.path and not self._begun:
+        if part is not self.path and not self._offset:
             self._hasher.update(f"{part.relative_to(self.path).as_posix()}\0{size}\0".encode())
-        self._begun = True
         view = memoryview(bytearray(max(1, min(SCRATCH_BYTES, size - self._offset))))
         with part.open("rb", buffering=0) as stream:
             stream.seek(self._offset)
@@ -110,10 +103,6 @@ class FileHasher:
 def hash_file(path: Path, advance: Callable[[int], None] | None = None) -> str:
     """Return the xxh3_128 of a file's content, streamed; of a folder: names and contents of all its files.
 
-    Args:
-        path: the file or folder.
-        advance: told of the number of bytes of each block, for a progress bar.
-
     Raises:
         InputError: the file cannot be read.
     """
@@ -133,8 +122,17 @@ def sample_hash(path: Path) -> str:
 
 
 def file_size(path: Path) -> int:
-    """Return the size in bytes, of a folder that of all its files."""
-    return sum(part.stat().st_size for part in _parts(path))
+    """Return the size in bytes, of a folder that of all its files.
+
+    Raises:
+        InputError: the file is missing.
+    """
+    try:
+        return sum(part.stat().st_size for part in _parts(path))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check that it is still there"
+        ) from error
 
 
 def digest_of(record: object) -> str:
@@ -145,9 +143,7 @@ def digest_of(record: object) -> str:
 def content_identity(paths: Iterable[Path], advance: Callable[[int], None] | None = None) -> dict[str, Any]:
     """Return ``{"files": [{"name", "size", "xxh3_128"}, ...], "digest"}``; reads every byte.
 
-    Args:
-        paths: the files, in reading order.
-        advance: told of the number of bytes of each block, for a progress bar.
+    After each block, ``advance`` is called with its number of bytes.
 
     Raises:
         InputError: a file cannot be read.
@@ -157,7 +153,7 @@ def content_identity(paths: Iterable[Path], advance: Callable[[int], None] | Non
 
 def identity_of_hashes(hashes: Mapping[Path, str]) -> dict[str, Any]:
     """Return the identity of `content_identity` from the hash of each file, in reading order."""
-    files = [{"name": path.name, "size": _size(path), "xxh3_128": text} for path, text in hashes.items()]
+    files = [{"name": path.name, "size": file_size(path), "xxh3_128": text} for path, text in hashes.items()]
     return {"files": files, "digest": digest_of(files)}
 
 
@@ -169,16 +165,7 @@ def quick_identity(paths: Iterable[Path]) -> dict[str, Any]:
     """
     files = []
     for path in paths:
-        size = _size(path)
+        size = file_size(path)
         times = [part.stat().st_mtime_ns for part in _parts(path)]
         files.append({"name": path.name, "size": size, "mtime_ns": max(times, default=0)})
     return {"files": files}
-
-
-def _size(path: Path) -> int:
-    try:
-        return file_size(path)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check that it is still there"
-        ) from error

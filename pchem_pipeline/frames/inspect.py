@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
-from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.identity import file_size, hash_file, sample_hash
 from pchem_pipeline.frames.reader import FrameReader, shared_notes
 from pchem_pipeline.frames.registry import detect_format, reader_class
@@ -20,12 +20,7 @@ from pchem_pipeline.frames.stamps import stamp_notes
 
 @dataclass
 class FileReport:
-    """What one file is, and what is wrong with it.
-
-    Attributes:
-        path: the file.
-        problem: why the file cannot be used; empty if it can.
-    """
+    """A file, and why it cannot be used; empty if it can."""
 
     path: Path
     problem: str = ""
@@ -79,14 +74,8 @@ def survey(
     settings: InputSettings, base_dir: Path, *, check_duplicates: bool = True
 ) -> tuple[list[FrameReader], InputReport]:
     """Open all files; return the readers of the good ones, in order, and the report on all."""
-    report = InputReport()
-    opened: list[tuple[FileReport, FrameReader]] = []
-    for path in resolve_files(settings, base_dir):
-        entry = FileReport(path)
-        report.files.append(entry)
-        reader = _open(entry, settings)
-        if reader is not None:
-            opened.append((entry, reader))
+    report = InputReport([FileReport(path) for path in resolve_files(settings, base_dir)])
+    opened = [(entry, reader) for entry in report.files if (reader := _open(entry, settings)) is not None]
     mark_repeated_paths(report.files)
     _mark_odd(opened)
     if check_duplicates:
@@ -102,14 +91,11 @@ def _open(entry: FileReport, settings: InputSettings) -> FrameReader | None:
     try:
         name = settings.format if settings.format != "auto" else detect_format(entry.path)
         reader = reader_class(name).open(entry.path, settings)
-    except ConfigError:
-        raise
     except InputError as error:
         entry.problem = str(error).removeprefix(f"{entry.path}: ")
         return None
     if 0 in reader.shape:
         entry.problem = "has no frames; omit it"
-        return None
     return reader
 
 
@@ -125,18 +111,15 @@ def mark_repeated_paths(files: list[FileReport]) -> None:
 
 def _mark_odd(opened: list[tuple[FileReport, FrameReader]]) -> None:
     """Mark files whose frames differ in shape or type from those of most files."""
-    kinds = [(reader.shape[1:], str(reader.dtype)) for entry, reader in opened if not entry.problem]
-    if not kinds:
-        return
-    common, _ = Counter(kinds).most_common(1)[0]
-    for entry, reader in opened:
-        kind = (reader.shape[1:], str(reader.dtype))
-        if kind != common and not entry.problem:
-            entry.problem = f"has {_words(kind)} frames, the others {_words(common)}"
-
-
-def _words(kind: tuple[tuple[int, ...], str]) -> str:
-    return f"{kind[0][0]} x {kind[0][1]} {kind[1]}"
+    kinds = [
+        (entry, f"{reader.shape[1]} x {reader.shape[2]} {reader.dtype}")
+        for entry, reader in opened
+        if not entry.problem
+    ]
+    most = Counter(kind for _, kind in kinds).most_common(1)
+    for entry, kind in kinds:
+        if kind != most[0][0]:
+            entry.problem = f"has {kind} frames, the others {most[0][0]}"
 
 
 def _mark_duplicates(files: list[FileReport]) -> None:
@@ -159,9 +142,9 @@ _CLOCK = re.compile(r"([01]\d|2[0-3])([-_.:h]?)([0-5]\d)([-_.:m]?)([0-5]\d)(\d{0
 
 
 def _gaps(paths: list[Path]) -> list[str]:
-    """Say which numbers are missing in the names of a numbered sequence of files.
+    """Say how many numbers are missing in the names of a sequence of files, unless the numbers are a clock.
 
-    A clock is no such number: its steps vary, or are those of a counter only if minutes have 60 seconds.
+    The steps of a clock vary, or are equal only if minutes have 60 seconds.
     """
     groups: defaultdict[tuple[Path, str], list[Path]] = defaultdict(list)
     for path in paths:

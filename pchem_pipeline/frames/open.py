@@ -24,16 +24,7 @@ def open_frames(
 ) -> FrameSequence:
     """Open all camera files as one stack, with bit shift, region of interest and frame range applied.
 
-    Args:
-        settings: the section ``input``.
-        base_dir: folder to which relative paths refer.
-        check_duplicates: also look for files with the same content (reads a little of each file), and at
-            some samples.
-        least: frames that there must be.
-
-    Returns:
-        One reader, that can be shared by threads and pickled to other processes; its ``report`` says what
-        was found and left out.
+    With ``check_duplicates``, also look for files with the same content, and at some samples.
 
     Raises:
         InputError: bad files (all in one message), too few frames, or a region outside of the frames.
@@ -69,13 +60,7 @@ _MARKER = (1 << 32) - 1
 
 
 def _bad_pixels(frames: FrameSequence, settings: InputSettings, base_dir: Path) -> dict[str, BoolArray]:
-    """Return by cause the pixels (y, x) of ``input.mask``, and those with a marker or a stamp.
-
-    The marker is in the first and the last frame.
-
-    Raises:
-        InputError: the mask is no image of the shape of the frames.
-    """
+    """Return by cause the pixels (y, x) of ``input.mask``, and those with a stamp, or always a marker."""
     n, rows, columns = frames.shape
     causes: dict[str, BoolArray] = {}
     stamped = stamped_pixels(frames)

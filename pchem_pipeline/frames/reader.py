@@ -6,7 +6,6 @@ Readers from elsewhere come through the entry point group ``pchem_pipeline.reade
 
 from __future__ import annotations
 
-import errno
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -36,22 +35,19 @@ class FrameReader(ABC):
         paths: the files behind the reader, in the order of their frames.
         shape: (number of frames, rows, columns).
         dtype: native unsigned type of the samples that `read_into` delivers.
-        bit_depth: bits of the ADC, where the file says so.
-        bit_shift: bits by which the samples are left-justified, where the file says so.
-        integration_time: s, where the file says so.
+        bit_depth: bits of the ADC; like all that follows to ``frame_stamps``, where the file says so.
+        bit_shift: bits by which the samples are left-justified.
+        integration_time: s.
         time_words: what the file states of it, and in what unit.
-        camera: its name, serial number, temperature and time, as far as the file says.
-        active: first row, end of the rows, first column and end of the columns of the light-sensitive area,
-            where the file says so.
-        overscan: likewise of pixels without electrons, where the file says so; None: all outside of
-            ``active``.
-        timestamps: start of each frame, s since 1970-01-01 UTC, (frames,), where the file says so.
-        frame_stamps: number that the camera gave to each frame, (frames,), where the file says so.
+        camera: its name, serial number, temperature and time.
+        active: first row, end of the rows, first column and end of the columns of the light-sensitive area.
+        overscan: likewise of pixels without electrons; None: all outside of ``active``.
+        timestamps: start of each frame, s since 1970-01-01 UTC, (frames,).
+        frame_stamps: number that the camera gave to each frame, (frames,).
         notes: remarks for the user on what was left out or assumed.
         byte_order: of the bytes of a sample, little or big, where ``input.byte_order`` decides it.
         unwritten: samples of the file were never written, and are read as a fill value.
-        rows_per_read: rows that are decoded together, so that they come at no more cost than one; 1 where
-            any rows can be read alone.
+        rows_per_read: rows that are decoded together, so that they come at no more cost than one.
         order_by_habit: whether the format has arrays that do not say which axis is time.
     """
 
@@ -90,14 +86,9 @@ class FrameReader(ABC):
 
     @abstractmethod
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
-        """Fill ``buffer`` with frames t0..t1 and rows y0..y1 (ends excluded), all columns.
+        """Fill ``buffer`` with frames t0..t1 and rows y0..y1 (ends excluded; None: to the last), all columns.
 
-        Args:
-            buffer: C-contiguous, (t1 - t0, y1 - y0, columns), of ``self.dtype``.
-            t0: first frame.
-            t1: end of the frames.
-            y0: first row.
-            y1: end of the rows; None means to the last.
+        The buffer is C-contiguous, of shape (t1 - t0, y1 - y0, columns) and of ``self.dtype``.
 
         Raises:
             InputError: the file vanished, changed or cannot be decoded.
@@ -190,11 +181,7 @@ def sound(path: Path, what: str) -> Iterator[None]:
     except (InputError, ConfigError):
         raise
     except Exception as error:
-        if (
-            isinstance(error, OSError)
-            and error.strerror
-            and error.errno in (errno.ENOENT, errno.EACCES, errno.EPERM)
-        ):
+        if isinstance(error, FileNotFoundError | PermissionError) and error.strerror:
             raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
         raise InputError(f"{path}: not a valid {what}, or truncated ({error}); copy it again") from error
 

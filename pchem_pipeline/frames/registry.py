@@ -16,20 +16,8 @@ from pchem_pipeline.frames.reader import FrameReader
 
 ENTRY_POINT_GROUP = "pchem_pipeline.readers"
 
-#: module and class of each of our readers; raw comes last since any bytes could be raw
-_OURS = {
-    "npy": ("npy", "NpyReader"),
-    "tiff": ("tiff", "TiffReader"),
-    "fits": ("fits", "FitsReader"),
-    "hdf5": ("hdf5", "Hdf5Reader"),
-    "zarr": ("omezarr", "ZarrReader"),
-    "ser": ("ser", "SerReader"),
-    "dcimg": ("dcimg", "DcimgReader"),
-    "spe": ("spe", "SpeReader"),
-    "sif": ("sif", "SifReader"),
-    "nd2": ("nd2", "Nd2Reader"),
-    "raw": ("raw", "RawReader"),
-}
+#: our formats: ``formats/npy.py`` has the class ``NpyReader``; raw comes last since any bytes could be raw
+_OURS = ("npy", "tiff", "fits", "hdf5", "zarr", "ser", "dcimg", "spe", "sif", "nd2", "raw")
 #: first bytes of files that hold others -> what made them
 _PACKED = {
     b"\x1f\x8b": "gzip",
@@ -71,10 +59,8 @@ def reader_class(name: str) -> type[FrameReader]:
         ConfigError: no such format, or a plug-in that is not a reader.
     """
     if name in _OURS:
-        module, cls = _OURS[name]
-        found: type[FrameReader] = getattr(
-            importlib.import_module(f"pchem_pipeline.frames.formats.{module}"), cls
-        )
+        module = importlib.import_module(f"pchem_pipeline.frames.formats.{name}")
+        found: type[FrameReader] = getattr(module, f"{name.capitalize()}Reader")
         return found
     plugins = _plugins()
     if name not in plugins:
@@ -94,20 +80,15 @@ def _load(point: EntryPoint) -> type[FrameReader]:
     if not (isinstance(cls, type) and issubclass(cls, FrameReader)) or cls.format_name != point.name:
         raise ConfigError(
             f"the reader {point.name!r} ({point.value}) must be a FrameReader with format_name = "
-            f"{point.name!r}; "
-            "repair or uninstall that package"
+            f"{point.name!r}; repair or uninstall that package"
         )
     return cls
 
 
 def frame_suffixes(name: str = "auto") -> dict[str, str]:
     """Return suffix -> format name, of one format or of all."""
-    names = reader_names() if name == "auto" else [name]
-    table: dict[str, str] = {}
-    for each in names:
-        for suffix in reader_class(each).suffixes:
-            table.setdefault(suffix, each)
-    return table
+    names = reversed(reader_names()) if name == "auto" else [name]  # of several readers the first counts
+    return {suffix: each for each in names for suffix in reader_class(each).suffixes}
 
 
 def detect_format(path: Path) -> str:
@@ -116,8 +97,11 @@ def detect_format(path: Path) -> str:
     Raises:
         InputError: the file is missing, empty, or of no known format.
     """
+    head = b""
     try:
-        head = b"" if path.is_dir() else _head(path)
+        if not path.is_dir():
+            with path.open("rb") as stream:
+                head = stream.read(64)
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); check the path and its permissions"
@@ -140,19 +124,10 @@ def detect_format(path: Path) -> str:
 
 
 def check_unpacked(path: Path, head: bytes) -> None:
-    """Refuse a file that holds another one: libraries may unpack it, but its bytes are not where they say.
-
-    Raises:
-        InputError: its first bytes are those of a program that packs files.
-    """
+    """Refuse a packed file: libraries may unpack it, but its bytes are not where they say."""
     for magic, program in _PACKED.items():
         if head.startswith(magic):
             raise InputError(f"{path}: compressed with {program}; unpack it first")
-
-
-def _head(path: Path) -> bytes:
-    with path.open("rb") as stream:
-        return stream.read(64)
 
 
 def require(module: str, extra: str, what: str) -> None:

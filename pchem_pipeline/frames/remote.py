@@ -33,9 +33,6 @@ def fetch(url: str) -> list[Path]:
     environment variables ``AWS_ACCESS_KEY_ID``, ``AWS_SECRET_ACCESS_KEY`` and ``AWS_ENDPOINT_URL``, or
     ``~/.aws``).
 
-    Args:
-        url: such as ``s3://bucket/frames/*.tif``.
-
     Raises:
         InputError: nothing is there, or the storage refuses.
         MissingDependencyError: the library of that kind of storage is not installed.

@@ -8,8 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from pchem_pipeline.base.errors import ConfigError, InputError
-from pchem_pipeline.frames.formats.omezarr import is_zarr
 from pchem_pipeline.frames.formats.raw import SIDECARS, RawReader, find_sidecar
+from pchem_pipeline.frames.formats.zarr import is_zarr
 from pchem_pipeline.frames.registry import frame_suffixes
 from pchem_pipeline.frames.remote import fetch, is_remote
 from pchem_pipeline.frames.settings import InputSettings
@@ -26,11 +26,7 @@ def natural_key(path: Path) -> tuple[tuple[tuple[int, int | str], ...], str]:
 
 
 def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
-    """Return the files that ``input.files`` names, in natural order; a path named twice is there twice.
-
-    Args:
-        settings: the section ``input``.
-        base_dir: folder to which relative paths refer.
+    """Return the files that ``input.files`` names, in natural order; a path named twice is listed twice.
 
     Raises:
         ConfigError: no files are named.
@@ -82,9 +78,9 @@ def input_paths(settings: InputSettings, base_dir: Path) -> list[Path]:
     paths = [] if mask is None else [mask]
     for path in resolve_files(settings, base_dir):
         paths.append(path)
-        if settings.format == "raw" or path.suffix.lower() in RawReader.suffixes:
-            sidecar = find_sidecar(path)
-            paths += [sidecar] if sidecar is not None else []
+        raw = settings.format == "raw" or path.suffix.lower() in RawReader.suffixes
+        if raw and (sidecar := find_sidecar(path)):
+            paths.append(sidecar)
     return paths
 
 
@@ -113,10 +109,8 @@ def _glob(pattern: Path, base_dir: Path) -> list[Path]:
 
 
 def _folder(folder: Path, settings: InputSettings) -> list[Path]:
-    if settings.format == "histogram":
-        suffixes = HISTOGRAM_SUFFIXES
-    else:
-        suffixes = frame_suffixes(settings.format)
+    histograms = settings.format == "histogram"
+    suffixes = HISTOGRAM_SUFFIXES if histograms else frame_suffixes(settings.format)
     entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
     files = [path for path in entries if path.is_file() and path.suffix.lower() in suffixes]
     if not files:

@@ -27,7 +27,7 @@ class FrameSequence(FrameReader):
         report: what was found in the files and what was done about it.
         excluded: pixels (y, x) whose samples are replaced by one that is the same in all frames; None: none.
         insensitive: pixels (y, x) outside of the light-sensitive area.
-        overscan_pixels: those of them that tell the bias, (y, x).
+        overscan_pixels: those of them that show the bias, (y, x).
         exclusions: why pixels are excluded.
         stated_integration_time: s, as the files say, whatever the settings say; None if they do not agree.
     """
@@ -65,7 +65,6 @@ class FrameSequence(FrameReader):
         self._first, end = _frame_range(settings, total, least)
         rows, columns = readers[0].shape[1:]
         self._y0, y1, self._x0, self._x1 = _region(settings, rows, columns)
-        self._columns = columns
         self.shape = (end - self._first, y1 - self._y0, self._x1 - self._x0)
         self.dtype = readers[0].dtype
         self.rows_per_read = max(reader.rows_per_read for reader in readers)
@@ -123,11 +122,11 @@ class FrameSequence(FrameReader):
         time = settings.integration_time
         self.integration_time = _agreed(readers, "integration_time") if time is None else time
         self.time_words = _time_words(readers[0], self.integration_time)
-        stamps = [reader.timestamps for reader in readers]
-        if all(each is not None for each in stamps):
-            self.timestamps = np.concatenate([each for each in stamps if each is not None])[self._first : end]
+        stamps = [reader.timestamps for reader in readers if reader.timestamps is not None]
+        if len(stamps) == len(readers):
+            self.timestamps = np.concatenate(stamps)[self._first : end]
         _check_same_camera(readers)
-        self.camera, moved = shared_facts(reader.camera for reader in readers)
+        self.camera, moved = shared_facts([reader.camera for reader in readers])
         self.notes = (*shared_notes(readers), *([moved] if moved else []))
 
     @classmethod
@@ -172,8 +171,7 @@ class FrameSequence(FrameReader):
     def stored(self, t0: int, t1: int, y0: int, y1: int) -> NDArray[Any]:
         """Return frames t0..t1 and rows y0..y1 (frame, y, x) as they are in the files."""
         buffer = np.empty((t1 - t0, y1 - y0, self.shape[2]), self.dtype)
-        for _ in self._parts(buffer, t0, t1, (y0, y1)):
-            pass
+        list(self._parts(buffer, t0, t1, (y0, y1)))
         return buffer
 
     def _parts(
@@ -231,24 +229,23 @@ class FrameSequence(FrameReader):
         self, reader: FrameReader, part: NDArray[Any], t0: int, t1: int, rows: tuple[int, int]
     ) -> None:
         """Read from one file, through a bounded scratch buffer if only some columns are wanted."""
-        if (self._x0, self._x1) == (0, self._columns):
+        columns = self.whole_shape[1]
+        if (self._x0, self._x1) == (0, columns):
             reader.read_into(part, t0, t1, *rows)
             return
         height = rows[1] - rows[0]
-        step = max(1, SCRATCH_BYTES // max(1, height * self._columns * self.dtype.itemsize))
-        scratch = np.empty((min(step, t1 - t0), height, self._columns), self.dtype)
+        step = max(1, SCRATCH_BYTES // max(1, height * columns * self.dtype.itemsize))
+        scratch = np.empty((min(step, t1 - t0), height, columns), self.dtype)
         for t in range(t0, t1, step):
             stop = min(t + step, t1)
             reader.read_into(scratch[: stop - t], t, stop, *rows)
             part[t - t0 : stop - t0] = scratch[: stop - t, :, self._x0 : self._x1]
 
     def check_bits(self, reader: FrameReader, part: NDArray[Any], y0: int) -> None:
-        """Replace excluded samples; shift left-justified ones, refusing to lose bits; check the bit depth.
+        """Replace excluded samples in part of a file (frame, y, x), from row ``y0`` on; undo the bit shift.
 
-        Args:
-            reader: of the file.
-            part: frames of it, (frame, y, x).
-            y0: their first row.
+        Raises:
+            InputError: a bit would be lost, or a value does not fit the bit depth.
         """
         if self.excluded is not None:
             ys, xs = self._places
@@ -303,10 +300,7 @@ def _where(paths: Sequence[Path]) -> str:
 
 
 def _check_same_camera(readers: Sequence[FrameReader]) -> None:
-    """Refuse files of different cameras or settings: their frames are no samples of one distribution.
-
-    A serial number that differs in each of many files counts files, not cameras.
-    """
+    """Refuse files of different cameras or settings: their frames are no samples of one distribution."""
     for name in dict.fromkeys(name for reader in readers for name in reader.camera.setup):
         values = {
             each.paths[0].name: each.camera.setup[name] for each in readers if name in each.camera.setup
@@ -318,6 +312,7 @@ def _check_same_camera(readers: Sequence[FrameReader]) -> None:
             )
     serials = {reader.paths[0].name: reader.camera.serial for reader in readers if reader.camera.serial}
     distinct = set(serials.values())
+    # a number that differs in each of many files counts files
     if len(distinct) > 1 and not 2 < len(readers) == len(distinct):
         shown = _first_of_each(serials, "serial number ")
         raise InputError(f"the files are from different cameras: {shown}; give those of one at a time")

@@ -168,20 +168,14 @@ class InputSettings(Section):
     )
 
     @model_validator(mode="after")
-    def _check_samples(self) -> Self:
-        if not self.samples:
-            return self
-        if self.files:
-            raise ValueError("files and samples: give only one of them")
-        if all(sample.bias for sample in self.samples):
-            raise ValueError("samples: every sample is a bias; list at least one with electrons")
-        shown = self.shown_sample
-        if shown is not None and (shown >= len(self.samples) or self.samples[shown].bias):
-            raise ValueError(f"shown_sample: {shown} is not a sample with electrons; choose another")
-        return self
-
-    @model_validator(mode="after")
     def _check(self) -> Self:
+        shown, lit = self.shown_sample, [n for n, sample in enumerate(self.samples) if not sample.bias]
+        if self.samples and self.files:
+            raise ValueError("files and samples: give only one of them")
+        if self.samples and not lit:
+            raise ValueError("samples: every sample is a bias; list at least one with electrons")
+        if self.samples and shown is not None and shown not in lit:
+            raise ValueError(f"shown_sample: {shown} is not a sample with electrons; choose another")
         times = [self.integration_time, *(sample.integration_time for sample in self.samples)]
         if any(0 < (time or 0) < SHORTEST for time in times):
             raise ValueError(f"integration_time must be at least {SHORTEST:g} s")

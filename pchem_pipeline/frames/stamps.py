@@ -33,10 +33,6 @@ def stamp_notes(readers: Sequence[FrameReader], frame_range: tuple[int, int | No
 
     From one file to the next nothing is judged: cameras count each recording anew. Nor are stamps that mostly
     do not rise evenly, which are no counts.
-
-    Args:
-        readers: of the files, in their order.
-        frame_range: first frame and end of those that are used; None: all.
     """
     first, end = frame_range or (0, None)
     total = sum(reader.shape[0] for reader in readers)
@@ -95,7 +91,7 @@ def stamped_pixels(frames: FrameSequence) -> BoolArray | None:
             return None
         beside = frames.top_rows(1, _TEXT[0])[0, :, width : _TEXT[1]]
     except InputError:
-        return None  # it is told where the frames are read
+        return None  # reading the frames will say so
     stamped = np.zeros(frames.whole_shape, np.bool_)
     stamped[0, :width] = True
     if np.unique(beside).size == 2:  # black and white

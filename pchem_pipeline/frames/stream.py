@@ -13,7 +13,6 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -38,29 +37,21 @@ class FrameSource(Protocol):
     @property
     def shape(self) -> tuple[int, int, int]:
         """Frames, rows, columns."""
-        ...
 
     @property
     def dtype(self) -> np.dtype[Any]:
         """Type of the samples."""
-        ...
 
     @property
     def rows_per_read(self) -> int:
         """Rows that are decoded together, and so come at no more cost than one."""
-        ...
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """Fill ``buffer`` (frame, y, x) with frames t0..t1 and rows y0..y1, ends excluded."""
-        ...
 
 
 class FrameStream:
-    """The frames of a stack by blocks: to be opened with ``with``, and iterated once.
-
-    Attributes:
-        bands: first row and end of each band of a block.
-    """
+    """The frames of a stack by blocks: to be opened with ``with``, and iterated once."""
 
     def __init__(
         self,
@@ -76,16 +67,17 @@ class FrameStream:
         Args:
             source: the frames.
             bands: the rows that are wanted, by bands.
-            step: frames in a block; blocks end at multiples of it, the last one may be shorter.
+            step: frames in a block; blocks end at multiples of it.
             frames: first frame and end of those that are wanted; None: all.
-            threads: threads that share the reading of a block (coded files cost time to decode).
+            threads: that share the reading of a block (coded files cost time to decode).
         """
         self.bands = bands
         self._source, self._threads = source, threads
         n_frames, _, columns = source.shape
-        self._first, self._end = frames or (0, n_frames)
-        self._step, self._skipped = step, self._first // step
-        longest = min(step, self._end - self._first)
+        first, end = frames or (0, n_frames)
+        cuts = [first, *range((first // step + 1) * step, end, step), end]
+        self._ranges = [*itertools.pairwise(cuts)] if first < end else []
+        longest = min(step, end - first)
         self._buffers = [
             [np.empty((longest, y1 - y0, columns), source.dtype) for y0, y1 in bands] for _ in range(2)
         ]
@@ -94,38 +86,27 @@ class FrameStream:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *unused: object) -> None:
         self._reader.shutdown()
-
-    @property
-    def n_blocks(self) -> int:
-        """Number of blocks."""
-        return -(-self._end // self._step) - self._skipped if self._end > self._first else 0
 
     def __iter__(self) -> Iterator[Block]:
         """Yield the blocks; each is overwritten after the next one was asked for."""
-        pending = self._request(0)
-        for number in range(self.n_blocks):
-            parts, reading = pending
+        requests = map(self._request, self._ranges, itertools.cycle(self._buffers))
+        pending = next(requests, None)
+        while pending is not None:
+            t0, parts, reading = pending
             reading.result()
-            if number + 1 < self.n_blocks:
-                pending = self._request(number + 1)
-            yield self._frames(number)[0], parts
+            pending = next(requests, None)
+            yield t0, parts
             del parts
-        del pending
         self._buffers = []
 
-    def _request(self, number: int) -> tuple[list[NDArray[Any]], Future[None]]:
-        t0, t1 = self._frames(number)
-        parts = [band[: t1 - t0] for band in self._buffers[number % 2]]
-        return parts, self._reader.submit(self._fill, parts, t0, t1)
-
-    def _frames(self, number: int) -> tuple[int, int]:
-        """Return the first frame of a block, and its end."""
-        start = (number + self._skipped) * self._step
-        return max(start, self._first), min(start + self._step, self._end)
+    def _request(
+        self, frames: tuple[int, int], buffers: Sequence[NDArray[Any]]
+    ) -> tuple[int, list[NDArray[Any]], Future[None]]:
+        t0, t1 = frames
+        parts = [band[: t1 - t0] for band in buffers]
+        return t0, parts, self._reader.submit(self._fill, parts, t0, t1)
 
     def _fill(self, parts: Sequence[NDArray[Any]], t0: int, t1: int) -> None:
         """Read frames t0..t1 into the parts, one for each band."""
@@ -157,20 +138,13 @@ class HashedFrameStream(FrameStream):
     ) -> None:
         """Take the memory; nothing is read yet.
 
-        Args:
-            stack: the frames.
-            bands: bands that cover all rows, from top to bottom.
-            step: see `FrameStream`.
-            files: all files that decide what is read, in reading order; among them those of the frames from
-                ``first`` on.
-            first: frame to begin with, the first one of a file.
-            threads: threads that decode, where there is something to decode.
-            advance: told of the number of bytes that were hashed.
+        The bands cover all rows, from top to bottom. All files that decide what is read are hashed, in
+        reading order; frames begin with ``first``, the first one of a file. For bytes that are hashed,
+        ``advance`` is called with their number.
         """
         super().__init__(stack, bands, step, frames=(first, stack.shape[0]), threads=threads)
         self._stack = stack
         self._hashers = {path: FileHasher(path, advance) for path in files}
-        self._sizes: dict[Path, int] = {}
 
     def identity(self) -> dict[str, Any]:
         """Hash what is left of the files, and return their identity; see `content_identity`.
@@ -181,19 +155,14 @@ class HashedFrameStream(FrameStream):
         return identity_of_hashes({path: hasher.hexdigest() for path, hasher in self._hashers.items()})
 
     def _fill(self, parts: Sequence[NDArray[Any]], t0: int, t1: int) -> None:
-        """Read the next frames, each once, and hash the bytes of their files up to there.
-
-        Raises:
-            InputError: a file vanished, changed or cannot be read.
-        """
+        """Read the next frames, each once, and hash the bytes of their files up to there."""
         decode: list[tuple[int, int]] = []
         for reader, first, end, offset in self._stack.pieces(t0, t1):
             hasher, n_frames = self._hashers[reader.paths[0]], reader.shape[0]
             if self._is_plain(reader):
                 self._take(reader, hasher, (first, end), [part[offset:] for part in parts])
             else:
-                size = self._sizes.setdefault(hasher.path, file_size(hasher.path))
-                hasher.read_to(size * end // n_frames)
+                hasher.read_to(file_size(hasher.path) * end // n_frames)
                 decode.append((t0 + offset, t0 + offset + end - first))
             if end == n_frames:
                 hasher.read_to()
@@ -224,10 +193,10 @@ class HashedFrameStream(FrameStream):
                 for part, (y0, y1) in zip(parts, self.bands, strict=True):
                     part[t] = frame[y0:y1]
         for part, (y0, _) in zip(parts, self.bands, strict=True):
-            own = part[: end - first]
-            unstore(own, layout.stored, layout.offset, hasher.path)
-            reader.put_right(own, first, y0)
-            self._stack.check_bits(reader, own, y0)
+            read = part[: end - first]
+            unstore(read, layout.stored, layout.offset, hasher.path)
+            reader.put_right(read, first, y0)
+            self._stack.check_bits(reader, read, y0)
 
     def _decode(self, parts: Sequence[NDArray[Any]], t0: int, ranges: Sequence[tuple[int, int]]) -> None:
         """Decode ranges of frames, shared among the threads, each frame once."""

@@ -18,14 +18,7 @@ WRITERS = ("tiff", "fits", "hdf5", "npy", "raw", "zarr", "ser")
 
 
 class StackFacts(NamedTuple):
-    """What the writer of a format is told of a stack.
-
-    Attributes:
-        shape: (frames, rows, columns).
-        dtype: of the samples.
-        integration_time: s; None: not known.
-        bit_depth: bits of the ADC; None: not known.
-    """
+    """What a writer has to know of a stack: (frames, rows, columns), type, integration time in s, bits."""
 
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
@@ -49,19 +42,11 @@ def write_frames(
     integration_time: float | None = None,
     bit_depth: int | None = None,
 ) -> Path:
-    """Write a stream of frames; the file appears only when it is whole.
+    """Write a stream of frames, and return its file, which appears only when it is whole.
 
-    Args:
-        format: tiff, fits, hdf5, npy, raw, zarr or ser.
-        path: the file; without a suffix the format's own is added.
-        blocks: arrays (any number of frames, rows, columns), in order, together ``shape``.
-        shape: (frames, rows, columns).
-        dtype: uint8, uint16 or uint32.
-        integration_time: s, recorded where the format has a place for it.
-        bit_depth: bits of the ADC, recorded likewise.
-
-    Returns:
-        The file written.
+    Blocks (any number of frames, rows, columns) of uint8, uint16 or uint32 make up the shape (frames, rows,
+    columns). A path without a suffix gets the format's own. Integration time (s) and bits of the ADC are
+    recorded where the format has a place for them.
 
     Raises:
         ConfigError: an unknown format, or an optional library is missing.
@@ -78,8 +63,7 @@ def write_frames(
     stream = _checked(blocks, shape)
     facts = StackFacts(shape, kind.newbyteorder("="), integration_time, bit_depth)
     importlib.import_module(reader.__module__).write_frames(path, stream, facts)
-    for _ in stream:  # a writer may stop when it has what it was told of
-        pass
+    list(stream)  # a writer may stop when it has as many frames as the shape says
     return path
 
 

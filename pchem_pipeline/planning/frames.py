@@ -10,8 +10,7 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
-from pchem_pipeline.planning.point import Point
-from pchem_pipeline.planning.targets import TARGET_NAMES, Target
+from pchem_pipeline.planning.targets import TARGET_NAMES, Point, Target
 
 
 @functools.lru_cache(maxsize=8192)
@@ -23,15 +22,7 @@ def _bound(point: Point) -> FloatArray:
 
 
 def frames_needed(target: Target, point: Point) -> float:
-    """Return the number of frames with which one sample reaches a target, by the Cramer-Rao bound.
-
-    Args:
-        target: what is wanted.
-        point: the pixel.
-
-    Returns:
-        Frames, whole; infinite where no number of them reaches it.
-    """
+    """Return the number of frames with which one sample reaches a target, by the Cramer-Rao bound, or inf."""
     gradient = target.gradient(point)
     variance = float(gradient @ _bound(point) @ gradient)
     if not np.isfinite(variance):
@@ -40,40 +31,25 @@ def frames_needed(target: Target, point: Point) -> float:
 
 
 def precision(point: Point, n_frames: float) -> dict[str, float]:
-    """Return the smallest standard deviations from so many frames: relative, of the bias in e-.
+    """Return the smallest standard deviation of each of `TARGET_NAMES` from so many frames of one sample.
 
-    Args:
-        point: the pixel.
-        n_frames: frames of one sample.
-
-    Returns:
-        By parameter of :data:`~pchem_pipeline.planning.targets.TARGET_NAMES`; NaN if undetermined.
+    They are relative, of the bias in e-; NaN if undetermined.
     """
     covariance = _bound(point) / n_frames
-    found = {}
-    for name, units in TARGET_NAMES.items():
-        gradient = Target(name, 1.0, units[0]).gradient(point)
-        found[name] = float(np.sqrt(gradient @ covariance @ gradient))
-    return found
+    gradients = {name: Target(name, 1.0, units[0]).gradient(point) for name, units in TARGET_NAMES.items()}
+    return {name: float(np.sqrt(each @ covariance @ each)) for name, each in gradients.items()}
 
 
 def best_exposure(targets: Sequence[Target], point: Point, low: float, high: float) -> tuple[float, float]:
-    """Return the exposure at which one sample needs the fewest frames for all targets.
+    """Return the exposure from ``low`` to ``high`` (e-) with the fewest frames for all targets, and these.
 
-    Args:
-        targets: what is wanted.
-        point: the pixel; its own exposure does not matter.
-        low: smallest exposure allowed, e-.
-        high: largest exposure allowed, e-.
-
-    Returns:
-        H (e-) and frames; the frames are infinite where no exposure reaches the targets.
+    They are infinite where no exposure reaches the targets; that of the point does not matter.
     """
     from scipy.optimize import minimize_scalar  # takes a fifth of a second, and reports import this
 
     def needed(log_exposure: float) -> float:
-        there = replace(point, quanta_exposure=float(np.exp(log_exposure)))
-        return max(frames_needed(target, there) for target in targets)
+        exposed = replace(point, quanta_exposure=float(np.exp(log_exposure)))
+        return max(frames_needed(target, exposed) for target in targets)
 
     grid = np.log(np.geomspace(low, high, 25))
     values = np.array([needed(x) for x in grid])

@@ -9,9 +9,8 @@ import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.planning.frames import best_exposure, frames_needed, precision
-from pchem_pipeline.planning.point import Point
 from pchem_pipeline.planning.split import Split, best_samples, best_split, split_frames
-from pchem_pipeline.planning.targets import Target
+from pchem_pipeline.planning.targets import Point, Target
 from pchem_pipeline.planning.verify import frames_simulated
 
 #: Without so much knowledge of the gain, one Gaussian fits as well.
@@ -74,18 +73,12 @@ def plan_one_sample(
     max_exposure: float,
     max_frames: float,
 ) -> Plan:
-    """Return the plan of one sample.
+    """Return the plan of one sample, with the exposure of the point if it is given, else with the best one.
 
-    Args:
-        targets: what is wanted; may be empty with a budget.
-        point: the pixel; its exposure counts if it was given.
-        exposure_given: else the best exposure is taken.
-        budget: frames there are, or None.
-        max_exposure: largest exposure allowed, e-.
-        max_frames: more frames than these are as good as never.
+    With a budget of frames there may be no targets. Exposures above ``max_exposure``, e-, are not tried.
 
     Raises:
-        ConfigError: a target that no number of frames reaches.
+        ConfigError: a target that no number of frames up to ``max_frames`` reaches.
     """
     aims = tuple(targets) or (Target("conversion_gain", 1.0, "%"),)
     best, best_frames = _best(aims, point, max_exposure, max_frames)
@@ -145,24 +138,21 @@ def _hopeless(target: Target, point: Point, where: str, more: str) -> str:
 def _best(
     targets: Sequence[Target], point: Point, max_exposure: float, max_frames: float
 ) -> tuple[float, float]:
-    """Return the exposure at which simulated pixels reach the targets soonest, few flagged in any quantity.
-
-    Exposures are simulated in the order of their bounds, as long as these promise anything.
-    """
+    """Return exposure and frames with which simulated pixels reach the targets, few of them flagged."""
     low = min(0.02, 0.1 * max_exposure)
     first, fewest = best_exposure((*targets, _SEEN), point, low, max_exposure)
     if not np.isfinite(first):
         return first, fewest
     tried = [first, *np.geomspace(low, max_exposure, _TRIED).tolist()]
     points = [replace(point, quanta_exposure=h) for h in tried]
-    promises = [(max(frames_needed(target, there) for target in targets), there) for there in points]
+    bounds = [(max(frames_needed(target, each) for target in targets), each) for each in points]
     best, frames = first, float("inf")
-    for bound, there in sorted(promises, key=lambda each: each[0]):
-        if bound >= frames:
+    for bound, exposed in sorted(bounds, key=lambda each: each[0]):
+        if bound >= frames:  # nor can the next ones, of larger bounds, need fewer
             break
-        needed = _needed(targets, there, min(frames, max_frames), every_flag=True)
+        needed = _needed(targets, exposed, min(frames, max_frames), every_flag=True)
         if needed < frames:
-            best, frames = there.quanta_exposure, needed
+            best, frames = exposed.quanta_exposure, needed
     return best, frames
 
 
@@ -175,18 +165,12 @@ def plan_samples(
     max_exposure: float,
     max_frames: float,
 ) -> SamplesPlan:
-    """Return how to divide frames over several samples.
+    """Return how to divide frames over samples of given exposures, e-, or chosen ones up to ``max_exposure``.
 
-    Args:
-        targets: gain, bias or read noise.
-        exposures: H of the samples, e-; None to choose them.
-        point: read noise and gain of the pixel.
-        budget: frames in total, or None for as many as the targets need.
-        max_exposure: largest exposure to choose, e-.
-        max_frames: more frames than these are as good as never.
+    The frames in total are the budget, or as many as the targets (gain, bias or read noise) need.
 
     Raises:
-        ConfigError: a target that no number of frames reaches.
+        ConfigError: a target that no number of frames up to ``max_frames`` reaches.
     """
     aims = (*targets, _SEEN)
     if exposures is None:

@@ -15,8 +15,7 @@ import numpy as np
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.model.errors.expected_information import shared_information
-from pchem_pipeline.planning.point import Point
-from pchem_pipeline.planning.targets import Target
+from pchem_pipeline.planning.targets import Point, Target
 
 _STEPS = 4000
 _LEAST_SHARE = 0.01
@@ -38,12 +37,7 @@ class Split:
 
 
 def best_split(targets: Sequence[Target], exposures: Sequence[float], point: Point) -> Split:
-    """Return the shares with which samples of given exposures reach all targets with the fewest frames.
-
-    Args:
-        targets: gain, bias or read noise; all samples share them.
-        exposures: H of the samples, e-, each once; 0 for bias frames.
-        point: read noise and gain of the pixel.
+    """Return the shares with which samples of given exposures (e-) reach all targets with the fewest frames.
 
     Raises:
         ConfigError: an exposure is negative or given twice, or a target is of one sample only.
@@ -62,13 +56,7 @@ def split_frames(
 
 
 def best_samples(targets: Sequence[Target], point: Point, high: float) -> Split:
-    """Return the exposures, 0 among them where it helps, and shares that reach the targets soonest.
-
-    Args:
-        targets: gain, bias or read noise.
-        point: read noise and gain of the pixel.
-        high: largest exposure allowed, e-.
-    """
+    """Return exposures up to ``high`` (e-), 0 among them where it helps, that reach the targets soonest."""
     grid = [0.0, *np.geomspace(min(0.05, 0.1 * high), high, 40).tolist()]
     coarse = best_split(targets, grid, point)
     kept = _merged(coarse)
@@ -119,9 +107,9 @@ def _informations(exposures: Sequence[float], point: Point) -> FloatArray:
 
 
 def _wishes(targets: Sequence[Target], point: Point) -> tuple[FloatArray, FloatArray]:
-    there = replace(point, quanta_exposure=1.0)
-    gradients = np.stack([target.gradient(there)[1:] for target in targets])
-    return gradients, np.array([target.wanted(there) for target in targets])
+    exposed = replace(point, quanta_exposure=1.0)
+    gradients = np.stack([target.gradient(exposed)[1:] for target in targets])
+    return gradients, np.array([target.wanted(exposed) for target in targets])
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:

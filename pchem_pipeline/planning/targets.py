@@ -1,4 +1,4 @@
-"""What is wanted: a parameter and how well it shall be known."""
+"""A pixel, and what is wanted of it: a parameter and how well it shall be known."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.base.variables import CHARGE_RATES
-from pchem_pipeline.planning.point import Point
 
 #: Parameters that can be planned for, with the units in which a precision can be given.
 TARGET_NAMES: dict[str, tuple[str, ...]] = {
@@ -28,14 +28,42 @@ _EXAMPLE = {"%": "1%", "e-": "0.02e-", "DN": "0.2DN", "e-/DN": "0.001e-/DN"}
 
 
 @dataclass(frozen=True)
-class Target:
-    """A precision: one standard deviation of a parameter of one pixel.
+class Point:
+    """A pixel under one exposure.
 
     Attributes:
-        name: of :data:`TARGET_NAMES`.
-        value: the number, in its unit.
-        unit: ``%``, ``e-``, ``DN`` or ``e-/DN``.
+        quanta_exposure: H, e-.
+        read_noise_e: s_e, e-, quantisation included.
+        conversion_gain: g, e-/DN; matters for rounding and for units of DN only.
+
+    Raises:
+        ConfigError: a number is out of range, or the read noise is below that of rounding.
     """
+
+    quanta_exposure: float
+    read_noise_e: float
+    conversion_gain: float
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "--exposure": (self.quanta_exposure, 1e-6, 1e4, "e-"),
+            "--read-noise": (self.read_noise_e, 1e-3, 100.0, "e-"),
+            "--gain": (self.conversion_gain, 1e-6, 1e2, "e-/DN"),
+        }
+        for option, (value, low, high, unit) in ranges.items():
+            if not low <= value <= high:
+                raise ConfigError(f"{option} {value:g}: give a number from {low:g} to {high:g} {unit}")
+        rounding = self.conversion_gain * np.sqrt(QUANTISATION_VARIANCE)
+        if self.read_noise_e < rounding:
+            raise ConfigError(
+                f"--read-noise {self.read_noise_e:g}: below the rounding noise of {rounding:.3g} e- at "
+                f"{self.conversion_gain:g} e-/DN, which the read noise includes"
+            )
+
+
+@dataclass(frozen=True)
+class Target:
+    """A precision: one standard deviation of a parameter of one pixel, see :data:`TARGET_NAMES`."""
 
     name: str
     value: float
@@ -51,13 +79,10 @@ class Target:
         return self.name not in ("quanta_exposure", *CHARGE_RATES)
 
     def gradient(self, point: Point) -> FloatArray:
-        """Return the derivative of the parameter by the coordinates of the information, shape (4,).
-
-        Relative for all but the bias, which is in e-.
-        """
+        """Return the derivative by the coordinates of the information, (4,): relative, of the bias in e-."""
+        if not self.shared:
+            return np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0])
         return {
-            "quanta_exposure": np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0]),
-            **dict.fromkeys(CHARGE_RATES, np.array([1.0 / point.quanta_exposure, 0.0, 0.0, 0.0])),
             "conversion_gain": np.array([0.0, 1.0, 0.0, 0.0]),
             "bias": np.array([0.0, 0.0, 1.0, 0.0]),
             "read_noise_dn": np.array([0.0, 0.0, 0.0, 1.0]),

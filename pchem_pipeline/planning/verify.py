@@ -18,8 +18,7 @@ from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, flags_of
 from pchem_pipeline.model.law.drawn_histograms import draw_histograms
-from pchem_pipeline.planning.point import Point
-from pchem_pipeline.planning.targets import Target
+from pchem_pipeline.planning.targets import Point, Target
 
 _PIXELS = 200  # simulated for a number of frames; 5 % of them have a standard error of 1.5 %
 _FLAGGED = 0.05  # largest share of pixels without a value or flagged
@@ -31,10 +30,8 @@ class Check:
     """One target after the simulation; numbers are relative, of the bias in e-.
 
     Attributes:
-        target: what was wanted.
         wanted: standard deviation wanted.
         rmse: root mean square error of the pixels that are not flagged.
-        rmse_stderr: its standard error.
         robust_sd: 1.4826 times the median absolute error; a few pixels far off do not move it.
     """
 
@@ -52,14 +49,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Verification:
-    """Outcome of a simulation.
-
-    Attributes:
-        n_pixels: simulated pixels.
-        n_failed: of them without a value.
-        n_flagged: of them flagged in what was wanted.
-        checks: one a target.
-    """
+    """Outcome of a simulation: pixels, those without a value, those flagged in what was wanted, targets."""
 
     n_pixels: int
     n_failed: int
@@ -91,11 +81,8 @@ def frames_simulated(
         exposures: H of the samples, e-; 0 for bias frames.
         shares: of the frames that each has, adding up to 1.
         bound: frames by the Cramer-Rao bound; fewer are not tried.
-        most: frames beyond which it does not matter.
+        most: the result is infinite where so many are too few.
         every_flag: whether flags count that do not concern what is wanted.
-
-    Returns:
-        Frames; infinite where ``most`` are too few.
     """
 
     def reached(frames: float) -> bool:
@@ -139,14 +126,7 @@ def verify(
 ) -> Verification:
     """Simulate pixels whose biases differ by fractions of a DN, and fit all samples jointly.
 
-    Args:
-        targets: what was wanted.
-        point: the pixel; of several exposures its own does not matter.
-        exposures: H of the samples, e-; 0 for bias frames.
-        frames: of each sample, above 0.
-        n_pixels: pixels to simulate.
-        seed: of the random numbers.
-        every_flag: whether flags count that do not concern what was wanted.
+    Arguments are as in `frames_simulated`, with the frames of each sample, above 0.
     """
     rng = np.random.default_rng(seed)
     bias = 100.0 + rng.random(n_pixels)
@@ -164,10 +144,9 @@ def verify(
     truth = drawn[brightest].truth
     errors = found / truth - 1  # relative; of mu in e-
     errors[:, 2] = (found[:, 2] - truth[:, 2]) * truth[:, 1]
-    own = functools.reduce(operator.or_, (flags_of(target.name) for target in targets))
-    words = fit.fit_status
-    failed = (words & int(FAILED)) != 0
-    flagged = ~failed & ((words & int(FLAGGED if every_flag else own)) != 0)
+    flags = functools.reduce(operator.or_, (flags_of(target.name) for target in targets))
+    failed = (fit.fit_status & int(FAILED)) != 0
+    flagged = ~failed & ((fit.fit_status & int(FLAGGED if every_flag else flags)) != 0)
     good = errors[~failed & ~flagged]
     return Verification(
         n_pixels,

@@ -236,7 +236,7 @@ def sample_sensor(config: RunConfig, samples: Sequence[OpenSample]) -> SensorInf
         names=first.names,
         samples=tuple(_sample(config.input, i, each) for i, each in enumerate(samples)),
         shown=shown_sample(config.input),
-        camera=shared_facts(each.sensor.camera for each in samples)[0],
+        camera=shared_facts([each.sensor.camera for each in samples])[0],
         whole=first.whole,
     )
 

@@ -66,8 +66,7 @@ def plan_table(options: argparse.Namespace) -> None:
     """Print how the real fit does with the frames that a plan asks for."""
     from pchem_pipeline.base.errors import ConfigError
     from pchem_pipeline.planning.plan import plan_one_sample, plan_samples
-    from pchem_pipeline.planning.point import Point
-    from pchem_pipeline.planning.targets import parse_target
+    from pchem_pipeline.planning.targets import Point, parse_target
     from pchem_pipeline.planning.verify import verify
 
     target = parse_target("conversion_gain=1%")

@@ -38,8 +38,7 @@ class Layout:
 
     Attributes:
         offsets: byte offset of each frame, (frames,).
-        rows: rows of a frame.
-        columns: columns of a frame.
+        rows, columns: of a frame.
         stored: numpy type of a stored sample with its byte order.
         offset: what is added to signed samples, DN; sums must not be negative. None: they are unsigned.
         packing: how samples are packed, in frames of whole groups; None: they are not.
@@ -79,15 +78,9 @@ def unsigned_type(stored: np.dtype[Any]) -> np.dtype[Any]:
 def even_offsets(
     path: Path, n_frames: int, frame_bytes: int, size: int, *, start: int = 0, step: int | None = None
 ) -> IntArray:
-    """Return the byte offset of each of the frames that lie evenly in a file.
+    """Return the byte offsets of frames that lie evenly in a file of ``size`` bytes, the first at ``start``.
 
-    Args:
-        path: the file, for the message.
-        n_frames: their number, as the header says.
-        frame_bytes: bytes of a frame.
-        size: bytes of the file.
-        start: offset of the first frame.
-        step: bytes from one frame to the next; None: they follow each other.
+    From one frame to the next there are ``step`` bytes; None: they follow each other.
 
     Raises:
         InputError: they do not fit into the file. The numbers of a damaged header must not take memory.
@@ -95,9 +88,9 @@ def even_offsets(
     step = frame_bytes if step is None else step
     if n_frames and frame_bytes < 1:
         raise InputError(f"{path}: no frames; omit it")
-    if n_frames and start + step * (n_frames - 1) + frame_bytes > size:
-        whole = max(0, (size - start - frame_bytes) // step + 1)
-        raise _truncated(path, n_frames, start + step * (n_frames - 1) + frame_bytes, size, whole)
+    end = start + step * (n_frames - 1) + frame_bytes
+    if n_frames and end > size:
+        raise _truncated(path, n_frames, end, size, max(0, (size - start - frame_bytes) // step + 1))
     if n_frames > _MOST_FRAMES:
         raise InputError(
             f"{path}: {n_frames} frames, more than {_MOST_FRAMES}; correct the header or input.shape"
@@ -113,11 +106,7 @@ def _truncated(path: Path, n_frames: int, needed: int, size: int, whole: int) ->
 
 
 class OpenedFile:
-    """A file open for one call, checked to be the one that was inspected.
-
-    Raises:
-        InputError: the file vanished or its size changed.
-    """
+    """A file open for one call; refused if it vanished, or became shorter since it was inspected."""
 
     def __init__(self, path: Path, size: int) -> None:
         self._path = path
@@ -131,7 +120,7 @@ class OpenedFile:
             os.close(self._handle)
             raise changed(path, "the file was truncated")
 
-    def __enter__(self) -> OpenedFile:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *unused: object) -> None:
@@ -157,7 +146,7 @@ class OpenedFile:
 
 
 class ContiguousReader(FrameReader):
-    """A reader that needs nothing but a `Layout`; of files without one it decodes by `decode_into`."""
+    """A reader that needs nothing but a `Layout`; of files without one it decodes by `_decode_into`."""
 
     #: what a file is called that cannot be opened
     kind: ClassVar[str] = "file"
@@ -169,20 +158,16 @@ class ContiguousReader(FrameReader):
         """See `FrameReader.open`."""
         reader = cls()
         with sound(path, cls.kind):
-            reader.inspect(path, settings)
+            reader._inspect(path, settings)
         reader.notes += axes_notes(path, reader._full)
         return reader
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """Take from a file what `FrameReader.open` promises; any error becomes one line."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
+        """Take from a file all that a reader says of it; any error becomes one line."""
         raise NotImplementedError
 
     def set_layout(self, path: Path, layout: Layout, size: int) -> None:
-        """Take the layout; ``size`` is the size of the file.
-
-        Raises:
-            InputError: the file is shorter than the layout says.
-        """
+        """Take the layout; refuse a file whose ``size`` is less than the layout says."""
         if layout.end > size:
             whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= size))
             raise _truncated(path, layout.offsets.size, layout.end, size, whole)
@@ -200,17 +185,9 @@ class ContiguousReader(FrameReader):
         settings: InputSettings | None,
         what: str,
     ) -> None:
-        """Set the shape of the stack and the type of its samples.
+        """Set the stack's shape and type from those of the stored array; refuse what cannot be frames.
 
-        Args:
-            path: the file.
-            full: shape as the file states it.
-            stored: type of the samples in the file.
-            settings: the section ``input``; None: the file says itself what its signed samples mean.
-            what: the array, for the message.
-
-        Raises:
-            InputError: these are no frames, see :mod:`.kinds`.
+        Without settings, the file says itself what its signed samples mean. Messages call the array ``what``.
         """
         self._offset = None if settings is None else check_samples(path, stored, settings)
         self.paths, self.shape = (path,), stack_shape(path, full, what)
@@ -229,7 +206,7 @@ class ContiguousReader(FrameReader):
         layout, path = self.layout, self.paths[0]
         if layout is None:
             try:
-                self.decode_into(buffer, t0, t1, y0, y1)
+                self._decode_into(buffer, t0, t1, y0, y1)
             except FileNotFoundError as error:
                 raise changed(path, "the file disappeared") from error
             except InputError:
@@ -265,7 +242,7 @@ class ContiguousReader(FrameReader):
     def put_right(self, buffer: NDArray[Any], t0: int, y0: int) -> None:
         """Put samples right that are not where the layout says, in frames from t0 and rows from y0 on."""
 
-    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
+    def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         """Fill the buffer from a file without a layout, with samples as they are stored."""
         raise NotImplementedError
 
@@ -278,13 +255,9 @@ def _runs(offsets: IntArray, frame_bytes: int) -> list[tuple[int, int]]:
 
 
 def unstore(buffer: NDArray[Any], stored: np.dtype[Any], offset: int | None, path: Path) -> None:
-    """Turn stored bytes into native unsigned samples, in place.
+    """Turn stored bytes in a buffer of unsigned samples into these, in place.
 
-    Args:
-        buffer: unsigned native type of the size of ``stored``, holding the bytes of the file.
-        stored: type in the file, with its byte order; floats hold whole numbers.
-        offset: what is added to signed samples, 0 to 2**(bits - 1); None: they are unsigned.
-        path: the file, for the message.
+    Floats hold whole numbers; an offset, 0 to 2**(bits - 1), is added to signed samples; None: unsigned.
 
     Raises:
         InputError: a sample is negative, with the offset, or no whole number.

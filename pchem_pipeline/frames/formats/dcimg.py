@@ -59,8 +59,7 @@ class DcimgReader(ContiguousReader):
     magic: ClassVar[tuple[bytes, ...]] = (_MAGIC,)
     _apart: _Apart | None = None
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         size = path.stat().st_size
         with path.open("rb") as stream:
             head = stream.read(_FILE.size)
@@ -121,9 +120,8 @@ class DcimgReader(ContiguousReader):
         with OpenedFile(self.paths[0], self._size) as file:
             for line, start in zip(numbers, starts, strict=True):
                 file.read_into(line.data.cast("B"), start)
-            apart = file.read_bytes(
-                starts[0] + _STAMP, len(_MARKER) if n_bytes == 32 or n_bytes >= 512 else 0
-            )
+            n_apart = len(_MARKER) if n_bytes == 32 or n_bytes >= 512 else 0
+            apart = file.read_bytes(starts[0] + _STAMP, n_apart)
         self._take_stamps(numbers[:, 0], numbers[:, 1:])
         row = self._marked_row() if apart else None
         if row is not None:
@@ -151,11 +149,7 @@ class DcimgReader(ContiguousReader):
         return marked[0] if len(marked) == 1 else None
 
     def _set_apart(self, start: int, step: int, n_bytes: int, row: int, column: int) -> None:
-        """Set which samples are stored apart.
-
-        Raises:
-            InputError: they lie outside of the file, or belong outside of the frames.
-        """
+        """Set which samples are stored apart; refuse those outside of the file, or for none of its rows."""
         n, rows, columns = self.shape
         end = column + n_bytes // self.dtype.itemsize
         if row >= rows or end > columns or n_bytes % self.dtype.itemsize:

@@ -85,19 +85,16 @@ class FitsReader(ContiguousReader):
     suffixes: ClassVar[tuple[str, ...]] = (".fits", ".fit", ".fts", ".fz")
     magic: ClassVar[tuple[bytes, ...]] = (b"SIMPLE  =",)
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         require("astropy.io.fits", "fits", "FITS files")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # truncation and sloppy headers are reported below
-            with path.open("rb") as stream:
-                check_unpacked(path, stream.read(8))
-            self._inspect(path, path.stat().st_size, settings)
-
-    def _inspect(self, path: Path, size: int, settings: InputSettings) -> None:
         from astropy.io import fits
 
-        with fits.open(path, memmap=False, do_not_scale_image_data=True, lazy_load_hdus=True) as hdus:
+        size = path.stat().st_size
+        with path.open("rb") as stream:
+            check_unpacked(path, stream.read(8))
+        options = {"memmap": False, "do_not_scale_image_data": True, "lazy_load_hdus": True}
+        # truncation and sloppy headers are reported below
+        with warnings.catch_warnings(action="ignore"), fits.open(path, **options) as hdus:
             self._numbers = _images(path, hdus, settings)
             hdu, several = hdus[self._numbers[0]], len(self._numbers) > 1
             header, primary = hdu.header, hdus[0].header
@@ -153,8 +150,7 @@ class FitsReader(ContiguousReader):
         """See `FrameReader.cards`."""
         from astropy.io import fits
 
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # as above
+        with warnings.catch_warnings(action="ignore"):  # as above
             with fits.open(self.paths[0], memmap=False, lazy_load_hdus=True) as hdus:
                 header = hdus[self._numbers[0]].header.copy(strip=True)
                 if self._numbers[0]:
@@ -164,8 +160,7 @@ class FitsReader(ContiguousReader):
             header.remove(name, ignore_missing=True)
         return tuple(header.cards)
 
-    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
-        """See `ContiguousReader.decode_into`."""
+    def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         from astropy.io import fits
 
         path = self.paths[0]
@@ -184,13 +179,9 @@ def _images(path: Path, hdus: Any, settings: InputSettings) -> list[int]:
     """Return the number of the only image of the file, or those of extensions with a frame each."""
     from astropy.io import fits
 
-    images = []
-    for number, hdu in enumerate(hdus):
-        if (
-            isinstance(hdu, fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU)
-            and hdu.header.get("NAXIS", 0) >= 2
-        ):
-            images.append((number, hdu))
+    kind = fits.PrimaryHDU | fits.ImageHDU | fits.CompImageHDU
+    numbered = ((n, hdu) for n, hdu in enumerate(hdus) if isinstance(hdu, kind))
+    images = [(n, hdu) for n, hdu in numbered if hdu.header.get("NAXIS", 0) >= 2]
     if not images:
         raise InputError(f"{path}: no image; omit it")
     if settings.dataset is not None:
@@ -198,7 +189,7 @@ def _images(path: Path, hdus: Any, settings: InputSettings) -> list[int]:
         images = [(n, hdu) for n, hdu in images if wanted in (str(n), hdu.name)]
     kinds = [_kind(hdu) for _, hdu in images]
     differing = [name for name in _ALIKE if len({kind[name] for kind in kinds}) > 1]
-    single = all(number and hdu.header["NAXIS"] == 2 for number, hdu in images)
+    single = all(n and hdu.header["NAXIS"] == 2 for n, hdu in images)
     if not images or (len(images) > 1 and (differing or not single)):
         names = ", ".join(f"{n} ({hdu.name or 'unnamed'})" for n, hdu in images[:12]) or "none"
         names += f" and {len(images) - 12} more" if len(images) > 12 else ""
@@ -207,7 +198,7 @@ def _images(path: Path, hdus: Any, settings: InputSettings) -> list[int]:
             f"{path}: images in the file{' with this name' * (settings.dataset is not None)}: {names}; "
             "choose one by its number in input.dataset (--dataset), or write the frames as one cube"
         )
-    return [number for number, _ in images]
+    return [n for n, _ in images]
 
 
 def _kind(hdu: Any) -> dict[str, str]:
@@ -237,17 +228,9 @@ def _value_notes(path: Path, header: Any, frames: int, *, several: bool) -> tupl
 
 
 def _coding_notes(path: Path, numbers: Sequence[int], piece: int, *, biased: bool) -> tuple[str, ...]:
-    """Say where compression lost information.
+    """Say where compression lost information in images of tiles of ``piece`` bytes, ``biased`` by BZERO.
 
-    Args:
-        path: the file.
-        numbers: of the images in it.
-        piece: bytes of a tile.
-        biased: unsigned by BZERO.
-
-    Raises:
-        InputError: unsigned samples in PLIO, of which the library does not take back the shift;
-            or a tile that holds more than its shape says.
+    Refuse biased samples in PLIO, of which the library does not undo the shift, and oversized tiles.
     """
     from astropy.io import fits
 

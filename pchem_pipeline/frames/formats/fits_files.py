@@ -45,13 +45,9 @@ _WCS = re.compile(
 
 
 class FitsImage(NamedTuple):
-    """An image of a FITS file.
+    """An image of a FITS file: blocks of planes, the shape of all together, their type, and further cards.
 
-    Attributes:
-        blocks: of its planes, in order; none: the image is a header alone.
-        shape: of the whole; empty: without samples.
-        dtype: floating point, whole numbers or bool.
-        cards: further ones: those of astropy, or (keyword, value) or (keyword, value, comment).
+    Of a header alone, blocks and shape are empty. Cards are those of astropy, or tuples that make one.
     """
 
     blocks: Iterable[NDArray[Any]]
@@ -82,15 +78,9 @@ def camera_cards(camera: CameraFacts, integration_time: float | None) -> list[tu
 def input_cards(
     frames: FrameSequence, readers: Sequence[FrameReader], camera: CameraFacts, time: float | None
 ) -> list[Any]:
-    """Return the cards that all of some input files have alike, for the region, and what is known beside.
+    """Return the cards that all input files have alike, for the region of interest, and those of the camera.
 
-    World coordinates are there if all their cards are alike.
-
-    Args:
-        frames: that were calibrated.
-        readers: of the input files.
-        camera: of them.
-        time: their integration time, s; None: not known.
+    World coordinates are kept if all their cards are alike. The integration time is in s; None: not known.
     """
     from astropy.io import fits
 
@@ -121,8 +111,8 @@ def write_images(path: Path, images: Sequence[FitsImage]) -> None:
     require("astropy.io.fits", "fits", "FITS files")
     from astropy.io import fits
 
-    with whole_file(path) as part, part.open("wb") as stream, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # cards of cameras may have to be mended
+    quiet = warnings.catch_warnings(action="ignore")  # cards of cameras may have to be mended
+    with whole_file(path) as part, part.open("wb") as stream, quiet:
         for number, (blocks, shape, dtype, cards) in enumerate(images):
             bits = 8 * dtype.itemsize
             zero = UNSIGNED_ZERO.get(bits, 0) if dtype.kind == "u" else 0

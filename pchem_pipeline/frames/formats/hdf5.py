@@ -72,12 +72,11 @@ class Hdf5Reader(ContiguousReader):
     suffixes: ClassVar[tuple[str, ...]] = (".h5", ".hdf5", ".hdf", ".nxs", ".nx5")
     magic: ClassVar[tuple[bytes, ...]] = (b"\x89HDF\r\n\x1a\n", b"MATLAB 7.3 MAT-file")
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         _require()
         try:
             with _LOCK, opened(path) as file:
-                self._inspect(path, file, settings)
+                self._inspect_file(path, file, settings)
         except OSError as error:
             words = "is open for writing or was not closed; wait for the writing program"
             if "already open for write" in str(error):
@@ -86,7 +85,7 @@ class Hdf5Reader(ContiguousReader):
                 raise InputError(f"{path}: {words}") from error
             raise
 
-    def _inspect(self, path: Path, file: Any, settings: InputSettings) -> None:
+    def _inspect_file(self, path: Path, file: Any, settings: InputSettings) -> None:
         import h5py
 
         found: dict[str, tuple[int, ...]] = {}
@@ -116,24 +115,23 @@ class Hdf5Reader(ContiguousReader):
         if dataset.is_virtual:
             held = sum(part.stat().st_size for part in virtual_files(path, dataset))
             check_coded(path, self.shape, self.shape[1:], self.dtype.itemsize, size + held)
-        self.notes = check_sources(path, dataset) + _reversed_axes(path, dataset)
+        self.notes = check_sources(path, dataset)
+        if "MATLAB_class" in dataset.attrs:  # it writes axes in reverse order
+            self.notes += (f"{path.name}: written by MATLAB: last axis read as frames, columns as rows",)
         if dataset.chunks is not None:
             check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
             _check_chunks(path, dataset)
         missing = _missing_chunks(path, dataset)
-        self.notes += missing
-        self.unwritten = bool(missing)
+        self.notes, self.unwritten = self.notes + missing, bool(missing)
         offsets = _plain_offsets(path, file, dataset, self.shape)
         if offsets is not None:
-            layout = Layout(offsets, *self.shape[1:], dataset.dtype, self._offset)
-            self.set_layout(path, layout, size)
+            self.set_layout(path, Layout(offsets, *self.shape[1:], dataset.dtype, self._offset), size)
         elif dataset.chunks is not None:
             self.rows_per_read = min(self.shape[1], int(dataset.chunks[-2]))
-        parent = dataset.parent
-        self.take_facts(_stated_facts(dataset, [parent, *(detectors if len(detectors) == 1 else [])]))
+        groups = [dataset.parent, *(detectors if len(detectors) == 1 else [])]
+        self.take_facts(_stated_facts(dataset, groups))
 
-    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
-        """See `ContiguousReader.decode_into`."""
+    def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         with _LOCK, opened(self.paths[0]) as file:
             dataset = file[self._name]
             if tuple(dataset.shape) != self._full:
@@ -153,11 +151,7 @@ def _chunks_of(dataset: Any) -> list[Any]:
 
 
 def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
-    """Say how many chunks of a dataset were never written; the library reads them as the fill value.
-
-    Raises:
-        InputError: none was written, or the file has no place for them at all.
-    """
+    """Say how many chunks of a dataset were never written; refuse one without any."""
     if dataset.chunks is None:
         plain = not (dataset.is_virtual or dataset.external) and dataset.id.get_storage_size() == 0
         return unwritten_notes(path, int(plain and dataset.size > 0), 1, "datasets")
@@ -169,9 +163,6 @@ def _check_chunks(path: Path, dataset: Any) -> None:
     """Refuse chunks that are not what their shape says, or were compressed twice.
 
     Beyond plain chunks that are too short the library reads on, and crashes.
-
-    Raises:
-        InputError: there is one.
     """
     record = dataset.id.get_create_plist()
     filters = [record.get_filter(number) for number in range(record.get_nfilters())]
@@ -203,8 +194,7 @@ def _plain_offsets(path: Path, file: Any, dataset: Any, shape: tuple[int, int, i
     if file.userblock_size or not plain_type or not dataset.size:
         return None
     if dataset.chunks is None:  # None where it lies elsewhere, is virtual, or was never written
-        start = dataset.id.get_offset()
-        size = path.stat().st_size
+        start, size = dataset.id.get_offset(), path.stat().st_size
         return None if start is None else even_offsets(path, n_frames, frame_bytes, size, start=start)
     filters = dataset.id.get_create_plist().get_nfilters()
     whole = dataset.ndim == 3 and dataset.chunks[1:] == dataset.shape[1:]
@@ -213,8 +203,7 @@ def _plain_offsets(path: Path, file: Any, dataset: Any, shape: tuple[int, int, i
     starts = np.full(-(-n_frames // dataset.chunks[0]), -1, np.int64)
     for chunk in _chunks_of(dataset):
         starts[chunk.chunk_offset[0] // dataset.chunks[0]] = chunk.byte_offset
-    frame = np.arange(n_frames, dtype=np.int64)
-    number, inside = np.divmod(frame, dataset.chunks[0])
+    number, inside = np.divmod(np.arange(n_frames, dtype=np.int64), dataset.chunks[0])
     offsets: IntArray = starts[number] + frame_bytes * inside
     return None if (starts < 0).any() else offsets
 
@@ -247,11 +236,9 @@ def _is_detector(group: Any) -> bool:
 
 
 def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
-    """Return what the attributes of the dataset say, else the values beside it (count_time in NeXus).
+    """Return what the attributes of the dataset say, else values (count_time in NeXus) in some groups.
 
-    Args:
-        dataset: the frames.
-        groups: the group of the dataset, and the detector where the frames are in NXdata by a link.
+    These are that of the dataset, and the detector where the frames are in NXdata by a link.
     """
     values = {name: np.ravel(value)[0] for name, value in dataset.attrs.items() if np.size(value) == 1}
     beside: dict[str, Any] = {}
@@ -266,10 +253,3 @@ def _stated_facts(dataset: Any, groups: list[Any]) -> StatedFacts:
                 beside[name] = np.ravel(other[()])[0]
                 units[name] = other.attrs.get("units", other.attrs.get("unit"))
     return facts_from_names({**beside, **values}, units)
-
-
-def _reversed_axes(path: Path, dataset: Any) -> tuple[str, ...]:
-    """Say how the axes of an array of MATLAB are read, which writes them in reverse order."""
-    if "MATLAB_class" not in dataset.attrs or dataset.ndim < 2:
-        return ()
-    return (f"{path.name}: written by MATLAB: last axis read as frames, columns as rows",)

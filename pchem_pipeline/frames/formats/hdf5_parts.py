@@ -42,11 +42,7 @@ def external_links(path: Path, file: Any) -> dict[str, str]:
 
 
 def check_links(path: Path, links: dict[str, str], wanted: str | None) -> None:
-    """Refuse what lies in another file (a Dectris master file, say).
-
-    Raises:
-        InputError: the wanted dataset is a link, or (none is wanted) there are links.
-    """
+    """Refuse a wanted dataset that lies in another file (a Dectris master file, say); None: any link."""
     asked = {name: links[name] for name in links if wanted is None or name == wanted.strip("/")}
     if asked:
         shown = ", ".join(f"{name} in {file}" for name, file in list(asked.items())[:4])
@@ -58,14 +54,7 @@ def check_links(path: Path, links: dict[str, str], wanted: str | None) -> None:
 
 
 def check_sources(path: Path, dataset: Any) -> tuple[str, ...]:
-    """Check that the files which hold the samples of a dataset are there and long enough.
-
-    Args:
-        path: the file of the dataset.
-        dataset: of h5py.
-
-    Returns:
-        A remark for the user where there are such files.
+    """Check that the files which hold the samples of a dataset exist and are long enough; return a remark.
 
     Raises:
         InputError: one of them is missing, shorter than the dataset says, or not beside or below its file.
@@ -125,10 +114,7 @@ def source_file(path: Path, other: Path) -> Path:
 def check_virtual(path: Path, dataset: Any, above: tuple[tuple[Path, str], ...] = ()) -> list[Any]:
     """Check where the parts of a virtual dataset are, before the library looks for them; return them.
 
-    Args:
-        path: the file of the dataset.
-        dataset: of h5py.
-        above: files and names of the virtual datasets that take this one as a part.
+    The datasets ``above`` have this one as a part.
 
     Raises:
         InputError: a part is the dataset itself, or not beside or below the file; or they are too many.
@@ -158,7 +144,7 @@ def check_virtual(path: Path, dataset: Any, above: tuple[tuple[Path, str], ...] 
 
 
 def virtual_files(path: Path, dataset: Any) -> list[Path]:
-    """Return the files that the parts of a virtual dataset are in, as far as they are there."""
+    """Return the existing files that the parts of a virtual dataset are in."""
     files: set[Path] = set()
     for name in {source.file_name for source in dataset.virtual_sources()} - {"."}:
         other = path.parent / name
@@ -195,10 +181,8 @@ def opened(path: Path) -> Any:
 
     try:
         return h5py.File(path, "r")
-    except BlockingIOError:
-        raise
     except OSError as error:
-        if "unable to lock file" not in str(error):
+        if isinstance(error, BlockingIOError) or "unable to lock file" not in str(error):
             raise
         return h5py.File(path, "r", locking=False)
 
@@ -234,11 +218,7 @@ def _fits(part: Any, source: Any) -> bool:
 
 
 def check_filters(path: Path, dataset: Any) -> None:
-    """Check that the filters by which a dataset is coded are installed, unless they were not applied.
-
-    Raises:
-        InputError: one is not.
-    """
+    """Refuse a dataset that is coded by a filter which is not installed."""
     from h5py import h5z
 
     record = dataset.id.get_create_plist()

@@ -39,15 +39,7 @@ _COMPRESSING = {*_SIZES, *_DECODERS, "zstd"}
 
 
 def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> int | None:
-    """Check that samples can be digital numbers: unsigned, or signed as the settings say.
-
-    Args:
-        path: the file, for the message.
-        dtype: type of the stored samples.
-        settings: the section ``input``; its ``dtype`` names the unsigned type that is meant.
-
-    Returns:
-        What is to be added to signed samples, DN; None for unsigned ones.
+    """Return what is to be added to signed samples, DN; None for unsigned ones. Refuse all others.
 
     Raises:
         InputError: float, complex, boolean, object, 64-bit or undeclared signed samples, or ``input.dtype``
@@ -85,7 +77,7 @@ def check_samples(path: Path, dtype: np.dtype[Any], settings: InputSettings) -> 
     raise InputError(f"{path}: samples of type {dtype.name}; uint8, uint16 or uint32 are needed")
 
 
-def stack_shape(path: Path, shape: Sequence[int], what: str = "array") -> tuple[int, int, int]:
+def stack_shape(path: Path, shape: Sequence[int], what: str) -> tuple[int, int, int]:
     """Return (frames, rows, columns) of an array; the axes before rows and columns are counted in turn.
 
     Raises:
@@ -126,14 +118,7 @@ def mosaic_note(path: Path, pattern: str) -> str:
 def check_coded(
     path: Path, shape: tuple[int, int, int], piece: Sequence[int], itemsize: int, size: int
 ) -> None:
-    """Check that coded frames can be what their header says, before memory is taken for them.
-
-    Args:
-        path: the file, for the message.
-        shape: (frames, rows, columns).
-        piece: shape of a chunk, tile or strip, which is decoded at once.
-        itemsize: bytes of a sample.
-        size: bytes of the file or folder.
+    """Check that frames coded in pieces of a shape can be in ``size`` bytes, before memory is taken for them.
 
     Raises:
         InputError: the frames are too many for so few bytes, or a piece is far larger than they all.
@@ -151,13 +136,9 @@ def check_coded(
 
 
 def check_unpacked_size(path: Path, pieces: Iterable[bytes], expected: int, codecs: Sequence[str]) -> None:
-    """Check that coded pieces hold no more than their shape says, before the library unpacks them whole.
+    """Check that coded pieces hold no more than the expected bytes, before the library unpacks them whole.
 
-    Args:
-        path: the file, for the message.
-        pieces: coded bytes.
-        expected: bytes of a piece by shape and type.
-        codecs: names of those in use; those that do not compress are passed over.
+    Of the codecs in use those that do not compress are ignored.
 
     Raises:
         InputError: one holds more, or is compressed twice.
@@ -204,7 +185,7 @@ def _unpacked_size(data: bytes, codec: str, most: int) -> int:
         try:
             found += len(unpack.decompress(data, most + 1 - found))
         except (zlib.error, lzma.LZMAError, OSError):
-            break  # it is told where the frames are read
+            break  # reading the frames will say so
         data = unpack.unused_data
     return found
 
@@ -212,13 +193,9 @@ def _unpacked_size(data: bytes, codec: str, most: int) -> int:
 def windows(
     buffer: NDArray[Any], full: tuple[int, ...], t0: int, y0: int
 ) -> Iterator[tuple[NDArray[Any], tuple[slice, ...]]]:
-    """Yield the parts of a buffer, shaped like parts of an array, with the indices of these.
+    """Yield the parts of a buffer (frame, y, x), shaped like parts of an array, with the indices of these.
 
-    Args:
-        buffer: (frame, y, x), C-contiguous.
-        full: shape of the array, of which the axes before the last two are counted in turn.
-        t0: first frame.
-        y0: first row.
+    The axes of the array before its last two are counted in turn: together they are the frames.
     """
     n, rows, columns = buffer.shape
     axes = full[:-2] or (1,)
@@ -238,11 +215,6 @@ def windows(
 def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: str | None) -> str:
     """Return the dataset to read: the wanted one, else the only one of three axes or more, else of two.
 
-    Args:
-        path: the file, for the message.
-        shapes: shape of every dataset in the file, by its path inside.
-        wanted: ``input.dataset``.
-
     Raises:
         InputError: not there, or not the only one; the message lists the candidates.
     """
@@ -258,9 +230,9 @@ def choose_dataset(path: Path, shapes: Mapping[str, tuple[int, ...]], wanted: st
         raise InputError(
             f"{path}: no dataset {wanted!r}, only: {listed or 'no images'}; correct input.dataset (--dataset)"
         )
-    if not stacks and not images:
-        raise InputError(f"{path}: no dataset of frames (frames, rows, columns); omit it")
     candidates = stacks or images
+    if not candidates:
+        raise InputError(f"{path}: no dataset of frames (frames, rows, columns); omit it")
     if len(candidates) > 1:
         raise InputError(f"{path}: several datasets: {listed}; choose one with input.dataset (--dataset)")
     return candidates[0]

@@ -24,14 +24,7 @@ _LARGEST_TIFF = 1 << 32
 
 @dataclass(frozen=True)
 class MapImage:
-    """A map and what it is.
-
-    Attributes:
-        name: as in the store.
-        values: (y, x).
-        unit: physical unit; ``"1"`` where there is none.
-        long_name: one sentence.
-    """
+    """A map (y, x), its name in the store, its unit (``"1"`` where there is none), and what it is."""
 
     name: str
     values: NDArray[Any]
@@ -40,15 +33,9 @@ class MapImage:
 
 
 def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) -> list[Path]:
-    """Write one FITS file with an image extension for each map.
+    """Write one FITS file with an image extension for each map, and return it.
 
-    Args:
-        path: the file.
-        maps: the maps; floating point and integers stay as they are.
-        header: keywords of the primary header (at most 8 characters each); None is left out.
-
-    Returns:
-        The file written.
+    The header gives keywords of the primary header (at most 8 characters each); None is left out.
 
     Raises:
         StoreError: the folder cannot be written.
@@ -64,15 +51,7 @@ def write_fits(path: Path, maps: Sequence[MapImage], header: Mapping[str, Any]) 
 
 
 def write_tiff(folder: Path, maps: Sequence[MapImage], suffix: str = ".tif") -> list[Path]:
-    """Write one TIFF file for each map: float32 for parameters, integers as they are.
-
-    Args:
-        folder: where to write ``<name>.tif``.
-        maps: the maps.
-        suffix: of the files.
-
-    Returns:
-        The files written.
+    """Write a TIFF file ``<name>.tif`` for each map, float32 or integers, and return the files.
 
     Raises:
         StoreError: the folder cannot be written.
@@ -110,12 +89,8 @@ def write_tiff_cube(
 ) -> None:
     """Write a page for each image: an ImageJ stack, or BigTIFF where that is too small.
 
-    Args:
-        path: the file.
-        blocks: arrays (any number of images, rows, columns), in order.
-        shape: (images, rows, columns) of all together.
-        dtype: type of the samples.
-        about: what the images are, as JSON data.
+    Blocks (any number of images, rows, columns) make up the shape (images, rows, columns); ``about`` says
+    what the images are, as JSON data.
 
     Raises:
         StoreError: the folder cannot be written.
@@ -138,13 +113,7 @@ def write_tiff_cube(
 
 
 def read_image(path: Path) -> FloatArray:
-    """Return an image, or a stack of images, from npy, TIFF or FITS.
-
-    Args:
-        path: the file.
-
-    Returns:
-        Shape (y, x) or (image, y, x).
+    """Return an image (y, x), or a stack of images (image, y, x), from npy, TIFF or FITS.
 
     Raises:
         InputError: there is no such file, or it is no image.

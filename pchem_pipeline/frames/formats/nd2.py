@@ -28,18 +28,16 @@ class Nd2Reader(ContiguousReader):
     suffixes: ClassVar[tuple[str, ...]] = (".nd2",)
     magic: ClassVar[tuple[bytes, ...]] = (b"\xda\xce\xbe\x0a", b"\0\0\0\x0cjP  ")
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         require("nd2", "nd2", "ND2 files")
         import nd2
 
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of metadata that are not used here
-            with nd2.ND2File(path) as file:
-                if file.is_legacy:
-                    raise InputError(f"{path}: ND2 of the old kind (JPEG 2000); export it as TIFF")
-                about, axes, dtype = file.attributes, dict(file.sizes), np.dtype(file.dtype)
-                words = file.text_info.get("capturing", "")
+        # the warnings are of metadata that are not used here
+        with warnings.catch_warnings(action="ignore"), nd2.ND2File(path) as file:
+            if file.is_legacy:
+                raise InputError(f"{path}: ND2 of the old kind (JPEG 2000); export it as TIFF")
+            about, axes, dtype = file.attributes, dict(file.sizes), np.dtype(file.dtype)
+            words = file.text_info.get("capturing", "")
         if about.componentCount != 1:
             raise InputError(
                 f"{path}: {about.componentCount} channels or colours; export one channel as TIFF"
@@ -62,8 +60,7 @@ class Nd2Reader(ContiguousReader):
         if others := [axis for axis in axes if axis not in "TYX"]:
             self.notes += (f"{path.name}: its frames differ in {', '.join(others)}; read in turn",)
 
-    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
-        """See `ContiguousReader.decode_into`."""
+    def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         import nd2
 
         path = self.paths[0]

@@ -25,8 +25,7 @@ class NpyReader(ContiguousReader):
     suffixes: ClassVar[tuple[str, ...]] = (".npy",)
     magic: ClassVar[tuple[bytes, ...]] = (b"\x93NUMPY",)
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         with path.open("rb") as stream:
             version = npy_format.read_magic(stream)
             old = version == (1, 0)

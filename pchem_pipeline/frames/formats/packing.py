@@ -22,13 +22,7 @@ class _Place(NamedTuple):
 
 
 class Packing(NamedTuple):
-    """How samples are packed, in groups of whole bytes.
-
-    Attributes:
-        bits: of a sample.
-        n_bytes: of a group.
-        places: of the samples of a group, in order.
-    """
+    """How samples of so many bits are packed in groups of whole bytes, and their places in a group."""
 
     bits: int
     n_bytes: int

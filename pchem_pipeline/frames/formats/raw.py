@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -38,7 +38,7 @@ _NAMES_IN_INF = {
     "gain": "EMCCD Gain",
     "binning": "binning",
 }
-#: what is said of samples that are not packed
+#: keys that only samples without packing have
 _UNPACKED = ("dtype", "offset", "byte_order")
 #: factor between the steps of samples from frame to frame by which another packing is told
 _CLEARLY = 4
@@ -74,29 +74,22 @@ def _read_sidecar(path: Path) -> _Sidecar:
     found = find_sidecar(path)
     if found is None:
         return _Sidecar()
+    import yaml
+
     try:
         text = found.read_text(encoding="utf-8")
-        if found.suffix == ".json":
-            content = json.loads(text)
-        elif found.suffix == ".inf":
-            content = _from_inf(text)
-        else:
-            import yaml
-
-            try:
-                content = yaml.safe_load(text)
-            except yaml.YAMLError as error:
-                raise ValueError("not valid YAML") from error
-        return _Sidecar.model_validate(content)
+        readers: dict[str, Callable[[str], Any]] = {".json": json.loads, ".inf": _from_inf}
+        return _Sidecar.model_validate(readers.get(found.suffix, yaml.safe_load)(text))
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise InputError(
             f"{path}: sidecar {found.name}: {where}: {first['msg']}; correct the sidecar"
         ) from error
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        words = "not valid YAML" if isinstance(error, yaml.YAMLError) else error
         raise InputError(
-            f"{path}: sidecar {found.name} cannot be read ({error}); correct the sidecar"
+            f"{path}: sidecar {found.name} cannot be read ({words}); correct the sidecar"
         ) from error
 
 
@@ -120,8 +113,7 @@ class RawReader(ContiguousReader):
     kind = "raw file"
     suffixes: ClassVar[tuple[str, ...]] = (".raw", ".bin", ".dat", ".dax")
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         side = _read_sidecar(path)
         facts = {name: getattr(settings, name, None) for name in _Sidecar.model_fields}
         facts = {name: getattr(side, name) if value is None else value for name, value in facts.items()}
@@ -202,11 +194,7 @@ class RawReader(ContiguousReader):
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:
     """Write frames as bytes, with a sidecar ``<path>.json``; see `frames.writing.write_frames`."""
     write_plain(path, b"", blocks, stack.dtype.newbyteorder("<"))
-    record = {
-        "shape": list(stack.shape),
-        "dtype": stack.dtype.name,
-        "byte_order": "little",
-        "header_bytes": 0,
-    }
+    record: dict[str, Any] = {"shape": stack.shape, "dtype": stack.dtype.name}
+    record |= {"byte_order": "little", "header_bytes": 0, **stack.stated}
     with whole_file(path.with_name(path.name + ".json")) as part:
-        part.write_text(json.dumps(record | stack.stated) + "\n", encoding="utf-8")
+        part.write_text(json.dumps(record) + "\n", encoding="utf-8")

@@ -40,8 +40,7 @@ class SerReader(ContiguousReader):
     suffixes: ClassVar[tuple[str, ...]] = (".ser",)
     magic: ClassVar[tuple[bytes, ...]] = (_MAGIC,)
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         with path.open("rb") as stream:
             head, size = stream.read(_HEADER.size), path.stat().st_size
         if len(head) < _HEADER.size or not head.startswith(_MAGIC):
@@ -62,8 +61,10 @@ class SerReader(ContiguousReader):
         offsets = even_offsets(path, n, rows * columns * stored.itemsize, size, start=_HEADER.size)
         self.set_layout(path, Layout(offsets, rows, columns, stored), size)
         self.bit_depth, self.byte_order = depth, order
+        taken = (ticks - _EPOCH) * 1e-7 if ticks > _EPOCH else None
         self._read_times()
-        taken = _seconds(ticks) if self.timestamps is None else float(self.timestamps[0])
+        if self.timestamps is not None:
+            taken = float(self.timestamps[0])
         self.camera = CameraFacts(text_of(instrument), taken=taken)
 
     def _read_times(self) -> None:
@@ -75,11 +76,6 @@ class SerReader(ContiguousReader):
         ticks = np.fromfile(self.paths[0], "<i8", n, offset=end)
         if (ticks > 0).all():
             self.timestamps = (ticks - _EPOCH) * 1e-7
-
-
-def _seconds(ticks: int) -> float | None:
-    """Return the header's time as s since 1970; None where it is empty."""
-    return (ticks - _EPOCH) * 1e-7 if ticks > _EPOCH else None
 
 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:

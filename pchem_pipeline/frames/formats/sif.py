@@ -42,8 +42,7 @@ class SifReader(ContiguousReader):
     suffixes: ClassVar[tuple[str, ...]] = (".sif",)
     magic: ClassVar[tuple[bytes, ...]] = (b"Andor Technology Multi-Channel File\n",)
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         require("sif_parser", "sif", "SIF files")
         import sif_parser
 

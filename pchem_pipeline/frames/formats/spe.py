@@ -8,7 +8,6 @@ Specification".
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 from xml.etree import ElementTree
@@ -52,8 +51,7 @@ class SpeReader(ContiguousReader):
     kind = "SPE file"
     suffixes: ClassVar[tuple[str, ...]] = (".spe",)
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         with path.open("rb") as stream:
             head, size = stream.read(_HEADER_BYTES), path.stat().st_size
         if len(head) < _HEADER_BYTES:
@@ -68,8 +66,8 @@ class SpeReader(ContiguousReader):
         step, footer = None, None
         if field["version"] >= 3 and field["footer"]:
             footer = _footer(path, field["footer"], size)
-            frame = next(each for each in _all(footer, "DataBlock") if each.get("type") == "Frame")
-            parts = [each for each in _all(frame, "DataBlock") if each.get("type") == "Region"]
+            frame = next(footer.iterfind(".//{*}DataBlock[@type='Frame']"))
+            parts = frame.findall(".//{*}DataBlock[@type='Region']")
             n, step, regions = int(frame.attrib["count"]), int(frame.attrib["stride"]), len(parts)
             rows, columns = (int(parts[0].attrib[name]) for name in ("height", "width"))
         if regions > 1:
@@ -89,20 +87,21 @@ class SpeReader(ContiguousReader):
 
     def _read_stamps(self, footer: Any) -> None:
         """Read the numbers behind the frames: when their exposure began, and the camera's count."""
-        n, frame_bytes, at = self.shape[0], self.layout.frame_bytes if self.layout else 0, 0
+        n, at = self.shape[0], 0
         places: dict[str, tuple[int, Any]] = {}
-        for element in (part for block in _all(footer, "MetaBlock") for part in block):
-            places.setdefault(element.get("event") or _name(element), (at, element))
+        for element in footer.iterfind(".//{*}MetaBlock/*"):
+            places.setdefault(element.get("event") or element.tag.rpartition("}")[2], (at, element))
             at += int(element.get("bitDepth", 0)) // 8
-        offsets = self._layout.offsets + frame_bytes
+        offsets = self._layout.offsets + self._layout.frame_bytes
         if not at or not n or int(offsets[-1]) + at > self._size:
             return
-        numbers: dict[str, Any] = {}
         with OpenedFile(self.paths[0], self._size) as file:
             data = [file.read_bytes(offset, at) for offset in offsets.tolist()]
-        for name, (place, element) in places.items():
-            if element.get("type") == "Int64" and element.get("bitDepth") == "64":
-                numbers[name] = np.array([struct.unpack_from("<q", each, place)[0] for each in data])
+        numbers = {
+            name: np.array([struct.unpack_from("<q", each, place)[0] for each in data])
+            for name, (place, element) in places.items()
+            if element.get("type") == "Int64" and element.get("bitDepth") == "64"
+        }
         self.frame_stamps = numbers.get("FrameTrackingNumber")
         begun = numbers.get("ExposureStarted")
         if begun is not None:
@@ -124,38 +123,21 @@ def _footer(path: Path, start: int, size: int) -> Any:
     return ElementTree.fromstring(text)
 
 
-def _name(element: Any) -> str:
-    """Return the name of an element without its namespace."""
-    return str(element.tag).rpartition("}")[2]
-
-
-def _all(root: Any, name: str) -> Iterator[Any]:
-    """Yield the elements of a name below a root."""
-    return (element for element in root.iter() if _name(element) == name)
-
-
 def _stated_facts(footer: Any) -> StatedFacts:
     """Return what the footer says of the camera and its setting."""
-
-    def text(*names: str) -> str | None:
-        """Return the text of the first element that is reached by these names."""
-        found = [footer]
-        for name in names:
-            found = [element for each in found for element in _all(each, name)]
-        return found[0].text if found else None
-
-    camera = next(_all(footer, "Camera"), ElementTree.Element("Camera"))
-    created = next(_all(footer, "Origin"), ElementTree.Element("Origin")).get("created")
-    setup = {"gain": text("Adc", "AnalogGain"), "readout_mode": text("Adc", "Quality")}
-    depth = text("Adc", "BitDepth") or ""
+    nothing = ElementTree.Element("none")
+    camera, origin = (next(footer.iterfind(f".//{{*}}{name}"), nothing) for name in ("Camera", "Origin"))
+    names = {"gain": "AnalogGain", "readout_mode": "Quality"}
+    setup = {ours: footer.findtext(f".//{{*}}Adc//{{*}}{name}") for ours, name in names.items()}
+    depth = footer.findtext(".//{*}Adc//{*}BitDepth") or ""
     return StatedFacts(
         CameraFacts(
             text_of(camera.get("model")),
             text_of(camera.get("serialNumber")),
-            celsius(text("Temperature", "Reading")),
-            seconds_of(created),
+            celsius(footer.findtext(".//{*}Temperature//{*}Reading")),
+            seconds_of(origin.get("created")),
             {name: value for name, value in setup.items() if value},
         ),
-        duration_of("ExposureTime", text("ExposureTime"), "ms"),
+        duration_of("ExposureTime", footer.findtext(".//{*}ExposureTime"), "ms"),
         bits_of(int(depth)) if depth.isdecimal() else None,
     )

@@ -56,41 +56,37 @@ class TiffReader(ContiguousReader):
     suffixes: ClassVar[tuple[str, ...]] = (".tif", ".tiff", ".btf", ".tf8", ".stk", ".dng")
     magic: ClassVar[tuple[bytes, ...]] = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         import tifffile
 
         logging.getLogger("tifffile").addHandler(_QUIET)  # what it would warn of is said in our errors
         size = path.stat().st_size
         check_chain(path, size)
         with tifffile.TiffFile(path) as file:
-            self._inspect(path, file, size, settings)
-
-    def _inspect(self, path: Path, file: Any, size: int, settings: InputSettings) -> None:
-        every = [*file.pages]
-        pages = [page for page in every if not page.is_reduced]
-        if not pages:  # in DNG the frame may be behind a preview
-            every += [below for page in file.pages for below in page.pages or ()]
+            every = [*file.pages]
             pages = [page for page in every if not page.is_reduced]
-        reduced = len(every) - len(pages)
-        if not pages:
-            raise InputError(f"{path}: not a valid TIFF file, or truncated (no pages); copy it again")
-        notes = [f"{path.name}: {reduced} reduced pages (previews) are ignored"] if reduced else []
-        first = pages[0]
-        _check_pages(path, pages)
-        offset = check_samples(path, np.dtype(first.dtype), settings)
-        count = len(pages) if len(pages) > 1 else images_behind_one_page(file)
-        notes += _channel_notes(path, *stated_channels(file), count) + _value_notes(path, pages)
-        self.notes = tuple(notes)
-        stored = np.dtype(first.dtype).newbyteorder(file.byteorder)
-        offsets = _contiguous_offsets(path, file, pages, size)
-        rows, columns = first.shape[-2:]
-        if offsets is not None:
-            self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
-        else:
-            self._set_coded(path, pages, size, offset)
-        self.take_facts(stated_facts(file, first))
-        self.active = active_area(first)
+            if not pages:  # in DNG the frame may be behind a preview
+                every += [below for page in file.pages for below in page.pages or ()]
+                pages = [page for page in every if not page.is_reduced]
+            reduced = len(every) - len(pages)
+            if not pages:
+                raise InputError(f"{path}: not a valid TIFF file, or truncated (no pages); copy it again")
+            notes = [f"{path.name}: {reduced} reduced pages (previews) are ignored"] if reduced else []
+            first = pages[0]
+            _check_pages(path, pages)
+            offset = check_samples(path, np.dtype(first.dtype), settings)
+            count = len(pages) if len(pages) > 1 else images_behind_one_page(file)
+            notes += _channel_notes(path, *stated_channels(file), count) + _value_notes(path, pages)
+            self.notes = tuple(notes)
+            stored = np.dtype(first.dtype).newbyteorder(file.byteorder)
+            offsets = _contiguous_offsets(path, file, pages, size)
+            rows, columns = first.shape[-2:]
+            if offsets is not None:
+                self.set_layout(path, Layout(offsets, rows, columns, stored, offset), size)
+            else:
+                self._set_coded(path, pages, size, offset)
+            self.take_facts(stated_facts(file, first))
+            self.active = active_area(first)
 
     def _set_coded(self, path: Path, pages: Sequence[Any], size: int, offset: int | None) -> None:
         """Remember where the pages are, after a look at where their strips or tiles are."""
@@ -109,8 +105,7 @@ class TiffReader(ContiguousReader):
         self.rows_per_read = min(rows, max(page.chunks[0] for page in pages))
         self._places = np.array([page.offset for page in pages], np.int64)
 
-    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
-        """See `ContiguousReader.decode_into`."""
+    def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         import tifffile
 
         path = self.paths[0]
@@ -234,29 +229,21 @@ def _words(page: Any) -> str:
 
 def _contiguous_offsets(path: Path, file: Any, pages: Sequence[Any], size: int) -> IntArray | None:
     """Return the offset of each frame if all are stored plainly, else None."""
-    first = pages[0]
-    dtype = np.dtype(first.dtype)
-    if any(int(page.compression) != 1 or int(page.fillorder) != 1 for page in pages):
-        return None
-    if any(
-        page.bitspersample != 8 * dtype.itemsize or page.is_tiled or page.predictor != 1 for page in pages
-    ):
-        return None
-    if any(0 in page.databytecounts for page in pages):  # never written: nothing lies at their offsets
-        return None
-    rows, columns = first.shape[-2:]
-    frame = rows * columns * dtype.itemsize
-    planes = first.samplesperpixel
-    if len(pages) == 1 and planes == 1 and (first.is_contiguous or _adjoining(first, frame)):
-        start = int(first.dataoffsets[0])
-        return even_offsets(path, images_behind_one_page(file), frame, size, start=start)
-    offsets = []
+    itemsize, planes = np.dtype(pages[0].dtype).itemsize, pages[0].samplesperpixel
+    frame = math.prod(pages[0].shape[-2:]) * itemsize
     for page in pages:
+        codings = int(page.compression), int(page.fillorder), page.predictor
+        if codings != (1, 1, 1) or page.bitspersample != 8 * itemsize or page.is_tiled:
+            return None
+        if 0 in page.databytecounts:  # never written: nothing lies at their offsets
+            return None
         if not page.is_contiguous and not _adjoining(page, frame * planes):
             return None
-        start = int(page.dataoffsets[0])
-        offsets += [start + plane * frame for plane in range(planes)]
-    return np.asarray(offsets, np.int64)
+    starts = np.array([page.dataoffsets[0] for page in pages], np.int64)
+    if len(pages) == 1 and planes == 1:
+        return even_offsets(path, images_behind_one_page(file), frame, size, start=int(starts[0]))
+    offsets: IntArray = np.add.outer(starts, frame * np.arange(planes)).ravel()
+    return offsets
 
 
 def _adjoining(page: Any, total: int) -> bool:

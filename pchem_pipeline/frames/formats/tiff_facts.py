@@ -53,7 +53,7 @@ def check_chain(path: Path, size: int) -> None:
     """Walk from directory to directory: the library stops silently at one that is damaged, or never.
 
     Raises:
-        InputError: no TIFF file, a directory that is not within the file, or a chain that runs in a circle.
+        InputError: no TIFF file, a directory that is not within the file, or a circular chain.
     """
     with path.open("rb") as stream:
         head = stream.read(16)
@@ -73,14 +73,13 @@ def check_chain(path: Path, size: int) -> None:
                 raise InputError(
                     f"{path}: damaged: after {len(seen)} pages the list of pages is circular; copy it again"
                 )
-            here = following
-            stream.seek(here)
+            seen.add(following)
+            stream.seek(following)
             tags = int.from_bytes(stream.read(kind.count_size), order)
-            stream.seek(here + kind.count_size + min(tags, _MOST_TAGS) * kind.tag)
+            stream.seek(following + kind.count_size + min(tags, _MOST_TAGS) * kind.tag)
             data = stream.read(kind.pointer)
             if tags > _MOST_TAGS or len(data) < kind.pointer:
-                raise _broken_chain(path, len(seen), size)
-            seen.add(here)
+                raise _broken_chain(path, len(seen) - 1, size)
             following = int.from_bytes(data, order)
         if not seen:
             raise _broken_chain(path, 0, size)
@@ -158,7 +157,9 @@ def stated_facts(file: Any, page: Any) -> StatedFacts:
         duration_of("Exposure-ms", record.get("Exposure-ms"), "ms"),
     )
     bits = page.bitspersample  # which say nothing where they are those of a whole type
-    depths = (_ome_depth(_ome(file)), own.bit_depth, None if bits in (8, 16, 32) else bits_of(bits))
+    significant = re.search(r'SignificantBits="(\d+)"', _ome(file))
+    stated = bits_of(int(significant[1])) if significant else None
+    depths = (stated, own.bit_depth, None if bits in (8, 16, 32) else bits_of(bits))
     names = [each.name for each in fields(CameraFacts)]
     camera = CameraFacts(*(first_of(getattr(each, name) for each in cameras) for name in names))
     return StatedFacts(camera, agreed_duration(times), first_of(depths))
@@ -184,11 +185,6 @@ def _ome_time(text: str) -> Duration | None:
     plane = re.search(r'<[^<>]*\sExposureTime="[^<>]*>', text)
     unit = _attribute(plane, "ExposureTimeUnit") or "s"  # as OME has it
     return duration_of("ExposureTime of OME", _attribute(plane, "ExposureTime"), unit)
-
-
-def _ome_depth(text: str) -> int | None:
-    match = re.search(r'SignificantBits="(\d+)"', text)
-    return bits_of(int(match[1])) if match else None
 
 
 def _ratio(value: Any) -> Duration | None:

@@ -12,7 +12,7 @@ from helpers.camera_files import opened, read, refused, write_hdf5
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.hdf5 import Hdf5Reader
-from pchem_pipeline.frames.formats.omezarr import ZarrReader
+from pchem_pipeline.frames.formats.zarr import ZarrReader
 from pchem_pipeline.frames.settings import InputSettings
 
 STACK = np.random.default_rng(13).integers(0, 65536, (7, 19, 22)).astype(np.uint16)

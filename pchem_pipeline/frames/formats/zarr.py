@@ -53,8 +53,7 @@ class ZarrReader(ContiguousReader):
         """See `FrameReader.recognises`: a zarr store is a folder with metadata."""
         return is_zarr(path)
 
-    def inspect(self, path: Path, settings: InputSettings) -> None:
-        """See `ContiguousReader.inspect`."""
+    def _inspect(self, path: Path, settings: InputSettings) -> None:
         import zarr
 
         if link := link_out_of(path):
@@ -71,9 +70,9 @@ class ZarrReader(ContiguousReader):
             array: Any = node
             self._name, attributes = "", dict(node.attrs)
         else:
-            self._name = _full_resolution(node, settings) or choose_dataset(
-                path, _shapes(node), settings.dataset
-            )
+            scales = _scales(node) if settings.dataset is None else None
+            full = scales and str(scales[0]["datasets"][0]["path"])  # the first level (0.5 and before)
+            self._name = full or choose_dataset(path, _shapes(node), settings.dataset)
             array = node[self._name]
             attributes = {**node.attrs, **array.attrs}
         from pchem_pipeline.store.zarr_store import foreign_codecs
@@ -90,11 +89,9 @@ class ZarrReader(ContiguousReader):
         self.take_facts(facts_from_names(attributes))
         self.notes = _channel_notes(path, _axes(node), self._full)
         missing = _check_chunks(path, path / self._name, array, parts)
-        self.unwritten = bool(missing)
-        self.notes += missing
+        self.notes, self.unwritten = self.notes + missing, bool(missing)
 
-    def decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
-        """See `ContiguousReader.decode_into`."""
+    def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         import zarr
 
         if not self.paths[0].exists():  # missing chunks would read as the fill value
@@ -108,7 +105,7 @@ class ZarrReader(ContiguousReader):
 def _check_chunks(path: Path, folder: Path, array: Any, parts: Sequence[Path]) -> tuple[str, ...]:
     """Refuse chunks that hold more than their shape; say how many are missing, and read as the fill value.
 
-    Not by ``nchunks_initialized`` of the library, whose time grows as the square of their number.
+    The time of the library's ``nchunks_initialized`` would grow as the square of their number.
     """
     from pchem_pipeline.store.zarr_store import codec_names
 
@@ -151,14 +148,6 @@ def _read(part: Path, start: int, length: int) -> bytes:
         return stream.read(length)
 
 
-def _full_resolution(group: Any, settings: InputSettings) -> str | None:
-    """Return the path of the first level of an OME-Zarr image (0.5 and before), else None."""
-    if settings.dataset is not None:
-        return None
-    scales = _scales(group)
-    return str(scales[0]["datasets"][0]["path"]) if scales else None
-
-
 def _scales(group: Any) -> Any:
     """Return the record of the levels of an OME-Zarr image; None where there is none."""
     record = group.attrs.get("ome", group.attrs)
@@ -184,8 +173,7 @@ def _channel_notes(path: Path, axes: Sequence[str], shape: Sequence[int]) -> tup
 
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of other files among the arrays
+    with warnings.catch_warnings(action="ignore"):  # of other files among the arrays
         members = list(group.members(max_depth=None))
     return {name: tuple(node.shape) for name, node in members if hasattr(node, "shape")}
 
