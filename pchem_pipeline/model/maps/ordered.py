@@ -97,6 +97,10 @@ class Ordered:
         """Return how many values are larger."""
         return self.size - int(np.searchsorted(self.values, value, "right"))
 
+    def within(self, low: float, high: float) -> Ordered:
+        """Return the values from low to high, both included."""
+        return Ordered(self.values[self.n_below(low) : self.size - self.n_above(high)])
+
     def histogram(self, edges: Sequence[float] | FloatArray) -> IntArray:
         """Return the values in each bin; the last edge belongs to the last bin."""
         ends = np.searchsorted(self.values, edges, "left")

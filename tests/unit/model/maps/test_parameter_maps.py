@@ -255,6 +255,8 @@ def test_every_number_is_that_of_numpy_to_the_bit(values):
     middle = values[values.size // 2]
     below, above = (values < middle).sum(), (values > middle).sum()
     assert (found.n_below(middle), found.n_above(middle)) == (below, above)
+    inside = np.sort(values[(values >= 0.0) & (values <= middle)])
+    np.testing.assert_array_equal(found.within(0.0, middle).values, inside)
     _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
     shares = (np.cumsum(counts) - 0.5 * counts) / values.size
     np.testing.assert_array_equal(found.shares(values), shares[inverse])
