@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray, PixelMaps, TimeSeries
+from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray, PixelMaps
 from pchem_pipeline.model.arithmetic.robust import OF_MEDIAN_DEVIATION
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.law.pcd import pcd_posterior
@@ -47,10 +47,8 @@ def exposure_profile(evidence: Evidence) -> ExposureProfile | None:
     time, good = evidence.time, evidence.maps.usable
     if time is None or time.frames.size < 8 or not good.any():
         return None
-    variance, exposure = (
-        float(np.sum(values[good] ** power))
-        for values, power in ((evidence.charge_std, 2), (evidence.maps.quanta_exposure, 1))
-    )
+    variance = float(np.sum(evidence.charge_std[good] ** 2))
+    exposure = float(np.sum(evidence.maps.quanta_exposure[good]))
     if not (variance > 0 and exposure > 0):
         return None
     deviation = np.asarray(time.frame_charge, np.float64) * (exposure / variance)
@@ -83,7 +81,7 @@ def block_charge(evidence: Evidence) -> BlockCharge | None:
     good = evidence.maps.usable & (evidence.charge_std > 0) & (evidence.maps.quanta_exposure > 0)
     if not good.any():
         return None
-    length = _lengths(time)
+    length = time.block_length.astype(np.float64)
     exposure, variance = evidence.maps.quanta_exposure[good], evidence.charge_std[good] ** 2
     charge = np.asarray(time.block_charge, np.float64)[:, good]
     charge -= np.average(charge, axis=0, weights=length)
@@ -123,12 +121,6 @@ def block_signal(evidence: Evidence) -> BlockCharge | None:
     signal -= np.median(signal / exposure, axis=1)[:, None] * exposure
     variance = (evidence.charge_std[at] ** 2 + (gain * evidence.readout_std[at]) ** 2) * usual**2
     return charge._replace(deviation=signal, variance=variance)
-
-
-def _lengths(time: TimeSeries) -> FloatArray:
-    """Return the number of frames of each block, (b,)."""
-    last = np.append(np.searchsorted(time.frames, time.block_start[1:]), time.frames.size)
-    return np.diff(np.append(np.searchsorted(time.frames, time.block_start[0]), last)).astype(np.float64)
 
 
 def exposure_nodes(factors: ArrayLike, n: int = 3) -> tuple[FloatArray, FloatArray]:

@@ -58,11 +58,9 @@ def responsivity(evidence: Evidence) -> float:
 
 
 def mean_response(evidence: Evidence, inside: BoolArray | None = None) -> float:
-    """Return the mean change of r over its standard deviation per DN of a common offset, 1/DN.
+    """Return the mean change of r / its standard deviation per DN of a common offset, 1/DN.
 
-    Args:
-        evidence: of some pixels.
-        inside: those that count, (y, x); None: all.
+    ``inside``: pixels that count, (y, x); None: all.
     """
     usable = evidence.maps.usable if inside is None else evidence.maps.usable & inside
     return float(np.mean((evidence.readout_std / evidence.maps.read_noise_dn**2)[usable]))

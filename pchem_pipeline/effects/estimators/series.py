@@ -127,15 +127,13 @@ def _time_profiles(series: FloatArray, position: FloatArray) -> tuple[TimeProfil
 
     constant = fit(np.ones((n, 1)))[1]
 
-    def multiple(profile: FloatArray, fraction: float | None = None) -> TimeProfile:
+    def multiple(shape: Literal["linear", "settling"], profile: FloatArray, numbers: float) -> TimeProfile:
         values, deviance = fit(np.stack([np.ones(n), profile], axis=1))
-        size, gain = float(values[1]), constant - deviance
-        if fraction is None:
-            return TimeProfile("linear", size, deviance + 2.0 * np.log(n), gain)
-        return TimeProfile("settling", size, deviance + 3.0 * np.log(n), gain, settling_fraction=fraction)
+        return TimeProfile(shape, float(values[1]), deviance + numbers * np.log(n), constant - deviance)
 
     def settled(fraction: float) -> TimeProfile:
-        return multiple(settling(position, fraction), fraction)
+        found = multiple("settling", settling(position, fraction), 3.0)
+        return found._replace(settling_fraction=fraction)
 
     def path(nodes: int) -> TimeProfile:
         values, deviance = fit(hats(position, nodes), _STIFF)
@@ -145,18 +143,14 @@ def _time_profiles(series: FloatArray, position: FloatArray) -> tuple[TimeProfil
 
     numbers = [nodes for nodes in _NODES if nodes == _NODES[0] or _PER_NODE * nodes <= n]
     return (
-        multiple(position - 0.5),
+        multiple("linear", position - 0.5, 2.0),
         settled(_settling_time(lambda fraction: settled(fraction).criterion)),
         min(map(path, numbers), key=lambda each: each.criterion),
     )
 
 
 def _settling_time(left: Callable[[float], float]) -> float:
-    """Return the time constant of an exponential approach that leaves least, in lengths of the run.
-
-    Args:
-        left: what an approach with a time constant leaves.
-    """
+    """Return the time constant, in lengths of the run, for which ``left`` is least."""
     from scipy.optimize import minimize_scalar  # not for every command that knows of effects
 
     losses = [left(fraction) for fraction in SETTLING]
@@ -202,7 +196,8 @@ def likeliest_parts(
     found: list[tuple[float, Layout, list[Steps]]] = []
     for layout, weights in layouts.items():
         steps = find_steps(series @ weights.T, gaps)
-        rest = series - np.stack([_profile(each, n) for each in steps], axis=1) @ (weights > 0)
+        profiles = [np.repeat(each.levels, np.diff([*each.starts, n])) for each in steps]
+        rest = series - np.stack(profiles, axis=1) @ (weights > 0)
         rest -= rest.mean(axis=1, keepdims=True) + rest.mean(axis=0)
         levels = sum(each.levels.size for each in steps)
         price = np.log(n) * (3 * levels - 2 * len(steps))
@@ -245,7 +240,7 @@ def find_steps(series: FloatArray, gaps: FloatArray | None = None) -> list[Steps
         (_with_common(series, cuts[1:-1], variance, waves) for waves in _WAVES), key=lambda one: one[0]
     )
     return [
-        Steps(np.array(begins, np.int64), _centred(level, begins, n))
+        Steps(np.array(begins, np.int64), level - (level * np.diff([*begins, n])).sum() / n)
         for level, begins in zip(levels, starts, strict=True)
     ]
 
@@ -258,28 +253,19 @@ def _own_variance(series: FloatArray) -> float:
 
 
 def _noise_variance(series: FloatArray) -> float:
-    """Return the variance of the white part: half the mean squared difference of successive values.
-
-    Sudden steps are so few that leaving out the largest twentieth of the differences takes care of them
-    (the rest of a Gaussian's squares is 0.774 of its mean square).
-    """
+    """Return the variance of the white part: half the mean squared difference of successive values."""
     squares = np.sort(np.diff(series) ** 2)
-    kept = squares[: max(int(0.95 * squares.size), 1)]
-    return float(kept.mean() / 2.0 / 0.774)
-
-
-def _profile(steps: Steps, n: int) -> FloatArray:
-    return np.repeat(steps.levels, np.diff([*steps.starts, n]))
+    # less the largest twentieth, the sudden steps; of a Gaussian the rest is 0.774 of the mean square
+    return float(squares[: max(int(0.95 * squares.size), 1)].mean() / 2.0 / 0.774)
 
 
 def _with_common(
     series: FloatArray, cuts: list[int], variance: float, n_waves: int
 ) -> tuple[float, list[list[int]], list[FloatArray]]:
-    """Return which series jump at the cuts, and the levels of all, the common mode included.
+    """Return Schwarz's criterion, which series jump at the cuts, and the levels of all, common mode included.
 
     Least squares in which the common mode counts less, by as much as it is noisier than a mean of ``m`` white
-    series, and may wander smoothly (some cosines). First comes what is left, with Schwarz's price of each
-    number.
+    series, and may wander smoothly (some cosines).
     """
     n, m = series.shape
     noise = _noise_variance(series.mean(axis=1))
@@ -299,10 +285,8 @@ def _with_common(
         owner = np.repeat(np.arange(m), [len(begins) for begins in starts])
         levels = [found[: owner.size][owner == q] for q in range(m)]
         weakest: dict[int, tuple[float, int]] = {}
-        place = 0
         for q, (begins, level) in enumerate(zip(starts, levels, strict=True)):
-            here = np.arange(place, place + len(begins))
-            place += len(begins)
+            here = np.flatnonzero(owner == q)
             spread = np.diag(inverse)[here]
             errors = variance * (spread[1:] + spread[:-1] - 2.0 * inverse[here[1:], here[:-1]])
             squares = np.diff(level) ** 2 / np.maximum(errors, np.finfo(np.float64).tiny)
@@ -320,12 +304,6 @@ def _indicators(begins: list[int], n: int, row: FloatArray) -> FloatArray:
     """Return the columns of a design that one series' levels have, (n * m, levels)."""
     inside = np.repeat(np.eye(len(begins)), np.diff([*begins, n]), axis=0)
     return (inside[:, None, :] * row[:, None]).reshape(n * row.size, len(begins))
-
-
-def _centred(levels: FloatArray, starts: list[int], n: int) -> FloatArray:
-    """Return levels less their mean over n values, each from its start on."""
-    lengths = np.diff([*starts, n])
-    return np.asarray(levels - (levels * lengths).sum() / n)
 
 
 def _best_cut(series: FloatArray, first: int, last: int, bonus: FloatArray) -> tuple[float, int]:
@@ -399,7 +377,7 @@ def _fitted(seen: FloatArray, variance: float, k: int) -> Levels:
         number = np.maximum(belongs.sum(axis=1), 1e-9)
         levels = Levels(belongs @ seen / number, number / number.sum())
     order = np.argsort(levels.values)
-    return Levels(levels.values[order], levels.shares[order])
+    return Levels(*(each[order] for each in levels))
 
 
 def _log_density(levels: Levels, seen: FloatArray, variance: float) -> tuple[FloatArray, FloatArray]:
@@ -461,7 +439,8 @@ def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:
     field = _without_slow(field[inside], numbers)
     grid = np.zeros((length, n_lines), np.float32)
     grid[np.ix_(numbers - numbers[0], lines)] = field
-    power = _half_plane(grid)
+    spectrum = np.fft.fft(np.fft.rfft(grid, axis=1).astype(np.complex64), axis=0)
+    power = np.asarray(np.abs(spectrum) ** 2, np.float32)  # at the non-negative frequencies along lines
     ratio = power / _level(power)
     place = np.unravel_index(int(ratio.argmax()), ratio.shape)
     excess = float(ratio[place]) - np.log(ratio.size)
@@ -503,12 +482,6 @@ def _prepared(means: AnyArray) -> tuple[FloatArray, IntArray]:
     lines = np.flatnonzero(np.isfinite(means).all(axis=0))
     field = means[:, lines].astype(np.float64)
     return field - field.mean(axis=0), lines
-
-
-def _half_plane(grid: Float32Array) -> Float32Array:
-    """Return the power at all frequencies along frames and the non-negative ones along lines."""
-    spectrum = np.fft.fft(np.fft.rfft(grid, axis=1).astype(np.complex64), axis=0)
-    return np.asarray(np.abs(spectrum) ** 2, np.float32)
 
 
 def _without_slow(field: FloatArray, frames: IntArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -147,13 +148,7 @@ def _fitted(
 ) -> Spot | None:
     """Return the spot that lowers chi2 the most, of a grid and then around it; None if none is positive.
 
-    Args:
-        places: rows and columns of the cells.
-        shape: rows and columns of the sensor.
-        falloffs: forms that are tried.
-        seen: what spots (n, rows, columns) would be in the data, (n, m).
-        target: the data, (m,).
-        inverse: their inverse variances, (m,).
+    Spots (n, rows, columns) are ``seen``, (n, m), in the data ``target``, (m,), of variances 1 / ``inverse``.
     """
     from scipy.optimize import minimize
 
@@ -166,17 +161,13 @@ def _fitted(
         size = np.maximum(size, 1e-300)
         return np.stack([np.where(there, overlap**2 / size, 0.0), overlap / size])
 
-    grid = [(float(y), float(x)) for y in np.linspace(0, 1, _CENTRES) for x in np.linspace(0, 1, _CENTRES)]
-    best: tuple[float, tuple[float, float], float, Falloff] = (0.0, grid[0], _RADII[0], "gaussian")
-    for falloff in falloffs:
-        for radius in _RADII:
-            gains = fits(grid, radius, falloff)[0]
-            place = int(gains.argmax())
-            if gains[place] > best[0]:
-                best = float(gains[place]), grid[place], radius, falloff
-    if not best[0] > 0.0:
+    grid = list(itertools.product(np.linspace(0, 1, _CENTRES).tolist(), repeat=2))
+    forms = list(itertools.product(falloffs, _RADII))
+    gains = np.stack([fits(grid, radius, falloff)[0] for falloff, radius in forms])
+    if not gains.max() > 0.0:
         return None
-    _, centre, radius, falloff = best
+    form, place = np.unravel_index(gains.argmax(), gains.shape)
+    (falloff, radius), centre = forms[form], grid[place]
 
     def loss(values: FloatArray) -> float:
         return -float(fits([(float(values[0]), float(values[1]))], float(np.exp(values[2])), falloff)[0, 0])
@@ -192,20 +183,13 @@ def _fitted(
 
 @dataclass(frozen=True)
 class _Lines:
-    """Charge of groups of rows and of columns along the run.
+    """Charge of groups of rows and of columns along the run."""
 
-    Attributes:
-        charge: sums of k - H of the row groups, then of the column groups, e-, (n, r + c).
-        y, x: mean row and column of the groups, (r,) and (c,).
-        response: sum over the pixels of a cell of dE[k] by an electron of light, (r, c).
-        variance: sum of Var(k), e-^2, which is also what a flicker of all pixels adds, (r, c).
-    """
-
-    charge: FloatArray
-    y: FloatArray
+    charge: FloatArray  # sums of k - H of the row groups, then of the column groups, e-, (n, r + c)
+    y: FloatArray  # mean row of each group, (r,), and column, (c,)
     x: FloatArray
-    response: FloatArray
-    variance: FloatArray
+    response: FloatArray  # sum over the pixels of a cell of dE[k] by an electron of light, (r, c)
+    variance: FloatArray  # sum of Var(k), e-^2, which is also what a flicker of all pixels adds, (r, c)
 
     def lines(self, cells: FloatArray) -> FloatArray:
         """Return the sums over rows and columns of what is in the cells, (..., r + c)."""
@@ -237,7 +221,14 @@ def best_bursts(evidence: Evidence) -> tuple[Spot, float] | None:
     burst = special.expit(odds)
     if share > _MOST or burst.sum() < _FEWEST_BURSTS:
         return None
-    spot = _form(lines, burst, shape)
+    # rows and columns of the bursts, less those of other frames
+    mean = burst @ lines.charge / burst.sum() - (1.0 - burst) @ lines.charge / (1.0 - burst).sum()
+    inverse = 1.0 / np.maximum(lines.lines(lines.variance), 1e-12)
+
+    def seen(spots: FloatArray) -> FloatArray:
+        return lines.lines(spots * lines.response)
+
+    spot = _fitted((lines.y, lines.x), shape, ("gaussian", "exponential"), seen, mean, inverse)
     return None if spot is None else (spot, share)
 
 
@@ -262,44 +253,25 @@ def _lines(evidence: Evidence) -> _Lines | None:
         sums = np.nan_to_num(series) * maps.usable.sum(axis=axis)
         sums = np.add.reduceat(sums.astype(np.float64), first[1 - axis], axis=1)
         # what changes slowly is no burst
-        charge.append(sums - _by_blocks(sums, time.frames, time.block_start))
+        means = np.add.reduceat(sums, np.searchsorted(time.frames, time.block_start), axis=0)
+        means /= time.block_length[:, None]
+        charge.append(sums - np.repeat(means, time.block_length, axis=0))
     y, x = (np.bincount(g, np.arange(g.size)) / np.bincount(g) for g in groups)
     return _Lines(np.concatenate(charge, axis=1), y, x, cells(response), cells(variance))
 
 
-def _by_blocks(sums: FloatArray, frames: IntArray, start: IntArray) -> FloatArray:
-    """Return the mean over the block of each frame, (n, lines)."""
-    first = np.searchsorted(frames, start)
-    length = np.diff(np.append(first, len(sums)))
-    means = np.add.reduceat(sums, first, axis=0) / length[:, None]
-    return np.asarray(np.repeat(means, length, axis=0))
-
-
 def _weights(lines: _Lines, shape: tuple[int, ...]) -> FloatArray:
     """Return weights of the lines for each spot's light in a frame, of unit variance, (spots, r + c)."""
-    grid, found = np.linspace(0.0, 1.0, 9), []
-    for radius in _RADII[1::2]:
-        for cy in grid:
-            for cx in grid:
-                spot = spot_image(lines.y, lines.x, shape, (float(cy), float(cx)), radius)
-                cells = spot.mean(axis=1, keepdims=True) + spot.mean(axis=0)
-                # neither a flicker of all pixels, which adds Var(k) to each, nor a constant is a spot
-                cells = cells - (cells * lines.variance).sum() / lines.variance.sum()
-                scale = np.sqrt((cells**2 * lines.variance).sum())
-                row = cells.mean(axis=1) - 0.5 * cells.mean()
-                found.append(np.append(row, cells.mean(axis=0) - 0.5 * cells.mean()) / scale)
+    grid, found = np.linspace(0.0, 1.0, 9).tolist(), []
+    for radius, y, x in itertools.product(_RADII[1::2], grid, grid):
+        spot = spot_image(lines.y, lines.x, shape, (y, x), radius)
+        cells = spot.mean(axis=1, keepdims=True) + spot.mean(axis=0)
+        # neither a flicker of all pixels, which adds Var(k) to each, nor a constant is a spot
+        cells = cells - (cells * lines.variance).sum() / lines.variance.sum()
+        scale = np.sqrt((cells**2 * lines.variance).sum())
+        row = cells.mean(axis=1) - 0.5 * cells.mean()
+        found.append(np.append(row, cells.mean(axis=0) - 0.5 * cells.mean()) / scale)
     return np.array(found)
-
-
-def _form(lines: _Lines, burst: FloatArray, shape: tuple[int, ...]) -> Spot | None:
-    """Return the spot that fits rows and columns of the bursts, less those of other frames, best."""
-    mean = burst @ lines.charge / burst.sum() - (1.0 - burst) @ lines.charge / (1.0 - burst).sum()
-    inverse = 1.0 / np.maximum(lines.lines(lines.variance), 1e-12)
-
-    def seen(spots: FloatArray) -> FloatArray:
-        return lines.lines(spots * lines.response)
-
-    return _fitted((lines.y, lines.x), shape, ("gaussian", "exponential"), seen, mean, inverse)
 
 
 # standard deviations up to which a pixel's deviation counts, and times that a mean is taken anew about which

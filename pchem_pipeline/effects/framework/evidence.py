@@ -225,6 +225,11 @@ class TimeSeries:
     waves: tuple[Wave, ...] = ()
     low_hits: IntArray = field(default_factory=lambda: np.empty((0, 4), np.int64))
 
+    @property
+    def block_length(self) -> IntArray:
+        """Number of frames of each block, shape (n_blocks,)."""
+        return np.diff(np.append(np.searchsorted(self.frames, self.block_start), self.frames.size))
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -271,5 +276,4 @@ class Evidence:
 
     def strongest(self, *names: str) -> float:
         """Return the largest |z| among the named statistics (0 where these data give none of them)."""
-        found: list[Any] = [abs(self.z[name]) for name in names if name in self.z]
-        return float(max(found, default=0.0))
+        return max((abs(self.z[name]) for name in names if name in self.z), default=0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, ClassVar, Literal, Self, TypeVar
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -95,18 +95,9 @@ def add_offset(values: AnyArray, offset_dn: ArrayLike, context: EffectContext) -
     return np.asarray(values + np.asarray(offset_dn) * context.truth["conversion_gain"])
 
 
-def sine_values(count: int) -> FloatArray:
-    """Return ``count`` values that stand, equally likely, for the sine of a random phase (arcsine law).
-
-    Gauss-Chebyshev quadrature: all moments up to order ``2 count - 1`` are exact.
-    """
-    return np.asarray(np.cos((2.0 * np.arange(count) + 1.0) * np.pi / (2.0 * count)))
-
-
-def quantile_means(values: FloatArray, count: int = 7) -> FloatArray:
-    """Return the means of ``count`` equal parts of the sorted values, stretched to their variance."""
-    ordered = np.sort(values)
-    means = np.array([part.mean() for part in np.array_split(ordered, min(count, ordered.size))])
+def quantile_means(values: FloatArray) -> FloatArray:
+    """Return the means of seven equal parts of the sorted values, stretched to their variance."""
+    means = np.array([part.mean() for part in np.array_split(np.sort(values), min(7, values.size))])
     centre, spread = float(values.mean()), float(means.std())
     return np.asarray(centre + (means - means.mean()) * (values.std() / spread if spread > 0 else 1.0))
 
@@ -307,9 +298,6 @@ class ReadoutAlternation(OffsetEffect, tag="readout_alternation"):
         return SharedOffset("frame", self.alternation_dn**2)
 
 
-Pickup = TypeVar("Pickup", bound="PeriodicPickup")
-
-
 class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
     """Sine along rows, columns and frames.
 
@@ -376,8 +364,8 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
         return np.asarray(self.amplitude_dn * along.imag)
 
     def offset_values(self) -> FloatArray:
-        """Return values, DN, of a sine at random phase (arcsine law)."""
-        return self.amplitude_dn * sine_values(5)
+        """Return values, DN, of a sine at random phase (arcsine law): Gauss-Chebyshev quadrature."""
+        return self.amplitude_dn * np.cos((2.0 * np.arange(5) + 1.0) * np.pi / 10.0)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -401,7 +389,13 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
                 fields = {name: loose.along, "amplitude_dn": loose.amplitude / alpha, "random_phase": True}
                 found.append((loose.excess, cls(**fields)))
         found += [(wave.excess, cls._of_wave(wave, evidence)) for wave in time.waves if not wave.alternates]
-        return _without_doubles(found)
+        kept: list[Self] = []
+        for _, pickup in sorted(found, key=lambda pair: -pair[0]):
+            # rows and columns both see a line along frames alone
+            places = [(p.cycles_per_row, p.cycles_per_column, p.cycles_per_frame) for p in (pickup, *kept)]
+            if not any(np.allclose(places[0], other, rtol=0.0, atol=1e-4) for other in places[1:]):
+                kept.append(pickup)
+        return kept[:4]
 
     @classmethod
     def _of_wave(cls, wave: Wave, evidence: Evidence) -> Self:
@@ -435,16 +429,6 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
         if self.cycles_per_row == 0.0 and self.cycles_per_column == 0.0:
             return SharedOffset("frame", variance)
         return SharedOffset("wave", variance, self.cycles_per_row, self.cycles_per_column)
-
-
-def _without_doubles(found: Sequence[tuple[float, Pickup]]) -> list[Pickup]:
-    """Return the hypotheses, the strongest first; rows and columns both see a line along frames alone."""
-    kept: list[Pickup] = []
-    for _, pickup in sorted(found, key=lambda pair: -pair[0]):
-        places = [(p.cycles_per_row, p.cycles_per_column, p.cycles_per_frame) for p in (pickup, *kept)]
-        if not any(np.allclose(places[0], other, rtol=0.0, atol=1e-4) for other in places[1:]):
-            kept.append(pickup)
-    return kept[:4]
 
 
 # frames in a record of noise, of which one is used: what is cut from a longer one has no period
@@ -524,14 +508,7 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
 
 
 def _pink_amplitudes(n: int) -> FloatArray:
-    """Return factors of the spectrum that make white noise of a record 1/f, of variance 1.
-
-    Args:
-        n: samples of a frame; there is nothing slower than one cycle in so many.
-
-    Returns:
-        (_RECORD n // 2 + 1,), real.
-    """
+    """Return factors of the spectrum that make white noise of a record 1/f from one cycle in n samples on."""
     cycles = np.arange(_RECORD * n // 2 + 1)
     amplitudes = np.where(cycles >= min(_RECORD, cycles[-1]), np.maximum(cycles, 1) ** -0.5, 0.0)
     weight = np.where((cycles == 0) | (2 * cycles == _RECORD * n), 1.0, 2.0)
@@ -617,11 +594,8 @@ class BiasJumps(OffsetEffect, tag="bias_jumps"):
 
     def offset_values(self) -> FloatArray:
         """Return the levels, DN; of paths those of all parts, since the pixels' places are not known here."""
-        if self.path:
-            values = _values(self.path)
-        else:
-            values = np.asarray(np.arange(self.levels) - (self.levels - 1) / 2.0, np.float64)
-        return self.amplitude_dn * quantile_means(values)
+        even = np.arange(self.levels) - (self.levels - 1) / 2.0
+        return self.amplitude_dn * quantile_means(_values(self.path) if self.path else even)
 
     def _levels(self, context: EffectContext) -> FloatArray:
         """Return the levels at the block's frames in units of ``amplitude_dn``, (frame, part)."""
@@ -647,7 +621,7 @@ class BiasJumps(OffsetEffect, tag="bias_jumps"):
         # a jump always goes to another level
         moves = generator.integers(1, self.levels, frames.size - 1)
         levels = (first + np.concatenate([[0], np.cumsum(moves)])) % self.levels
-        return frames, np.asarray(levels - (self.levels - 1) / 2.0, np.float64)
+        return frames, levels - (self.levels - 1) / 2.0
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -692,10 +666,8 @@ def _level_steps(path: Path, n_frames: int) -> tuple[IntArray, FloatArray]:
 
 
 def _values(paths: tuple[Path, ...]) -> FloatArray:
-    """Return the levels that the paths go through, each as often as it lasts, zero on average.
-
-    The length of the run is not known here: the last level is taken to last as long as the others do.
-    """
+    """Return the levels that the paths go through, each as often as it lasts, zero on average."""
+    # the length of the run is not known here: the last level is taken to last as long as the others do
     last = max((path[-1][0] for path in paths if path), default=0)
     end = last + max(1, last // max(1, max(len(path) for path in paths) - 1))
     found = [np.zeros(1)]
