@@ -52,29 +52,26 @@ class CommonModes:
         for effect, shared in found:
             _check(effect, shared)
         # other frames are taken at other times; of a tag that is there several times, all or none
-        left = {
-            effect.tag: None for effect, shared in found if shared.variance is None or effect.when is not None
-        }
-        parts: dict[bytes, BoolArray] = {}
-        variances: dict[bytes, FloatArray] = {}
+        left = dict.fromkeys(
+            effect.tag for effect, shared in found if shared.variance is None or effect.when is not None
+        )
+        removed = dict.fromkeys(effect.tag for effect, _ in found if effect.tag not in left)
+        parts: dict[bytes, tuple[BoolArray, FloatArray]] = {}
         waves = []
         for effect, shared in found:
             if effect.tag in left or shared.variance is None:
                 continue
             mask = np.ones(shape, np.bool_) if effect.region is None else effect.region.mask(shape)
-            key = mask.tobytes()
-            parts[key] = mask
-            own = variances.setdefault(key, np.zeros(3))
+            _, variances = parts.setdefault(mask.tobytes(), (mask, np.zeros(3)))
             if shared.of != "wave":
-                own[_AXES.index(shared.of)] += shared.variance
+                variances[_AXES.index(shared.of)] += shared.variance
             elif shared.variance > 0.0:
-                place = float(list(parts).index(key))
+                place = float(list(parts).index(mask.tobytes()))
                 waves.append([shared.cycles_per_row, shared.cycles_per_column, shared.variance, place])
-        removed = dict.fromkeys(effect.tag for effect, _ in found if effect.tag not in left)
         return cls(
             tuple(removed),
-            np.array(list(parts.values()), np.bool_).reshape(-1, *shape),
-            np.array(list(variances.values())).reshape(-1, 3),
+            np.array([mask for mask, _ in parts.values()], np.bool_).reshape(-1, *shape),
+            np.array([variances for _, variances in parts.values()]).reshape(-1, 3),
             tuple(left),
             np.array(waves).reshape(-1, 4),
         )
@@ -94,11 +91,7 @@ class CommonModes:
 
 
 def _check(effect: Effect, shared: SharedOffset) -> None:
-    """Refuse what an effect of another package may say.
-
-    Raises:
-        PchEmError: its offset is of nothing that is known, or its variance is none.
-    """
+    """Refuse what an effect of another package may say: an unknown kind, or an impossible variance."""
     known = shared.of in (*_AXES, "wave")
     if not known or (shared.variance is not None and not 0.0 <= shared.variance < np.inf):
         raise PchEmError(f"effect {effect.tag!r}: shared_offset() returned {shared}, which is not an offset")
@@ -173,16 +166,11 @@ class _Design:
     """Offsets of samples as a linear function of standard normal numbers, z.
 
     Of each part there is one of the frame, one of each row, one of each column; of each wave two.
-
-    Attributes:
-        modes: which offsets there are.
-        down: cosine and sine of each wave down the rows, shape (wave, y, 2).
-        along: along the columns, shape (wave, x, 2).
     """
 
     modes: CommonModes
-    down: FloatArray
-    along: FloatArray
+    down: FloatArray  # cosine and sine of each wave down the rows, shape (wave, y, 2)
+    along: FloatArray  # along the columns, shape (wave, x, 2)
 
     @classmethod
     def of(cls, modes: CommonModes) -> _Design:

@@ -98,32 +98,18 @@ def calibration_variance(calibration: Calibration) -> FloatArray:
     Returns:
         e-^2, e- and 1, shape (3, y, x); NaN for pixels without a calibration.
     """
-    return _variance(calibration, calibration.whole_covariance)
-
-
-def _variance(calibration: Calibration, covariance: FloatArray) -> FloatArray:
-    gain = calibration.conversion_gain
-    found = np.stack(
-        [
-            gain**2 * covariance[..., 1, 1],
-            -2.0 * covariance[..., 0, 1],
-            covariance[..., 0, 0] / gain**2,
-        ]
-    )
-    return np.where(calibration.usable, found, np.nan)
+    gain, covariance = calibration.conversion_gain, calibration.whole_covariance
+    of_gain, common, of_bias = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    return np.where(calibration.usable, [gain**2 * of_bias, -2.0 * common, of_gain / gain**2], np.nan)
 
 
 def with_its_errors(calibration: Calibration, signal: FloatArray) -> Calibration:
     """Return a calibration whose law holds what is not known of g and mu, at a signal.
 
     Electron numbers are then given all calibrations that are possible, not given that this one is right; a
-    bias that is an electron off is not in it.
-
-    Args:
-        calibration: of these pixels.
-        signal: e-, shape (y, x).
+    bias that is an electron off is not in it. The signal is in e-, shape (y, x).
     """
-    variance = stderr_at(_variance(calibration, calibration.covariance), signal) ** 2
+    variance = stderr_at(calibration_variance(replace(calibration, rivals=None)), signal) ** 2
     variance /= calibration.conversion_gain**2
     law = calibration.law.with_variance(dn2=np.nan_to_num(variance).ravel())
     return replace(calibration, law=law)

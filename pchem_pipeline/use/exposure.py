@@ -122,17 +122,11 @@ def mean_signal(
 
 @dataclass(frozen=True)
 class _Known:
-    """Histograms of pixels of which g, mu and sigma are known, and the climb to their exposures.
+    """Histograms of pixels of which g, mu and sigma are known, and the climb to their exposures."""
 
-    Attributes:
-        given: a sample for each part of a DN in which codes lie: all have one exposure.
-        law: of the samples.
-        satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
-    """
-
-    given: Histograms
+    given: Histograms  # a sample for each part of a DN in which codes lie: all have one exposure
     law: Law
-    satellites: FloatArray
+    satellites: FloatArray  # amplitude (e-) and weight of free satellites, shape (n, 2)
 
     @classmethod
     def of(
@@ -196,12 +190,8 @@ class _Known:
     def at_border(self, pixels: IntArray, height: FloatArray, own: FloatArray) -> FloatArray:
         """Return one over the mean square of H over the likelihoods of which the maximum is at 0.
 
-        The curvature there says nothing: they fall as an exponential does, or as half a normal law.
-
-        Args:
-            pixels: which, shape (m,).
-            height: log-likelihood at 0, shape (m,).
-            own: (g, mu, sigma), shape (m, 3).
+        The curvature there says nothing: they fall as an exponential does, or as half a normal law. Of
+        ``pixels``, with log-likelihood ``height`` at 0, (m,), and ``own`` (g, mu, sigma), (m, 3).
         """
         reach = _DEPTH / self.given.counts[pixels].sum(axis=1)  # by one a sample and electron at most
         near = np.arange(pixels.size)

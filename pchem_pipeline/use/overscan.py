@@ -95,11 +95,8 @@ def _row_sums(values: FloatArray, where: BoolArray) -> FloatArray:
 def _variances(rows: FloatArray, scatter: FloatArray, number: IntArray, degrees: int) -> tuple[float, float]:
     """Return the variances of the offsets of frames and rows, DN^2, from samples that include them.
 
-    Args:
-        rows: means of the rows less those over the frames, DN, shape (frame, row).
-        scatter: sum of the variances of a row's samples, over the square of their number, DN^2, shape (row,).
-        number: of pixels of a row, shape (row,).
-        degrees: of freedom of the frames.
+    ``rows`` as in `_parted`; ``scatter`` is the sum of the variances of a row's samples, over the square of
+    their ``number``, shape (row,).
     """
     if number.size < 2:
         return 0.0, 0.0
@@ -113,10 +110,8 @@ def _variances(rows: FloatArray, scatter: FloatArray, number: IntArray, degrees:
 def _parted(rows: FloatArray, own: FloatArray, degrees: int) -> tuple[float, float]:
     """Return the variances of the offsets of frames and of rows, DN^2; 0 where a single row tells none.
 
-    Args:
-        rows: as in `_variances`.
-        own: what the pixels' own noise gives to each, DN^2, shape (row,).
-        degrees: of freedom of the frames.
+    ``rows`` are their means less those over the frames, (frame, row), with as many ``degrees`` of freedom of
+    the frames; ``own`` is the variance that the pixels' own noise gives to each, (row,).
     """
     if own.size < 2:
         return 0.0, 0.0

@@ -175,15 +175,11 @@ class AdcInl(Effect, tag="adc_inl"):
     )
 
     @model_validator(mode="after")
-    def _one_form(self) -> Self:
+    def _of_one_form_and_monotone(self) -> Self:
         if (self.form == "curve") != bool(self.curve):
             raise ValueError("adc_inl: form curve and the list `curve` belong together; give both or none")
         if self.curve and len(self.curve) < _FEWEST_KNOTS:
             raise ValueError(f"adc_inl: curve needs at least {_FEWEST_KNOTS} values, got {len(self.curve)}")
-        return self
-
-    @model_validator(mode="after")
-    def _monotone(self) -> Self:
         if self.inl_lsb * self._steepest() >= 1.0:
             form = f"period_dn {self.period_dn}" if self.form == "sine" else f"spacing_dn {self.spacing_dn}"
             raise ValueError(
@@ -350,19 +346,14 @@ class AdcDnl(Effect, tag="adc_dnl"):
         """Return the shifts of the edges of codes ``first .. last``, DN: (codes,) or (codes, x)."""
         if self.pattern != "random":
             return self._listed(np.arange(first, last + 1))
-        parts = []
-        for chunk in range(first // _CHUNK, last // _CHUNK + 1):
-            # a negative code has no edge in the ADC, but the signal may lie there before it is cut
-            draw = chunk & 0xFFFF
-            if columns is None:
-                parts.append(context.random.generator(draw=draw).standard_normal(_CHUNK))
-            else:
-                drawn = [
-                    context.random.generator(x=int(x), draw=draw).standard_normal(_CHUNK) for x in columns
-                ]
-                parts.append(np.stack(drawn, axis=1))
-        begin = first - first // _CHUNK * _CHUNK
-        chosen = np.concatenate(parts)[begin : begin + last - first + 1]
+        # a negative code has no edge in the ADC, but the signal may lie there before it is cut
+        draws = [chunk & 0xFFFF for chunk in range(first // _CHUNK, last // _CHUNK + 1)]
+
+        def normal(x: int | None) -> FloatArray:
+            parts = [context.random.generator(x=x, draw=draw).standard_normal(_CHUNK) for draw in draws]
+            return np.concatenate(parts)[first % _CHUNK :][: last - first + 1]
+
+        chosen = normal(None) if columns is None else np.stack([normal(int(x)) for x in columns], axis=1)
         # a width is the difference of two edges
         shift = chosen * (self.dnl_lsb / np.sqrt(2.0))
         return np.asarray(np.clip(shift, -_FARTHEST_RANDOM, _FARTHEST_RANDOM), np.float64)
@@ -572,11 +563,8 @@ class Clipping(Effect, tag="clipping"):
         code = evidence.code
         high = code.maximum if _piles_up(code, code.maximum, above=True) else None
         low = code.minimum if code.minimum > 0 and _piles_up(code, code.minimum, above=False) else None
-        if high is None and low is None:
-            return ()
-        if high is None or low is None:
-            return (cls(low=low, high=high),)
-        return cls(low=low, high=high), cls(high=high), cls(low=low)
+        pairs = dict.fromkeys(((low, high), (None, high), (low, None)))
+        return [cls(low=low, high=high) for low, high in pairs if (low, high) != (None, None)]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law that counts at the limits what lies beyond them."""

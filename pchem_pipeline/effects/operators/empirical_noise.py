@@ -399,17 +399,13 @@ def _average(mode: NoiseMode) -> _Average:
     power = np.maximum(1.0 + spectrum(mode.lags, mode.correlation), 0.0)
     weights = np.fft.ifftn(np.sqrt(power)).real
     far = [_REACH * size // _POINTS if size > 1 else 0 for size in weights.shape]
-    taps = []
-    for index in np.ndindex(*(2 * n + 1 for n in far)):
-        lag = tuple(i - n for i, n in zip(index, far, strict=True))
-        taps.append(((lag[0], lag[1], lag[2]), float(weights[lag])))
+    frames, rows, columns = (range(-n, n + 1) for n in far)
+    taps = [((t, y, x), float(weights[t, y, x])) for t in frames for y in rows for x in columns]
     taps.sort(key=lambda tap: -abs(tap[1]))
     kept = [tap for tap in taps[:_MOST_TAPS] if abs(tap[1]) >= _SMALLEST_TAP * abs(taps[0][1])]
     norm = sum(weight**2 for _, weight in kept) ** 0.5
-    reach = np.abs([lag for lag, _ in kept]).max(axis=0)
-    return _Average(
-        tuple((lag, weight / norm) for lag, weight in kept), (int(reach[0]), int(reach[1]), int(reach[2]))
-    )
+    t, y, x = np.abs([lag for lag, _ in kept]).max(axis=0).tolist()
+    return _Average(tuple((lag, weight / norm) for lag, weight in kept), (t, y, x))
 
 
 def _of_light(change: FloatArray, number: int, context: EffectContext) -> FloatArray:

@@ -386,9 +386,7 @@ def _logarithmic_beyond_one(v: FloatArray, x: FloatArray) -> IntArray:
         extra[active] += 1
         mass = mass * theta * (n / (n + 1))
         below = below + mass
-        # rounding must not keep the last few alive for ever
-        active = np.where(mass > 1e-17, active, -1)
-        keep = active >= 0
+        keep = mass > 1e-17  # rounding must not keep the last few alive for ever
         active, below, mass, theta = active[keep], below[keep], mass[keep], theta[keep]
         n += 1
     return extra
@@ -526,21 +524,14 @@ class Trapping(Effect, tag="trapping"):
 
     def chance(self, exposure: FloatArray) -> FloatArray:
         """Return m, the chance that a sample with electrons loses one, for exposures H, e-."""
-        return _chance(self.capture, self.release, -np.expm1(-exposure))
-
-
-def _chance(capture: float, release: float, some: FloatArray) -> FloatArray:
-    """Return m, the chance that a sample with electrons loses one, given how probable it is to have any."""
-    return np.asarray(capture * release / (release + capture * some))
+        some = -np.expm1(-exposure)
+        return np.asarray(self.capture * self.release / (self.release + self.capture * some))
 
 
 def _states(filled: BoolArray, emptied: BoolArray, history: int) -> IntArray:
     """Return whether traps are full before and behind each frame, (frame + 1, y, x), 0 or 1.
 
-    Args:
-        filled: in which frames an empty trap is filled, (frame, y, x).
-        emptied: in which frames a full trap is emptied, (frame, y, x).
-        history: frames beyond which a trap is taken for empty.
+    In the frames ``filled`` an empty trap is filled, in those ``emptied`` a full one is emptied.
     """
     start = np.zeros((1, *filled.shape[1:]), np.bool_)
     frame = np.arange(filled.shape[0] + 1)[:, None, None]

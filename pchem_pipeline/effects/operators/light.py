@@ -119,8 +119,7 @@ class Glow(Effect, tag="glow"):
             size = (context.random.uniform(("frame",))[:, 0, 0] < self.burst_share).astype(np.float64)
         result: AnyArray = values.copy()
         bright = size > 0
-        pattern = self.peak_e * self.pattern(context.rows, context.shape)
-        result[bright] += size[bright, None, None] * pattern
+        result[bright] += size[bright, None, None] * (self.peak_e * self.pattern(context.rows, context.shape))
         return result
 
     def added_exposure(
@@ -144,16 +143,12 @@ class Glow(Effect, tag="glow"):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return a spot that bursts, from rows and columns, and one that grows, from block means."""
-        bursts = best_bursts(evidence)
-        found = [] if bursts is None else [cls._of(*bursts)]
         growing = _growing(evidence)
-        return [*found, *([] if growing is None else [cls._of(growing)])]
-
-    @classmethod
-    def _of(cls, spot: Spot, burst_share: float | None = None) -> Self:
-        return cls.model_validate(
-            {"peak_e": spot.peak, "falloff": spot.falloff, "burst_share": burst_share, **spot.place}
-        )
+        found = (best_bursts(evidence), None if growing is None else (growing, None))
+        return [
+            cls(peak_e=spot.peak, falloff=spot.falloff, burst_share=share, **spot.place)
+            for spot, share in filter(None, found)
+        ]
 
     def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return rare bursts more often than they are, and how much rarer they are."""
@@ -268,13 +263,15 @@ class Persistence(Effect, tag="persistence"):
 
     def _seen_image(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the image as a grid over the window, as fine as that over the sensor."""
-        spans = (rows, columns)
         cells = (len(self.image), len(self.image[0]))
-        places = [
+        y, x = (
             (low + (np.arange(n) + 0.5) * (high - low) / n) / size
-            for (low, high), n, size in zip(spans, cells, shape, strict=True)
-        ]
-        values = self._image_at(*places)
+            for (low, high), n, size in zip((rows, columns), cells, shape, strict=True)
+        )
+        return self._with_image(self._image_at(y, x))
+
+    def _with_image(self, values: FloatArray) -> Self:
+        """Return it with such an image; values are relative to the largest one of the image so far."""
         brightest = float(values.max())
         grid = _numbers(values / brightest) if brightest > 0 else ((1.0,),)
         return self.model_copy(update={"image": grid, "peak_e": self.peak_e * brightest})
@@ -287,12 +284,9 @@ class Persistence(Effect, tag="persistence"):
             parts.append(((np.arange(many) + 0.5) / many * size - low) / (high - low))
         y, x = parts
         values = self._image_at(y, x) * ((y > 0) & (y < 1))[:, None] * ((x > 0) & (x < 1))
-        brightest = float(values.max())
-        if not brightest > 0:  # it lies between the centres of cells
-            values[np.abs(y - 0.5).argmin(), np.abs(x - 0.5).argmin()] = brightest = 1.0
-        return self.model_copy(
-            update={"image": _numbers(values / brightest), "peak_e": self.peak_e * brightest}
-        )
+        if not values.max() > 0:  # it lies between the centres of cells
+            values[np.abs(y - 0.5).argmin(), np.abs(x - 0.5).argmin()] = 1.0
+        return self._with_image(values)
 
     def _image_at(self, y: FloatArray, x: FloatArray) -> FloatArray:
         """Return the image, relative to its largest value, at places 0..1 of the sensor."""
@@ -465,9 +459,8 @@ class DarkCurrentRts(Effect, tag="dark_current_rts"):
         step = self.step_e * (random.exponential() if self.steps == "exponential" else 1.0)
         starts_high = random.random() < high / (low + high)
         # an even number of dwell times, well above what the run holds; the same whatever the block
-        pairs = int(
-            2.0 + context.n_frames / (low + high) * 1.5 + 6.0 * (context.n_frames / (low + high)) ** 0.5
-        )
+        cycles = context.n_frames / (low + high)
+        pairs = int(2.0 + cycles * 1.5 + 6.0 * cycles**0.5)
         dwell = random.exponential(size=(pairs, 2)) * ((high, low) if starts_high else (low, high))
         changes = np.cumsum(dwell.reshape(-1))
         # frames before the run are as the first one
@@ -487,11 +480,10 @@ class DarkCurrentRts(Effect, tag="dark_current_rts"):
             return None
         found: dict[tuple[int, int], Telegraph] = {}
         good = maps.usable
-        columns = maps.maps
         for y in np.flatnonzero(good.any(axis=1)):
             row = np.ascontiguousarray(frames[:, y].T)
             for x in np.flatnonzero(good[y]):
-                telegraph = find_telegraph(row[x], numbers, np.array([values[y, x] for values in columns]))
+                telegraph = find_telegraph(row[x], numbers, np.array([values[y, x] for values in maps.maps]))
                 if telegraph is not None:
                     found[int(y), int(x)] = telegraph
         # where most of them seem to blink, it is something else

@@ -223,10 +223,19 @@ class FrameNoise(SharedNoise, tag="frame_noise"):
         Half the mean squared difference of successive frame means, even and odd frames centred apart, less
         what the noise of pixels, rows and columns gives.
         """
-        if evidence.time is None:
+        time = evidence.time
+        if time is None:
             return ()
-        expected = _expected(evidence, evidence.time)
-        steps = _steps(evidence.time)
+        expected = float(mean_variance(evidence))
+        for lines, axis in ((time.row_readout, 1), (time.column_readout, 0)):
+            excess, error = line_excess(lines, mean_variance(evidence, axis))
+            if excess > POSSIBLE * error:
+                expected += excess / lines.shape[1]
+        means = time.frame_readout.astype(np.float64)
+        for chosen in (time.frames % 2 == 0, time.frames % 2 == 1):
+            if chosen.any():
+                means[chosen] -= means[chosen].mean()
+        steps = np.diff(means)[successive(time.frames)]
         if steps.size < 8 or not expected > 0:
             return ()
         excess = float((steps**2).mean() / 2.0 - expected)
@@ -235,26 +244,6 @@ class FrameNoise(SharedNoise, tag="frame_noise"):
         if excess < POSSIBLE * error:
             return ()
         return (cls(frame_noise_dn=float(np.sqrt(excess)) / responsivity(evidence)),)
-
-
-def _expected(evidence: Evidence, time: TimeSeries) -> float:
-    """Return the variance, DN^2, that pixels, rows and columns by themselves give to frame means."""
-    expected = float(mean_variance(evidence))
-    for means, axis in ((time.row_readout, 1), (time.column_readout, 0)):
-        excess, error = line_excess(means, mean_variance(evidence, axis))
-        if excess > POSSIBLE * error:
-            expected += excess / means.shape[1]
-    return expected
-
-
-def _steps(time: TimeSeries) -> FloatArray:
-    """Return differences of the frame means of successive frames, DN, without even-odd contrast."""
-    means = time.frame_readout.astype(np.float64).copy()
-    for parity in (0, 1):
-        chosen = time.frames % 2 == parity
-        if chosen.any():
-            means[chosen] -= means[chosen].mean()
-    return np.asarray(np.diff(means)[successive(time.frames)], np.float64)
 
 
 class ReadoutAlternation(OffsetEffect, tag="readout_alternation"):
@@ -365,7 +354,7 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
 
     def offset_values(self) -> FloatArray:
         """Return values, DN, of a sine at random phase (arcsine law): Gauss-Chebyshev quadrature."""
-        return self.amplitude_dn * np.cos((2.0 * np.arange(5) + 1.0) * np.pi / 10.0)
+        return np.asarray(self.amplitude_dn * np.cos((2.0 * np.arange(5) + 1.0) * np.pi / 10.0))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -594,7 +583,7 @@ class BiasJumps(OffsetEffect, tag="bias_jumps"):
 
     def offset_values(self) -> FloatArray:
         """Return the levels, DN; of paths those of all parts, since the pixels' places are not known here."""
-        even = np.arange(self.levels) - (self.levels - 1) / 2.0
+        even = np.asarray(np.arange(self.levels) - (self.levels - 1) / 2.0, np.float64)
         return self.amplitude_dn * quantile_means(_values(self.path) if self.path else even)
 
     def _levels(self, context: EffectContext) -> FloatArray:
@@ -621,7 +610,7 @@ class BiasJumps(OffsetEffect, tag="bias_jumps"):
         # a jump always goes to another level
         moves = generator.integers(1, self.levels, frames.size - 1)
         levels = (first + np.concatenate([[0], np.cumsum(moves)])) % self.levels
-        return frames, levels - (self.levels - 1) / 2.0
+        return frames, np.asarray(levels - (self.levels - 1) / 2.0, np.float64)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:

@@ -141,7 +141,6 @@ class BitErrors(Effect, tag="bit_errors"):
         """Return the shares of each pixel's samples whose bit is 0 and goes up, or 1 and goes down, (n,)."""
         from pchem_pipeline.effects.estimators.codes import code_range
         from pchem_pipeline.model.law.mass import sample_mass
-        from pchem_pipeline.model.law.sample_law import SampleLaw
 
         first, last = code_range(maps)
         codes = np.arange(first, last + 1)
@@ -233,14 +232,8 @@ class RepeatedFrames(Effect, tag="repeated_frames"):
     def history(self) -> int:
         """Return how long a run of repeats can get, frames."""
         random = math.ceil(math.log(_RARE) / math.log(self.probability)) if self.probability > 0 else 0
-        return random + self._longest_listed()
-
-    def _longest_listed(self) -> int:
-        """Return the length of the longest run of successive numbers in ``frames``."""
-        if not self.frames:
-            return 0
         breaks = np.flatnonzero(np.diff(self.frames) != 1) + 1
-        return int(np.diff(np.concatenate([[0], breaks, [len(self.frames)]])).max())
+        return random + int(np.diff([0, *breaks, len(self.frames)]).max())
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, with repeats in place of their frames."""
@@ -583,14 +576,9 @@ def _threshold(seen: PredictedSamples) -> tuple[int, float] | None:
 def _replaced_share(own: float, moments: FloatArray) -> float:
     """Return the share s of replaced samples from how many are above their own and others' predictions.
 
-    A sample x exceeds the prediction of a chance frame with probability q(x). Of the samples before the
-    correction, those that come out are ``1 - s q`` (in other places), so that ``(1 - s) E[q / (1 - s q)]`` of
-    those that came out exceed their own; the expectation is a series in the moments of q.
-
-    Args:
-        own: samples above their own prediction.
-        moments: those above one, two, three given predictions of other frames, as E[q], E[q^2], E[q^3] times
-            the number of samples.
+    A sample x exceeds the prediction of a chance frame with probability q(x); ``moments`` are E[q], E[q^2]
+    and E[q^3] times the number of samples. Of the samples before the correction, those that come out are
+    ``1 - s q`` (in other places), so that ``(1 - s) E[q / (1 - s q)]`` of those exceed their own.
     """
     first, second, third = moments
     ratio = min(third / second, 1.0) if second > 0 else 0.0
