@@ -71,8 +71,7 @@ def simulate_block(
         settings: the section ``simulate``.
         frames: first frame and the frame after the last.
         rows: first row and the row after the last; ``None`` for all.
-        electron_frames: for how many of the block's first frames the electron number is wanted;
-            ``None`` for all.
+        electron_frames: first frames whose electron number is wanted; ``None`` for all.
 
     Returns:
         Digital numbers (frame, y, x), DN, unsigned; true electron numbers (frame, y, x), e-.

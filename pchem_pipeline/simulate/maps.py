@@ -36,10 +36,7 @@ if TYPE_CHECKING:
 
 
 def draw_truth(settings: SimulateSettings) -> TruthMaps:
-    """Draw the true parameter maps (y, x) of the sensor.
-
-    Args:
-        settings: the section ``simulate``.
+    """Draw the true parameter maps (y, x) of the sensor of a section ``simulate``.
 
     Raises:
         ConfigError: if a value is impossible (H < 0, g <= 0, read noise < 0).
@@ -149,11 +146,7 @@ def _with_defects(truth: TruthMaps, settings: SimulateSettings) -> TruthMaps:
 
 
 def truncated_quantile(distribution: Distribution, u: FloatArray) -> FloatArray:
-    """Return the quantiles of a distribution truncated to its bounds.
-
-    Args:
-        distribution: the settings.
-        u: probabilities in (0, 1), any shape.
+    """Return the quantiles of a distribution truncated to its bounds, at probabilities ``u`` in (0, 1).
 
     Raises:
         ConfigError: if the bounds leave practically nothing of the distribution.

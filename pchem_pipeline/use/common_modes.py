@@ -151,12 +151,7 @@ class Reference:
 
 
 def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
-    """Return the exposure to expect from the mean of some frames, e-, shape (y, x); NaN: no calibration.
-
-    Args:
-        mean: DN, shape (y, x).
-        calibration: of these pixels.
-    """
+    """Return the exposure, e-, (y, x), to expect from the mean of some frames, DN; NaN: no calibration."""
     signal = (mean - calibration.bias) * calibration.conversion_gain
     return np.where(calibration.usable, np.maximum(signal, 0.02), np.nan)  # e-, at least
 
@@ -259,15 +254,10 @@ def estimate_offsets(
     reference: Reference,
     modes: CommonModes,
 ) -> Offsets:
-    """Return the most probable offsets of the frames, rows, columns and waves.
+    """Return the most probable offsets of whole frames (frame, y, x), DN, their rows, columns and waves.
 
     The posterior mode of normal offsets under the mixture of all pixels of the line (best linear prediction
     where the electron numbers are known): each pixel says of the offset what its electron number leaves open.
-
-    Args:
-        frames: DN, whole frames, shape (frame, y, x).
-        reference: the pixels that tell the offsets.
-        modes: which offsets there are.
     """
     from pchem_pipeline.model.law.pcd import pcd_posterior  # loads compiled loops
 

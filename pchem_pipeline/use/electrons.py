@@ -18,16 +18,13 @@ def electrons(
     offsets: Float32Array | None = None,
     room: Float32Array | None = None,
 ) -> Float32Array:
-    """Return ``g (x - mu)``, less the offsets that frames, rows and columns share.
+    """Return ``g (x - mu)``, e-, of frames (frame, y, x), DN; NaN for pixels without a calibration.
 
     Args:
         frames: DN, shape (frame, y, x).
         calibration: of these pixels.
-        offsets: of each sample, DN, shape of the frames; none: None, or an empty array.
+        offsets: that frames, rows and columns share, DN, shape of the frames; none: None, or an empty array.
         room: for as many frames or more, in which the result lies then; None: it has its own.
-
-    Returns:
-        e-, shape (frame, y, x); NaN for pixels without a calibration.
     """
     gain = np.where(calibration.usable, calibration.conversion_gain, np.nan).astype(np.float32)
     bias = calibration.bias.astype(np.float32)
@@ -42,13 +39,10 @@ def electrons(
 
 
 def add_up(frames: NDArray[np.unsignedinteger[Any]], offsets: Float32Array, sums: FloatArray) -> None:
-    """Add x to the sums of pixels, where there are offsets also x^2, x - b and its square; see its range.
+    """Add x to the sums of pixels, where there are offsets b also x^2, x - b and its square; see its range.
 
-    Args:
-        frames: DN, shape (frame, y, x).
-        offsets: b, DN, shape of the frames, or an empty array: none.
-        sums: out, shape (6, y, x): x, x^2, x - b, its square (they stay where there are no offsets), and the
-            smallest and largest x.
+    ``sums``, shape (6, y, x), are x, x^2, x - b, its square (they stay where there are no offsets), and the
+    smallest and largest x. Frames and offsets (or an empty array) are in DN, shape (frame, y, x).
     """
     sums[0] += frames.sum(axis=0, dtype=np.uint64)
     np.minimum(sums[4], frames.min(axis=0), out=sums[4])
@@ -68,11 +62,7 @@ def whole_parts(
 ) -> NDArray[np.uint32]:
     """Return ``x - b`` in whole parts of a DN, ``lift`` DN higher so that none is negative.
 
-    Args:
-        frames: DN, shape (frame, y, x).
-        offsets: b, DN, shape of the frames.
-        parts: codes in a DN.
-        lift: DN.
+    Of frames and their offsets b, DN, (frame, y, x), with so many ``parts`` in a DN.
     """
     out = np.empty(frames.shape, np.uint32)
     for frame, offset, own in zip(frames, offsets, out, strict=True):
@@ -116,11 +106,6 @@ def with_its_errors(calibration: Calibration, signal: FloatArray) -> Calibration
 
 
 def stderr_at(variance: FloatArray, signal: FloatArray) -> FloatArray:
-    """Return the standard error from the calibration at a signal.
-
-    Args:
-        variance: of `calibration_variance`, shape (3, y, x).
-        signal: e-, shape (y, x) or (frame, y, x).
-    """
+    """Return the standard error from the calibration at a signal, e-, shape (y, x) or (frame, y, x)."""
     whole = variance[0] + variance[1] * signal + variance[2] * signal**2
     return np.asarray(np.sqrt(np.maximum(whole, 0.0)))

@@ -31,12 +31,7 @@ class Overscan:
 
     @classmethod
     def measured(cls, frames: Iterable[FloatArray], where: BoolArray) -> Overscan:
-        """Return that of some frames.
-
-        Args:
-            frames: samples of each in the pixels of the overscan, in C order, DN, shape (pixel,).
-            where: these pixels, shape (y, x).
-        """
+        """Return that of the samples of frames in the pixels ``where`` (y, x), in C order, DN, (pixel,)."""
         rows: list[FloatArray] = []
         first, total, square = np.zeros((3, int(where.sum())))
         for values in frames:
@@ -76,8 +71,7 @@ class Overscan:
     def variances_in(self, frames: Iterable[FloatArray]) -> tuple[float, float]:
         """Return the variances of the offsets that other frames, and their rows, have from the bias, DN^2.
 
-        Args:
-            frames: as in `measured`, of the pixels with a bias.
+        Of the pixels with a bias; frames as in `measured`.
         """
         where = np.isfinite(self.bias)
         number, bias = where.sum(axis=1), self.bias[where]

@@ -123,32 +123,26 @@ def block_signal(evidence: Evidence) -> BlockCharge | None:
     return charge._replace(deviation=signal, variance=variance)
 
 
-def exposure_nodes(factors: ArrayLike, n: int = 3) -> tuple[FloatArray, FloatArray]:
-    """Return weights and nodes of a mixture of ``n`` exposures with the same first 2n moments as ``factors``.
+def exposure_nodes(factors: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return weights and nodes of a mixture of three exposures with the first six moments of ``factors``.
 
     Gauss's quadrature for the empirical law (Golub and Welsch 1969), from its moments by Lanczos's recursion.
-
-    Args:
-        factors: exposures relative to H, one for each frame, mean 1.
-        n: nodes; fewer where the factors take fewer values.
-
-    Returns:
-        Weights that sum to 1, and factors of mean 1, each (n,).
+    Factors are exposures relative to H, one for each frame, of mean 1; of one or two values come as few
+    nodes.
     """
     values = np.asarray(factors, np.float64).reshape(-1)
     scale = float(values.std())
     if scale < 1e-9:
         return np.ones(1), np.ones(1)
     z = (values - values.mean()) / scale
-    diagonal, off = np.zeros(n), np.zeros(n - 1)
+    diagonal, off, size = np.zeros(3), np.zeros(2), 3
     before, current = np.zeros(z.size), np.full(z.size, z.size**-0.5)
-    size = n
-    for j in range(n):
+    for j in range(3):
         step = z * current - (off[j - 1] * before if j else 0.0)
         diagonal[j] = float(current @ step)
         step = step - diagonal[j] * current
         norm = float(np.linalg.norm(step))
-        if j == n - 1 or norm < 1e-6:
+        if j == 2 or norm < 1e-6:
             size = j + 1
             break
         off[j], before, current = norm, current, step / norm
@@ -166,14 +160,9 @@ _POINTS_PER_SIGMA = 4
 
 
 def charlier_information(exposure: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return I, the variance per frame of the efficient score ``E[C2 | x] / 2``, e-^4.
+    """Return I, the variance per frame of the efficient score ``E[C2 | x] / 2``, e-^4, shape (n,).
 
-    Args:
-        exposure: H, e-, shape (n,).
-        noise: sigma_e, e-, shape (n,).
-
-    Returns:
-        Bilinear interpolation, in logarithms, of a table; shape (n,).
+    Bilinear interpolation, in logarithms, of a table over H and sigma_e, e-, (n,) each.
     """
     table = _table()
     i, u = _place(np.log(_EXPOSURES), np.log(np.maximum(exposure, 1e-9)))

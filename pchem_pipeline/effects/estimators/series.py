@@ -66,11 +66,9 @@ class TimeProfile(NamedTuple):
 
 
 def settling(position: FloatArray, fraction: float) -> FloatArray:
-    """Return an exponential approach to the end, of mean 0 and range 1 over the run.
+    """Return an exponential approach to the end, of mean 0 and range 1, at times from 0 (first frame) to 1.
 
-    Args:
-        position: times from 0 (first frame) to 1 (last frame).
-        fraction: time constant in lengths of the run.
+    ``fraction``: time constant in lengths of the run.
     """
     whole = -np.expm1(-1.0 / fraction)
     mean = (1.0 - fraction * whole) / whole
@@ -78,12 +76,7 @@ def settling(position: FloatArray, fraction: float) -> FloatArray:
 
 
 def along_path(position: FloatArray, path: Sequence[float]) -> FloatArray:
-    """Return a broken line through nodes at equal distances along the run, of mean 0 over the run.
-
-    Args:
-        position: times from 0 (first frame) to 1 (last frame).
-        path: the nodes, at least two.
-    """
+    """Return a broken line of mean 0 through nodes at equal distances, at times from 0 (first frame) to 1."""
     nodes = np.array(path)
     # the mean of a broken line counts its ends by half
     mean = (nodes.sum() - (nodes[0] + nodes[-1]) / 2.0) / (nodes.size - 1)
@@ -100,11 +93,8 @@ def likely_profiles(series: FloatArray, position: FloatArray) -> list[TimeProfil
     """Return the time profiles that a series may follow, the likeliest first; none if it may be constant.
 
     Of the best line, exponential approach and broken line those that explain more than chance and, with more
-    freedom than the line, more than it by the Bayesian information criterion.
-
-    Args:
-        series: with white noise, shape (n,).
-        position: times from 0 (first frame of the run) to 1 (last frame), shape (n,).
+    freedom than the line, more than it by the Bayesian information criterion. Values with white noise, (n,),
+    at times from 0 (first frame of the run) to 1 (last frame), (n,).
     """
     line, *curves = _time_profiles(series, position)
     kept = [line, *(curve for curve in curves if curve.criterion < line.criterion)]
@@ -183,14 +173,10 @@ class Steps:
 def likeliest_parts(
     series: FloatArray, gaps: FloatArray, layouts: Mapping[Layout, FloatArray]
 ) -> tuple[Layout, list[Steps]]:
-    """Return which groups of series jump together, and the jumps of each.
+    """Return which groups of series (n, m) jump together, and the jumps of each.
 
-    By the squares of what is left in all series, and Schwarz's price for each level and jump.
-
-    Args:
-        series: shape (n, m).
-        gaps: time between each value and the one before, in units of the shortest, shape (n,).
-        layouts: weights of the series in the mean of each group, shape (p, m), p of 2 or more.
+    By the squares of what is left in all series, and Schwarz's price for each level and jump. ``gaps`` as in
+    `find_steps`; ``layouts`` are weights of the series in the mean of each group, (p, m), p of 2 or more.
     """
     n, own = len(series), _own_variance(series)
     found: list[tuple[float, Layout, list[Steps]]] = []
@@ -208,15 +194,12 @@ def likeliest_parts(
 
 
 def find_steps(series: FloatArray, gaps: FloatArray | None = None) -> list[Steps]:
-    """Return the levels of each series and where they begin.
+    """Return the levels of each series of (n, m), m of 2 or more, and where they begin.
 
     A cut must lower the sum of squares by ``4 log(n m) + 6`` times the variance of the noise (twice what the
     Bayesian information criterion asks for: series without steps are cut about once in a thousand times).
-
-    Args:
-        series: shape (n, m), m of 2 or more.
-        gaps: time between each value and the one before, in units of the shortest, shape (n,): a change
-            during a long gap is so much likelier than one between two neighbours. All alike if None.
+    ``gaps``: time between each value and the one before, in units of the shortest, (n,): a change during a
+    long gap is so much likelier than one between two neighbours. All alike if None.
     """
     n, m = series.shape
     variance = _own_variance(series)
@@ -345,13 +328,9 @@ class Levels(NamedTuple):
 
 
 def few_levels(seen: FloatArray, variance: float) -> Levels | None:
-    """Return the fewest values that explain what is seen; None where a normal law does so as well.
+    """Return the fewest values that explain what is seen, (n,); None where a normal law does so as well.
 
     Mixtures of normal laws of known variance by EM, two values and more as long as Schwarz's criterion falls.
-
-    Args:
-        seen: relative deviations, each with noise, shape (n,).
-        variance: of that noise.
     """
     price = math.log(seen.size)  # of a value and its share: twice half a logarithm
     whole = float(seen.var())
@@ -422,12 +401,8 @@ def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:
     """Return the highest line over frames and lines, or None where none stands out.
 
     What is constant in time (part of the bias map), drifts (slower than three cycles per run) and alternation
-    (half the frame rate) are taken away first.
-
-    Args:
-        means: (n, lines), DN; lines with NaN do not count.
-        frames: frame number of each, shape (n,); there may be gaps.
-        n_run: number of frames of the run.
+    (half the frame rate) are taken away first. Means (n, lines), DN, with NaN for lines that do not count, of
+    frames with these numbers, (n,), which may have gaps, in a run of ``n_run``.
     """
     field, lines = _prepared(means)
     if field.shape[0] < 64 or field.shape[1] < 1:
@@ -451,11 +426,7 @@ def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:
 
 
 def incoherent_line(means: AnyArray) -> Line | None:
-    """Return the highest line within frames whose phase is new in every frame, or None.
-
-    Args:
-        means: (n, lines), DN; lines with NaN do not count.
-    """
+    """Return the highest line within frames, of means as in `coherent_line`, whose phase is new in each."""
     field, lines = _prepared(means)
     if field.shape[0] < 16 or field.shape[1] < 8:
         return None
@@ -499,8 +470,8 @@ def _level(power: Float32Array) -> Float32Array:
     """Return the noise power around each place, so that broad humps of the spectrum are no lines.
 
     By stretches of frequencies along frames: at each of the lowest frequencies along lines, where jumps and
-    noise of frames are, and at all the others together. The median of exponentially distributed powers is
-    log 2 of their mean.
+    noise of frames are, and at all the others together. The median of exponential powers is log 2 of their
+    mean.
     """
     level = np.empty_like(power)
     length = power.shape[0]

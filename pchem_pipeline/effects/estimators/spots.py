@@ -28,14 +28,9 @@ def spot_image(
 ) -> FloatArray:
     """Return the brightness of a spot relative to the sensor's brightest pixel, shape (rows, columns).
 
-    Args:
-        rows: of the pixels.
-        columns: of the pixels.
-        shape: rows and columns of the sensor.
-        centre: its row over the number of rows, and its column over that of columns.
-        radius: over the longer side of the sensor: standard deviation of a Gaussian, or the distance in which
-            an exponential falls to 1/e.
-        falloff: which of them.
+    The pixels are those of some rows and columns of a sensor of this shape. The centre is relative to the
+    numbers of rows and columns, the radius to the longer side: the standard deviation of a Gaussian, or the
+    distance in which an exponential falls to 1/e.
     """
     side = max(shape)
     dy = ((rows + 0.5) / shape[0] - centre[0]) * shape[0] / side
@@ -55,12 +50,8 @@ def spot_to_window(
 ) -> dict[str, float]:
     """Return a spot as it is on some rows and columns that are taken for a sensor of their own.
 
-    Args:
-        spot: ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect, and whatever else it has.
-        falloff: see :func:`spot_image`.
-        rows: first, and behind the last.
-        columns: likewise.
-        shape: rows and columns of the sensor.
+    It is given by ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect; ranges as in
+    `to_window`.
     """
     centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
     # the brightest of these pixels is the one nearest to the centre
@@ -116,12 +107,8 @@ def best_spot(
 ) -> Spot | None:
     """Return the spot that fits amplitudes in the cells of a grid best; None if none is positive.
 
-    Args:
-        amplitude: (rows, columns) of a grid over the sensor.
-        noise: standard errors, infinite without pixels.
-        background: what may be there in any proportion beside the spot.
-        shape: rows and columns of the sensor.
-        falloffs: forms that are tried.
+    On a sensor of this shape, with standard errors ``noise``, infinite without pixels. What is like the
+    ``background`` may be there in any proportion beside the spot.
     """
     y, x = ((np.arange(n) + 0.5) * size / n - 0.5 for n, size in zip(amplitude.shape, shape, strict=True))
     inverse = noise**-2.0

@@ -17,16 +17,13 @@ the work is divided:
 
 Halos and histories of several effects add up.
 
-Any effect may have a place and a time (:attr:`~Effect.region`, :attr:`~Effect.when`): it is then applied as
-ever, and what it makes of the samples is kept only there. No effect has to know of it, nor one of another
-package. Several entries of one effect in different regions have strengths and random numbers of their own: so
-are taps described that differ.
+Any effect may have a place and a time (:attr:`~Effect.region`, :attr:`~Effect.when`): what it makes of the
+samples is kept only there, without its knowing. Several entries of one effect in different regions have
+strengths and random numbers of their own: so are taps described that differ.
 
-The same class says what is known of the effect (:attr:`~Effect.title`, :attr:`~Effect.source`,
-:attr:`~Effect.signature`, :attr:`~Effect.separate`), guesses its own parameters from what a stack shows
-(:meth:`~Effect.estimate`), and changes the law of a pixel's samples (:meth:`~Effect.sample_law`), so that the
-fit of the four parameters can run with it. What it adds to the exposure of single pixels, it finds in the
-frames (:meth:`~Effect.added_exposure`). What many pixels share is taken from calibrated frames
+The same class guesses its own parameters from what a stack shows (:meth:`~Effect.estimate`), changes the law
+of a pixel's samples (:meth:`~Effect.sample_law`), so that the fit can run with it, finds the exposure that it
+adds to single pixels (:meth:`~Effect.added_exposure`), and names the offset that many pixels share
 (:meth:`~Effect.shared_offset`).
 """
 
@@ -220,11 +217,7 @@ class Effect(Section):
 
     @classmethod
     def __pydantic_init_subclass__(cls, tag: str = "", **_: Any) -> None:
-        """Register a class with such a tag.
-
-        Raises:
-            ConfigError: if it has no plane or does nothing, or another class has the tag.
-        """
+        """Register a class with such a tag; ConfigError: no plane, does nothing, or its tag is taken."""
         known = _registered.setdefault(tag_of(cls), cls) if tag else cls
         if known is not cls:
             raise ConfigError(
@@ -270,15 +263,10 @@ class Effect(Section):
         return self.model_copy(update={"region": region, "when": when})
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it as it acts on some rows and columns that are taken for a sensor of their own.
+        """Return it as it acts on some rows and columns (ranges) that are taken for a sensor of their own.
 
         For effects with places among their parameters, or a pattern that begins at row or column 0; a region
-        is cut elsewhere.
-
-        Args:
-            rows: first, and behind the last.
-            columns: likewise.
-            shape: rows and columns of the sensor.
+        is cut elsewhere. ``shape``: rows and columns of the whole sensor.
         """
         return self
 
@@ -288,43 +276,33 @@ class Effect(Section):
 
     @abstractmethod
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-        """Return what the plane becomes under this effect.
+        """Return what the plane becomes under this effect, a new array of the same shape and dtype.
 
         Args:
             values: (frame, y, x), unit and dtype of the plane; not to be changed.
             context: the block's frame numbers, rows, maps and random numbers.
-
-        Returns:
-            A new array of the same shape and dtype.
         """
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
-        """Return it with each of its :attr:`typical_values`.
-
-        Used as guesses where :meth:`estimate` has nothing better, and for demonstrations.
-        """
+        """Return it with each of its :attr:`typical_values`, for guesses and demonstrations."""
         return tuple(cls.model_validate(values) for values in cls.typical_values)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return hypotheses about its parameters, the likeliest first; none where nothing speaks for it.
 
-        A hypothesis is only a guess: its strength is found by simulation and its fingerprint compared with
-        the evidence afterwards, so a false one costs time and nothing else. It says what the effect is like,
-        and its strength to a factor of some three. The default is :meth:`typical_as_seen` by the two leading
-        statistics of the signature; none where no statistic depends on the effect.
+        Only guesses of what it is like, of a strength right to a factor of some three: this is found by
+        simulation, and a false one costs time and nothing else. The default is :meth:`typical_as_seen` by the
+        two leading statistics of the signature; none where no statistic depends on the effect.
         """
         return () if cls.untestable else cls.typical_as_seen(evidence, *cls.signature[:2])
 
     @classmethod
     def typical_as_seen(cls, evidence: Evidence, *names: str) -> list[Self]:
-        """Return what is typical, as strong as statistics stand out; none where they do not.
+        """Return what is typical, as strong as the named statistics, which it raises, stand out; else none.
 
-        Args:
-            evidence: of one split.
-            names: of statistics that the effect raises; if its typical strengths have either sign, the first
-                of them has that of the strength and is the one that counts.
+        If its typical strengths have either sign, only the first statistic counts, which has that sign.
         """
         found = []
         typical = cls.typical()
@@ -341,10 +319,8 @@ class Effect(Section):
     def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return the effect as one simulation shows it best, and by what to multiply what it then shows.
 
-        For effects of rare events: by chance a simulated stack holds none of them, or too many.
-
-        Args:
-            frames: numbers of the frames to be simulated, increasing, shape (n,).
+        For rare events: by chance a simulated stack, of frames with increasing numbers, holds none or too
+        many.
         """
         return self, 1.0
 
@@ -358,27 +334,19 @@ class Effect(Section):
     def details(self) -> tuple[str, ...]:
         """Return positive numbers beside the strength with which the statistics go smoothly.
 
-        A search tunes them by simulation where a set with the effect leaves something; those that the law of
-        a sample tells, it takes from the histograms.
+        A search tunes them by simulation; those that the law of a sample tells, it takes from the histograms.
         """
         return ()
 
     def with_satellites(self, amplitude_e: FloatArray, weight: FloatArray, share: float) -> Self:
-        """Return it with the numbers that free satellites of single pixels tell; by default as it is.
+        """Return it with what free satellites of single pixels tell; by default as it is.
 
-        Args:
-            amplitude_e: of the levels of pixels that have some, e-, shape (n,).
-            weight: of these levels, shape (n,).
-            share: of the pixels that have some.
+        They have levels of ``amplitude_e``, e-, and ``weight``, (n,), in this share of the pixels.
         """
         return self
 
     def scaled(self, factor: float) -> Self:
-        """Return a copy of ``factor`` times the strength, kept within the limits of its field.
-
-        Raises:
-            ConfigError: if the effect has no strength to scale.
-        """
+        """Return a copy of ``factor`` times the strength, within its limits; ConfigError: it has none."""
         if not self.strength:
             raise ConfigError(f"effect {self.tag!r} has no strength to scale")
         return self.times(self.strength, factor)
@@ -413,10 +381,7 @@ class Effect(Section):
         return " and ".join(f"its {name} is at the limit of {v:g}" for name, v in self.at_limits().items())
 
     def at_limits(self) -> dict[str, float]:
-        """Return the parameters at a limit of their field, by name.
-
-        Not those at their default, nor those of :attr:`may_be_at_bound`.
-        """
+        """Return parameters at a limit of their field, by name; not defaults, nor `may_be_at_bound`."""
         found = {}
         for name, field in type(self).model_fields.items():
             value = getattr(self, name)
@@ -435,10 +400,7 @@ class Effect(Section):
     def by_law(self, shape: tuple[int, int]) -> Sequence[Effect]:
         """Return effects of one law each for all of their pixels that together are this one.
 
-        For effects with places among their parameters.
-
-        Args:
-            shape: rows and columns of the sensor.
+        For effects with places among their parameters, on a sensor of so many rows and columns.
         """
         return (self,)
 
@@ -446,11 +408,8 @@ class Effect(Section):
         """Return the law of the pixels' samples with this effect: its place in the fit.
 
         Args:
-            model: the law so far, of n pixels.
+            model: the law so far, of n pixels; returned where the effect leaves a pixel's histogram as it is.
             maps: parameters of these pixels, each (n,) (what is known before the fit with the effect).
-
-        Returns:
-            The law with the effect; the same one where it leaves a pixel's own histogram as it is.
         """
         return model
 
@@ -459,23 +418,18 @@ class Effect(Section):
     ) -> AddedExposure | None:
         """Return what it adds to the exposure of each pixel: H is then the exposure without.
 
-        For effects on single pixels, whose histograms show the mean exposure whatever it is made of.
+        For effects on single pixels, whose histograms show the mean exposure whatever it is made of; None
+        where it adds nothing, or only in proportion to H.
 
         Args:
             frames: (frame, y, x), DN; not to be changed.
             numbers: their numbers in the run, increasing, shape (frame,).
             maps: plain fit of these pixels, (y, x) each.
-
-        Returns:
-            Levels and weights, (j, y, x) each; None where it adds nothing, or only in proportion to H.
         """
         return None
 
     def shared_offset(self) -> SharedOffset | None:
-        """Return the offset that it gives to many pixels of a frame alike: calibrated frames are freed of it.
-
-        None where it gives none.
-        """
+        """Return the offset that pixels of a frame share: calibrated frames are freed of it; or None."""
         return None
 
     def displaced(self) -> Mapping[Literal["rows", "columns"], FloatArray]:
@@ -488,21 +442,15 @@ class Effect(Section):
     def replacement(self, frames: NDArray[np.unsignedinteger]) -> Replacement | None:
         """Return the rule by which it replaces samples by others of their frame; None where it does not.
 
-        The law of a pixel then depends on others: the search learns the sensor by what stands in for each.
-
-        Args:
-            frames: codes (frame, y, x), DN, before any is replaced.
+        The law of a pixel then depends on others: the search learns the sensor by what stands in for each. Of
+        codes (frame, y, x), DN, before any is replaced.
         """
         return None
 
     def added_scatter_e(self, exposure: FloatArray) -> FloatArray | None:
-        """Return the scatter that it adds to electron numbers, e- rms, where that is its size.
+        """Return the scatter that it adds to electron numbers of these means, e- rms, if that is its size.
 
-        Args:
-            exposure: mean number of electrons of each pixel, e-.
-
-        Returns:
-            One for each pixel; None where samples with and without it tell its size.
+        None where samples with and without it tell its size.
         """
         return None
 
@@ -521,11 +469,7 @@ def registered_effects() -> dict[str, type[Effect]]:
 
 
 def tag_of(effect: Any) -> str:
-    """Return the tag of an effect class.
-
-    Raises:
-        ConfigError: if the class is not an :class:`Effect` with a tag, a plane and its own ``apply``.
-    """
+    """Return the tag of an effect class; ConfigError: it lacks a tag, a plane or its own ``apply``."""
     where = f"{getattr(effect, '__module__', '?')}.{getattr(effect, '__qualname__', effect)}"
     if not (isinstance(effect, type) and issubclass(effect, Effect)):
         raise ConfigError(

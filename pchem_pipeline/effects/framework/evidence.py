@@ -32,15 +32,7 @@ PLACES = ("next", "before", "early", "late", "lost", "twice")
 
 @dataclass(frozen=True)
 class PixelMaps(PixelParameters):
-    """Fitted parameters of the pixels, each (y, x); NaN where ``usable`` is False.
-
-    Attributes:
-        quanta_exposure: H, e-.
-        conversion_gain: g, e-/DN.
-        bias: mu, DN.
-        read_noise_dn: sigma, DN, quantisation included.
-        usable: pixels with a fit that can be relied upon.
-    """
+    """Fitted parameters of the pixels, each (y, x); NaN where not ``usable``: a fit to be relied upon."""
 
     usable: BoolArray
 

@@ -179,11 +179,7 @@ class Region(_Place):
         return cls.model_validate(simplest_region(mask))
 
     def mask(self, shape: tuple[int, ...], rows: IntArray | None = None) -> BoolArray:
-        """Return which pixels of a sensor, or of a band of its rows, lie in the region, (y, x).
-
-        Args:
-            shape: rows and columns of the sensor.
-            rows: numbers of the band's rows; None: all.
+        """Return which pixels of a sensor, or of a band of its rows with these numbers, lie in it, (y, x).
 
         Raises:
             ConfigError: it reaches beyond the sensor.

@@ -1,8 +1,8 @@
-"""Find effects by tag: our own files, and those of other installed packages.
+"""Find effects by tag: our own files, and those of other installed packages, when somebody asks.
 
-Both are looked for only when somebody asks. Our own are in the modules of the folder ``operators``, so that
-adding an effect touches no other file; others' are announced by entry points of the group
-``pchem_pipeline.effects`` (name: the tag; value: ``package.module:Class``).
+Our own are in the modules of the folder ``operators``, so that adding an effect touches no other file;
+others' are announced by entry points of the group ``pchem_pipeline.effects`` (name: the tag; value:
+``package.module:Class``).
 """
 
 from __future__ import annotations

@@ -540,9 +540,7 @@ class ResponseTerm(Section):
     def seen(self, charge: FloatArray, exposure: FloatArray) -> FloatArray:
         """Return the charge that each sample follows, about its mean (frame, y, x), e-.
 
-        Args:
-            charge: electrons of the samples (frame, y, x).
-            exposure: mean number of electrons (y, x).
+        Of electrons of the samples (frame, y, x), with a mean ``exposure`` (y, x).
         """
         charge = np.maximum(charge - self.above, 0.0) - excess_moments(exposure, self.above)[0]
         axes = _ALONG[self.of]
@@ -555,12 +553,7 @@ class ResponseTerm(Section):
 
 
 def excess_moments(exposure: FloatArray, above: float) -> tuple[FloatArray, FloatArray]:
-    """Return the mean and the variance of what Poisson counts have above a number, e- and e-^2.
-
-    Args:
-        exposure: mean counts, any shape.
-        above: the number, 0 or more.
-    """
+    """Return the mean and the variance of what Poisson counts of some means have above a number, e-, e-^2."""
     if above == 0.0:
         return exposure, exposure
     largest = float(np.max(np.nan_to_num(exposure), initial=0.0))

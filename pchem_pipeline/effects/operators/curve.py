@@ -359,10 +359,7 @@ class AdcDnl(Effect, tag="adc_dnl"):
         return np.asarray(np.clip(shift, -_FARTHEST_RANDOM, _FARTHEST_RANDOM), np.float64)
 
     def _listed(self, wanted: IntArray) -> FloatArray:
-        """Return the shifts of the edges of successive codes that need no random numbers, DN.
-
-        Where a list would change the order of two edges they coincide.
-        """
+        """Return shifts of edges that need no random numbers, DN; edges never change their order."""
         codes = np.arange(wanted[0] - 1, wanted[-1] + 1)
         if self.pattern == "bit":
             shift = (codes >> self.bit & 1) - 0.5

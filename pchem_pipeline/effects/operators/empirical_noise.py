@@ -199,14 +199,9 @@ class NoiseMode(Section):
         return " and ".join(found)
 
     def relative(self, rows: IntArray, columns: IntArray, shape: tuple[int, int]) -> FloatArray:
-        """Return the size relative to others in pixels of a sensor, in a shape that fits (y, x).
+        """Return the relative size in some rows and columns of a sensor, in a shape that fits (y, x).
 
         Its mean square is 1 where shape and profile reach; beyond there is none.
-
-        Args:
-            rows: of the pixels, shape (y,).
-            columns: likewise, shape (x,).
-            shape: rows and columns of the sensor.
         """
         (top, bottom), (left, right) = self.extent or ((0, shape[0]), (0, shape[1]))
         if self.shape:
@@ -235,12 +230,9 @@ class NoiseMode(Section):
         return np.asarray(found / np.sqrt(np.mean(fine**2)))
 
     def reaching(self, extent: tuple[Span, Span], by: tuple[int, int], whole: tuple[int, int]) -> NoiseMode:
-        """Return it on pixels that are counted differently.
+        """Return it on pixels whose rows and columns are higher ``by`` so much, of a ``whole`` number.
 
-        Args:
-            extent: rows and columns that it reaches over where it says nothing of that.
-            by: how much higher the rows and columns are.
-            whole: rows and columns that there are then.
+        ``extent``: rows and columns that it reaches over where it says nothing of that.
         """
         if not (self.shape or self.profile):
             return self
@@ -380,9 +372,7 @@ class _Average(NamedTuple):
 def spectrum(lags: Sequence[Lag], values: Sequence[float]) -> FloatArray:
     """Return ``2 sum_l values_l cos(w l)`` on a grid of frequencies w, the part of lag 0 left out.
 
-    Args:
-        lags: distances; each stands for its opposite, too.
-        values: covariances or correlations at these.
+    Of covariances or correlations at distances, of which each stands for its opposite, too.
     """
     farthest = np.abs(np.array(lags, np.int64).reshape(-1, 3)).max(axis=0, initial=0)
     sizes = [max(_POINTS * int(far), 1) for far in farthest]

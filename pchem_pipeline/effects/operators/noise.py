@@ -262,8 +262,7 @@ class NoiseSkew(Effect, tag="noise_skew"):
 def _exponential_parts(n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return mean (less 1), weight and variance of n consecutive parts of an exponential of mean 1.
 
-    The edges are at equal steps of the fifth root of the survival, so that the tail is resolved, which makes
-    the skew.
+    Edges at equal steps of the fifth root of the survival resolve the tail, which makes the skew.
     """
     edges = -_ROOT * np.log(1.0 - np.arange(n) / n)
     survival = np.append(np.exp(-edges), 0.0)

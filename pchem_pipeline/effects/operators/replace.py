@@ -557,10 +557,7 @@ class PixelCorrection(Effect, tag="pixel_correction"):
 
 
 def _threshold(seen: PredictedSamples) -> tuple[int, float] | None:
-    """Return the threshold, DN, and the share of samples replaced above it; None where none is.
-
-    Of all thresholds the one at which a share explains the deficit above it best (Poisson likelihood).
-    """
+    """Return the threshold, DN, that best explains the deficit above it, and the share replaced, or None."""
     own, (one, _, _) = seen.above, seen.above_chance
     with np.errstate(divide="ignore", invalid="ignore"):
         fall = np.where(own > 0, own * np.log(own / one), 0.0) - (own - one)
