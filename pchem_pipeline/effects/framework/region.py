@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Field,
     SerializerFunctionWrapHandler,
     ValidationInfo,
-    field_validator,
     model_serializer,
     model_validator,
 )
@@ -76,7 +76,7 @@ def _ascending(spans: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...
 
 #: A range: first and last + 1.
 Span = tuple[int, int]
-Spans = Annotated[tuple[Span, ...], BeforeValidator(_spans)]
+Spans = Annotated[tuple[Span, ...], BeforeValidator(_spans), AfterValidator(_ascending)]
 Numbers = Annotated[tuple[int, ...], BeforeValidator(lambda v: (v,) if isinstance(v, int) else v)]
 
 
@@ -153,11 +153,6 @@ class Region(_Place):
         from pchem_pipeline.effects.framework.pixel_sets import mask_file, runs_of
 
         return {**rest, "pixels": runs_of(mask_file(Path(folder or ".") / str(value["mask"])))}
-
-    @field_validator("rows", "columns")
-    @classmethod
-    def _ranges(cls, spans: tuple[Span, ...]) -> tuple[Span, ...]:
-        return _ascending(spans)
 
     @model_validator(mode="after")
     def _somewhere(self) -> Self:
@@ -237,11 +232,6 @@ class When(_Place):
         if when is None or place is not None:
             raise ValueError(f"{value!r} is no time; write {GRAMMAR}")
         return when.numbers()
-
-    @field_validator("range")
-    @classmethod
-    def _ranges(cls, spans: tuple[Span, ...]) -> tuple[Span, ...]:
-        return _ascending(spans)
 
     @model_validator(mode="after")
     def _sometime(self) -> Self:

@@ -420,8 +420,6 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the flickering exposure (frame, y, x), e-."""
-        if self.rms == 0:
-            return values.copy()
         if self.period_frames is not None:
             phase = context.frames / self.period_frames + self.phase_cycles
             factor = np.maximum(1.0 + self.rms * np.sqrt(2.0) * np.sin(2.0 * np.pi * phase), 0.0)

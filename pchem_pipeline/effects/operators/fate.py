@@ -59,8 +59,6 @@ class SpuriousCharge(Effect, tag="spurious_charge"):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, spurious ones included."""
-        if self.mean_e == 0:
-            return values.copy()
         return np.asarray(values + context.random.poisson(np.full(values.shape, self.mean_e)))
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
@@ -98,8 +96,6 @@ class ChargeLag(Effect, tag="charge_lag"):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as read; the first frame gets nothing from before."""
-        if self.fraction == 0:
-            return values.copy()
         u = context.random.uniform(("frame", "y", "x"))
         late = binomial_upper(u.reshape(-1), values.reshape(-1), self.fraction).reshape(values.shape)
         result: AnyArray = values - late
@@ -138,8 +134,6 @@ class ChargeDiffusion(Effect, tag="charge_diffusion"):
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as collected."""
         result = values.copy()
-        if self.fraction == 0:
-            return result
         u = context.random.uniform(("frame", "y", "x"))
         (frame, y, x), (_, to_y, to_x) = sent_to_neighbours(values, u, self.fraction)
         row = context.rows[0] + to_y
@@ -187,8 +181,6 @@ class OpticalCrosstalk(Effect, tag="optical_crosstalk"):
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, with those that came from the neighbours."""
         result = values.copy()
-        if self.probability == 0:
-            return result
         u = context.random.uniform(("frame", "y", "x"))
         _, (frame, y, x) = sent_to_neighbours(values, u, self.probability)
         inside = (y >= 0) & (y < values.shape[1]) & (x >= 0) & (x < values.shape[2])
@@ -307,8 +299,6 @@ class OverdispersedCounts(Effect, tag="overdispersed_counts"):
         """Return electron numbers (frame, y, x), e-, made of Poisson ones of mean ``context.exposure``."""
         assert context.exposure is not None  # the chain gives it from this plane on
         a, exposure = self.relative_variance, context.exposure
-        if a == 0:
-            return values.copy()
         if self.exposures == "lognormal":
             return self._thinned_or_added(values, exposure, context)
         u = context.random.uniform(("frame", "y", "x"))

@@ -302,8 +302,6 @@ class Persistence(Effect, tag="persistence"):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the exposure with what the earlier image left (frame, y, x), e-; draws nothing."""
-        if self.peak_e == 0:
-            return values.copy()
         left = self._left(context.frames)
         return np.asarray(values + left[:, None, None] * self.pattern(context.rows, context.shape))
 
