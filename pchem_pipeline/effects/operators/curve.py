@@ -55,11 +55,10 @@ Noise = Literal["kept", "bent"]
 class Nonlinearity(Effect, tag="nonlinearity"):
     """Relative change of the step per electron, the same in every pixel.
 
-    The capacitance of the sense node and the gain of the source follower depend on the voltage, so the
-    response of a pixel bends (Janesick 2007, chapter on V/V and V/e- nonlinearity): ``k`` electrons give ``k
-    (1 + b (k - 1) / 2)`` in units of the first step, and the step from ``k`` to ``k + 1`` is ``1 + b k``.
-    What comes after the read noise (an amplifier, a converter) bends that as well: it is ``1 + b k`` times
-    as large at ``k`` electrons.
+    The capacitance of the sense node and the gain of the source follower depend on the voltage (Janesick
+    2007, V/V and V/e- nonlinearity): ``k`` electrons give ``k (1 + b (k - 1) / 2)`` in units of the first
+    step, and the step from ``k`` to ``k + 1`` is ``1 + b k``. What comes after the read noise (an amplifier,
+    a converter) makes that ``1 + b k`` times as large, too.
 
     Signature: the score of position against the square of the electron number (He1C2) has one sign in all
     pixels; then He3C1 and He3; He2C1 where the read noise is bent, too. Nothing in time or space. The gain
@@ -126,8 +125,7 @@ class AdcInl(Effect, tag="adc_inl"):
 
     What the ADC converts is ``x + a d(x)`` instead of x (IEEE Std 1241: INL is the deviation of the transfer
     curve from the best line). The form d is a sine, ``sin(2 pi x / P + phi)``, or a smooth curve through
-    knots: one bend over the codes in use is a half or a whole period; segmented references and ramps have
-    more, of any form. It is fixed in DN, whatever the bias and the gain of a pixel.
+    knots. It is fixed in DN, whatever the bias and the gain of a pixel.
 
     Signature: counts per DN, summed over the pixels, deviate smoothly along DN, beyond what the pixels' own
     bias and gain take up; pixels of different bias show the same pattern at the same DN.
@@ -267,12 +265,10 @@ _BIT_GAIN = 12.0
 class AdcDnl(Effect, tag="adc_dnl"):
     """Shifts of the code edges.
 
-    The lower edge of code c lies at ``c - 1/2 + d_c`` (IEEE Std 1241): shifts of edges from the matching of
-    comparators and capacitors, the same code by code for everything that goes through that ADC. An error of
-    the weight of one binary bit repeats with the bit's period (period 16 in EMCCD bias frames, Harpsoe et
-    al. 2012, A&A 542, A23; binary offsets in many instruments, Boone et al. 2018, PASP 130, 064504). A
-    missing code, of a converter or of a look-up table behind it, is one whose two edges coincide: a DNL of
-    -1 LSB.
+    The lower edge of code c lies at ``c - 1/2 + d_c`` (IEEE Std 1241), from the matching of comparators and
+    capacitors, the same for everything that goes through that ADC. An error of the weight of one binary bit
+    repeats with the bit's period (Harpsoe et al. 2012; Boone et al. 2018). A missing code, of a converter or
+    of a look-up table behind it, is one whose two edges coincide: a DNL of -1 LSB.
 
     Signature: counts per DN, summed over the pixels, deviate with alternating sign from code to code; every
     pixel's histogram fits worse, since the pattern is fixed in DN and not at a pixel's peaks.
@@ -435,13 +431,12 @@ class GainStitch(Effect, tag="gain_stitch"):
     """Above ``level_dn`` the scale deviates by ``gain_change (x - origin_dn)``, below it by nothing.
 
     Dual-gain sensors read every pixel by a high and a low gain and join the two into one scale at a fixed
-    level (sCMOS cameras: a kink, a change of width and codes that are missing or doubled there); so do ADCs
-    with two slopes. If the gains are not matched exactly, the scale has a kink at the level, and a step
-    where they are matched about another point.
+    level; so do ADCs with two slopes. If the gains are not matched exactly, the scale has a kink at the
+    level, and a step where they are matched about another point.
 
-    Signature: counts per DN, summed over the pixels, deviate on both sides of one DN, beyond what the
-    pixels' own bias and gain take up; pixels of different bias show it at the same DN. A step shows sharply,
-    at one code; a kink without a step is hardly told from a bend of the whole curve (`adc_inl`).
+    Signature: counts per DN, summed over the pixels, deviate on both sides of one DN, beyond what the pixels'
+    own bias and gain take up; pixels of different bias show it at the same DN. A step shows sharply, at one
+    code; a kink alone is hardly told from a bend of the whole curve (`adc_inl`).
     """
 
     plane = Plane.ADC

@@ -255,16 +255,15 @@ class ExposureDrift(Drift, tag="exposure_drift"):
     """Relative change of H from the first frame to the last, the same in every pixel.
 
     PCH-EM assumes independent, identically distributed frames (Hendrickson et al. 2023, Sec. II-B). Here
-    frame ``n`` of ``N`` sees ``H_n = H (1 + drift s_n)`` with a time profile s of mean 0 and range 1, so
-    they are not. Dark current doubles every 6 to 8 K, about 10 % per kelvin, so a tenth of a kelvin over the
-    run already drifts by 1 %.
+    frame ``n`` of ``N`` sees ``H_n = H (1 + drift s_n)`` with a time profile s of mean 0 and range 1. Dark
+    current doubles every 6 to 8 K, so a tenth of a kelvin over the run already drifts by 1 %.
 
     A ``path`` may be in any unit: its mean and range are taken out. Of a time constant or a path alone, the
     shape need not be told.
 
     Signature: block means of the electron number follow the drift with a slope proportional to H, those of
-    the readout residual do not. The mean over the run stays; for large N the variance grows by ``(drift H /
-    g)^2 / 12`` DN^2 and is no longer that of any single PCD.
+    the readout residual do not. For large N the variance grows by ``(drift H / g)^2 / 12`` DN^2 and is no
+    longer that of any single PCD.
     """
 
     plane = Plane.EXPOSURE
@@ -340,14 +339,13 @@ _SLOWEST = 20
 class ExposureFlicker(Effect, tag="exposure_flicker"):
     """Relative fluctuation of H from frame to frame, the same in all pixels.
 
-    The intensity noise of a lamp or laser, a shutter that jitters, or a temperature that jumps multiplies
-    the exposure of all pixels of frame t by ``a_t`` of mean 1 and standard deviation s (EMVA Standard 1288,
-    release 4.0, requires the source to be stable for this reason). Successive frames may be alike
-    (``correlation_frames``), or the flicker may be a sine: a lamp on the mains, aliased by the frame rate. A
-    lamp that misses a cycle or a laser that hops between modes takes a few values only (``levels``).
+    The intensity noise of a lamp or laser, a shutter that jitters, or a temperature that jumps multiplies the
+    exposure of all pixels of frame t by ``a_t`` of mean 1 and standard deviation s. Successive frames may be
+    alike (``correlation_frames``), or the flicker may be a sine: a lamp on the mains, aliased by the frame
+    rate. A lamp that misses a cycle or a laser that hops between modes takes a few values only (``levels``).
 
-    Signature: the frame means of the electron number scatter more than their shot noise, those of the
-    readout residual do not, and the two do not vary together.
+    Signature: the frame means of the electron number scatter more than their shot noise, those of the readout
+    residual do not, and the two do not vary together.
     """
 
     plane = Plane.EXPOSURE

@@ -47,11 +47,10 @@ class Glow(Effect, tag="glow"):
 
     Output amplifiers, and circuits beside the array, emit near-infrared light that the pixels around them
     collect (amplifier glow of CCDs, circuit glow of CMOS and infrared sensors); a light leak does the same.
-    What is constant is part of the pixels' exposure and in their maps; what bursts now and then, or grows
-    while the electronics warm up, is not.
+    What is constant is part of H; what bursts, or grows while the electronics warm up, is not.
 
-    Signature: means of the electron number of the rows and columns around one place rise, in single frames
-    or along the run, not in proportion to H; nothing in the readout residual.
+    Signature: mean electron numbers of the rows and columns around one place rise, in single frames or along
+    the run, not in proportion to H; nothing in the readout residual.
     """
 
     plane = Plane.EXPOSURE
@@ -182,13 +181,12 @@ _DECAYS = (*SETTLING, 2.0)
 class Persistence(Effect, tag="persistence"):
     """Exposure left over from an earlier image, fading away from the first frame on.
 
-    Traps that a bright exposure has filled empty with their own time constants, and the exposure of frame t
-    becomes ``H + A_p exp(-t / tau)`` with the image A of before (Smith et al. 2008, "A theory for image
-    persistence in HgCdTe photodiodes"). Its map is that of the earlier image and not of H: a spot here, or
-    any image on a coarse grid.
+    Traps that a bright exposure has filled empty with their own time constants: the exposure of frame t
+    becomes ``H + A_p exp(-t / tau)`` with the image A of before (Smith et al. 2008), a spot here, or any
+    image on a coarse grid.
 
-    Signature: block means of the electron number fall along the run in a connected part of the sensor, not
-    in proportion to H; nothing in the readout residual.
+    Signature: block means of the electron number fall along the run in a connected part of the sensor, not in
+    proportion to H; nothing in the readout residual.
     """
 
     plane = Plane.EXPOSURE
@@ -389,10 +387,9 @@ _FEW_PIXELS = 0.3
 class DarkCurrentRts(Effect, tag="dark_current_rts"):
     """Two levels of the exposure, H and H + step, in a fraction of the pixels.
 
-    Random telegraph signals of the dark current are found in few pixels of new sensors and in many
-    irradiated ones, with jumps that are exponentially distributed over the pixels (Hopkins and Hopkinson
-    1993; Goiffon et al. 2009; Virmontois et al. 2013). The state is a Markov chain with exponential dwell
-    times.
+    Random telegraph signals of the dark current are found in few pixels of new sensors and in many irradiated
+    ones, with exponentially distributed jumps (Hopkins and Hopkinson 1993; Goiffon et al. 2009; Virmontois et
+    al. 2013). The state is a Markov chain with exponential dwell times.
 
     Signature: block means of the electron number wander in few pixels, strongly, and successive electron
     numbers are alike there; nothing in the readout residual, nothing in the other pixels.

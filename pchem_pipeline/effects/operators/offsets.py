@@ -105,9 +105,8 @@ def quantile_means(values: FloatArray) -> FloatArray:
 class SharedNoise(OffsetEffect):
     """Base of noise that the pixels of a frame, row or column share: an offset that is new in every frame.
 
-    A reference, ramp or supply that is sampled once for many pixels shifts them all: ``x += n_t`` with
-    ``n_t ~ N(0, s^2)``; the strength is s. A pixel's own histogram only broadens: its read noise becomes
-    ``(sigma^2 + s^2)^(1/2)`` DN. Offsets that do not change from frame to frame are part of the bias map.
+    What is sampled once for many pixels shifts them all: ``x += n_t`` with ``n_t ~ N(0, s^2)``; the strength
+    is s. A pixel's own histogram only broadens, to ``(sigma^2 + s^2)^(1/2)`` DN.
 
     Attributes:
         shared_by: what has one offset.
@@ -192,9 +191,8 @@ class ColumnNoise(SharedNoise, tag="column_noise"):
 class FrameNoise(SharedNoise, tag="frame_noise"):
     """Random offset per frame: noise of a reference that is sampled once per frame.
 
-    It is what remains of pedestal noise after a correction by rows, and why overscan or optically black
-    pixels are subtracted frame by frame (Janesick 2001, Scientific Charge-Coupled Devices; Rauscher 2015,
-    PASP 127, 1144 draws such pedestals).
+    It remains of pedestal noise after a correction by rows, and is why overscan or optically black pixels are
+    subtracted frame by frame (Janesick 2001; Rauscher 2015 draws such pedestals).
 
     Signature: frame means of the readout residual scatter more than ``n`` independent pixels do, by
     ``frame_noise_dn^2``, white from frame to frame; those of the charge do not.
@@ -249,13 +247,11 @@ class FrameNoise(SharedNoise, tag="frame_noise"):
 class ReadoutAlternation(OffsetEffect, tag="readout_alternation"):
     """Offset of alternating sign, the same in every pixel: ``+alternation_dn`` in frames 0, 2, 4, ...
 
-    Two banks of sampling capacitors or ADCs that take turns, or two frame buffers with their own references,
-    leave ``x += (-1)^t d``. (Banks that take turns along columns or rows leave a fixed pattern, which is
-    part of the bias map.)
+    Two banks of capacitors or ADCs, or two frame buffers, that take turns leave ``x += (-1)^t d``. (Along
+    columns or rows such banks leave a fixed pattern, which is part of the bias map.)
 
     Signature: the mean readout residual of even frames exceeds that of odd ones by ``2 alternation_dn``; lag
-    1 is anticorrelated as much as lag 2 is correlated. A pixel's own histogram becomes two copies ``2
-    |alternation_dn|`` apart.
+    1 is anticorrelated as much as lag 2 is correlated. A pixel's histogram becomes two copies that far apart.
     """
 
     title = "even-odd readout alternation (ping-pong offset)"
@@ -292,8 +288,7 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
 
     Switching supplies, clocks and mains reach the video signal, ``x += a sin(2 pi (f_y y + f_x x + f_t t) +
     phi)``. The phase runs on from row to row and frame to frame, or is new in every frame if the frames are
-    not evenly spaced. The herring-bone pattern of the STIS CCD (Jansen et al. 2003, HST Calibration
-    Workshop) is the classic.
+    not evenly spaced. The herring-bone pattern of the STIS CCD (Jansen et al. 2003) is the classic.
 
     Signature: the spectrum of the row means (over frames and rows) of the readout residual has one line, and
     frame means have one where the phase does not advance along the rows; the charge has none. Where samples
@@ -428,10 +423,9 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
     """Noise with a spectrum of ``1 / f`` along the samples of a tap, from one cycle per frame on.
 
     Where pixels leave the sensor one after the other through one amplifier (CCD, EMCCD, skipper) or few of
-    them, the slow part of that amplifier's noise is common to samples that follow each other: stripes along
-    the rows that are soft at their ends, of all widths. Each tap reads a block of columns, row by row, with
-    noise of its own (correlated pink noise of near-infrared arrays: Rauscher 2015; Pyxel
-    ``correlated_pink_noise_cmos``).
+    them, the slow part of its noise is common to samples that follow each other: stripes along the rows that
+    are soft at their ends. Each tap reads a block of columns, row by row, with noise of its own (Rauscher
+    2015; Pyxel ``correlated_pink_noise_cmos``).
 
     Signature: row means of the readout residual scatter, those of adjacent rows alike, and neighbours along
     the row are correlated more than pixels far apart in it. A pixel's own histogram only broadens.
@@ -518,11 +512,9 @@ _PARTS: dict[Parts, FloatArray] = {
 class BiasJumps(OffsetEffect, tag="bias_jumps"):
     """Piecewise constant offset of each quadrant or half of the sensor, independent of the others.
 
-    Each quadrant or half, as if it had an amplifier of its own, sits on one of several levels and jumps to
-    another. The bias jumps of the CCDs of HST/WFPC2 (a tenth of a DN and more; WFPC2 Data Handbook) and the
-    "popcorn mesa" noise of HgCdTe arrays are of this kind.
-
-    An odd middle row or column belongs to the bottom or right.
+    Each part, as if it had an amplifier of its own, sits on one of several levels and jumps to another, like
+    the bias jumps of the CCDs of HST/WFPC2 (a tenth of a DN and more) and the "popcorn mesa" noise of HgCdTe
+    arrays. An odd middle row or column belongs to the bottom or right.
 
     Signature: means of the readout residual wander in one quadrant and not in the others, in sudden steps;
     the charge does not. A pixel's own histogram becomes copies of itself at the levels.
