@@ -33,9 +33,9 @@ class CommonModes:
         parts: pixels of each part, shape (part, y, x); parts may overlap.
         variances: of offsets of the frames, rows and columns of each part, DN^2, shape (part, 3); 0: none.
         left: tags of effects on many pixels alike that are not the same in other frames.
+        waves: patterns ``c cos(2 pi (f_y y + f_x x)) + s sin(...)`` with their own c and s in each frame:
+            f_y, f_x, the variance of c and of s (DN^2), and the number of the part, shape (wave, 4).
         in_noise: variance of these offsets that the read noise of the run includes, DN^2.
-        waves: periodic patterns ``c cos(2 pi (f_y y + f_x x)) + s sin(...)`` with their own c and s in each
-            frame: f_y, f_x, the variance of c and of s (DN^2), and the number of the part, shape (wave, 4).
     """
 
     removed: tuple[str, ...] = ()

@@ -209,7 +209,9 @@ def best_bend(evidence: Evidence) -> list[Bend]:
     curve = CurveResponse.of(evidence)
     if curve is None:
         return []
-    periods = np.geomspace(_SHORTEST, max(2.0 * _in_use(curve.expected), 4.0 * _SHORTEST), _PERIODS)
+    share = np.cumsum(curve.expected) / curve.expected.sum()
+    in_use = float(np.ptp(np.searchsorted(share, [0.01, 0.99])) + 1)  # DN of the middle 98 % of the samples
+    periods = np.geomspace(_SHORTEST, max(2.0 * in_use, 4.0 * _SHORTEST), _PERIODS)
     turned = np.outer(2.0 * np.pi / periods, curve.edges)
     gains, factors = curve.fits(np.stack([np.sin(turned), np.cos(turned)], axis=1))
     worth = curve.worth(gains)
@@ -234,22 +236,19 @@ def best_curve(evidence: Evidence) -> Curve | None:
     best, most = None, float(response.fits(waves)[0].max(initial=0.0))
     share = np.cumsum(response.expected) / response.expected.sum()
     first, last = response.edges[np.searchsorted(share, [_RARE, 1.0 - _RARE])]
+    weight = np.sqrt(np.append(response.expected, 0.0) + np.append(0.0, response.expected))
     for number in _KNOTS:
         knots = np.linspace(first, last, number)
         values, gain = _fit_knots(response, through_knots(knots, np.eye(number), response.edges))
         # a sine has three numbers
         least = (_LEAST_BEND_GAIN + _PRICE * (number - 3)) if best is None else 2.0 * _PRICE
         if response.worth(np.array([gain]), most, least)[0]:
-            level = _straight(response, through_knots(knots, values, response.edges))
+            # less a straight line, which bias and gain of the pixels take up
+            deviation = through_knots(knots, values, response.edges)
+            level = np.polynomial.Polynomial.fit(response.edges, deviation, 1, w=weight)
             best = Curve(float(knots[0]), float(knots[1] - knots[0]), values - level(knots))
             most = gain
     return best
-
-
-def _straight(response: CurveResponse, deviation: FloatArray) -> np.polynomial.Polynomial:
-    """Return the straight line through a deviation (codes + 1,): bias and gain of the pixels take it up."""
-    counts = np.append(response.expected, 0.0) + np.append(0.0, response.expected)
-    return np.polynomial.Polynomial.fit(response.edges, deviation, 1, w=np.sqrt(counts))
 
 
 def _fit_knots(response: CurveResponse, basis: FloatArray) -> tuple[FloatArray, float]:
@@ -297,12 +296,6 @@ def best_stitch(evidence: Evidence) -> list[Stitch]:
         if curve.worth(gains)[best] and (not found or gains[best] > found[0][0] + _LEAST_BEND_GAIN / 2):
             found.insert(0, (gains[best], Stitch(float(levels[best]), *map(float, factors[best]))))
     return [stitch for _, stitch in found]
-
-
-def _in_use(expected: FloatArray) -> float:
-    """Return over how many DN the middle 98 % of the samples spread."""
-    share = np.cumsum(expected) / expected.sum()
-    return float(np.searchsorted(share, 0.99) - np.searchsorted(share, 0.01) + 1)
 
 
 def _sample(maps: PixelMaps) -> PixelMaps:

@@ -84,10 +84,8 @@ def _in_its_place(
     added = effect.added_exposure(frames if when.all() else frames[when], numbers[when], maps)
     if added is None or effect.everywhere:
         return added
-    rows, columns = maps.bias.shape
-    inside = np.ones((rows, columns), np.bool_)
-    if effect.region is not None:
-        inside = effect.region.mask((rows, columns))
+    shape = maps.bias.shape
+    inside = np.ones(shape, np.bool_) if effect.region is None else effect.region.mask(shape)
     share = when.mean()
     none = np.zeros((1, *inside.shape))
     weight = np.concatenate([none + 1.0 - share * inside, share * np.where(inside, added.weight, 0.0)])

@@ -161,8 +161,7 @@ class Effect(Section):
         plane: where in the signal chain it acts, and so what :meth:`apply` gets (see :class:`Plane`).
         along: the later the signal comes to it than to others of its plane, the larger: what adds to a
             voltage, then what bends it, then the steps of the converter, then its limits.
-        title: its name in the literature.
-        source: where it is described.
+        title, source: its name in the literature, and where it is described.
         factors: what it changes, what shares it, how it varies; None of a description, which measures them.
         signature: the statistics (names in :mod:`pchem_pipeline.discrepancy.observe.catalogue`) that it moves
             first, the most telling one first.
@@ -176,13 +175,11 @@ class Effect(Section):
         rough_law: whether :meth:`sample_law` is right for the pixels' parameters only, so that the histograms
             of a few pixels do not tell whether they have the effect.
         empirical: whether it is no hypothesis, but what is measured where all of those have failed.
-        far_reaching: whether samples depend on others anywhere in their frame, so that a part of the sensor
-            by itself does not show it.
+        far_reaching: whether samples depend on others anywhere in their frame: a part does not show it.
         typical_values: parameters as met in practice, one set for each of its kinds (signs, patterns).
         may_be_at_bound: parameters that may well be at a limit, as half a cycle or a missing code. A
             fit that drives any other one there has taken another effect for this one.
-        reach_rows, reach_frames: rows on either side, and frames before, that a sample depends on, where
-            that is so whatever the parameters.
+        reach_rows, reach_frames: rows on either side, and frames before, that a sample depends on.
     """
 
     tag: str = ""
@@ -361,9 +358,7 @@ class Effect(Section):
     def limited(cls, name: str, value: float) -> float:
         """Return a value cut to the limits that its field states."""
         for limit in cls.model_fields[name].metadata:
-            low, high = getattr(limit, "ge", None), getattr(limit, "le", None)
-            value = max(value, low) if low is not None else value
-            value = min(value, high) if high is not None else value
+            value = min(max(value, getattr(limit, "ge", -math.inf)), getattr(limit, "le", math.inf))
         return value
 
     @classmethod
@@ -382,16 +377,14 @@ class Effect(Section):
 
     def at_limits(self) -> dict[str, float]:
         """Return parameters at a limit of their field, by name; not defaults, nor `may_be_at_bound`."""
-        found = {}
-        for name, field in type(self).model_fields.items():
-            value = getattr(self, name)
-            if not isinstance(value, float) or value == field.default or name in self.may_be_at_bound:
-                continue
-            if any(
-                value in (getattr(limit, "ge", None), getattr(limit, "le", None)) for limit in field.metadata
-            ):
-                found[name] = value
-        return found
+        return {
+            name: value
+            for name, field in type(self).model_fields.items()
+            if isinstance(value := getattr(self, name), float)
+            and value != field.default
+            and name not in self.may_be_at_bound
+            and any(value in (getattr(x, "ge", None), getattr(x, "le", None)) for x in field.metadata)
+        }
 
     def describe(self) -> str:
         """Describe in a few words what is known of it."""
@@ -455,7 +448,7 @@ class Effect(Section):
         return None
 
     def halo(self) -> int:
-        """Return how many rows on either side a row depends on, px: :attr:`reach_rows`."""
+        """Return how many rows on either side a row depends on, px."""
         return self.reach_rows
 
     def history(self) -> int:

@@ -168,11 +168,9 @@ class BiasDrift(Drift, OffsetEffect, tag="bias_drift"):
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law smeared over the path; of a walk that with its variance."""
-        return (
-            model.with_variance(dn2=self.drift_dn**2 / 6.0)
-            if self.shape == "walk"
-            else super().sample_law(model, maps)
-        )
+        if self.shape == "walk":
+            return model.with_variance(dn2=self.drift_dn**2 / 6.0)
+        return super().sample_law(model, maps)
 
     @classmethod
     def series(cls, evidence: Evidence, time: TimeSeries) -> FloatArray:

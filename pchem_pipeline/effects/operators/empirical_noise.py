@@ -36,7 +36,6 @@ _REACH = 3  # of the moving average along an axis, for each of them
 _MOST_TAPS, _SMALLEST_TAP = 200, 0.01  # of the moving average; of the largest weight
 _LINE: dict[Dim, str] = {"frame": "frame", "y": "row", "x": "column"}
 _NODES, _NARROWEST = 5, 0.05  # of the law of noise of changing size; relative, to be a law
-_NYQUIST = 0.5  # cycles
 _CHANGED = {"gain": "gain", "light": "light", "noise": "read noise"}
 
 
@@ -114,7 +113,7 @@ class NoiseMode(Section):
         if self.wave is not None and (
             self.lags
             or self.burst is not None
-            or max(map(abs, self.wave)) > _NYQUIST
+            or max(map(abs, self.wave)) > 0.5
             or any(self.wave[axis] for axis in fixed)
         ):
             raise ValueError(f"wave: at most half a cycle, and 0 within a {self.of}; no lags, no burst")
