@@ -36,11 +36,7 @@ if TYPE_CHECKING:
 
 
 def draw_truth(settings: SimulateSettings) -> TruthMaps:
-    """Draw the true parameter maps (y, x) of the sensor of a section ``simulate``.
-
-    Raises:
-        ConfigError: if a value is impossible (H < 0, g <= 0, read noise < 0).
-    """
+    """Draw the true maps (y, x) of a sensor; ConfigError: H < 0, g <= 0 or read noise < 0 somewhere."""
     given = settings.parameters.given()
     maps = {
         name: _with_patterns(truncated_quantile(distribution, u), name, distribution, settings)
@@ -138,11 +134,7 @@ def _with_defects(truth: TruthMaps, settings: SimulateSettings) -> TruthMaps:
 
 
 def truncated_quantile(distribution: Distribution, u: FloatArray) -> FloatArray:
-    """Return the quantiles of a distribution truncated to its bounds, at probabilities ``u`` in (0, 1).
-
-    Raises:
-        ConfigError: if the bounds leave practically nothing of the distribution.
-    """
+    """Return quantiles at ``u`` in (0, 1) within the bounds; ConfigError: nothing lies in these."""
     if isinstance(distribution, Constant):
         return np.full(u.shape, distribution.value)
     low = 0.0 if distribution.minimum is None else _cdf(distribution, distribution.minimum)

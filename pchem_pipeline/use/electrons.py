@@ -20,11 +20,8 @@ def electrons(
 ) -> Float32Array:
     """Return ``g (x - mu)``, e-, of frames (frame, y, x), DN; NaN for pixels without a calibration.
 
-    Args:
-        frames: DN, shape (frame, y, x).
-        calibration: of these pixels.
-        offsets: that frames, rows and columns share, DN, shape of the frames; none: None, or an empty array.
-        room: for as many frames or more, in which the result lies then; None: it has its own.
+    Offsets that frames, rows and columns share, DN, of the shape of the frames (none: None, or an empty
+    array), are taken off. ``room``, for as many frames or more, is where the result is to lie.
     """
     gain = np.where(calibration.usable, calibration.conversion_gain, np.nan).astype(np.float32)
     bias = calibration.bias.astype(np.float32)
@@ -81,12 +78,9 @@ def read_stderr(calibration: Calibration) -> FloatArray:
 
 
 def calibration_variance(calibration: Calibration) -> FloatArray:
-    """Return (c0, c1, c2) of the variance ``c0 + c1 E + c2 E^2`` that the calibration gives to E electrons.
+    """Return (c0, c1, c2), (3, y, x), of the variance ``c0 + c1 E + c2 E^2`` that the calibration gives.
 
-    ``E = g (x - mu)`` moves by ``(E / g) dg - g dmu``. The error is common to all frames.
-
-    Returns:
-        e-^2, e- and 1, shape (3, y, x); NaN for pixels without a calibration.
+    ``E = g (x - mu)``, e-, moves by ``(E / g) dg - g dmu``, in all frames alike; NaN without a calibration.
     """
     gain, covariance = calibration.conversion_gain, calibration.whole_covariance
     of_gain, common, of_bias = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]

@@ -207,8 +207,7 @@ def estimate_exposure(
     ``sum_i c_i log sum_k P(k; H) P(x_i | k)``, the cells of the codes integrated exactly; effects of the
     model are in the law. It uses what a sample says of its electron number, where the mean of rounded or of
     corrected frames adds the read noise to that of the numbers. NaN where all samples lie below those of no
-    electron. Histograms (y, x, code) have their bin 0 at the code ``origin``, (y, x), and ``parts`` codes in
-    a DN.
+    electron. Histograms (y, x, code) begin at ``origin``, (y, x), with ``parts`` codes in a DN.
     """
     n, occupied = origin.size, counts.reshape(origin.size, -1) > 0
     highest = (origin.ravel() + occupied.shape[1] - 1 - occupied[:, ::-1].argmax(axis=1)) / parts

@@ -39,11 +39,7 @@ class ExposureProfile(NamedTuple):
 
 
 def exposure_profile(evidence: Evidence) -> ExposureProfile | None:
-    """Return how the exposure common to all pixels went along, or None where time is not known.
-
-    Frame t has ``sum(k - H) / sum(H)`` of mean ``d_t sum(Var k) / sum(H)`` and variance ``sum(Var k) /
-    sum(H)^2``.
-    """
+    """Return how the exposure common to all pixels went along, or None where time is not known."""
     time, good = evidence.time, evidence.maps.usable
     if time is None or time.frames.size < 8 or not good.any():
         return None
@@ -127,8 +123,7 @@ def exposure_nodes(factors: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Return weights and nodes of a mixture of three exposures with the first six moments of ``factors``.
 
     Gauss's quadrature for the empirical law (Golub and Welsch 1969), from its moments by Lanczos's recursion.
-    Factors are exposures relative to H, one for each frame, of mean 1; of one or two values come as few
-    nodes.
+    Factors are exposures relative to H, one for each frame, of mean 1; fewer values have fewer nodes.
     """
     values = np.asarray(factors, np.float64).reshape(-1)
     scale = float(values.std())

@@ -28,10 +28,7 @@ _MOST_SHIFTS = 4
 
 
 def usable_codes(code: CodeResiduals, *, most: int = 1 << 12) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the longest run of codes with counts enough: codes, relative residuals, expected counts.
-
-    Of a run longer than ``most`` the part with the most counts.
-    """
+    """Return the longest run of codes with counts enough: codes, relative residuals, expected counts."""
     every = code.first + np.arange(code.expected.size)
     # the extreme codes are where a limit piles counts up
     inside = (every > code.minimum) & (every < code.maximum)
@@ -40,7 +37,7 @@ def usable_codes(code: CodeResiduals, *, most: int = 1 << 12) -> tuple[IntArray,
     if not runs.size:
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
     part = slice(*map(int, runs[np.diff(runs).argmax()]))
-    if part.stop - part.start > most:
+    if part.stop - part.start > most:  # the part with the most counts
         sums = np.cumsum(np.concatenate([[0.0], code.expected[part]]))
         begin = part.start + int((sums[most:] - sums[:-most]).argmax())
         part = slice(begin, begin + most)
@@ -252,14 +249,11 @@ def best_curve(evidence: Evidence) -> Curve | None:
 
 
 def _fit_knots(response: CurveResponse, basis: FloatArray) -> tuple[FloatArray, float]:
-    """Return values at the knots of a basis (codes + 1, knots), LSB, and by how much they lower chi2.
-
-    What hardly shows (a straight line, which bias and gain take up, above all) is left at nothing.
-    """
+    """Return values at the knots of a basis (codes + 1, knots), LSB, and by how much they lower chi2."""
     u, size, directions = np.linalg.svd(response.response @ basis, full_matrices=False)
     seen = u.T @ response.residuals
     kept = seen * np.clip(1.0 - _DOUBT / np.maximum(seen**2, 1e-9), 0.0, None)
-    kept[size < _WEAKEST * size[0]] = 0.0
+    kept[size < _WEAKEST * size[0]] = 0.0  # above all a straight line, which bias and gain take up
     values = directions.T @ (kept / np.maximum(size, 1e-300))
     return values, float((seen**2 - (seen - kept) ** 2).sum())
 
@@ -273,10 +267,7 @@ def through_knots(knots: FloatArray, values: FloatArray, places: FloatArray) -> 
 
 
 def best_stitch(evidence: Evidence) -> list[Stitch]:
-    """Return the break of the curve that explains the residuals of the codes best; none if none does.
-
-    A kink alone first, then with a step at the level, where that explains more.
-    """
+    """Return the breaks that explain the codes best: a kink, and before it one with a step if better."""
     curve = CurveResponse.of(evidence)
     if curve is None:
         return []

@@ -32,10 +32,7 @@ class Multiple(NamedTuple):
 
 
 def multiple_of(pattern: FloatArray, seen: FloatArray, weight: FloatArray | float = 1.0) -> Multiple:
-    """Return how many times a pattern, of any shape, is in what is seen, of the same shape.
-
-    ``weight``: inverse variance of what is seen, of all or of each.
-    """
+    """Return how many times a pattern is in what is seen, of inverse variance ``weight``, of one shape."""
     information = float((weight * pattern**2).sum())
     if not (np.isfinite(information) and information > 0):
         return Multiple(0.0, np.inf)
@@ -55,10 +52,7 @@ def responsivity(evidence: Evidence) -> float:
 
 
 def mean_response(evidence: Evidence, inside: BoolArray | None = None) -> float:
-    """Return the mean change of r / its standard deviation per DN of a common offset, 1/DN.
-
-    ``inside``: pixels that count, (y, x); None: all.
-    """
+    """Return the mean change of r / its standard deviation per DN of a common offset of pixels, 1/DN."""
     usable = evidence.maps.usable if inside is None else evidence.maps.usable & inside
     return float(np.mean((evidence.readout_std / evidence.maps.read_noise_dn**2)[usable]))
 

@@ -66,10 +66,7 @@ class TimeProfile(NamedTuple):
 
 
 def settling(position: FloatArray, fraction: float) -> FloatArray:
-    """Return an exponential approach to the end, of mean 0 and range 1, at times from 0 (first frame) to 1.
-
-    ``fraction``: time constant in lengths of the run.
-    """
+    """Return an exponential approach to the end, of mean 0 and range 1, at times 0..1, as ``fraction``."""
     whole = -np.expm1(-1.0 / fraction)
     mean = (1.0 - fraction * whole) / whole
     return np.asarray(-np.expm1(-position / fraction) / whole - mean)
@@ -456,10 +453,8 @@ def _prepared(means: AnyArray) -> tuple[FloatArray, IntArray]:
 
 
 def _without_slow(field: FloatArray, frames: IntArray) -> FloatArray:
-    """Return the field without what no pickup does: the mean, slow changes and alternation of each line.
-
-    They are fitted and not only left out of the spectrum, where gaps between the frames spread them widely.
-    """
+    """Return the field without what no pickup does: the mean, slow changes and alternation of each line."""
+    # fitted and not only left out of the spectrum, where gaps between the frames spread them widely
     position = (frames - frames[0]) / max(int(frames[-1] - frames[0]), 1)
     waves = [np.cos(np.pi * j * position) for j in range(_SLOW_WAVES + 1)]
     basis = np.linalg.qr(np.stack([*waves, 1.0 - 2.0 * (frames % 2)], axis=1))[0]
@@ -470,8 +465,7 @@ def _level(power: Float32Array) -> Float32Array:
     """Return the noise power around each place, so that broad humps of the spectrum are no lines.
 
     By stretches of frequencies along frames: at each of the lowest frequencies along lines, where jumps and
-    noise of frames are, and at all the others together. The median of exponential powers is log 2 of their
-    mean.
+    noise of frames are, and at all the others together.
     """
     level = np.empty_like(power)
     length = power.shape[0]
@@ -479,7 +473,7 @@ def _level(power: Float32Array) -> Float32Array:
         level[piece, :_FRAME_LIKE] = np.median(power[piece, :_FRAME_LIKE], axis=0)
         if power.shape[1] > _FRAME_LIKE:
             level[piece, _FRAME_LIKE:] = np.median(power[piece, _FRAME_LIKE:])
-    # what was fitted and taken away leaves holes: never less than half the typical level
+    # what was fitted and taken away leaves holes; exponential powers have a median of log 2 of their mean
     return np.asarray(np.maximum(level, np.float32(0.5) * np.median(level)) / np.log(2.0), np.float32)
 
 

@@ -50,8 +50,7 @@ def spot_to_window(
 ) -> dict[str, float]:
     """Return a spot as it is on some rows and columns that are taken for a sensor of their own.
 
-    It is given by ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect; ranges as in
-    `to_window`.
+    By ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect; ranges as in `to_window`.
     """
     centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
     # the brightest of these pixels is the one nearest to the centre
@@ -293,10 +292,7 @@ class FadingCells:
 
     @classmethod
     def of(cls, blocks: BlockCharge, exposure: FloatArray, decay: float, grid: int) -> FadingCells:
-        """Return the least squares amplitudes at a time constant, on a grid of so many rows and columns.
-
-        Each is a power of two, smaller where the sensor is.
-        """
+        """Return the least squares amplitudes at a time constant, on a grid of so many cells or fewer."""
         shape = _exponential(blocks, decay)
         weight = blocks.length * shape
         found = weight @ blocks.deviation / (weight @ shape)
@@ -381,10 +377,7 @@ class Fading:
 
 
 def fading_of(blocks: BlockCharge, cells: FadingCells, n_run: int) -> Fading:
-    """Return the time constants, from the time profile of all pixels with their amplitudes as weights.
-
-    A second one where it explains more by three standard deviations.
-    """
+    """Return the time constants of all pixels together, a second one if that explains more by 3 sigma."""
     # cells of noise would weigh in with the time constant that they were found with
     significant = (cells.amplitude / cells.noise) ** 2 > _PRICE_OF_CELL
     amplitude = np.where(significant, cells.amplitude, 0.0).reshape(-1)[cells.cell]

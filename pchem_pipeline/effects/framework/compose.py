@@ -93,10 +93,7 @@ def _in_its_place(
 
 
 def pixel_maps(parameters: Sequence[FloatArray], usable: BoolArray) -> PixelMaps:
-    """Return (H, g, mu, sigma) of n pixels as effects take them, each (n,), NaN where not usable.
-
-    ``usable``: pixels with a fit that can be relied upon; those without finite parameters are none of them.
-    """
+    """Return (H, g, mu, sigma) of n pixels as effects take them, each (n,), NaN where not usable."""
     columns = [np.asarray(values, np.float64).ravel() for values in parameters]
     known = np.asarray(usable, bool).ravel() & np.isfinite(np.stack(columns)).all(axis=0)
     return PixelMaps.known(columns, known)

@@ -316,8 +316,7 @@ class Effect(Section):
     def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return the effect as one simulation shows it best, and by what to multiply what it then shows.
 
-        For rare events: by chance a simulated stack, of frames with increasing numbers, holds none or too
-        many.
+        For rare events: by chance a stack of such frames (of increasing numbers) holds none, or too many.
         """
         return self, 1.0
 
@@ -391,10 +390,7 @@ class Effect(Section):
         return self.title or self.tag
 
     def by_law(self, shape: tuple[int, int]) -> Sequence[Effect]:
-        """Return effects of one law each for all of their pixels that together are this one.
-
-        For effects with places among their parameters, on a sensor of so many rows and columns.
-        """
+        """Return effects of one law each for all of their pixels that together are this one on a sensor."""
         return (self,)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
@@ -441,10 +437,7 @@ class Effect(Section):
         return None
 
     def added_scatter_e(self, exposure: FloatArray) -> FloatArray | None:
-        """Return the scatter that it adds to electron numbers of these means, e- rms, if that is its size.
-
-        None where samples with and without it tell its size.
-        """
+        """Return the scatter that it adds to electrons of these means, e- rms; None: it has no such size."""
         return None
 
     def halo(self) -> int:

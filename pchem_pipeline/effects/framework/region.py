@@ -164,21 +164,13 @@ class Region(_Place):
 
     @classmethod
     def of_mask(cls, mask: BoolArray) -> Region:
-        """Return the region of a map of pixels, in its simplest form: ranges, else single pixels.
-
-        Raises:
-            ConfigError: it holds no pixel, or too many single ones.
-        """
+        """Return the simplest region of a map of pixels; ConfigError: no pixel, or too many runs of them."""
         from pchem_pipeline.effects.framework.pixel_sets import simplest_region
 
         return cls.model_validate(simplest_region(mask))
 
     def mask(self, shape: tuple[int, ...], rows: IntArray | None = None) -> BoolArray:
-        """Return which pixels of a sensor, or of a band of its rows with these numbers, lie in it, (y, x).
-
-        Raises:
-            ConfigError: it reaches beyond the sensor.
-        """
+        """Return its pixels of a sensor, or of a band of rows, (y, x); ConfigError: it reaches beyond."""
         from pchem_pipeline.effects.framework.pixel_sets import region_mask
 
         return region_mask(self, shape, rows)
@@ -288,11 +280,7 @@ class When(_Place):
 
 
 def parse_place(text: str) -> tuple[Region | None, When | None]:
-    """Return the place and the time of one line, for example ``columns=40:50,frames=200:400``.
-
-    Raises:
-        ValueError: it is not of the grammar; says it.
-    """
+    """Return place and time of one line, as ``columns=40:50,frames=200:400``; ValueError: another grammar."""
     region: dict[str, Any] = {}
     when: dict[str, Any] = {}
     if text.startswith("{"):  # as :meth:`Region.text` writes what the grammar has no words for

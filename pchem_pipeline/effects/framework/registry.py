@@ -38,11 +38,7 @@ def broken_plugins() -> Mapping[str, str]:
 
 
 def effect_class(tag: str) -> type[Effect]:
-    """Return the effect of a tag.
-
-    Raises:
-        ConfigError: if there is none; names those there are and the plug-ins left out.
-    """
+    """Return the effect of a tag; ConfigError: there is none; it names those there are."""
     classes, broken = _discover()
     if tag in classes:
         return classes[tag]

@@ -79,10 +79,7 @@ class InterpixelCapacitance(Effect, tag="interpixel_capacitance"):
     )
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
-        """Return the signal (frame, y, x), e-, with the neighbours' charge; draws nothing.
-
-        At the edges of the sensor the missing neighbours take and give nothing.
-        """
+        """Return the signal (frame, y, x), e-, with the charge of the neighbours that there are."""
         result: AnyArray = values.copy()
         if context.charge is None:
             return result
@@ -108,10 +105,7 @@ class InterpixelCapacitance(Effect, tag="interpixel_capacitance"):
         return [*(one.model_copy(update=differing) for one in found), *found]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with a smaller step, the neighbours' mean charge and its variance.
-
-        The four neighbours are taken to have the pixel's own exposure.
-        """
+        """Return the law with a smaller step and neighbours' charge, of the pixel's own exposure."""
         exposure = np.nan_to_num(maps.quanta_exposure)
         squares = 4.0 * self.coupling**2 * (1.0 + self.anisotropy**2)
         return model.with_levels(
@@ -538,10 +532,7 @@ class ResponseTerm(Section):
         return what + (f" {where}" if any(self.place) else "")
 
     def seen(self, charge: FloatArray, exposure: FloatArray) -> FloatArray:
-        """Return the charge that each sample follows, about its mean (frame, y, x), e-.
-
-        Of electrons of the samples (frame, y, x), with a mean ``exposure`` (y, x).
-        """
+        """Return the charge (frame, y, x) that samples follow, less its mean by the exposure (y, x), e-."""
         charge = np.maximum(charge - self.above, 0.0) - excess_moments(exposure, self.above)[0]
         axes = _ALONG[self.of]
         sums = np.broadcast_to(charge.sum(axis=axes, keepdims=True), charge.shape) if axes else charge
