@@ -1,4 +1,4 @@
-"""What an effect is told about the block of frames that it acts on."""
+"""What an effect knows of the block of frames that it acts on."""
 
 from __future__ import annotations
 

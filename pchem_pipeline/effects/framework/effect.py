@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 #: Frames through which the samples that an effect without a name moves are followed.
 DEPTH = 4
-#: Parts of such an effect that are told in words.
+#: Parts of such an effect that are described in words.
 MOST_TOLD = 4
 # standard deviations by which an effect of typical strength moves its leading statistic, in so many samples
 _USUAL, _USUAL_SAMPLES = 7.0, 1e6
@@ -252,7 +252,7 @@ class Effect(Section):
 
     @property
     def measured_parts(self) -> int:
-        """How many things are told that were measured and have no explanation."""
+        """How many things it describes that were measured and have no explanation."""
         return int(type(self).empirical)
 
     def at_place(self, region: Region | None, when: When | None = None) -> Self:

@@ -675,9 +675,9 @@ class EmpiricalResponse(Effect, tag="empirical_response"):
             followed.setdefault(term.describe(), []).append(
                 f"{100.0 * self.response * term.weight:+.2g} %{only}"
             )
-        told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:MOST_TOLD]]
+        words = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:MOST_TOLD]]
         more = f", and {len(followed) - MOST_TOLD} more" if len(followed) > MOST_TOLD else ""
-        return f"samples{in_place(self)} depend on the charge of other samples ({', '.join(told)}{more})"
+        return f"samples{in_place(self)} depend on the charge of other samples ({', '.join(words)}{more})"
 
 
 def _few(parts: Sequence[str]) -> str:

@@ -658,8 +658,8 @@ class EmpiricalElectrons(Effect, tag="empirical_electrons"):
 
     def describe(self) -> str:
         """Return what is known of it."""
-        told = [mode.describe(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
-        return f"electron numbers{in_place(self)} are not independent ({'; '.join(told)})"
+        parts = [mode.describe(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
+        return f"electron numbers{in_place(self)} are not independent ({'; '.join(parts)})"
 
 
 def _gone(electrons: IntArray, u: FloatArray, chance: float) -> IntArray:

@@ -742,9 +742,6 @@ class Empirical(Effect, tag="empirical"):
 
     def describe(self) -> str:
         """Return what is known of it."""
-        what = {
-            "sample": "samples", "row": "rows", "column": "columns", "frame": "frames",
-        }[self.together]  # fmt: skip
         if self.squares:
             rows, columns = (("even", "odd")[parity] for parity in self.squares)
             return (
@@ -753,9 +750,9 @@ class Empirical(Effect, tag="empirical"):
             )
         shares = self.shares()
         order = np.argsort(-shares)[:MOST_TOLD]
-        told = [f"{percent(shares[i])} {self.moves[i].describe()}" for i in order]
-        how = f" {self.moves[0].describe()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
-        return f"{percent(self.share)} of the {what}{in_place(self)} are shifted{how}"
+        parts = [f"{percent(shares[i])} {self.moves[i].describe()}" for i in order]
+        how = f" {self.moves[0].describe()}" if len(self.moves) == 1 else f" ({', '.join(parts)})"
+        return f"{percent(self.share)} of the {self.together}s{in_place(self)} are shifted{how}"
 
 
 def _averaged(values: IntArray, chosen: BoolArray) -> IntArray:
