@@ -145,7 +145,9 @@ class Glow(Effect, tag="glow"):
         growing = _growing(evidence)
         found = (best_bursts(evidence), None if growing is None else (growing, None))
         return [
-            cls(peak_e=spot.peak, falloff=spot.falloff, burst_share=share, **spot.place)
+            cls.model_validate(
+                {"peak_e": spot.peak, "falloff": spot.falloff, "burst_share": share, **spot.place}
+            )
             for spot, share in filter(None, found)
         ]
 
