@@ -32,7 +32,7 @@ class Multiple(NamedTuple):
 
 
 def multiple_of(pattern: FloatArray, seen: FloatArray, weight: FloatArray | float = 1.0) -> Multiple:
-    """Return how many times a pattern is in what is seen, of inverse variance ``weight``, of one shape."""
+    """Return how many times a pattern is in what is seen, which has the inverse variance ``weight``."""
     information = float((weight * pattern**2).sum())
     if not (np.isfinite(information) and information > 0):
         return Multiple(0.0, np.inf)
@@ -52,7 +52,7 @@ def responsivity(evidence: Evidence) -> float:
 
 
 def mean_response(evidence: Evidence, inside: BoolArray | None = None) -> float:
-    """Return the mean change of r / its standard deviation per DN of a common offset of pixels, 1/DN."""
+    """Return the mean of d(r / sd of r) by a common offset of the pixels ``inside`` (None: all), 1/DN."""
     usable = evidence.maps.usable if inside is None else evidence.maps.usable & inside
     return float(np.mean((evidence.readout_std / evidence.maps.read_noise_dn**2)[usable]))
 

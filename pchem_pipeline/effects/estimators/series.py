@@ -66,7 +66,7 @@ class TimeProfile(NamedTuple):
 
 
 def settling(position: FloatArray, fraction: float) -> FloatArray:
-    """Return an exponential approach to the end, of mean 0 and range 1, at times 0..1, as ``fraction``."""
+    """Return an exponential approach at times 0..1, of mean 0, range 1 and time constant ``fraction``."""
     whole = -np.expm1(-1.0 / fraction)
     mean = (1.0 - fraction * whole) / whole
     return np.asarray(-np.expm1(-position / fraction) / whole - mean)

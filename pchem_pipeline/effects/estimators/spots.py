@@ -292,7 +292,7 @@ class FadingCells:
 
     @classmethod
     def of(cls, blocks: BlockCharge, exposure: FloatArray, decay: float, grid: int) -> FadingCells:
-        """Return the least squares amplitudes at a time constant, on a grid of so many cells or fewer."""
+        """Return least squares amplitudes at a time constant, on at most ``grid`` rows and columns."""
         shape = _exponential(blocks, decay)
         weight = blocks.length * shape
         found = weight @ blocks.deviation / (weight @ shape)
@@ -301,21 +301,22 @@ class FadingCells:
         cell = (blocks.y * rows // exposure.shape[0]) * columns + blocks.x * columns // exposure.shape[1]
         n = rows * columns
 
-        def mean_of(values: FloatArray, inverse: FloatArray) -> FloatArray:
-            return np.bincount(cell, values * inverse, n) / np.maximum(np.bincount(cell, inverse, n), 1e-300)
-
         inverse = stderr**-2
+        held = np.bincount(cell, inverse, n)
+
+        def mean_of(values: FloatArray) -> FloatArray:
+            return np.bincount(cell, values * inverse, n) / np.maximum(held, 1e-300)
+
         # from the middle of each cell: from 0 on a bright image would be cut at so many steps
         amplitude = np.nan_to_num(ndimage.median(found, cell, np.arange(n)))
         for _ in range(_CUT_ROUNDS):
             # single pixels that jump are another effect
             middle = amplitude[cell]
-            amplitude = mean_of(np.clip(found, middle - _CUT * stderr, middle + _CUT * stderr), inverse)
-        held = np.bincount(cell, inverse, n)
+            amplitude = mean_of(np.clip(found, middle - _CUT * stderr, middle + _CUT * stderr))
         noise = np.where(held > 0, np.maximum(held, 1e-300) ** -0.5, np.inf)
         freedom = max(int((held > 0).sum()) - 1, 1)
         score = (float(np.sum((amplitude / noise) ** 2)) - freedom) / np.sqrt(2.0 * freedom)
-        bright = mean_of(exposure[blocks.y, blocks.x], inverse)
+        bright = mean_of(exposure[blocks.y, blocks.x])
         size = (rows, columns)
         return cls(decay, amplitude.reshape(size), noise.reshape(size), bright.reshape(size), score, cell)
 

@@ -342,7 +342,7 @@ class Effect(Section):
         return self
 
     def scaled(self, factor: float) -> Self:
-        """Return a copy of ``factor`` times the strength, within its limits; ConfigError: it has none."""
+        """Return a copy of ``factor`` times the strength, within its limits; ConfigError: no strength."""
         if not self.strength:
             raise ConfigError(f"effect {self.tag!r} has no strength to scale")
         return self.times(self.strength, factor)

@@ -105,7 +105,7 @@ class InterpixelCapacitance(Effect, tag="interpixel_capacitance"):
         return [*(one.model_copy(update=differing) for one in found), *found]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with a smaller step and neighbours' charge, of the pixel's own exposure."""
+        """Return the law with a smaller step, and charge of neighbours as exposed as the pixel."""
         exposure = np.nan_to_num(maps.quanta_exposure)
         squares = 4.0 * self.coupling**2 * (1.0 + self.anisotropy**2)
         return model.with_levels(

@@ -229,7 +229,7 @@ class NoiseMode(Section):
         return np.asarray(found / np.sqrt(np.mean(fine**2)))
 
     def reaching(self, extent: tuple[Span, Span], by: tuple[int, int], whole: tuple[int, int]) -> NoiseMode:
-        """Return it on pixels whose rows and columns are higher ``by`` so much, of a ``whole`` number.
+        """Return it on pixels whose row and column numbers are larger ``by`` so much, ``whole`` of them.
 
         ``extent``: rows and columns that it reaches over where it says nothing of that.
         """
