@@ -83,7 +83,6 @@ class NoiseMode(Section):
         max_length=32,
         description="relative size along a row or column, at evenly spaced points; empty: uniform",
     )
-
     extent: tuple[Span, Span] | None = Field(
         default=None,
         description="shape, profile: range of rows and of columns, ends excluded; null: all",

@@ -70,9 +70,8 @@ class ChargeLag(Effect, tag="charge_lag"):
     """Probability that an electron is read with the next frame instead of its own.
 
     An incomplete transfer out of the photodiode leaves each electron behind with probability f (Fossum and
-    Hondongwa 2014, "A Review of the Pinned Photodiode"; 0.1 e- and less in the pump-gate pixels of Ma et al.
-    2015). Poisson electrons that are delayed independently stay independent Poisson from frame to frame
-    (Mirasol 1963, for the output of the queue M/G/infinity): at constant exposure this is invisible.
+    Hondongwa 2014; 0.1 e- and less in the pump-gate pixels of Ma et al. 2015). Poisson electrons that are
+    delayed independently stay independent Poisson from frame to frame (Mirasol 1963).
 
     Signature: none at constant exposure: what is late in one frame is replaced, on average and in law, by
     what was late in the frame before.
@@ -106,13 +105,10 @@ class ChargeLag(Effect, tag="charge_lag"):
 class ChargeDiffusion(Effect, tag="charge_diffusion"):
     """Probability that an electron is collected by one of the four neighbours (each a quarter of it).
 
-    Carriers released below the depleted region wander sideways before they are collected (Janesick 2001,
-    Scientific Charge-Coupled Devices, ch. 4). Each electron moves to one of the four neighbours with
-    probability f, independently of the others. Poisson electrons that are moved independently stay
+    Carriers released below the depleted region wander sideways before they are collected (Janesick 2001, ch.
+    4). One that would leave the sensor at its edge stays. Poisson electrons that are moved independently stay
     independent Poisson (Kingman 1993, Poisson Processes, displacement theorem): in frames of one constant
     exposure this is invisible, and part of H.
-
-    An electron that would leave the sensor at its edge stays.
 
     Signature: none: the map of H is blurred, and nothing tells a blurred map from a smooth one.
     """
@@ -147,14 +143,11 @@ class ChargeDiffusion(Effect, tag="charge_diffusion"):
 class OpticalCrosstalk(Effect, tag="optical_crosstalk"):
     """Probability that an electron makes one more in one of the four neighbours (each a quarter of it).
 
-    Every electron makes, with probability p, one further electron in one of the four neighbours. Electron
-    luminescence does so in image sensors, avalanches in single-photon diode arrays (Rech et al. 2008; Otte
-    et al. 2009). Each pixel's count stays Poisson, of mean ``H + p`` times the mean of its neighbours' H,
-    but neighbours are correlated: ``cov(K_i, K_j) = (p / 4) (H_i + H_j)``. Only the electrons themselves
-    show it, not the readout.
-
-    Photons that leave the sensor at its edge are lost. H is the exposure from outside: the electrons that
-    come from the neighbours are on top of it.
+    Electron luminescence does so in image sensors, avalanches in single-photon diode arrays (Rech et al.
+    2008; Otte et al. 2009). Each pixel's count stays Poisson, of mean ``H + p`` times the mean of its
+    neighbours' H, but neighbours are correlated: ``cov(K_i, K_j) = (p / 4) (H_i + H_j)``. Only the electrons
+    themselves show it, not the readout. Photons that leave the sensor at its edge are lost. H is the exposure
+    from outside.
 
     Signature: electron numbers of neighbours along x and y are correlated by about p / 2; the readout
     residual follows neither the neighbour's residual nor its electrons.
@@ -197,12 +190,9 @@ class BranchingCounts(Effect, tag="branching_counts"):
 
     Avalanches, hot carriers and luminescence that is absorbed in the pixel itself multiply electrons: every
     one, the secondary ones too, makes Poisson many (mean l) more. A primary one then becomes a cluster of
-    Borel size, and Poisson many of them a generalised Poisson number (Consul and Jain 1973), in use for
-    silicon photomultipliers (Vinogradov 2012): ``P(k) = q (q + l k)^(k - 1) exp(-q - l k) / k!`` of mean ``q
-    / (1 - l)`` and variance ``q / (1 - l)^3``.
-
-    H stays the mean number of electrons, ``q = H (1 - l)`` the primary ones: the two cannot be told apart at
-    one exposure.
+    Borel size, and Poisson many of them a generalised Poisson number (Consul and Jain 1973; Vinogradov 2012
+    for silicon photomultipliers): ``P(k) = q (q + l k)^(k - 1) exp(-q - l k) / k!`` of mean ``q / (1 - l)``
+    and variance ``q / (1 - l)^3``. H stays the mean number of electrons, ``q = H (1 - l)`` the primary ones.
 
     Signature: the score of the second Charlier polynomial is positive in all pixels, and per sample the same
     at every H; then that of the third; nothing in time, nothing between neighbours.

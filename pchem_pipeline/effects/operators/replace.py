@@ -210,7 +210,6 @@ class RepeatedFrames(Effect, tag="repeated_frames"):
     frames: tuple[int, ...] = Field(
         default=(), max_length=1 << 20, description="numbers of further frames that repeat the one before"
     )
-
     rows: tuple[int, int] | None = Field(
         default=None, description="repeated rows: first and last + 1; null: all"
     )
@@ -482,14 +481,13 @@ class PixelCorrection(Effect, tag="pixel_correction"):
 
     Scientific cameras correct hot and blinking pixels in their firmware, often by default and without a word
     in the file: hot-pixel correction with levels (Hamamatsu ``HOTPIXELCORRECT_LEVEL``), dynamic filters of
-    telegraph noise (Andor ``SpuriousNoiseFilter``), static maps of blemishes. The rule is a threshold: a
-    sample that exceeds the median of its eight neighbours by more than so many DN comes out as that median.
+    telegraph noise (Andor ``SpuriousNoiseFilter``), static maps of blemishes.
 
     Signature: samples equal what their neighbours predict more often than what those of the next frame do,
     and exceed it less often; the upper tail of a pixel is cut, the more so the darker its neighbours. A
     pixel's own histogram has no law of its own, since the cut is where the neighbours put it: the search
-    learns the sensor by what those predict (:meth:`replacement`), and in a fit the pixels keep the
-    parameters of their corrected samples.
+    learns the sensor by what those predict (:meth:`replacement`), and in a fit the pixels keep the parameters
+    of their corrected samples.
     """
 
     plane = Plane.READOUT
