@@ -176,34 +176,25 @@ class AnalogMemory(Effect, tag="analog_memory"):
         The first frame of the block has none before it (it is only the history of the others).
         """
         result: AnyArray = values.copy()
-        if context.charge is not None:
-            result[1:] += self._memories(context) * self._left(context.charge[:-1])
+        if context.charge is None:
+            return result
+        left, memory = context.charge[:-1], np.asarray(self.memory)
+        if self.saturation_e is not None:
+            left = -self.saturation_e * np.expm1(-left / self.saturation_e)
+        if self.spread > 0:
+            normal = special.ndtri(context.random.uniform(("y", "x"), OF_PIXEL[0]))
+            memory = self.memory * np.exp(self.spread * normal - self.spread**2 / 2.0)
+        result[1:] += memory * left
         return result
-
-    def _memories(self, context: EffectContext) -> FloatArray | float:
-        """Return the memory of the pixels, shape (1, y, x), or of all."""
-        if self.spread == 0:
-            return self.memory
-        normal = special.ndtri(context.random.uniform(("y", "x"), OF_PIXEL[0]))
-        return np.asarray(self.memory * np.exp(self.spread * normal - self.spread**2 / 2.0))
-
-    def _left(self, charge: AnyArray) -> AnyArray:
-        """Return what is left of a charge where all of it is remembered, e-."""
-        if self.saturation_e is None:
-            return charge
-        return np.asarray(-self.saturation_e * np.expm1(-charge / self.saturation_e))
-
-    def _left_of(self, exposure: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the mean, e-, and mean square, e-^2, of what is left of Poisson electrons."""
-        if self.saturation_e is None:
-            return exposure, exposure * (1.0 + exposure)
-        # E[exp(-n K / S)], the generating function of K
-        once, twice = (np.exp(exposure * np.expm1(-n / self.saturation_e)) for n in (1.0, 2.0))
-        return self.saturation_e * (1.0 - once), self.saturation_e**2 * (1.0 - 2.0 * once + twice)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the mean of what is left of the frame before, and its variance."""
-        mean, square = self._left_of(np.nan_to_num(maps.quanta_exposure))
+        exposure = np.nan_to_num(maps.quanta_exposure)
+        mean, square = exposure, exposure * (1.0 + exposure)
+        if self.saturation_e is not None:
+            # E[exp(-n K / S)], the generating function of K
+            once, twice = (np.exp(exposure * np.expm1(-n / self.saturation_e)) for n in (1.0, 2.0))
+            mean, square = self.saturation_e * (1.0 - once), self.saturation_e**2 * (1.0 - 2.0 * once + twice)
         # the mean of a pixel's own memory is not told from its bias
         variance = (square - mean**2) * np.exp(self.spread**2)
         return model.with_levels(shift_e=self.memory * mean).with_variance(e2=self.memory**2 * variance)

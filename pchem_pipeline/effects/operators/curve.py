@@ -13,7 +13,6 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.estimators.codes import (
-    Curve,
     Stitch,
     best_bend,
     best_curve,
@@ -227,15 +226,14 @@ class AdcInl(Effect, tag="adc_inl"):
             if 2.0 * math.pi * bend.amplitude < bend.period
         ]
         curve = best_curve(evidence)
-        return sines if curve is None else [*cls._through(curve), *sines]
-
-    @classmethod
-    def _through(cls, curve: Curve) -> list[Self]:
-        """Return the effect with this curve; none where it turns back."""
+        if curve is None:
+            return sines
         size = float(np.abs(curve.values).max())
         listed = tuple(np.round(curve.values / size, 4).tolist())
         form = cls(inl_lsb=0.0, form="curve", first_dn=curve.first, spacing_dn=curve.spacing, curve=listed)
-        return [form.model_copy(update={"inl_lsb": size})] if size * form._steepest() < 1.0 else []
+        if size * form._steepest() < 1.0:  # else it turns back
+            return [form.model_copy(update={"inl_lsb": size}), *sines]
+        return sines
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the code edges where the bent curve crosses them."""

@@ -250,19 +250,9 @@ class Persistence(Effect, tag="persistence"):
         return not self.image
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with its spot or image counted from these rows and columns."""
-        if self.image:
-            return self._seen_image(rows, columns, shape)
-        return self.model_copy(update=spot_to_window(vars(self), "gaussian", rows, columns, shape))
-
-    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with its spot or image counted on the sensor; an image is dark elsewhere."""
-        if self.image:
-            return self._found_image(rows, columns, shape)
-        return self.model_copy(update=spot_to_sensor(vars(self), rows, columns, shape))
-
-    def _seen_image(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with the image as a grid over the window, as fine as that over the sensor."""
+        """Return it with its spot or image, a grid as fine, counted from these rows and columns."""
+        if not self.image:
+            return self.model_copy(update=spot_to_window(vars(self), "gaussian", rows, columns, shape))
         cells = (len(self.image), len(self.image[0]))
         y, x = (
             (low + (np.arange(n) + 0.5) * (high - low) / n) / size
@@ -270,23 +260,25 @@ class Persistence(Effect, tag="persistence"):
         )
         return self._with_image(self._image_at(y, x))
 
-    def _with_image(self, values: FloatArray) -> Self:
-        """Return it with such an image; values are relative to the largest one of the image so far."""
-        brightest = float(values.max())
-        grid = _numbers(values / brightest) if brightest > 0 else ((1.0,),)
-        return self.model_copy(update={"image": grid, "peak_e": self.peak_e * brightest})
-
-    def _found_image(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with the image as a grid over the sensor, as fine where that takes few cells."""
+    def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
+        """Return it with its spot or image counted on the sensor; an image is dark elsewhere."""
+        if not self.image:
+            return self.model_copy(update=spot_to_sensor(vars(self), rows, columns, shape))
         parts, cells = [], (len(self.image), len(self.image[0]))
         for (low, high), n, size in zip((rows, columns), cells, shape, strict=True):
-            many = min(-(-n * size // (high - low)), _MOST_CELLS)
+            many = min(-(-n * size // (high - low)), _MOST_CELLS)  # as fine where that takes few cells
             parts.append(((np.arange(many) + 0.5) / many * size - low) / (high - low))
         y, x = parts
         values = self._image_at(y, x) * ((y > 0) & (y < 1))[:, None] * ((x > 0) & (x < 1))
         if not values.max() > 0:  # it lies between the centres of cells
             values[np.abs(y - 0.5).argmin(), np.abs(x - 0.5).argmin()] = 1.0
         return self._with_image(values)
+
+    def _with_image(self, values: FloatArray) -> Self:
+        """Return it with such an image; values are relative to the largest one of the image so far."""
+        brightest = float(values.max())
+        grid = _numbers(values / brightest) if brightest > 0 else ((1.0,),)
+        return self.model_copy(update={"image": grid, "peak_e": self.peak_e * brightest})
 
     def _image_at(self, y: FloatArray, x: FloatArray) -> FloatArray:
         """Return the image, relative to its largest value, at places 0..1 of the sensor."""

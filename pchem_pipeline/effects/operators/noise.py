@@ -241,15 +241,12 @@ class NoiseSkew(Effect, tag="noise_skew"):
         Mean and variance of the noise stay exact. Its law is to 1e-6 nats per sample up to a share of 0.86,
         and to 1.5e-5 at 0.95.
         """
-        shifts, weights, variances = _exponential_parts(self._lobes)
+        # parts that are as wide in units of the Gaussian part, whatever the share
+        wide = abs(self.share) / max(self._gaussian, 1e-3)
+        parts = int(np.clip(np.ceil(_LOBES * wide / _ENOUGH_FOR), _LOBES, _MOST_LOBES))
+        shifts, weights, variances = _exponential_parts(parts)
         width = np.sqrt(1.0 - self.share**2 * (1.0 - variances))
         return model.with_noise(weights, shift_sigma=self.share * shifts, width=width)
-
-    @property
-    def _lobes(self) -> int:
-        """Parts of the exponential that are as wide in units of the Gaussian part, whatever the share."""
-        wide = abs(self.share) / max(self._gaussian, 1e-3)
-        return int(np.clip(np.ceil(_LOBES * wide / _ENOUGH_FOR), _LOBES, _MOST_LOBES))
 
     @property
     def _gaussian(self) -> float:

@@ -120,25 +120,19 @@ class BitErrors(Effect, tag="bit_errors"):
             return (cls(share=1.0, bit=broken[0], fault=broken[1]),)
         bits = range(min(int(codes[-1]).bit_length(), _MOST_BITS))
         faults = [cls(share=1.0, bit=bit, fault=fault) for bit in bits for fault in _FAULTS]
-        seen = [_moved(code, fault.faulty(codes)) for fault in faults]
-        best = max(range(len(seen)), key=lambda i: seen[i].sigmas)
-        same = [i for i, fault in enumerate(faults) if fault.bit == faults[best].bit]
-        likely = sorted((i for i in same if seen[i].sigmas > CERTAIN), key=lambda i: -seen[i].sigmas)
-        return [faults[i].model_copy(update={"share": min(seen[i].value, 1.0)}) for i in likely]
+        seen = {fault: _moved(code, fault.faulty(codes)) for fault in faults}
+        ordered = sorted(faults, key=lambda fault: -seen[fault].sigmas)
+        return [
+            fault.model_copy(update={"share": min(seen[fault].value, 1.0)})
+            for fault in ordered
+            if fault.bit == ordered[0].bit and seen[fault].sigmas > CERTAIN
+        ]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with satellites at the weight of the bit, of the share that each pixel has there.
 
         Right in how many samples move, and how far; not in from which of a pixel's codes.
         """
-        up, down = self._moving(maps)
-        weight = float(1 << self.bit)
-        weights = self.share * np.stack([down, up], axis=1)
-        weights = np.concatenate([weights, 1.0 - weights.sum(axis=1, keepdims=True)], axis=1)
-        return model.with_noise(weights, shift_dn=np.array([-weight, weight, 0.0]))
-
-    def _moving(self, maps: PixelMaps) -> tuple[FloatArray, FloatArray]:
-        """Return the shares of each pixel's samples whose bit is 0 and goes up, or 1 and goes down, (n,)."""
         from pchem_pipeline.effects.estimators.codes import code_range
         from pchem_pipeline.model.law.mass import sample_mass
 
@@ -146,8 +140,12 @@ class BitErrors(Effect, tag="bit_errors"):
         codes = np.arange(first, last + 1)
         mass = np.nan_to_num(sample_mass(SampleLaw(), maps, codes, smallest=1e-50))
         is_set = (codes >> self.bit & 1).astype(np.float64)
-        up, down = mass @ (1.0 - is_set), mass @ is_set
-        return (up * (self.fault != "zero"), down * (self.fault != "one"))
+        # shares of each pixel's samples whose bit is 0 and goes up, or 1 and goes down
+        up, down = (mass @ (1.0 - is_set)) * (self.fault != "zero"), (mass @ is_set) * (self.fault != "one")
+        weight = float(1 << self.bit)
+        weights = self.share * np.stack([down, up], axis=1)
+        weights = np.concatenate([weights, 1.0 - weights.sum(axis=1, keepdims=True)], axis=1)
+        return model.with_noise(weights, shift_dn=np.array([-weight, weight, 0.0]))
 
 
 def _moved(code: CodeResiduals, to: IntArray) -> Multiple:
