@@ -320,20 +320,18 @@ class FadingCells:
         size = (rows, columns)
         return cls(decay, amplitude.reshape(size), noise.reshape(size), bright.reshape(size), score, cell)
 
-    def above_background(self) -> FloatArray:
-        """Return the amplitudes with that part of H added which makes their median 0."""
-        held = np.isfinite(self.noise) & (self.exposure > 0)
-        background = float(np.median(self.amplitude[held] / self.exposure[held]))
-        return np.where(held, self.amplitude - background * self.exposure, 0.0)
-
     def image(self) -> FloatArray:
         """Return the amplitudes above the background without their noise, >= 0.
 
         A group of two by two cells keeps its differences where they stand out, and has its mean otherwise; so
         on with the means, up to the whole sensor (Donoho and Johnstone 1994, with Haar's wavelets by groups).
         """
+        held = np.isfinite(self.noise) & (self.exposure > 0)
+        # with that part of H added which makes their median 0
+        background = float(np.median(self.amplitude[held] / self.exposure[held]))
+        above = np.where(held, self.amplitude - background * self.exposure, 0.0)
         weight = np.where(np.isfinite(self.noise), self.noise, np.inf) ** -2.0
-        image = np.maximum(_denoised(self.above_background(), weight), 0.0)
+        image = np.maximum(_denoised(above, weight), 0.0)
         return np.where(image > _DARK * image.max(), image, 0.0)
 
 

@@ -31,7 +31,6 @@ from pchem_pipeline.effects.framework.effect import (
     SharedOffset,
     Turns,
 )
-from pchem_pipeline.effects.framework.evidence import Wave
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -372,7 +371,16 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
             if loose is not None and (line is None or line.amplitude < 0.7 * loose.amplitude):
                 fields = {name: loose.along, "amplitude_dn": loose.amplitude / alpha, "random_phase": True}
                 found.append((loose.excess, cls(**fields)))
-        found += [(wave.excess, cls._of_wave(wave, evidence)) for wave in time.waves if not wave.alternates]
+        for wave in (wave for wave in time.waves if not wave.alternates):
+            pickup = cls(
+                amplitude_dn=wave.amplitude / mean_response(evidence),
+                cycles_per_row=wave.per_row,
+                cycles_per_column=wave.per_column,
+                cycles_per_frame=wave.per_frame or 0.0,
+                phase=0.0 if wave.per_frame is None else wave.phase,
+                random_phase=wave.per_frame is None,
+            )
+            found.append((wave.excess, pickup))
         kept: list[Self] = []
         for _, pickup in sorted(found, key=lambda pair: -pair[0]):
             # rows and columns both see a line along frames alone
@@ -380,19 +388,6 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
             if not any(np.allclose(places[0], other, rtol=0.0, atol=1e-4) for other in places[1:]):
                 kept.append(pickup)
         return kept[:4]
-
-    @classmethod
-    def _of_wave(cls, wave: Wave, evidence: Evidence) -> Self:
-        """Return the pickup that makes a wave across rows and columns."""
-        steady = wave.per_frame is not None
-        return cls(
-            amplitude_dn=wave.amplitude / mean_response(evidence),
-            cycles_per_row=wave.per_row,
-            cycles_per_column=wave.per_column,
-            cycles_per_frame=wave.per_frame or 0.0,
-            phase=wave.phase if steady else 0.0,
-            random_phase=not steady,
-        )
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the phase at the first row and column of a window."""
