@@ -38,9 +38,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.simulate.settings import SimulateSettings
     from pchem_pipeline.simulate.truth import TruthMaps
 
-_SAMPLE_PURPOSE = "sample"
-# bytes per sample of a block: digital and electron numbers
-_BYTES_PER_SAMPLE = 8
+_BYTES_PER_SAMPLE = 8  # of a block: digital and electron numbers
 _SAMPLES_AT_ONCE = 1 << 19
 _FRAMES_AT_ONCE = 8
 # as long as so many histories are the frames for which one is simulated
@@ -73,8 +71,7 @@ def simulate_block(
         settings: the section ``simulate``.
         frames: first frame and the frame after the last.
         rows: first row and the row after the last; ``None`` for all.
-        electron_frames: for how many of the block's first frames the electron number is wanted;
-            ``None`` for all.
+        electron_frames: first frames whose electron number is wanted; ``None`` for all.
 
     Returns:
         Digital numbers (frame, y, x), DN, unsigned; true electron numbers (frame, y, x), e-.
@@ -123,15 +120,20 @@ class _Block:
     def run(self) -> tuple[NDArray[Any], IntArray]:
         """Return digital numbers and electron numbers of the block."""
         settings, truth = self.settings, self.truth
-        context = self._context()
-        if _of_plane(settings.effects, Plane.EXPOSURE):
-            exposure, charge, noise = self._varying_exposure(context)
-        else:
-            exposure, charge, noise = self._constant_exposure()
+        context = EffectContext(
+            frames=_frozen(self.frames),
+            n_frames=settings.n_frames,
+            rows=_frozen(self.rows),
+            shape=settings.shape,
+            integration_time=settings.integration_time,
+            bit_depth=settings.bit_depth,
+            truth={name: _frozen(getattr(truth, name)) for name in _MAPS},
+            random=self._streams("effect"),
+        )
+        exposure, charge, noise = self._samples(context)
         context = replace(context, exposure=_frozen(exposure))
         charge = self._apply(Plane.CHARGE, charge, context)
-        context = replace(context, charge=_frozen(charge))
-        context = replace(context, read_noise=_frozen(noise))
+        context = replace(context, charge=_frozen(charge), read_noise=_frozen(noise))
         analog = self._apply(Plane.ANALOG, charge + noise, context)
         at_adc = self._apply(Plane.ADC, analog / truth.conversion_gain + truth.bias, context)
         top = 2**settings.bit_depth - 1
@@ -143,45 +145,25 @@ class _Block:
             )
         return dn, charge
 
-    def _words(self) -> tuple[NDArray[np.uint64], NDArray[np.uint64], NDArray[np.uint64]]:
-        """Return the counter words of the block's frames, rows and columns."""
-        columns = np.arange(self.settings.shape[1])
-        return to_words(self.frames), to_words(self.rows), to_words(columns)
-
-    def _varying_exposure(self, context: EffectContext) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Return exposure, electron number and read noise (frame, y, x), e-, each sample by itself."""
-        truth = self.truth
-        u, v = uniform_pair(make_key(self.settings.seed, _SAMPLE_PURPOSE), *self._words())
-        exposure = np.array(np.broadcast_to(truth.quanta_exposure, u.shape))
-        exposure = self._apply(Plane.EXPOSURE, exposure, context)
-        return exposure, poisson_quantile(u, exposure), truth.analog_read_noise_e * normal_quantile(v)
-
-    def _constant_exposure(self) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Return the same where no effect touches the exposure: the numbers are equal, and come sooner."""
-        truth, words = self.truth, self._words()
+    def _samples(self, context: EffectContext) -> tuple[FloatArray, IntArray, FloatArray]:
+        """Return exposure, electron number and read noise (frame, y, x), e-."""
+        read_noise, columns = self.truth.analog_read_noise_e, np.arange(self.settings.shape[1])
+        words = to_words(self.frames), to_words(self.rows), to_words(columns)
+        key = make_key(self.settings.seed, "sample")
         shape = tuple(axis.size for axis in words)
+        exposure = np.broadcast_to(self.truth.quanta_exposure, shape)
+        if _of_plane(self.settings.effects, Plane.EXPOSURE):
+            u, v = uniform_pair(key, *words)
+            exposure = self._apply(Plane.EXPOSURE, np.array(exposure), context)
+            return exposure, poisson_quantile(u, exposure), read_noise * normal_quantile(v)
+        # the same numbers, sooner: each pixel's table of electron numbers serves all frames
         charge, noise = np.empty(shape, np.int64), np.empty(shape)
-        keys = SampleKeys(*words, make_key(self.settings.seed, _SAMPLE_PURPOSE))
-        draw_rows(truth.quanta_exposure, truth.analog_read_noise_e, keys, charge, noise)
-        return np.broadcast_to(truth.quanta_exposure, shape), charge, noise
+        draw_rows(self.truth.quanta_exposure, read_noise, SampleKeys(*words, key), charge, noise)
+        return exposure, charge, noise
 
     def _streams(self, purpose: str) -> KeyedStreams:
         columns = np.arange(self.settings.shape[1])
         return KeyedStreams(self.settings.seed, purpose, self.frames, self.rows, columns)
-
-    def _context(self) -> EffectContext:
-        settings = self.settings
-        maps = {name: _frozen(getattr(self.truth, name)) for name in _MAPS}
-        return EffectContext(
-            frames=_frozen(self.frames),
-            n_frames=settings.n_frames,
-            rows=_frozen(self.rows),
-            shape=settings.shape,
-            integration_time=settings.integration_time,
-            bit_depth=settings.bit_depth,
-            truth=maps,
-            random=self._streams("effect"),
-        )
 
     def _apply(self, plane: Plane, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
         for position, effect in _of_plane(self.settings.effects, plane):

@@ -36,21 +36,20 @@ if TYPE_CHECKING:
 
 
 def draw_truth(settings: SimulateSettings) -> TruthMaps:
-    """Draw the true parameter maps (y, x) of the sensor.
-
-    Args:
-        settings: the section ``simulate``.
-
-    Raises:
-        ConfigError: if a value is impossible (H < 0, g <= 0, read noise < 0).
-    """
+    """Draw the true maps (y, x) of a sensor; ConfigError: H < 0, g <= 0 or read noise < 0 somewhere."""
     given = settings.parameters.given()
     maps = {
         name: _with_patterns(truncated_quantile(distribution, u), name, distribution, settings)
         for (name, distribution), u in zip(given.items(), _copula(settings), strict=True)
     }
     for name, values in maps.items():
-        _refuse_impossible(name, values)
+        positive = name in ("conversion_gain", "dn_per_electron")
+        lowest = float(values.min())
+        if name != "bias" and (lowest < 0 or (positive and lowest == 0)):
+            raise ConfigError(
+                f"simulate.parameters.{name} is {lowest:.4g} in some pixels, which is impossible; set a "
+                f"minimum {'above' if positive else 'of'} 0"
+            )
     if "dark_current" in maps:
         maps["quanta_exposure"] = maps["dark_current"] * settings.integration_time
     if "dn_per_electron" in maps:
@@ -89,8 +88,6 @@ def _with_patterns(
         streams = _streams(settings, f"{name} pattern {i}")
         shift = _pattern(pattern, streams, settings.shape)
         values = values * (1.0 + shift) if pattern.relative else values + shift
-    if distribution.minimum is None and distribution.maximum is None:
-        return values
     return np.clip(values, distribution.minimum, distribution.maximum)
 
 
@@ -111,18 +108,6 @@ def _pattern(pattern: Pattern, streams: KeyedStreams, shape: tuple[int, int]) ->
         case RadialPattern():
             shift = 2.0 * (x**2 + y**2)
     return np.asarray(pattern.amplitude * shift, dtype=np.float64)
-
-
-def _refuse_impossible(name: str, values: FloatArray) -> None:
-    if name == "bias":
-        return
-    must_be_positive = name in ("conversion_gain", "dn_per_electron")
-    lowest = float(values.min())
-    if lowest < 0 or (must_be_positive and lowest == 0):
-        raise ConfigError(
-            f"simulate.parameters.{name} is {lowest:.4g} in some pixels, which is impossible; set a minimum "
-            f"{'above' if must_be_positive else 'of'} 0"
-        )
 
 
 def _with_defects(truth: TruthMaps, settings: SimulateSettings) -> TruthMaps:
@@ -149,15 +134,7 @@ def _with_defects(truth: TruthMaps, settings: SimulateSettings) -> TruthMaps:
 
 
 def truncated_quantile(distribution: Distribution, u: FloatArray) -> FloatArray:
-    """Return the quantiles of a distribution truncated to its bounds.
-
-    Args:
-        distribution: the settings.
-        u: probabilities in (0, 1), any shape.
-
-    Raises:
-        ConfigError: if the bounds leave practically nothing of the distribution.
-    """
+    """Return quantiles at ``u`` in (0, 1) within the bounds; ConfigError: nothing lies in these."""
     if isinstance(distribution, Constant):
         return np.full(u.shape, distribution.value)
     low = 0.0 if distribution.minimum is None else _cdf(distribution, distribution.minimum)

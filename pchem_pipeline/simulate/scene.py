@@ -39,12 +39,8 @@ def with_scene(
 ) -> tuple[TruthMaps, SimulateSettings]:
     """Return the sensor and its settings when it looks at a scene.
 
-    The scene is all of the exposure, the dark one included. Dead and stuck pixels see nothing.
-
-    Args:
-        truth: the sensor.
-        settings: of the simulation.
-        scene: e- per frame: a number, an image (y, x), or a sequence (image, y, x).
+    A number, an image (y, x), or a sequence (image, y, x), e- per frame: all of the exposure, the dark one
+    included. Dead and stuck pixels see nothing.
 
     Raises:
         ConfigError: its shape is not the sensor's, or a value is impossible.

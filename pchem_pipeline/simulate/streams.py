@@ -1,14 +1,13 @@
 """Random numbers keyed on (root seed, purpose, frame, y, x): the same at every tiling and backend.
 
 Philox4x32-10 (Salmon et al. 2011) as a function from position to bits: the key is a hash of the seed and
-of what the numbers are for, the counter is the position. Nothing is drawn in sequence, so the block
-of frames that shares a key is a single frame, the smallest that there is. numpy has the same generator, but a
-keyed number costs 35 us there, since each key takes a generator of its own.
+of what the numbers are for, the counter is the position. numpy has the same generator, but a keyed number
+costs 35 us there, since each key takes a generator of its own.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import blake2b
 from typing import TYPE_CHECKING
 
@@ -71,9 +70,7 @@ def poisson_quantile(u: FloatArray, mean: FloatArray) -> IntArray:
 
 @dataclass(frozen=True)
 class KeyedStreams:
-    """The random numbers of one purpose for a block of frames and a band of rows.
-
-    It is the ``RandomSource`` that effects are given.
+    """The random numbers of one purpose for a block of frames and a band of rows: a ``RandomSource``.
 
     Attributes:
         seed: root seed of the run.
@@ -104,11 +101,13 @@ class KeyedStreams:
 
     def normal(self, dims: tuple[Dim, ...], draw: int = 0) -> FloatArray:
         """Return standard normal numbers, with length 1 along the dimensions not in ``dims``."""
-        return normal_quantile(self._other("normal").uniform(dims, draw))
+        other = replace(self, purpose=f"{self.purpose}/normal")
+        return normal_quantile(other.uniform(dims, draw))
 
     def poisson(self, mean: FloatArray, draw: int = 0) -> IntArray:
         """Return Poisson numbers of the given mean (frame, y, x), one per sample."""
-        return poisson_quantile(self._other("poisson").uniform(_DIMS, draw), mean)
+        other = replace(self, purpose=f"{self.purpose}/poisson")
+        return poisson_quantile(other.uniform(_DIMS, draw), mean)
 
     def generator(
         self, *, frame: int | None = None, y: int | None = None, x: int | None = None, draw: int = 0
@@ -117,6 +116,3 @@ class KeyedStreams:
         name = f"{self.seed}/{self.purpose}/generator/{frame}/{y}/{x}/{draw}"
         key = int.from_bytes(blake2b(name.encode(), digest_size=16).digest(), "little")
         return np.random.Generator(np.random.Philox(key=key))
-
-    def _other(self, kind: str) -> KeyedStreams:
-        return KeyedStreams(self.seed, f"{self.purpose}/{kind}", self.frames, self.rows, self.columns)

@@ -15,9 +15,7 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# variance of rounding to whole DN, uniform over one DN (sigma_Q of the paper)
-#: largest quanta exposure that can be simulated, e-
-LARGEST_EXPOSURE = 1e7
+_LARGEST_EXPOSURE = 1e7  # that can be simulated, e-
 
 
 class Defect(IntEnum):
@@ -53,7 +51,7 @@ class TruthMaps:
     def __post_init__(self) -> None:
         """Refuse parameters out of range: the compiled chain does not check them."""
         allowed = {
-            "quanta_exposure": (0.0, LARGEST_EXPOSURE),
+            "quanta_exposure": (0.0, _LARGEST_EXPOSURE),
             "conversion_gain": (np.nextafter(0.0, 1.0), np.inf),
             "bias": (-np.inf, np.inf),
             "analog_read_noise_e": (0.0, np.inf),

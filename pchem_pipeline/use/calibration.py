@@ -131,14 +131,10 @@ class Calibration(PixelParameters):
 
 
 def covariance_of(stderr: FloatArray, correlation: FloatArray) -> FloatArray:
-    """Return the covariance of (g, mu, sigma) from what the fit stores.
+    """Return the covariance of (g, mu, sigma), (y, x, 3, 3), from what the fit stores.
 
-    Args:
-        stderr: of (H, g, mu, sigma), shape (4, y, x).
-        correlation: of (H, g), (H, mu), (H, sigma), (g, mu), (g, sigma), (mu, sigma), shape (y, x, 6).
-
-    Returns:
-        Shape (y, x, 3, 3), in units of the parameters.
+    Standard errors of (H, g, mu, sigma), (4, y, x), and correlations of (H, g), (H, mu), (H, sigma), (g, mu),
+    (g, sigma), (mu, sigma), (y, x, 6).
     """
     matrix = np.zeros((*stderr.shape[1:], 3, 3))
     for place, (i, j) in {3: (0, 1), 4: (0, 2), 5: (1, 2)}.items():

@@ -33,9 +33,9 @@ class CommonModes:
         parts: pixels of each part, shape (part, y, x); parts may overlap.
         variances: of offsets of the frames, rows and columns of each part, DN^2, shape (part, 3); 0: none.
         left: tags of effects on many pixels alike that are not the same in other frames.
+        waves: patterns ``c cos(2 pi (f_y y + f_x x)) + s sin(...)`` with their own c and s in each frame:
+            f_y, f_x, the variance of c and of s (DN^2), and the number of the part, shape (wave, 4).
         in_noise: variance of these offsets that the read noise of the run includes, DN^2.
-        waves: periodic patterns ``c cos(2 pi (f_y y + f_x x)) + s sin(...)`` with their own c and s in each
-            frame: f_y, f_x, the variance of c and of s (DN^2), and the number of the part, shape (wave, 4).
     """
 
     removed: tuple[str, ...] = ()
@@ -52,29 +52,26 @@ class CommonModes:
         for effect, shared in found:
             _check(effect, shared)
         # other frames are taken at other times; of a tag that is there several times, all or none
-        left = {
-            effect.tag: None for effect, shared in found if shared.variance is None or effect.when is not None
-        }
-        parts: dict[bytes, BoolArray] = {}
-        variances: dict[bytes, FloatArray] = {}
+        left = dict.fromkeys(
+            effect.tag for effect, shared in found if shared.variance is None or effect.when is not None
+        )
+        removed = dict.fromkeys(effect.tag for effect, _ in found if effect.tag not in left)
+        parts: dict[bytes, tuple[BoolArray, FloatArray]] = {}
         waves = []
         for effect, shared in found:
             if effect.tag in left or shared.variance is None:
                 continue
             mask = np.ones(shape, np.bool_) if effect.region is None else effect.region.mask(shape)
-            key = mask.tobytes()
-            parts[key] = mask
-            own = variances.setdefault(key, np.zeros(3))
+            _, variances = parts.setdefault(mask.tobytes(), (mask, np.zeros(3)))
             if shared.of != "wave":
-                own[_AXES.index(shared.of)] += shared.variance
+                variances[_AXES.index(shared.of)] += shared.variance
             elif shared.variance > 0.0:
-                place = float(list(parts).index(key))
+                place = float(list(parts).index(mask.tobytes()))
                 waves.append([shared.cycles_per_row, shared.cycles_per_column, shared.variance, place])
-        removed = dict.fromkeys(effect.tag for effect, _ in found if effect.tag not in left)
         return cls(
             tuple(removed),
-            np.array(list(parts.values()), np.bool_).reshape(-1, *shape),
-            np.array(list(variances.values())).reshape(-1, 3),
+            np.array([mask for mask, _ in parts.values()], np.bool_).reshape(-1, *shape),
+            np.array([variances for _, variances in parts.values()]).reshape(-1, 3),
             tuple(left),
             np.array(waves).reshape(-1, 4),
         )
@@ -94,11 +91,7 @@ class CommonModes:
 
 
 def _check(effect: Effect, shared: SharedOffset) -> None:
-    """Refuse what an effect of another package may say.
-
-    Raises:
-        PchEmError: its offset is of nothing that is known, or its variance is none.
-    """
+    """Refuse what an effect of another package may say: an unknown kind, or an impossible variance."""
     known = shared.of in (*_AXES, "wave")
     if not known or (shared.variance is not None and not 0.0 <= shared.variance < np.inf):
         raise PchEmError(f"effect {effect.tag!r}: shared_offset() returned {shared}, which is not an offset")
@@ -158,12 +151,7 @@ class Reference:
 
 
 def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
-    """Return the exposure to expect from the mean of some frames, e-, shape (y, x); NaN: no calibration.
-
-    Args:
-        mean: DN, shape (y, x).
-        calibration: of these pixels.
-    """
+    """Return the exposure, e-, (y, x), to expect from the mean of some frames, DN; NaN: no calibration."""
     signal = (mean - calibration.bias) * calibration.conversion_gain
     return np.where(calibration.usable, np.maximum(signal, 0.02), np.nan)  # e-, at least
 
@@ -173,16 +161,11 @@ class _Design:
     """Offsets of samples as a linear function of standard normal numbers, z.
 
     Of each part there is one of the frame, one of each row, one of each column; of each wave two.
-
-    Attributes:
-        modes: which offsets there are.
-        down: cosine and sine of each wave down the rows, shape (wave, y, 2).
-        along: along the columns, shape (wave, x, 2).
     """
 
     modes: CommonModes
-    down: FloatArray
-    along: FloatArray
+    down: FloatArray  # cosine and sine of each wave down the rows, shape (wave, y, 2)
+    along: FloatArray  # along the columns, shape (wave, x, 2)
 
     @classmethod
     def of(cls, modes: CommonModes) -> _Design:
@@ -271,15 +254,10 @@ def estimate_offsets(
     reference: Reference,
     modes: CommonModes,
 ) -> Offsets:
-    """Return the most probable offsets of the frames, rows, columns and waves.
+    """Return the most probable offsets of whole frames (frame, y, x), DN, their rows, columns and waves.
 
     The posterior mode of normal offsets under the mixture of all pixels of the line (best linear prediction
     where the electron numbers are known): each pixel says of the offset what its electron number leaves open.
-
-    Args:
-        frames: DN, whole frames, shape (frame, y, x).
-        reference: the pixels that tell the offsets.
-        modes: which offsets there are.
     """
     from pchem_pipeline.model.law.pcd import pcd_posterior  # loads compiled loops
 

@@ -18,16 +18,10 @@ def electrons(
     offsets: Float32Array | None = None,
     room: Float32Array | None = None,
 ) -> Float32Array:
-    """Return ``g (x - mu)``, less the offsets that frames, rows and columns share.
+    """Return ``g (x - mu)``, e-, of frames (frame, y, x), DN; NaN for pixels without a calibration.
 
-    Args:
-        frames: DN, shape (frame, y, x).
-        calibration: of these pixels.
-        offsets: of each sample, DN, shape of the frames; none: None, or an empty array.
-        room: for as many frames or more, in which the result lies then; None: it has its own.
-
-    Returns:
-        e-, shape (frame, y, x); NaN for pixels without a calibration.
+    Offsets that frames, rows and columns share, DN, of the shape of the frames (none: None, or an empty
+    array), are taken off. ``room``, for as many frames or more, is where the result is to lie.
     """
     gain = np.where(calibration.usable, calibration.conversion_gain, np.nan).astype(np.float32)
     bias = calibration.bias.astype(np.float32)
@@ -42,13 +36,10 @@ def electrons(
 
 
 def add_up(frames: NDArray[np.unsignedinteger[Any]], offsets: Float32Array, sums: FloatArray) -> None:
-    """Add x to the sums of pixels, where there are offsets also x^2, x - b and its square; see its range.
+    """Add x to the sums of pixels, where there are offsets b also x^2, x - b and its square; see its range.
 
-    Args:
-        frames: DN, shape (frame, y, x).
-        offsets: b, DN, shape of the frames, or an empty array: none.
-        sums: out, shape (6, y, x): x, x^2, x - b, its square (they stay where there are no offsets), and the
-            smallest and largest x.
+    ``sums``, shape (6, y, x), are x, x^2, x - b, its square (they stay where there are no offsets), and the
+    smallest and largest x. Frames and offsets (or an empty array) are in DN, shape (frame, y, x).
     """
     sums[0] += frames.sum(axis=0, dtype=np.uint64)
     np.minimum(sums[4], frames.min(axis=0), out=sums[4])
@@ -68,11 +59,7 @@ def whole_parts(
 ) -> NDArray[np.uint32]:
     """Return ``x - b`` in whole parts of a DN, ``lift`` DN higher so that none is negative.
 
-    Args:
-        frames: DN, shape (frame, y, x).
-        offsets: b, DN, shape of the frames.
-        parts: codes in a DN.
-        lift: DN.
+    Of frames and their offsets b, DN, (frame, y, x), with so many ``parts`` in a DN.
     """
     out = np.empty(frames.shape, np.uint32)
     for frame, offset, own in zip(frames, offsets, out, strict=True):
@@ -91,50 +78,28 @@ def read_stderr(calibration: Calibration) -> FloatArray:
 
 
 def calibration_variance(calibration: Calibration) -> FloatArray:
-    """Return (c0, c1, c2) of the variance ``c0 + c1 E + c2 E^2`` that the calibration gives to E electrons.
+    """Return (c0, c1, c2), (3, y, x), of the variance ``c0 + c1 E + c2 E^2`` that the calibration gives.
 
-    ``E = g (x - mu)`` moves by ``(E / g) dg - g dmu``. The error is common to all frames.
-
-    Returns:
-        e-^2, e- and 1, shape (3, y, x); NaN for pixels without a calibration.
+    ``E = g (x - mu)``, e-, moves by ``(E / g) dg - g dmu``, in all frames alike; NaN without a calibration.
     """
-    return _variance(calibration, calibration.whole_covariance)
-
-
-def _variance(calibration: Calibration, covariance: FloatArray) -> FloatArray:
-    gain = calibration.conversion_gain
-    found = np.stack(
-        [
-            gain**2 * covariance[..., 1, 1],
-            -2.0 * covariance[..., 0, 1],
-            covariance[..., 0, 0] / gain**2,
-        ]
-    )
-    return np.where(calibration.usable, found, np.nan)
+    gain, covariance = calibration.conversion_gain, calibration.whole_covariance
+    of_gain, common, of_bias = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    return np.where(calibration.usable, [gain**2 * of_bias, -2.0 * common, of_gain / gain**2], np.nan)
 
 
 def with_its_errors(calibration: Calibration, signal: FloatArray) -> Calibration:
     """Return a calibration whose law holds what is not known of g and mu, at a signal.
 
     Electron numbers are then given all calibrations that are possible, not given that this one is right; a
-    bias that is an electron off is not in it.
-
-    Args:
-        calibration: of these pixels.
-        signal: e-, shape (y, x).
+    bias that is an electron off is not in it. The signal is in e-, shape (y, x).
     """
-    variance = stderr_at(_variance(calibration, calibration.covariance), signal) ** 2
+    variance = stderr_at(calibration_variance(replace(calibration, rivals=None)), signal) ** 2
     variance /= calibration.conversion_gain**2
     law = calibration.law.with_variance(dn2=np.nan_to_num(variance).ravel())
     return replace(calibration, law=law)
 
 
 def stderr_at(variance: FloatArray, signal: FloatArray) -> FloatArray:
-    """Return the standard error from the calibration at a signal.
-
-    Args:
-        variance: of `calibration_variance`, shape (3, y, x).
-        signal: e-, shape (y, x) or (frame, y, x).
-    """
+    """Return the standard error from the calibration at a signal, e-, shape (y, x) or (frame, y, x)."""
     whole = variance[0] + variance[1] * signal + variance[2] * signal**2
     return np.asarray(np.sqrt(np.maximum(whole, 0.0)))

@@ -74,10 +74,8 @@ class ExposurePool:
     def of(cls, signal: FloatArray, noise: FloatArray, n_frames: int) -> ExposurePool:
         """Return the pool of some pixels; hot ones do not widen it.
 
-        Args:
-            signal: unbiased estimate of H, e-, NaN where there is none.
-            noise: variance of a sample at a given electron number, e-^2, same shape.
-            n_frames: N.
+        ``signal``: unbiased estimate of H, e-, NaN where there is none; ``noise``: variance of a sample at a
+        given electron number, e-^2, same shape; ``n_frames``: N.
         """
         known = np.isfinite(signal) & np.isfinite(noise)
         if not known.any():
@@ -89,9 +87,7 @@ class ExposurePool:
     def priors(self, signal: FloatArray, noise: FloatArray) -> FloatArray:
         """Return equally probable exposures of each pixel, e-, shape (y, x, j); one where they are near.
 
-        Args:
-            signal: unbiased estimate of H from these frames, shape (y, x); NaN where there is none.
-            noise: as of :meth:`of`.
+        ``signal`` and ``noise`` as of :meth:`of`, from these frames, shape (y, x).
         """
         others = self.variance * (self.n_frames - 1)
         own = others / (others + self.mean + noise)
@@ -122,17 +118,11 @@ def mean_signal(
 
 @dataclass(frozen=True)
 class _Known:
-    """Histograms of pixels of which g, mu and sigma are known, and the climb to their exposures.
+    """Histograms of pixels of which g, mu and sigma are known, and the climb to their exposures."""
 
-    Attributes:
-        given: a sample for each part of a DN in which codes lie: all have one exposure.
-        law: of the samples.
-        satellites: amplitude (e-) and weight of free satellites, shape (n, 2).
-    """
-
-    given: Histograms
+    given: Histograms  # a sample for each part of a DN in which codes lie: all have one exposure
     law: Law
-    satellites: FloatArray
+    satellites: FloatArray  # amplitude (e-) and weight of free satellites, shape (n, 2)
 
     @classmethod
     def of(
@@ -162,17 +152,10 @@ class _Known:
     def climb(
         self, pixels: IntArray, exposure: FloatArray, own: FloatArray, *, stay: bool = False
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Climb to the exposure of largest likelihood, or evaluate where it is to ``stay``.
+        """Climb from exposures (m,), e-, of ``pixels`` to the likeliest; ``stay``: evaluate there.
 
-        Args:
-            pixels: which, shape (m,).
-            exposure: starts, e-, shape (m,).
-            own: (g, mu, sigma), shape (m, 3).
-            stay: the exposure is the one given.
-
-        Returns:
-            Exposure, e-, 0 where no electron is likelier than any; log-likelihood, nats; minus the second
-            derivatives of that in H and in (H, g, mu, sigma), shape (m, 4).
+        With ``own`` (g, mu, sigma), (m, 3). Returns the exposure, e-, 0 where no electron is likelier than
+        any; log-likelihood, nats; minus its second derivatives in H and in (H, g, mu, sigma), (m, 4).
         """
         gain, bias, sigma = own.T
         least = np.maximum(LEAST_NOISE_DN, LEAST_NOISE_E / gain)
@@ -196,12 +179,8 @@ class _Known:
     def at_border(self, pixels: IntArray, height: FloatArray, own: FloatArray) -> FloatArray:
         """Return one over the mean square of H over the likelihoods of which the maximum is at 0.
 
-        The curvature there says nothing: they fall as an exponential does, or as half a normal law.
-
-        Args:
-            pixels: which, shape (m,).
-            height: log-likelihood at 0, shape (m,).
-            own: (g, mu, sigma), shape (m, 3).
+        The curvature there says nothing: they fall as an exponential does, or as half a normal law. Of
+        ``pixels``, with log-likelihood ``height`` at 0, (m,), and ``own`` (g, mu, sigma), (m, 3).
         """
         reach = _DEPTH / self.given.counts[pixels].sum(axis=1)  # by one a sample and electron at most
         near = np.arange(pixels.size)
@@ -228,13 +207,7 @@ def estimate_exposure(
     ``sum_i c_i log sum_k P(k; H) P(x_i | k)``, the cells of the codes integrated exactly; effects of the
     model are in the law. It uses what a sample says of its electron number, where the mean of rounded or of
     corrected frames adds the read noise to that of the numbers. NaN where all samples lie below those of no
-    electron.
-
-    Args:
-        counts: histograms, shape (y, x, code).
-        origin: code of bin 0, shape (y, x).
-        calibration: of these pixels.
-        parts: codes in a DN.
+    electron. Histograms (y, x, code) begin at ``origin``, (y, x), with ``parts`` codes in a DN.
     """
     n, occupied = origin.size, counts.reshape(origin.size, -1) > 0
     highest = (origin.ravel() + occupied.shape[1] - 1 - occupied[:, ::-1].argmax(axis=1)) / parts

@@ -31,12 +31,7 @@ class Overscan:
 
     @classmethod
     def measured(cls, frames: Iterable[FloatArray], where: BoolArray) -> Overscan:
-        """Return that of some frames.
-
-        Args:
-            frames: samples of each in the pixels of the overscan, in C order, DN, shape (pixel,).
-            where: these pixels, shape (y, x).
-        """
+        """Return that of the samples of frames in the pixels ``where`` (y, x), in C order, DN, (pixel,)."""
         rows: list[FloatArray] = []
         first, total, square = np.zeros((3, int(where.sum())))
         for values in frames:
@@ -76,8 +71,7 @@ class Overscan:
     def variances_in(self, frames: Iterable[FloatArray]) -> tuple[float, float]:
         """Return the variances of the offsets that other frames, and their rows, have from the bias, DN^2.
 
-        Args:
-            frames: as in `measured`, of the pixels with a bias.
+        Of the pixels with a bias; frames as in `measured`.
         """
         where = np.isfinite(self.bias)
         number, bias = where.sum(axis=1), self.bias[where]
@@ -95,11 +89,8 @@ def _row_sums(values: FloatArray, where: BoolArray) -> FloatArray:
 def _variances(rows: FloatArray, scatter: FloatArray, number: IntArray, degrees: int) -> tuple[float, float]:
     """Return the variances of the offsets of frames and rows, DN^2, from samples that include them.
 
-    Args:
-        rows: means of the rows less those over the frames, DN, shape (frame, row).
-        scatter: sum of the variances of a row's samples, over the square of their number, DN^2, shape (row,).
-        number: of pixels of a row, shape (row,).
-        degrees: of freedom of the frames.
+    ``rows`` as in `_parted`; ``scatter`` is the sum of the variances of a row's samples, over the square of
+    their ``number``, shape (row,).
     """
     if number.size < 2:
         return 0.0, 0.0
@@ -113,10 +104,8 @@ def _variances(rows: FloatArray, scatter: FloatArray, number: IntArray, degrees:
 def _parted(rows: FloatArray, own: FloatArray, degrees: int) -> tuple[float, float]:
     """Return the variances of the offsets of frames and of rows, DN^2; 0 where a single row tells none.
 
-    Args:
-        rows: as in `_variances`.
-        own: what the pixels' own noise gives to each, DN^2, shape (row,).
-        degrees: of freedom of the frames.
+    ``rows`` are their means less those over the frames, (frame, row), with as many ``degrees`` of freedom of
+    the frames; ``own`` is the variance that the pixels' own noise gives to each, (row,).
     """
     if own.size < 2:
         return 0.0, 0.0

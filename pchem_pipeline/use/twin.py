@@ -70,14 +70,10 @@ class Twin:
 
 
 def twin_maps(maps: tuple[FloatArray, ...], usable: BoolArray, level: NDArray[Any]) -> TruthMaps:
-    """Return the maps of a simulated sensor from those of a fit.
+    """Return the maps of a simulated sensor from (H, g, mu, sigma) of a fit, (y, x) each.
 
-    Pixels without a fit have no parameters that could be simulated: they always give their usual DN.
-
-    Args:
-        maps: (H, g, mu, sigma), (y, x) each.
-        usable: pixels with a fit.
-        level: usual DN of each pixel, shape (y, x).
+    Pixels without a fit, those not ``usable``, have no parameters that could be simulated: they always give
+    their usual DN, ``level``.
     """
     exposure, gain, bias, sigma = (np.where(usable, values, 0.0) for values in maps)
     typical = float(np.median(gain[usable])) if usable.any() else 1.0
@@ -97,11 +93,8 @@ def redrawn(
 ) -> tuple[FloatArray, ...]:
     """Return maps that are as likely as those of the fit: drawn within their errors.
 
-    Args:
-        maps: (H, g, mu, sigma), (y, x) each.
-        stderr: of the four, shape (4, y, x).
-        correlation: of (H, g), (H, mu), (H, sigma), (g, mu), (g, sigma), (mu, sigma), shape (y, x, 6).
-        seed: of the random numbers.
+    Maps are (H, g, mu, sigma), (y, x) each, with standard errors (4, y, x) and correlations as in
+    :func:`~pchem_pipeline.use.calibration.covariance_of`.
     """
     matrix = np.broadcast_to(np.eye(4), (*stderr.shape[1:], 4, 4)).copy()
     for place, (i, j) in enumerate([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
@@ -126,11 +119,6 @@ def extrapolated(truth: TruthMaps, shape: tuple[int, int], seed: int) -> TruthMa
     sensor draw theirs from the old ones; what is left comes in blocks of neighbouring pixels, all maps from
     the same place (block bootstrap: Kuensch 1989, Ann. Statist. 17, 1217), so that the parameters of a pixel
     and its neighbours belong together as they did. Exposure, gain and read noise multiply, the bias adds.
-
-    Args:
-        truth: the sensor.
-        shape: rows and columns of the new one.
-        seed: of the random numbers.
     """
     rng = np.random.default_rng(seed)
     rows, columns = (rng.integers(old, size=new) for old, new in zip(truth.shape, shape, strict=True))
@@ -154,10 +142,7 @@ def extrapolated(truth: TruthMaps, shape: tuple[int, int], seed: int) -> TruthMa
 
 
 def _patterns(values: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """Return centre, pattern of the rows, of the columns, and the rest, whose variances add to the whole.
-
-    A mean of a line scatters by its pixels, too: that part stays with the rest.
-    """
+    """Return centre, pattern of the rows, of the columns, and the rest, whose variances add to the whole."""
     centre = float(np.nanmean(values))
     of_rows = np.nan_to_num(np.nanmean(values, axis=1) - centre)
     of_columns = np.nan_to_num(np.nanmean(values, axis=0) - centre)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray, PixelMaps, TimeSeries
+from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray, PixelMaps
 from pchem_pipeline.model.arithmetic.robust import OF_MEDIAN_DEVIATION
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.law.pcd import pcd_posterior
@@ -39,18 +39,12 @@ class ExposureProfile(NamedTuple):
 
 
 def exposure_profile(evidence: Evidence) -> ExposureProfile | None:
-    """Return how the exposure common to all pixels went along, or None where time is not known.
-
-    Frame t has ``sum(k - H) / sum(H)`` of mean ``d_t sum(Var k) / sum(H)`` and variance ``sum(Var k) /
-    sum(H)^2``.
-    """
+    """Return how the exposure common to all pixels went along, or None where time is not known."""
     time, good = evidence.time, evidence.maps.usable
     if time is None or time.frames.size < 8 or not good.any():
         return None
-    variance, exposure = (
-        float(np.sum(values[good] ** power))
-        for values, power in ((evidence.charge_std, 2), (evidence.maps.quanta_exposure, 1))
-    )
+    variance = float(np.sum(evidence.charge_std[good] ** 2))
+    exposure = float(np.sum(evidence.maps.quanta_exposure[good]))
     if not (variance > 0 and exposure > 0):
         return None
     deviation = np.asarray(time.frame_charge, np.float64) * (exposure / variance)
@@ -83,7 +77,7 @@ def block_charge(evidence: Evidence) -> BlockCharge | None:
     good = evidence.maps.usable & (evidence.charge_std > 0) & (evidence.maps.quanta_exposure > 0)
     if not good.any():
         return None
-    length = _lengths(time)
+    length = time.block_length.astype(np.float64)
     exposure, variance = evidence.maps.quanta_exposure[good], evidence.charge_std[good] ** 2
     charge = np.asarray(time.block_charge, np.float64)[:, good]
     charge -= np.average(charge, axis=0, weights=length)
@@ -125,38 +119,25 @@ def block_signal(evidence: Evidence) -> BlockCharge | None:
     return charge._replace(deviation=signal, variance=variance)
 
 
-def _lengths(time: TimeSeries) -> FloatArray:
-    """Return the number of frames of each block, (b,)."""
-    last = np.append(np.searchsorted(time.frames, time.block_start[1:]), time.frames.size)
-    return np.diff(np.append(np.searchsorted(time.frames, time.block_start[0]), last)).astype(np.float64)
-
-
-def exposure_nodes(factors: ArrayLike, n: int = 3) -> tuple[FloatArray, FloatArray]:
-    """Return weights and nodes of a mixture of ``n`` exposures with the same first 2n moments as ``factors``.
+def exposure_nodes(factors: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return weights and nodes of a mixture of three exposures with the first six moments of ``factors``.
 
     Gauss's quadrature for the empirical law (Golub and Welsch 1969), from its moments by Lanczos's recursion.
-
-    Args:
-        factors: exposures relative to H, one for each frame, mean 1.
-        n: nodes; fewer where the factors take fewer values.
-
-    Returns:
-        Weights that sum to 1, and factors of mean 1, each (n,).
+    Factors are exposures relative to H, one for each frame, of mean 1; fewer values have fewer nodes.
     """
     values = np.asarray(factors, np.float64).reshape(-1)
     scale = float(values.std())
     if scale < 1e-9:
         return np.ones(1), np.ones(1)
     z = (values - values.mean()) / scale
-    diagonal, off = np.zeros(n), np.zeros(n - 1)
+    diagonal, off, size = np.zeros(3), np.zeros(2), 3
     before, current = np.zeros(z.size), np.full(z.size, z.size**-0.5)
-    size = n
-    for j in range(n):
+    for j in range(3):
         step = z * current - (off[j - 1] * before if j else 0.0)
         diagonal[j] = float(current @ step)
         step = step - diagonal[j] * current
         norm = float(np.linalg.norm(step))
-        if j == n - 1 or norm < 1e-6:
+        if j == 2 or norm < 1e-6:
             size = j + 1
             break
         off[j], before, current = norm, current, step / norm
@@ -174,14 +155,9 @@ _POINTS_PER_SIGMA = 4
 
 
 def charlier_information(exposure: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return I, the variance per frame of the efficient score ``E[C2 | x] / 2``, e-^4.
+    """Return I, the variance per frame of the efficient score ``E[C2 | x] / 2``, e-^4, shape (n,).
 
-    Args:
-        exposure: H, e-, shape (n,).
-        noise: sigma_e, e-, shape (n,).
-
-    Returns:
-        Bilinear interpolation, in logarithms, of a table; shape (n,).
+    Bilinear interpolation, in logarithms, of a table over H and sigma_e, e-, (n,) each.
     """
     table = _table()
     i, u = _place(np.log(_EXPOSURES), np.log(np.maximum(exposure, 1e-9)))

@@ -20,8 +20,6 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.framework.evidence import CodeResiduals
 from pchem_pipeline.effects.types import BoolArray, Evidence, FloatArray, IntArray, PixelMaps, SampleLaw
 
-Residuals = tuple["IntArray", "FloatArray", "FloatArray"]
-
 # fewest expected counts at which a relative residual is about normal
 _FEWEST = 100.0
 # fall of chi2 that one edge must bring, and most edges
@@ -29,22 +27,17 @@ _LEAST_GAIN = 18.0
 _MOST_SHIFTS = 4
 
 
-def usable_codes(code: CodeResiduals, *, most: int = 1 << 12) -> Residuals:
-    """Return the longest run of codes with counts enough: codes, relative residuals, expected counts.
-
-    Of a run longer than ``most`` the part with the most counts.
-    """
+def usable_codes(code: CodeResiduals, *, most: int = 1 << 12) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return the longest run of codes with counts enough: codes, relative residuals, expected counts."""
     every = code.first + np.arange(code.expected.size)
     # the extreme codes are where a limit piles counts up
     inside = (every > code.minimum) & (every < code.maximum)
     good = np.concatenate([[False], inside & (code.expected >= _FEWEST), [False]])
-    edges = np.flatnonzero(np.diff(good.astype(np.int8)))
-    starts, ends = edges[::2], edges[1::2]
-    if not starts.size:
+    runs = np.flatnonzero(np.diff(good.astype(np.int8))).reshape(-1, 2)
+    if not runs.size:
         return np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
-    longest = int((ends - starts).argmax())
-    part = slice(int(starts[longest]), int(ends[longest]))
-    if part.stop - part.start > most:
+    part = slice(*map(int, runs[np.diff(runs).argmax()]))
+    if part.stop - part.start > most:  # the part with the most counts
         sums = np.cumsum(np.concatenate([[0.0], code.expected[part]]))
         begin = part.start + int((sums[most:] - sums[:-most]).argmax())
         part = slice(begin, begin + most)
@@ -114,11 +107,10 @@ def edge_shifts(residuals: FloatArray, expected: FloatArray, variance: float) ->
 
 def code_range(maps: PixelMaps) -> tuple[int, int]:
     """Return first and last code that the pixels can give, 8 standard deviations included."""
-    parts = (maps.bias, maps.quanta_exposure, maps.conversion_gain, maps.read_noise_dn)
-    good = np.isfinite(np.stack([np.ravel(p) for p in parts])).all(axis=0)
-    if not good.any():
+    parts = np.stack([np.ravel(each) for each in maps.maps])
+    exposure, gain, mu, noise = parts[:, np.isfinite(parts).all(axis=0)]
+    if not mu.size:
         return 0, 0
-    mu, exposure, gain, noise = (np.ravel(p)[good] for p in parts)
     top = mu + (exposure + 8 * np.sqrt(exposure) + 8) / gain + 8 * noise
     return max(0, int(np.floor((mu - 8 * noise).min()))), int(np.ceil(top.max()))
 
@@ -159,23 +151,6 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class SampledPixels:
-    """A sample of pixels in their own windows of codes.
-
-    Attributes:
-        first: code of the first cell of each window, (n, 1).
-        density: of the samples at the cells' edges, per DN, (n, cells + 1).
-        mass: of the cells, (n, cells).
-        tangents: change of the masses with H, mu, sigma, g, orthonormal under ``1 / mass``, (n, 4, cells).
-    """
-
-    first: IntArray
-    density: FloatArray
-    mass: FloatArray
-    tangents: FloatArray
-
-
-@dataclass(frozen=True)
 class Stitch:
     """A deviation ``slope (x - level) + step`` above a level, none below: DN per DN, DN, DN."""
 
@@ -204,17 +179,20 @@ class CurveResponse:
     def of(cls, evidence: Evidence) -> CurveResponse | None:
         """Return that of the evidence; None of too few codes or without a usable pixel."""
         codes, residuals, expected = usable_codes(evidence.code, most=_MOST_CODES)
-        pixels = sampled_tangents(evidence.maps)
-        if codes.size < 16 or pixels is None:
+        pixels = _sample(evidence.maps)
+        if codes.size < 16 or not pixels.bias.size:
             return None
-        samples = evidence.n_frames * int(evidence.maps.usable.sum()) / len(pixels.first)
+        samples = evidence.n_frames * int(evidence.maps.usable.sum()) / pixels.bias.size
         response = _response(pixels, codes) * (samples / np.sqrt(expected))[:, None]
         return cls(np.append(codes, codes[-1] + 1) - 0.5, response, residuals * np.sqrt(expected), expected)
 
     def fits(self, deviations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return by how much pairs of deviations (kinds, 2, codes + 1) lower chi2, and their factors."""
-        found = [_fit(self.response @ pair.T, self.residuals) for pair in deviations]
-        return np.array([gain for gain, _ in found]), np.array([factors for _, factors in found])
+        designs = [self.response @ pair.T for pair in deviations]
+        factors = [np.linalg.lstsq(design, self.residuals, rcond=None)[0] for design in designs]
+        left = [self.residuals - design @ each for design, each in zip(designs, factors, strict=True)]
+        total = float((self.residuals**2).sum())
+        return np.array([total - float((each**2).sum()) for each in left]), np.array(factors)
 
     def worth(self, gains: FloatArray, known: float = 0.0, least: float = _LEAST_BEND_GAIN) -> BoolArray:
         """Return which gains are more than a known one, and what chance and what else is amiss brings."""
@@ -228,7 +206,9 @@ def best_bend(evidence: Evidence) -> list[Bend]:
     curve = CurveResponse.of(evidence)
     if curve is None:
         return []
-    periods = np.geomspace(_SHORTEST, max(2.0 * _in_use(curve.expected), 4.0 * _SHORTEST), _PERIODS)
+    share = np.cumsum(curve.expected) / curve.expected.sum()
+    in_use = float(np.ptp(np.searchsorted(share, [0.01, 0.99])) + 1)  # DN of the middle 98 % of the samples
+    periods = np.geomspace(_SHORTEST, max(2.0 * in_use, 4.0 * _SHORTEST), _PERIODS)
     turned = np.outer(2.0 * np.pi / periods, curve.edges)
     gains, factors = curve.fits(np.stack([np.sin(turned), np.cos(turned)], axis=1))
     worth = curve.worth(gains)
@@ -253,33 +233,27 @@ def best_curve(evidence: Evidence) -> Curve | None:
     best, most = None, float(response.fits(waves)[0].max(initial=0.0))
     share = np.cumsum(response.expected) / response.expected.sum()
     first, last = response.edges[np.searchsorted(share, [_RARE, 1.0 - _RARE])]
+    weight = np.sqrt(np.append(response.expected, 0.0) + np.append(0.0, response.expected))
     for number in _KNOTS:
         knots = np.linspace(first, last, number)
         values, gain = _fit_knots(response, through_knots(knots, np.eye(number), response.edges))
         # a sine has three numbers
         least = (_LEAST_BEND_GAIN + _PRICE * (number - 3)) if best is None else 2.0 * _PRICE
         if response.worth(np.array([gain]), most, least)[0]:
-            level = _straight(response, through_knots(knots, values, response.edges))
+            # less a straight line, which bias and gain of the pixels take up
+            deviation = through_knots(knots, values, response.edges)
+            level = np.polynomial.Polynomial.fit(response.edges, deviation, 1, w=weight)
             best = Curve(float(knots[0]), float(knots[1] - knots[0]), values - level(knots))
             most = gain
     return best
 
 
-def _straight(response: CurveResponse, deviation: FloatArray) -> np.polynomial.Polynomial:
-    """Return the straight line through a deviation (codes + 1,): bias and gain of the pixels take it up."""
-    counts = np.append(response.expected, 0.0) + np.append(0.0, response.expected)
-    return np.polynomial.Polynomial.fit(response.edges, deviation, 1, w=np.sqrt(counts))
-
-
 def _fit_knots(response: CurveResponse, basis: FloatArray) -> tuple[FloatArray, float]:
-    """Return values at the knots of a basis (codes + 1, knots), LSB, and by how much they lower chi2.
-
-    What hardly shows (a straight line, which bias and gain take up, above all) is left at nothing.
-    """
+    """Return values at the knots of a basis (codes + 1, knots), LSB, and by how much they lower chi2."""
     u, size, directions = np.linalg.svd(response.response @ basis, full_matrices=False)
     seen = u.T @ response.residuals
     kept = seen * np.clip(1.0 - _DOUBT / np.maximum(seen**2, 1e-9), 0.0, None)
-    kept[size < _WEAKEST * size[0]] = 0.0
+    kept[size < _WEAKEST * size[0]] = 0.0  # above all a straight line, which bias and gain take up
     values = directions.T @ (kept / np.maximum(size, 1e-300))
     return values, float((seen**2 - (seen - kept) ** 2).sum())
 
@@ -293,10 +267,7 @@ def through_knots(knots: FloatArray, values: FloatArray, places: FloatArray) -> 
 
 
 def best_stitch(evidence: Evidence) -> list[Stitch]:
-    """Return the break of the curve that explains the residuals of the codes best; none if none does.
-
-    A kink alone first, then with a step at the level, where that explains more.
-    """
+    """Return the breaks that explain the codes best: a kink, and before it one with a step if better."""
     curve = CurveResponse.of(evidence)
     if curve is None:
         return []
@@ -318,67 +289,45 @@ def best_stitch(evidence: Evidence) -> list[Stitch]:
     return [stitch for _, stitch in found]
 
 
-def sampled_tangents(maps: PixelMaps) -> SampledPixels | None:
-    """Return masses and tangents of pixels spread over the sensor; None where none is usable."""
-    from pchem_pipeline.model.law.mass import sample_slopes
-
-    pixels = _sample(maps)
-    if pixels is None:
-        return None
-    exposure, gain, bias, noise = (each[:, None] for each in pixels.maps)
-    sigma = np.sqrt(np.maximum(noise**2 - QUANTISATION_VARIANCE, 0.01))
-    first = np.floor(bias - 5.0 * sigma).astype(np.int64)
-    cells = int(np.ceil((10.0 * sigma + (exposure + 5.0 * np.sqrt(exposure) + 2.0) / gain).max()))
-    mass, slopes = sample_slopes(SampleLaw(), pixels, first[:, 0], cells)
-    # a larger bias takes from each code what lies at its upper edge, and gives what lies at its lower one
-    density = np.pad(-np.cumsum(slopes[:, 2], axis=1), ((0, 0), (1, 0)))
-    mass = np.maximum(mass, 1e-12)
-    root = np.sqrt(mass)[:, :, None]
-    tangents = np.linalg.qr(slopes.transpose(0, 2, 1) / root)[0] * root
-    return SampledPixels(first, density, mass, tangents.transpose(0, 2, 1))
-
-
-def _in_use(expected: FloatArray) -> float:
-    """Return over how many DN the middle 98 % of the samples spread."""
-    share = np.cumsum(expected) / expected.sum()
-    return float(np.searchsorted(share, 0.99) - np.searchsorted(share, 0.01) + 1)
-
-
-def _sample(maps: PixelMaps) -> PixelMaps | None:
+def _sample(maps: PixelMaps) -> PixelMaps:
     """Return pixels spread over the sensor, shape (n,), without the widest histograms."""
     some = maps.of(maps.usable & np.isfinite(np.stack(maps.maps)).all(axis=0))
     if not some.bias.size:
-        return None
+        return some
     widths = (some.quanta_exposure + 6.0 * np.sqrt(some.quanta_exposure)) / some.conversion_gain
     kept = np.flatnonzero(widths <= np.quantile(widths, 0.95))
     return some.of(kept[:: max(1, kept.size // _PIXELS)])
 
 
-def _response(pixels: SampledPixels, codes: IntArray) -> FloatArray:
+def _response(pixels: PixelMaps, codes: IntArray) -> FloatArray:
     """Return the change of the mass of the codes per DN of deviation at their edges, (codes, codes + 1).
 
-    Summed over the sample of pixels, with what their fits take up projected out.
+    Summed over the pixels, each in a window of codes, with what their fits take up projected out.
     """
-    n_cells = pixels.mass.shape[1]
+    from pchem_pipeline.model.law.mass import sample_slopes
+
+    exposure, gain, bias, noise = pixels.maps
+    sigma = np.sqrt(np.maximum(noise**2 - QUANTISATION_VARIANCE, 0.01))
+    first = np.floor(bias - 5.0 * sigma).astype(np.int64)
+    n_cells = int(np.ceil((10.0 * sigma + (exposure + 5.0 * np.sqrt(exposure) + 2.0) / gain).max()))
+    mass, slopes = sample_slopes(SampleLaw(), pixels, first, n_cells)
+    # a larger bias takes from each code what lies at its upper edge, and gives what lies at its lower one
+    density = np.pad(-np.cumsum(slopes[:, 2], axis=1), ((0, 0), (1, 0)))
+    mass = np.maximum(mass, 1e-12)
+    root = np.sqrt(mass)[:, :, None]
+    # changes of the masses with H, mu, sigma, g, orthonormal under 1 / mass, (n, 4, cells)
+    tangents = (np.linalg.qr(slopes.transpose(0, 2, 1) / root)[0] * root).transpose(0, 2, 1)
     total = np.zeros((codes.size + 2 * n_cells, codes.size + 2 * n_cells + 1))
     cells = np.arange(n_cells)
-    for first, density, mass, tangents in zip(
-        pixels.first[:, 0] - codes[0] + n_cells, pixels.density, pixels.mass, pixels.tangents, strict=True
-    ):
-        if not 0 <= first <= total.shape[0] - n_cells:
+    for begin, edge, weight, along in zip(first - codes[0] + n_cells, density, mass, tangents, strict=True):
+        if not 0 <= begin <= total.shape[0] - n_cells:
             continue
         # a deviation at an edge moves the samples there into the upper cell
-        taken = np.zeros((len(tangents), n_cells + 1))
-        taken[:, :-1] = tangents / mass * density[:-1]
-        taken[:, 1:] -= tangents / mass * density[1:]
-        change = total[first : first + n_cells, first : first + n_cells + 1]
-        change -= tangents.T @ taken
-        change[cells, cells] += density[:-1]
-        change[cells, cells + 1] -= density[1:]
+        taken = np.zeros((len(along), n_cells + 1))
+        taken[:, :-1] = along / weight * edge[:-1]
+        taken[:, 1:] -= along / weight * edge[1:]
+        change = total[begin : begin + n_cells, begin : begin + n_cells + 1]
+        change -= along.T @ taken
+        change[cells, cells] += edge[:-1]
+        change[cells, cells + 1] -= edge[1:]
     return total[n_cells:-n_cells, n_cells:-n_cells]
-
-
-def _fit(design: FloatArray, scaled: FloatArray) -> tuple[float, FloatArray]:
-    """Return by how much a sine and a cosine lower chi2 of the codes, and their factors."""
-    factors: FloatArray = np.linalg.lstsq(design, scaled, rcond=None)[0].astype(np.float64)
-    return float((scaled**2).sum() - ((scaled - design @ factors) ** 2).sum()), factors

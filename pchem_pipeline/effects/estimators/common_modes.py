@@ -32,13 +32,7 @@ class Multiple(NamedTuple):
 
 
 def multiple_of(pattern: FloatArray, seen: FloatArray, weight: FloatArray | float = 1.0) -> Multiple:
-    """Return how many times a pattern is in what is seen.
-
-    Args:
-        pattern: expected for a coefficient of 1, any shape.
-        seen: of the same shape.
-        weight: inverse variance of what is seen, of all or of each.
-    """
+    """Return how many times a pattern is in what is seen, which has the inverse variance ``weight``."""
     information = float((weight * pattern**2).sum())
     if not (np.isfinite(information) and information > 0):
         return Multiple(0.0, np.inf)
@@ -58,12 +52,7 @@ def responsivity(evidence: Evidence) -> float:
 
 
 def mean_response(evidence: Evidence, inside: BoolArray | None = None) -> float:
-    """Return the mean change of r over its standard deviation per DN of a common offset, 1/DN.
-
-    Args:
-        evidence: of some pixels.
-        inside: those that count, (y, x); None: all.
-    """
+    """Return the mean of d(r / sd of r) by a common offset of the pixels ``inside`` (None: all), 1/DN."""
     usable = evidence.maps.usable if inside is None else evidence.maps.usable & inside
     return float(np.mean((evidence.readout_std / evidence.maps.read_noise_dn**2)[usable]))
 
@@ -71,8 +60,7 @@ def mean_response(evidence: Evidence, inside: BoolArray | None = None) -> float:
 def mean_variance(evidence: Evidence, axis: int | tuple[int, int] = (0, 1)) -> FloatArray:
     """Return the variance, DN^2, that the pixels' own noise gives to means of r over usable pixels.
 
-    ``axis`` as in a sum over (y, x): both for frame means, 1 for row means, 0 for column means; NaN where
-    there is no usable pixel.
+    ``axis`` as in a sum over (y, x): 1 for row means, 0 for column means; NaN where no pixel is usable.
     """
     usable = evidence.maps.usable & np.isfinite(evidence.readout_std)
     n = usable.sum(axis)
@@ -89,9 +77,7 @@ def successive(frames: AnyArray) -> BoolArray:
 def line_excess(means: AnyArray, variance: FloatArray) -> tuple[float, float]:
     """Return the variance of the lines' offsets beyond that of their pixels, and its standard error, DN^2.
 
-    Args:
-        means: mean of r of each line in each frame, shape (n, lines), NaN for lines without pixels.
-        variance: what the pixels' noise gives to each, shape (lines,), NaN for such lines.
+    Of means of r, (n, lines), with what the pixels' noise gives to their variance, (lines,); NaN: no pixels.
     """
     good = np.isfinite(variance) & np.isfinite(means).all(axis=0)
     n_frames, n_lines = means.shape[0], int(good.sum())

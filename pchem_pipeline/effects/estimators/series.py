@@ -66,24 +66,14 @@ class TimeProfile(NamedTuple):
 
 
 def settling(position: FloatArray, fraction: float) -> FloatArray:
-    """Return an exponential approach to the end, of mean 0 and range 1 over the run.
-
-    Args:
-        position: times from 0 (first frame) to 1 (last frame).
-        fraction: time constant in lengths of the run.
-    """
+    """Return an exponential approach at times 0..1, of mean 0, range 1 and time constant ``fraction``."""
     whole = -np.expm1(-1.0 / fraction)
     mean = (1.0 - fraction * whole) / whole
     return np.asarray(-np.expm1(-position / fraction) / whole - mean)
 
 
 def along_path(position: FloatArray, path: Sequence[float]) -> FloatArray:
-    """Return a broken line through nodes at equal distances along the run, of mean 0 over the run.
-
-    Args:
-        position: times from 0 (first frame) to 1 (last frame).
-        path: the nodes, at least two.
-    """
+    """Return a broken line of mean 0 through nodes at equal distances, at times from 0 (first frame) to 1."""
     nodes = np.array(path)
     # the mean of a broken line counts its ends by half
     mean = (nodes.sum() - (nodes[0] + nodes[-1]) / 2.0) / (nodes.size - 1)
@@ -100,11 +90,8 @@ def likely_profiles(series: FloatArray, position: FloatArray) -> list[TimeProfil
     """Return the time profiles that a series may follow, the likeliest first; none if it may be constant.
 
     Of the best line, exponential approach and broken line those that explain more than chance and, with more
-    freedom than the line, more than it by the Bayesian information criterion.
-
-    Args:
-        series: with white noise, shape (n,).
-        position: times from 0 (first frame of the run) to 1 (last frame), shape (n,).
+    freedom than the line, more than it by the Bayesian information criterion. Values with white noise, (n,),
+    at times from 0 (first frame of the run) to 1 (last frame), (n,).
     """
     line, *curves = _time_profiles(series, position)
     kept = [line, *(curve for curve in curves if curve.criterion < line.criterion)]
@@ -127,15 +114,13 @@ def _time_profiles(series: FloatArray, position: FloatArray) -> tuple[TimeProfil
 
     constant = fit(np.ones((n, 1)))[1]
 
-    def multiple(profile: FloatArray, fraction: float | None = None) -> TimeProfile:
+    def multiple(shape: Literal["linear", "settling"], profile: FloatArray, numbers: float) -> TimeProfile:
         values, deviance = fit(np.stack([np.ones(n), profile], axis=1))
-        size, gain = float(values[1]), constant - deviance
-        if fraction is None:
-            return TimeProfile("linear", size, deviance + 2.0 * np.log(n), gain)
-        return TimeProfile("settling", size, deviance + 3.0 * np.log(n), gain, settling_fraction=fraction)
+        return TimeProfile(shape, float(values[1]), deviance + numbers * np.log(n), constant - deviance)
 
     def settled(fraction: float) -> TimeProfile:
-        return multiple(settling(position, fraction), fraction)
+        found = multiple("settling", settling(position, fraction), 3.0)
+        return found._replace(settling_fraction=fraction)
 
     def path(nodes: int) -> TimeProfile:
         values, deviance = fit(hats(position, nodes), _STIFF)
@@ -145,18 +130,14 @@ def _time_profiles(series: FloatArray, position: FloatArray) -> tuple[TimeProfil
 
     numbers = [nodes for nodes in _NODES if nodes == _NODES[0] or _PER_NODE * nodes <= n]
     return (
-        multiple(position - 0.5),
+        multiple("linear", position - 0.5, 2.0),
         settled(_settling_time(lambda fraction: settled(fraction).criterion)),
         min(map(path, numbers), key=lambda each: each.criterion),
     )
 
 
 def _settling_time(left: Callable[[float], float]) -> float:
-    """Return the time constant of an exponential approach that leaves least, in lengths of the run.
-
-    Args:
-        left: what an approach with a time constant leaves.
-    """
+    """Return the time constant, in lengths of the run, for which ``left`` is least."""
     from scipy.optimize import minimize_scalar  # not for every command that knows of effects
 
     losses = [left(fraction) for fraction in SETTLING]
@@ -189,20 +170,17 @@ class Steps:
 def likeliest_parts(
     series: FloatArray, gaps: FloatArray, layouts: Mapping[Layout, FloatArray]
 ) -> tuple[Layout, list[Steps]]:
-    """Return which groups of series jump together, and the jumps of each.
+    """Return which groups of series (n, m) jump together, and the jumps of each.
 
-    By the squares of what is left in all series, and Schwarz's price for each level and jump.
-
-    Args:
-        series: shape (n, m).
-        gaps: time between each value and the one before, in units of the shortest, shape (n,).
-        layouts: weights of the series in the mean of each group, shape (p, m), p of 2 or more.
+    By the squares of what is left in all series, and Schwarz's price for each level and jump. ``gaps`` as in
+    `find_steps`; ``layouts`` are weights of the series in the mean of each group, (p, m), p of 2 or more.
     """
     n, own = len(series), _own_variance(series)
     found: list[tuple[float, Layout, list[Steps]]] = []
     for layout, weights in layouts.items():
         steps = find_steps(series @ weights.T, gaps)
-        rest = series - np.stack([_profile(each, n) for each in steps], axis=1) @ (weights > 0)
+        profiles = [np.repeat(each.levels, np.diff([*each.starts, n])) for each in steps]
+        rest = series - np.stack(profiles, axis=1) @ (weights > 0)
         rest -= rest.mean(axis=1, keepdims=True) + rest.mean(axis=0)
         levels = sum(each.levels.size for each in steps)
         price = np.log(n) * (3 * levels - 2 * len(steps))
@@ -213,15 +191,12 @@ def likeliest_parts(
 
 
 def find_steps(series: FloatArray, gaps: FloatArray | None = None) -> list[Steps]:
-    """Return the levels of each series and where they begin.
+    """Return the levels of each series of (n, m), m of 2 or more, and where they begin.
 
     A cut must lower the sum of squares by ``4 log(n m) + 6`` times the variance of the noise (twice what the
     Bayesian information criterion asks for: series without steps are cut about once in a thousand times).
-
-    Args:
-        series: shape (n, m), m of 2 or more.
-        gaps: time between each value and the one before, in units of the shortest, shape (n,): a change
-            during a long gap is so much likelier than one between two neighbours. All alike if None.
+    ``gaps``: time between each value and the one before, in units of the shortest, (n,): a change during a
+    long gap is so much likelier than one between two neighbours. All alike if None.
     """
     n, m = series.shape
     variance = _own_variance(series)
@@ -245,7 +220,7 @@ def find_steps(series: FloatArray, gaps: FloatArray | None = None) -> list[Steps
         (_with_common(series, cuts[1:-1], variance, waves) for waves in _WAVES), key=lambda one: one[0]
     )
     return [
-        Steps(np.array(begins, np.int64), _centred(level, begins, n))
+        Steps(np.array(begins, np.int64), level - (level * np.diff([*begins, n])).sum() / n)
         for level, begins in zip(levels, starts, strict=True)
     ]
 
@@ -258,28 +233,19 @@ def _own_variance(series: FloatArray) -> float:
 
 
 def _noise_variance(series: FloatArray) -> float:
-    """Return the variance of the white part: half the mean squared difference of successive values.
-
-    Sudden steps are so few that leaving out the largest twentieth of the differences takes care of them
-    (the rest of a Gaussian's squares is 0.774 of its mean square).
-    """
+    """Return the variance of the white part: half the mean squared difference of successive values."""
     squares = np.sort(np.diff(series) ** 2)
-    kept = squares[: max(int(0.95 * squares.size), 1)]
-    return float(kept.mean() / 2.0 / 0.774)
-
-
-def _profile(steps: Steps, n: int) -> FloatArray:
-    return np.repeat(steps.levels, np.diff([*steps.starts, n]))
+    # less the largest twentieth, the sudden steps; of a Gaussian the rest is 0.774 of the mean square
+    return float(squares[: max(int(0.95 * squares.size), 1)].mean() / 2.0 / 0.774)
 
 
 def _with_common(
     series: FloatArray, cuts: list[int], variance: float, n_waves: int
 ) -> tuple[float, list[list[int]], list[FloatArray]]:
-    """Return which series jump at the cuts, and the levels of all, the common mode included.
+    """Return Schwarz's criterion, which series jump at the cuts, and the levels of all, common mode included.
 
     Least squares in which the common mode counts less, by as much as it is noisier than a mean of ``m`` white
-    series, and may wander smoothly (some cosines). First comes what is left, with Schwarz's price of each
-    number.
+    series, and may wander smoothly (some cosines).
     """
     n, m = series.shape
     noise = _noise_variance(series.mean(axis=1))
@@ -299,10 +265,8 @@ def _with_common(
         owner = np.repeat(np.arange(m), [len(begins) for begins in starts])
         levels = [found[: owner.size][owner == q] for q in range(m)]
         weakest: dict[int, tuple[float, int]] = {}
-        place = 0
         for q, (begins, level) in enumerate(zip(starts, levels, strict=True)):
-            here = np.arange(place, place + len(begins))
-            place += len(begins)
+            here = np.flatnonzero(owner == q)
             spread = np.diag(inverse)[here]
             errors = variance * (spread[1:] + spread[:-1] - 2.0 * inverse[here[1:], here[:-1]])
             squares = np.diff(level) ** 2 / np.maximum(errors, np.finfo(np.float64).tiny)
@@ -320,12 +284,6 @@ def _indicators(begins: list[int], n: int, row: FloatArray) -> FloatArray:
     """Return the columns of a design that one series' levels have, (n * m, levels)."""
     inside = np.repeat(np.eye(len(begins)), np.diff([*begins, n]), axis=0)
     return (inside[:, None, :] * row[:, None]).reshape(n * row.size, len(begins))
-
-
-def _centred(levels: FloatArray, starts: list[int], n: int) -> FloatArray:
-    """Return levels less their mean over n values, each from its start on."""
-    lengths = np.diff([*starts, n])
-    return np.asarray(levels - (levels * lengths).sum() / n)
 
 
 def _best_cut(series: FloatArray, first: int, last: int, bonus: FloatArray) -> tuple[float, int]:
@@ -367,13 +325,9 @@ class Levels(NamedTuple):
 
 
 def few_levels(seen: FloatArray, variance: float) -> Levels | None:
-    """Return the fewest values that explain what is seen; None where a normal law does so as well.
+    """Return the fewest values that explain what is seen, (n,); None where a normal law does so as well.
 
     Mixtures of normal laws of known variance by EM, two values and more as long as Schwarz's criterion falls.
-
-    Args:
-        seen: relative deviations, each with noise, shape (n,).
-        variance: of that noise.
     """
     price = math.log(seen.size)  # of a value and its share: twice half a logarithm
     whole = float(seen.var())
@@ -399,7 +353,7 @@ def _fitted(seen: FloatArray, variance: float, k: int) -> Levels:
         number = np.maximum(belongs.sum(axis=1), 1e-9)
         levels = Levels(belongs @ seen / number, number / number.sum())
     order = np.argsort(levels.values)
-    return Levels(levels.values[order], levels.shares[order])
+    return Levels(*(each[order] for each in levels))
 
 
 def _log_density(levels: Levels, seen: FloatArray, variance: float) -> tuple[FloatArray, FloatArray]:
@@ -444,12 +398,8 @@ def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:
     """Return the highest line over frames and lines, or None where none stands out.
 
     What is constant in time (part of the bias map), drifts (slower than three cycles per run) and alternation
-    (half the frame rate) are taken away first.
-
-    Args:
-        means: (n, lines), DN; lines with NaN do not count.
-        frames: frame number of each, shape (n,); there may be gaps.
-        n_run: number of frames of the run.
+    (half the frame rate) are taken away first. Means (n, lines), DN, with NaN for lines that do not count, of
+    frames with these numbers, (n,), which may have gaps, in a run of ``n_run``.
     """
     field, lines = _prepared(means)
     if field.shape[0] < 64 or field.shape[1] < 1:
@@ -461,7 +411,8 @@ def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:
     field = _without_slow(field[inside], numbers)
     grid = np.zeros((length, n_lines), np.float32)
     grid[np.ix_(numbers - numbers[0], lines)] = field
-    power = _half_plane(grid)
+    spectrum = np.fft.fft(np.fft.rfft(grid, axis=1).astype(np.complex64), axis=0)
+    power = np.asarray(np.abs(spectrum) ** 2, np.float32)  # at the non-negative frequencies along lines
     ratio = power / _level(power)
     place = np.unravel_index(int(ratio.argmax()), ratio.shape)
     excess = float(ratio[place]) - np.log(ratio.size)
@@ -472,11 +423,7 @@ def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:
 
 
 def incoherent_line(means: AnyArray) -> Line | None:
-    """Return the highest line within frames whose phase is new in every frame, or None.
-
-    Args:
-        means: (n, lines), DN; lines with NaN do not count.
-    """
+    """Return the highest line within frames, of means as in `coherent_line`, whose phase is new in each."""
     field, lines = _prepared(means)
     if field.shape[0] < 16 or field.shape[1] < 8:
         return None
@@ -505,17 +452,9 @@ def _prepared(means: AnyArray) -> tuple[FloatArray, IntArray]:
     return field - field.mean(axis=0), lines
 
 
-def _half_plane(grid: Float32Array) -> Float32Array:
-    """Return the power at all frequencies along frames and the non-negative ones along lines."""
-    spectrum = np.fft.fft(np.fft.rfft(grid, axis=1).astype(np.complex64), axis=0)
-    return np.asarray(np.abs(spectrum) ** 2, np.float32)
-
-
 def _without_slow(field: FloatArray, frames: IntArray) -> FloatArray:
-    """Return the field without what no pickup does: the mean, slow changes and alternation of each line.
-
-    They are fitted and not only left out of the spectrum, where gaps between the frames spread them widely.
-    """
+    """Return the field without what no pickup does: the mean, slow changes and alternation of each line."""
+    # fitted and not only left out of the spectrum, where gaps between the frames spread them widely
     position = (frames - frames[0]) / max(int(frames[-1] - frames[0]), 1)
     waves = [np.cos(np.pi * j * position) for j in range(_SLOW_WAVES + 1)]
     basis = np.linalg.qr(np.stack([*waves, 1.0 - 2.0 * (frames % 2)], axis=1))[0]
@@ -526,8 +465,7 @@ def _level(power: Float32Array) -> Float32Array:
     """Return the noise power around each place, so that broad humps of the spectrum are no lines.
 
     By stretches of frequencies along frames: at each of the lowest frequencies along lines, where jumps and
-    noise of frames are, and at all the others together. The median of exponentially distributed powers is
-    log 2 of their mean.
+    noise of frames are, and at all the others together.
     """
     level = np.empty_like(power)
     length = power.shape[0]
@@ -535,7 +473,7 @@ def _level(power: Float32Array) -> Float32Array:
         level[piece, :_FRAME_LIKE] = np.median(power[piece, :_FRAME_LIKE], axis=0)
         if power.shape[1] > _FRAME_LIKE:
             level[piece, _FRAME_LIKE:] = np.median(power[piece, _FRAME_LIKE:])
-    # what was fitted and taken away leaves holes: never less than half the typical level
+    # what was fitted and taken away leaves holes; exponential powers have a median of log 2 of their mean
     return np.asarray(np.maximum(level, np.float32(0.5) * np.median(level)) / np.log(2.0), np.float32)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -27,14 +28,9 @@ def spot_image(
 ) -> FloatArray:
     """Return the brightness of a spot relative to the sensor's brightest pixel, shape (rows, columns).
 
-    Args:
-        rows: of the pixels.
-        columns: of the pixels.
-        shape: rows and columns of the sensor.
-        centre: its row over the number of rows, and its column over that of columns.
-        radius: over the longer side of the sensor: standard deviation of a Gaussian, or the distance in which
-            an exponential falls to 1/e.
-        falloff: which of them.
+    The pixels are those of some rows and columns of a sensor of this shape. The centre is relative to the
+    numbers of rows and columns, the radius to the longer side: the standard deviation of a Gaussian, or the
+    distance in which an exponential falls to 1/e.
     """
     side = max(shape)
     dy = ((rows + 0.5) / shape[0] - centre[0]) * shape[0] / side
@@ -54,12 +50,7 @@ def spot_to_window(
 ) -> dict[str, float]:
     """Return a spot as it is on some rows and columns that are taken for a sensor of their own.
 
-    Args:
-        spot: ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect, and whatever else it has.
-        falloff: see :func:`spot_image`.
-        rows: first, and behind the last.
-        columns: likewise.
-        shape: rows and columns of the sensor.
+    By ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect; ranges as in `to_window`.
     """
     centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
     # the brightest of these pixels is the one nearest to the centre
@@ -115,12 +106,8 @@ def best_spot(
 ) -> Spot | None:
     """Return the spot that fits amplitudes in the cells of a grid best; None if none is positive.
 
-    Args:
-        amplitude: (rows, columns) of a grid over the sensor.
-        noise: standard errors, infinite without pixels.
-        background: what may be there in any proportion beside the spot.
-        shape: rows and columns of the sensor.
-        falloffs: forms that are tried.
+    On a sensor of this shape, with standard errors ``noise``, infinite without pixels. What is like the
+    ``background`` may be there in any proportion beside the spot.
     """
     y, x = ((np.arange(n) + 0.5) * size / n - 0.5 for n, size in zip(amplitude.shape, shape, strict=True))
     inverse = noise**-2.0
@@ -147,13 +134,7 @@ def _fitted(
 ) -> Spot | None:
     """Return the spot that lowers chi2 the most, of a grid and then around it; None if none is positive.
 
-    Args:
-        places: rows and columns of the cells.
-        shape: rows and columns of the sensor.
-        falloffs: forms that are tried.
-        seen: what spots (n, rows, columns) would be in the data, (n, m).
-        target: the data, (m,).
-        inverse: their inverse variances, (m,).
+    Spots (n, rows, columns) are ``seen``, (n, m), in the data ``target``, (m,), of variances 1 / ``inverse``.
     """
     from scipy.optimize import minimize
 
@@ -166,17 +147,13 @@ def _fitted(
         size = np.maximum(size, 1e-300)
         return np.stack([np.where(there, overlap**2 / size, 0.0), overlap / size])
 
-    grid = [(float(y), float(x)) for y in np.linspace(0, 1, _CENTRES) for x in np.linspace(0, 1, _CENTRES)]
-    best: tuple[float, tuple[float, float], float, Falloff] = (0.0, grid[0], _RADII[0], "gaussian")
-    for falloff in falloffs:
-        for radius in _RADII:
-            gains = fits(grid, radius, falloff)[0]
-            place = int(gains.argmax())
-            if gains[place] > best[0]:
-                best = float(gains[place]), grid[place], radius, falloff
-    if not best[0] > 0.0:
+    grid = list(itertools.product(np.linspace(0, 1, _CENTRES).tolist(), repeat=2))
+    forms = list(itertools.product(falloffs, _RADII))
+    gains = np.stack([fits(grid, radius, falloff)[0] for falloff, radius in forms])
+    if not gains.max() > 0.0:
         return None
-    _, centre, radius, falloff = best
+    form, place = np.unravel_index(gains.argmax(), gains.shape)
+    (falloff, radius), centre = forms[form], grid[place]
 
     def loss(values: FloatArray) -> float:
         return -float(fits([(float(values[0]), float(values[1]))], float(np.exp(values[2])), falloff)[0, 0])
@@ -192,20 +169,13 @@ def _fitted(
 
 @dataclass(frozen=True)
 class _Lines:
-    """Charge of groups of rows and of columns along the run.
+    """Charge of groups of rows and of columns along the run."""
 
-    Attributes:
-        charge: sums of k - H of the row groups, then of the column groups, e-, (n, r + c).
-        y, x: mean row and column of the groups, (r,) and (c,).
-        response: sum over the pixels of a cell of dE[k] by an electron of light, (r, c).
-        variance: sum of Var(k), e-^2, which is also what a flicker of all pixels adds, (r, c).
-    """
-
-    charge: FloatArray
-    y: FloatArray
+    charge: FloatArray  # sums of k - H of the row groups, then of the column groups, e-, (n, r + c)
+    y: FloatArray  # mean row of each group, (r,), and column, (c,)
     x: FloatArray
-    response: FloatArray
-    variance: FloatArray
+    response: FloatArray  # sum over the pixels of a cell of dE[k] by an electron of light, (r, c)
+    variance: FloatArray  # sum of Var(k), e-^2, which is also what a flicker of all pixels adds, (r, c)
 
     def lines(self, cells: FloatArray) -> FloatArray:
         """Return the sums over rows and columns of what is in the cells, (..., r + c)."""
@@ -237,7 +207,14 @@ def best_bursts(evidence: Evidence) -> tuple[Spot, float] | None:
     burst = special.expit(odds)
     if share > _MOST or burst.sum() < _FEWEST_BURSTS:
         return None
-    spot = _form(lines, burst, shape)
+    # rows and columns of the bursts, less those of other frames
+    mean = burst @ lines.charge / burst.sum() - (1.0 - burst) @ lines.charge / (1.0 - burst).sum()
+    inverse = 1.0 / np.maximum(lines.lines(lines.variance), 1e-12)
+
+    def seen(spots: FloatArray) -> FloatArray:
+        return lines.lines(spots * lines.response)
+
+    spot = _fitted((lines.y, lines.x), shape, ("gaussian", "exponential"), seen, mean, inverse)
     return None if spot is None else (spot, share)
 
 
@@ -262,44 +239,25 @@ def _lines(evidence: Evidence) -> _Lines | None:
         sums = np.nan_to_num(series) * maps.usable.sum(axis=axis)
         sums = np.add.reduceat(sums.astype(np.float64), first[1 - axis], axis=1)
         # what changes slowly is no burst
-        charge.append(sums - _by_blocks(sums, time.frames, time.block_start))
+        means = np.add.reduceat(sums, np.searchsorted(time.frames, time.block_start), axis=0)
+        means /= time.block_length[:, None]
+        charge.append(sums - np.repeat(means, time.block_length, axis=0))
     y, x = (np.bincount(g, np.arange(g.size)) / np.bincount(g) for g in groups)
     return _Lines(np.concatenate(charge, axis=1), y, x, cells(response), cells(variance))
 
 
-def _by_blocks(sums: FloatArray, frames: IntArray, start: IntArray) -> FloatArray:
-    """Return the mean over the block of each frame, (n, lines)."""
-    first = np.searchsorted(frames, start)
-    length = np.diff(np.append(first, len(sums)))
-    means = np.add.reduceat(sums, first, axis=0) / length[:, None]
-    return np.asarray(np.repeat(means, length, axis=0))
-
-
 def _weights(lines: _Lines, shape: tuple[int, ...]) -> FloatArray:
     """Return weights of the lines for each spot's light in a frame, of unit variance, (spots, r + c)."""
-    grid, found = np.linspace(0.0, 1.0, 9), []
-    for radius in _RADII[1::2]:
-        for cy in grid:
-            for cx in grid:
-                spot = spot_image(lines.y, lines.x, shape, (float(cy), float(cx)), radius)
-                cells = spot.mean(axis=1, keepdims=True) + spot.mean(axis=0)
-                # neither a flicker of all pixels, which adds Var(k) to each, nor a constant is a spot
-                cells = cells - (cells * lines.variance).sum() / lines.variance.sum()
-                scale = np.sqrt((cells**2 * lines.variance).sum())
-                row = cells.mean(axis=1) - 0.5 * cells.mean()
-                found.append(np.append(row, cells.mean(axis=0) - 0.5 * cells.mean()) / scale)
+    grid, found = np.linspace(0.0, 1.0, 9).tolist(), []
+    for radius, y, x in itertools.product(_RADII[1::2], grid, grid):
+        spot = spot_image(lines.y, lines.x, shape, (y, x), radius)
+        cells = spot.mean(axis=1, keepdims=True) + spot.mean(axis=0)
+        # neither a flicker of all pixels, which adds Var(k) to each, nor a constant is a spot
+        cells = cells - (cells * lines.variance).sum() / lines.variance.sum()
+        scale = np.sqrt((cells**2 * lines.variance).sum())
+        row = cells.mean(axis=1) - 0.5 * cells.mean()
+        found.append(np.append(row, cells.mean(axis=0) - 0.5 * cells.mean()) / scale)
     return np.array(found)
-
-
-def _form(lines: _Lines, burst: FloatArray, shape: tuple[int, ...]) -> Spot | None:
-    """Return the spot that fits rows and columns of the bursts, less those of other frames, best."""
-    mean = burst @ lines.charge / burst.sum() - (1.0 - burst) @ lines.charge / (1.0 - burst).sum()
-    inverse = 1.0 / np.maximum(lines.lines(lines.variance), 1e-12)
-
-    def seen(spots: FloatArray) -> FloatArray:
-        return lines.lines(spots * lines.response)
-
-    return _fitted((lines.y, lines.x), shape, ("gaussian", "exponential"), seen, mean, inverse)
 
 
 # standard deviations up to which a pixel's deviation counts, and times that a mean is taken anew about which
@@ -334,10 +292,7 @@ class FadingCells:
 
     @classmethod
     def of(cls, blocks: BlockCharge, exposure: FloatArray, decay: float, grid: int) -> FadingCells:
-        """Return the least squares amplitudes at a time constant, on a grid of so many rows and columns.
-
-        Each is a power of two, smaller where the sensor is.
-        """
+        """Return least squares amplitudes at a time constant, on at most ``grid`` rows and columns."""
         shape = _exponential(blocks, decay)
         weight = blocks.length * shape
         found = weight @ blocks.deviation / (weight @ shape)
@@ -346,29 +301,24 @@ class FadingCells:
         cell = (blocks.y * rows // exposure.shape[0]) * columns + blocks.x * columns // exposure.shape[1]
         n = rows * columns
 
-        def mean_of(values: FloatArray, inverse: FloatArray) -> FloatArray:
-            return np.bincount(cell, values * inverse, n) / np.maximum(np.bincount(cell, inverse, n), 1e-300)
-
         inverse = stderr**-2
+        held = np.bincount(cell, inverse, n)
+
+        def mean_of(values: FloatArray) -> FloatArray:
+            return np.bincount(cell, values * inverse, n) / np.maximum(held, 1e-300)
+
         # from the middle of each cell: from 0 on a bright image would be cut at so many steps
         amplitude = np.nan_to_num(ndimage.median(found, cell, np.arange(n)))
         for _ in range(_CUT_ROUNDS):
             # single pixels that jump are another effect
             middle = amplitude[cell]
-            amplitude = mean_of(np.clip(found, middle - _CUT * stderr, middle + _CUT * stderr), inverse)
-        held = np.bincount(cell, inverse, n)
+            amplitude = mean_of(np.clip(found, middle - _CUT * stderr, middle + _CUT * stderr))
         noise = np.where(held > 0, np.maximum(held, 1e-300) ** -0.5, np.inf)
         freedom = max(int((held > 0).sum()) - 1, 1)
         score = (float(np.sum((amplitude / noise) ** 2)) - freedom) / np.sqrt(2.0 * freedom)
-        bright = mean_of(exposure[blocks.y, blocks.x], inverse)
+        bright = mean_of(exposure[blocks.y, blocks.x])
         size = (rows, columns)
         return cls(decay, amplitude.reshape(size), noise.reshape(size), bright.reshape(size), score, cell)
-
-    def above_background(self) -> FloatArray:
-        """Return the amplitudes with that part of H added which makes their median 0."""
-        held = np.isfinite(self.noise) & (self.exposure > 0)
-        background = float(np.median(self.amplitude[held] / self.exposure[held]))
-        return np.where(held, self.amplitude - background * self.exposure, 0.0)
 
     def image(self) -> FloatArray:
         """Return the amplitudes above the background without their noise, >= 0.
@@ -376,8 +326,12 @@ class FadingCells:
         A group of two by two cells keeps its differences where they stand out, and has its mean otherwise; so
         on with the means, up to the whole sensor (Donoho and Johnstone 1994, with Haar's wavelets by groups).
         """
+        held = np.isfinite(self.noise) & (self.exposure > 0)
+        # with that part of H added which makes their median 0
+        background = float(np.median(self.amplitude[held] / self.exposure[held]))
+        above = np.where(held, self.amplitude - background * self.exposure, 0.0)
         weight = np.where(np.isfinite(self.noise), self.noise, np.inf) ** -2.0
-        image = np.maximum(_denoised(self.above_background(), weight), 0.0)
+        image = np.maximum(_denoised(above, weight), 0.0)
         return np.where(image > _DARK * image.max(), image, 0.0)
 
 
@@ -422,10 +376,7 @@ class Fading:
 
 
 def fading_of(blocks: BlockCharge, cells: FadingCells, n_run: int) -> Fading:
-    """Return the time constants, from the time profile of all pixels with their amplitudes as weights.
-
-    A second one where it explains more by three standard deviations.
-    """
+    """Return the time constants of all pixels together, a second one if that explains more by 3 sigma."""
     # cells of noise would weigh in with the time constant that they were found with
     significant = (cells.amplitude / cells.noise) ** 2 > _PRICE_OF_CELL
     amplitude = np.where(significant, cells.amplitude, 0.0).reshape(-1)[cells.cell]

@@ -53,11 +53,7 @@ def added_exposures(
 ) -> AddedExposure | None:
     """Return what effects add to the exposure of each pixel, all together; None where none adds any.
 
-    Args:
-        effects: of the model.
-        frames: (frame, y, x), DN.
-        numbers: their numbers in the run, increasing, shape (frame,).
-        maps: plain fit of these pixels.
+    Found in frames (frame, y, x), DN, of increasing numbers in the run, from the plain fit of these pixels.
 
     Raises:
         ConfigError: if an effect fails; it is named.
@@ -88,10 +84,8 @@ def _in_its_place(
     added = effect.added_exposure(frames if when.all() else frames[when], numbers[when], maps)
     if added is None or effect.everywhere:
         return added
-    rows, columns = maps.bias.shape
-    inside = np.ones((rows, columns), np.bool_)
-    if effect.region is not None:
-        inside = effect.region.mask((rows, columns))
+    shape = maps.bias.shape
+    inside = np.ones(shape, np.bool_) if effect.region is None else effect.region.mask(shape)
     share = when.mean()
     none = np.zeros((1, *inside.shape))
     weight = np.concatenate([none + 1.0 - share * inside, share * np.where(inside, added.weight, 0.0)])
@@ -99,12 +93,7 @@ def _in_its_place(
 
 
 def pixel_maps(parameters: Sequence[FloatArray], usable: BoolArray) -> PixelMaps:
-    """Return (H, g, mu, sigma) of n pixels as effects take them, each (n,), NaN where not usable.
-
-    Args:
-        parameters: the four, any shape with n elements.
-        usable: pixels with a fit that can be relied upon; those without finite parameters are none of them.
-    """
+    """Return (H, g, mu, sigma) of n pixels as effects take them, each (n,), NaN where not usable."""
     columns = [np.asarray(values, np.float64).ravel() for values in parameters]
     known = np.asarray(usable, bool).ravel() & np.isfinite(np.stack(columns)).all(axis=0)
     return PixelMaps.known(columns, known)
@@ -159,10 +148,6 @@ def along_chain(model: Sequence[Effect], new: Sequence[Effect]) -> tuple[Effect,
 
     In a plane effects act in the order of their list: a limit of the ADC before an offset that is added there
     is no limit of what comes out. Where any order will do it is that of the tags.
-
-    Args:
-        model: effects in their order, which may be a user's.
-        new: effects in any order.
     """
     planes = list(Plane)
 
@@ -185,13 +170,9 @@ def sample_law(
     """Return the law of the pixels' samples with all effects, composed in their order.
 
     An effect with a region changes the law of its pixels only; one that acts in some of the frames makes it a
-    mixture, see :meth:`~pchem_pipeline.model.law.sample_law.SampleLaw.mixed_with`.
-
-    Args:
-        effects: of the run's model.
-        maps: what is known of the n pixels before, each (n,).
-        added: exposure that effects add to these pixels, (j, n) each or of that many pixels; None: nothing.
-        places: of these pixels; None: not known, which effects with a place or a time need.
+    mixture, see :meth:`~pchem_pipeline.model.law.sample_law.SampleLaw.mixed_with`. The n pixels have
+    parameters ``maps``, (n,) each, known before, and exposures ``added`` by effects. Effects with a place or
+    a time need the ``places`` of the pixels.
 
     Raises:
         ConfigError: if an effect cannot say what it does to these pixels; it is named.

@@ -1,4 +1,4 @@
-"""What an effect is told about the block of frames that it acts on."""
+"""What an effect knows of the block of frames that it acts on."""
 
 from __future__ import annotations
 
@@ -27,11 +27,10 @@ ALL_ROWS = 1 << 20
 class RandomSource(Protocol):
     """Random numbers of one effect, keyed on position: the same at every tiling.
 
-    ``dims`` names the dimensions along which the numbers differ; along the others there is one
-    number for all. ``("frame", "y")`` gives each row of each frame its own number, shape
-    (n_frames, n_rows, 1), and the same row of the same frame gets the same number whatever
-    block or band is being simulated. ``()`` gives one number for the whole run. ``draw`` tells
-    several independent sets apart.
+    ``dims`` names the dimensions along which the numbers differ; along the others there is one number for
+    all. ``("frame", "y")`` gives each row of each frame its own number, shape (n_frames, n_rows, 1), whatever
+    block or band is being simulated, ``()`` one number for the whole run. ``draw`` tells independent sets
+    apart.
     """
 
     def uniform(self, dims: tuple[Dim, ...], draw: int = 0) -> FloatArray:

@@ -2,14 +2,12 @@
 
 An effect on single electrons changes few samples. One keyed uniform number per sample says which; what
 happens there is worked out for those samples alone. Every function grows with its probability from the same
-end of the number, so the samples that change at a small strength also change at a large one, and at none
-nothing does.
+end of the number, so the samples that change at a small strength also change at a large one.
 
 A stationary Markov process at a frame between two known ones depends on those two alone. So from a coarse
 grid of frames, so far apart that they are independent, midpoints are filled in level by level, down to the
-frames that are wanted (Levy's construction of Brownian motion, by dyadic midpoints). Every frame has a
-random number of its own, keyed on its number, and a block needs but a few beside its own: about two for
-each level.
+frames that are wanted (Levy's construction of Brownian motion), each with a random number keyed on its
+number: about two frames beside the block for each level.
 """
 
 from __future__ import annotations
@@ -27,14 +25,10 @@ _STEPS = np.array([[0, 1], [0, -1], [1, 0], [-1, 0]])
 
 
 def further_uniform(u: FloatArray, draw: IntArray | int) -> FloatArray:
-    """Return more uniform numbers in (0, 1) of samples whose own number is ``u``.
+    """Return more uniform numbers in (0, 1) of samples whose own number is ``u``, any shape.
 
     The bits of the number are scrambled by the finaliser of SplitMix64 (Steele, Lea and Flood 2014), once for
-    the number and once with ``draw`` added, so it costs nothing where it is not asked for.
-
-    Args:
-        u: numbers in (0, 1), any shape.
-        draw: which further number, >= 0, broadcasts against ``u``.
+    the number and once with ``draw`` >= 0 added, which tells further numbers apart.
     """
     bits = _scrambled(np.ascontiguousarray(u, np.float64).view(np.uint64))
     bits = _scrambled(bits + np.asarray(draw).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15))
@@ -51,10 +45,7 @@ def _scrambled(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
 def binomial_upper(u: FloatArray, n: IntArray, p: FloatArray | float) -> IntArray:
     """Return binomial numbers of which the smallest ``u`` give the largest: N >= j where u < P(N >= j).
 
-    Args:
-        u: numbers in (0, 1), shape (m,).
-        n: trials, shape (m,).
-        p: probability, below 1, shape (m,) or one for all.
+    Of n trials, with uniform numbers u, (m,) each, and a probability p below 1, (m,) or one for all.
     """
     p = np.broadcast_to(np.asarray(p, np.float64), u.shape)
     exponent = n * np.log1p(-p)
@@ -102,9 +93,8 @@ def regrouped(
         electrons: Poisson numbers, e-, any shape.
         u: a uniform number for each.
         bound: upper limit of both probabilities of ``law``, broadcasts against ``electrons``.
-        law: from flat indices of samples to the probabilities, per electron, to be left out and (of the rest)
-            to become a cluster.
-        extra: from uniform numbers and flat indices to how many electrons a cluster has beyond one, >= 1.
+        law: from flat indices of samples to the probabilities, per electron, to be lost or else a cluster.
+        extra: from uniform numbers and flat indices to the electrons of a cluster beyond one, >= 1.
     """
     result = np.array(electrons)
     flat, numbers = result.reshape(-1), u.reshape(-1)
@@ -129,14 +119,8 @@ def sent_to_neighbours(
 ) -> tuple[tuple[IntArray, ...], tuple[IntArray, ...]]:
     """Choose electrons with a probability each, and for each of them one of the four neighbours.
 
-    Args:
-        electrons: electron numbers (frame, y, x), e-.
-        u: a uniform number for each.
-        probability: that an electron is chosen, below 1.
-
-    Returns:
-        Indices (frame, y, x) of the pixels where the chosen electrons are, and of the neighbours, which may
-        lie outside the array.
+    Of electron numbers (frame, y, x), e-, with a uniform number ``u`` for each. Returns indices (frame, y, x)
+    of the pixels where the chosen ones are, and of the neighbours, which may lie outside the array.
     """
     index = np.flatnonzero((u < electrons * probability).reshape(-1))
     v = u.reshape(-1)[index]
@@ -157,11 +141,9 @@ OF_PIXEL = (0xFFFFFFFE, 0xFFFFFFFF, 0xFFFFFFFD, 0xFFFFFFFC)
 
 
 def frame_key(frame: int, process: int = 0) -> int:
-    """Return the number of the draw that belongs to a frame, also to one that is not in the block.
+    """Return the number of the draw that belongs to a frame, also to one before the run or beside the block.
 
-    Args:
-        frame: its number; those before the run are negative.
-        process: tells up to 7 independent processes of one effect apart (0 to 6).
+    ``process`` tells up to 7 independent processes of one effect apart (0 to 6).
     """
     return frame & _FRAMES | process << _BITS
 
@@ -172,17 +154,13 @@ def between_grid_points(
     independent: Callable[[int], AnyArray],
     midpoint: Callable[[int, AnyArray, AnyArray, int], AnyArray],
 ) -> list[AnyArray]:
-    """Return the states of a stationary Markov process at frames.
+    """Return the states of a stationary Markov process at frames, (n,), n >= 1, in order.
 
     Args:
-        frames: frame numbers, shape (n,), at least one.
+        frames: frame numbers.
         longest: correlation time, frames, > 0: states much farther apart are independent.
         independent: gives the state at a frame from its stationary law.
-        midpoint: gives the state at a frame from (its number, the state h frames before, the state h frames
-            after, h).
-
-    Returns:
-        The state at each frame, in order.
+        midpoint: gives that at (frame, the state h frames before, the state h frames after, h).
     """
     step = 1 << int(np.ceil(np.log2(max(_FAR * longest, 1.0))))
     first, last = int(frames.min()), int(frames.max())
@@ -204,18 +182,14 @@ def two_states(
     uniform: Callable[[int], FloatArray],
     longest: float,
 ) -> FloatArray:
-    """Return a Markov chain of two states for each of n traps: 1 where it is full and 0 where it is empty.
+    """Return a Markov chain of two states for each of n traps, 1: full, 0: empty; shape (frame, n).
 
     Args:
-        frames: frame numbers, shape (m,), at least one.
-        correlation_frames: tau > 0, of all or of each, (n,): the correlation of states h frames apart is
-            exp(-h / tau).
+        frames: frame numbers, at least one.
+        correlation_frames: tau > 0, (n,) or of all: states h frames apart are correlated by exp(-h / tau).
         occupied: probability that a trap is full, of all or of each, (n,).
         uniform: gives the uniform numbers of a frame, shape (n,).
         longest: about the largest correlation time of any trap, whichever are asked for here.
-
-    Returns:
-        Shape (m, n).
     """
 
     def full_after(state: FloatArray | float, rho: FloatArray) -> FloatArray:

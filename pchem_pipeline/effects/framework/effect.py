@@ -17,16 +17,13 @@ the work is divided:
 
 Halos and histories of several effects add up.
 
-Any effect may have a place and a time (:attr:`~Effect.region`, :attr:`~Effect.when`): it is then applied as
-ever, and what it makes of the samples is kept only there. No effect has to know of it, nor one of another
-package. Several entries of one effect in different regions have strengths and random numbers of their own: so
-are taps described that differ.
+Any effect may have a place and a time (:attr:`~Effect.region`, :attr:`~Effect.when`): what it makes of the
+samples is kept only there, without its knowing. Several entries of one effect in different regions have
+strengths and random numbers of their own: so are taps described that differ.
 
-The same class says what is known of the effect (:attr:`~Effect.title`, :attr:`~Effect.source`,
-:attr:`~Effect.signature`, :attr:`~Effect.separate`), guesses its own parameters from what a stack shows
-(:meth:`~Effect.estimate`), and changes the law of a pixel's samples (:meth:`~Effect.sample_law`), so that the
-fit of the four parameters can run with it. What it adds to the exposure of single pixels, it finds in the
-frames (:meth:`~Effect.added_exposure`). What many pixels share is taken from calibrated frames
+The same class guesses its own parameters from what a stack shows (:meth:`~Effect.estimate`), changes the law
+of a pixel's samples (:meth:`~Effect.sample_law`), so that the fit can run with it, finds the exposure that it
+adds to single pixels (:meth:`~Effect.added_exposure`), and names the offset that many pixels share
 (:meth:`~Effect.shared_offset`).
 """
 
@@ -58,7 +55,7 @@ if TYPE_CHECKING:
 
 #: Frames through which the samples that an effect without a name moves are followed.
 DEPTH = 4
-#: Parts of such an effect that are told in words.
+#: Parts of such an effect that are described in words.
 MOST_TOLD = 4
 # standard deviations by which an effect of typical strength moves its leading statistic, in so many samples
 _USUAL, _USUAL_SAMPLES = 7.0, 1e6
@@ -164,8 +161,7 @@ class Effect(Section):
         plane: where in the signal chain it acts, and so what :meth:`apply` gets (see :class:`Plane`).
         along: the later the signal comes to it than to others of its plane, the larger: what adds to a
             voltage, then what bends it, then the steps of the converter, then its limits.
-        title: its name in the literature.
-        source: where it is described.
+        title, source: its name in the literature, and where it is described.
         factors: what it changes, what shares it, how it varies; None of a description, which measures them.
         signature: the statistics (names in :mod:`pchem_pipeline.discrepancy.observe.catalogue`) that it moves
             first, the most telling one first.
@@ -179,13 +175,11 @@ class Effect(Section):
         rough_law: whether :meth:`sample_law` is right for the pixels' parameters only, so that the histograms
             of a few pixels do not tell whether they have the effect.
         empirical: whether it is no hypothesis, but what is measured where all of those have failed.
-        far_reaching: whether samples depend on others anywhere in their frame, so that a part of the sensor
-            by itself does not show it.
+        far_reaching: whether samples depend on others anywhere in their frame: a part does not show it.
         typical_values: parameters as met in practice, one set for each of its kinds (signs, patterns).
         may_be_at_bound: parameters that may well be at a limit, as half a cycle or a missing code. A
             fit that drives any other one there has taken another effect for this one.
-        reach_rows, reach_frames: rows on either side, and frames before, that a sample depends on, where
-            that is so whatever the parameters.
+        reach_rows, reach_frames: rows on either side, and frames before, that a sample depends on.
     """
 
     tag: str = ""
@@ -220,11 +214,7 @@ class Effect(Section):
 
     @classmethod
     def __pydantic_init_subclass__(cls, tag: str = "", **_: Any) -> None:
-        """Register a class with such a tag.
-
-        Raises:
-            ConfigError: if it has no plane or does nothing, or another class has the tag.
-        """
+        """Register a class with such a tag; ConfigError: no plane, does nothing, or its tag is taken."""
         known = _registered.setdefault(tag_of(cls), cls) if tag else cls
         if known is not cls:
             raise ConfigError(
@@ -262,7 +252,7 @@ class Effect(Section):
 
     @property
     def measured_parts(self) -> int:
-        """How many things are told that were measured and have no explanation."""
+        """How many things it describes that were measured and have no explanation."""
         return int(type(self).empirical)
 
     def at_place(self, region: Region | None, when: When | None = None) -> Self:
@@ -270,15 +260,10 @@ class Effect(Section):
         return self.model_copy(update={"region": region, "when": when})
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it as it acts on some rows and columns that are taken for a sensor of their own.
+        """Return it as it acts on some rows and columns (ranges) that are taken for a sensor of their own.
 
         For effects with places among their parameters, or a pattern that begins at row or column 0; a region
-        is cut elsewhere.
-
-        Args:
-            rows: first, and behind the last.
-            columns: likewise.
-            shape: rows and columns of the sensor.
+        is cut elsewhere. ``shape``: rows and columns of the whole sensor.
         """
         return self
 
@@ -288,43 +273,33 @@ class Effect(Section):
 
     @abstractmethod
     def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
-        """Return what the plane becomes under this effect.
+        """Return what the plane becomes under this effect, a new array of the same shape and dtype.
 
         Args:
             values: (frame, y, x), unit and dtype of the plane; not to be changed.
             context: the block's frame numbers, rows, maps and random numbers.
-
-        Returns:
-            A new array of the same shape and dtype.
         """
 
     @classmethod
     def typical(cls) -> Sequence[Self]:
-        """Return it with each of its :attr:`typical_values`.
-
-        Used as guesses where :meth:`estimate` has nothing better, and for demonstrations.
-        """
+        """Return it with each of its :attr:`typical_values`, for guesses and demonstrations."""
         return tuple(cls.model_validate(values) for values in cls.typical_values)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return hypotheses about its parameters, the likeliest first; none where nothing speaks for it.
 
-        A hypothesis is only a guess: its strength is found by simulation and its fingerprint compared with
-        the evidence afterwards, so a false one costs time and nothing else. It says what the effect is like,
-        and its strength to a factor of some three. The default is :meth:`typical_as_seen` by the two leading
-        statistics of the signature; none where no statistic depends on the effect.
+        Only guesses of what it is like, of a strength right to a factor of some three: this is found by
+        simulation, and a false one costs time and nothing else. The default is :meth:`typical_as_seen` by the
+        two leading statistics of the signature; none where no statistic depends on the effect.
         """
         return () if cls.untestable else cls.typical_as_seen(evidence, *cls.signature[:2])
 
     @classmethod
     def typical_as_seen(cls, evidence: Evidence, *names: str) -> list[Self]:
-        """Return what is typical, as strong as statistics stand out; none where they do not.
+        """Return what is typical, as strong as the named statistics, which it raises, stand out; else none.
 
-        Args:
-            evidence: of one split.
-            names: of statistics that the effect raises; if its typical strengths have either sign, the first
-                of them has that of the strength and is the one that counts.
+        If its typical strengths have either sign, only the first statistic counts, which has that sign.
         """
         found = []
         typical = cls.typical()
@@ -341,10 +316,7 @@ class Effect(Section):
     def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return the effect as one simulation shows it best, and by what to multiply what it then shows.
 
-        For effects of rare events: by chance a simulated stack holds none of them, or too many.
-
-        Args:
-            frames: numbers of the frames to be simulated, increasing, shape (n,).
+        For rare events: by chance a stack of such frames (of increasing numbers) holds none, or too many.
         """
         return self, 1.0
 
@@ -358,27 +330,19 @@ class Effect(Section):
     def details(self) -> tuple[str, ...]:
         """Return positive numbers beside the strength with which the statistics go smoothly.
 
-        A search tunes them by simulation where a set with the effect leaves something; those that the law of
-        a sample tells, it takes from the histograms.
+        A search tunes them by simulation; those that the law of a sample tells, it takes from the histograms.
         """
         return ()
 
     def with_satellites(self, amplitude_e: FloatArray, weight: FloatArray, share: float) -> Self:
-        """Return it with the numbers that free satellites of single pixels tell; by default as it is.
+        """Return it with what free satellites of single pixels tell; by default as it is.
 
-        Args:
-            amplitude_e: of the levels of pixels that have some, e-, shape (n,).
-            weight: of these levels, shape (n,).
-            share: of the pixels that have some.
+        They have levels of ``amplitude_e``, e-, and ``weight``, (n,), in this share of the pixels.
         """
         return self
 
     def scaled(self, factor: float) -> Self:
-        """Return a copy of ``factor`` times the strength, kept within the limits of its field.
-
-        Raises:
-            ConfigError: if the effect has no strength to scale.
-        """
+        """Return a copy of ``factor`` times the strength, within its limits; ConfigError: no strength."""
         if not self.strength:
             raise ConfigError(f"effect {self.tag!r} has no strength to scale")
         return self.times(self.strength, factor)
@@ -393,9 +357,7 @@ class Effect(Section):
     def limited(cls, name: str, value: float) -> float:
         """Return a value cut to the limits that its field states."""
         for limit in cls.model_fields[name].metadata:
-            low, high = getattr(limit, "ge", None), getattr(limit, "le", None)
-            value = max(value, low) if low is not None else value
-            value = min(value, high) if high is not None else value
+            value = min(max(value, getattr(limit, "ge", -math.inf)), getattr(limit, "le", math.inf))
         return value
 
     @classmethod
@@ -413,44 +375,30 @@ class Effect(Section):
         return " and ".join(f"its {name} is at the limit of {v:g}" for name, v in self.at_limits().items())
 
     def at_limits(self) -> dict[str, float]:
-        """Return the parameters at a limit of their field, by name.
-
-        Not those at their default, nor those of :attr:`may_be_at_bound`.
-        """
-        found = {}
-        for name, field in type(self).model_fields.items():
-            value = getattr(self, name)
-            if not isinstance(value, float) or value == field.default or name in self.may_be_at_bound:
-                continue
-            if any(
-                value in (getattr(limit, "ge", None), getattr(limit, "le", None)) for limit in field.metadata
-            ):
-                found[name] = value
-        return found
+        """Return parameters at a limit of their field, by name; not defaults, nor `may_be_at_bound`."""
+        return {
+            name: value
+            for name, field in type(self).model_fields.items()
+            if isinstance(value := getattr(self, name), float)
+            and value != field.default
+            and name not in self.may_be_at_bound
+            and any(value in (getattr(x, "ge", None), getattr(x, "le", None)) for x in field.metadata)
+        }
 
     def describe(self) -> str:
         """Describe in a few words what is known of it."""
         return self.title or self.tag
 
     def by_law(self, shape: tuple[int, int]) -> Sequence[Effect]:
-        """Return effects of one law each for all of their pixels that together are this one.
-
-        For effects with places among their parameters.
-
-        Args:
-            shape: rows and columns of the sensor.
-        """
+        """Return effects of one law each for all of their pixels that together are this one on a sensor."""
         return (self,)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law of the pixels' samples with this effect: its place in the fit.
 
         Args:
-            model: the law so far, of n pixels.
+            model: the law so far, of n pixels; returned where the effect leaves a pixel's histogram as it is.
             maps: parameters of these pixels, each (n,) (what is known before the fit with the effect).
-
-        Returns:
-            The law with the effect; the same one where it leaves a pixel's own histogram as it is.
         """
         return model
 
@@ -459,23 +407,18 @@ class Effect(Section):
     ) -> AddedExposure | None:
         """Return what it adds to the exposure of each pixel: H is then the exposure without.
 
-        For effects on single pixels, whose histograms show the mean exposure whatever it is made of.
+        For effects on single pixels, whose histograms show the mean exposure whatever it is made of; None
+        where it adds nothing, or only in proportion to H.
 
         Args:
             frames: (frame, y, x), DN; not to be changed.
             numbers: their numbers in the run, increasing, shape (frame,).
             maps: plain fit of these pixels, (y, x) each.
-
-        Returns:
-            Levels and weights, (j, y, x) each; None where it adds nothing, or only in proportion to H.
         """
         return None
 
     def shared_offset(self) -> SharedOffset | None:
-        """Return the offset that it gives to many pixels of a frame alike: calibrated frames are freed of it.
-
-        None where it gives none.
-        """
+        """Return the offset that pixels of a frame share: calibrated frames are freed of it; or None."""
         return None
 
     def displaced(self) -> Mapping[Literal["rows", "columns"], FloatArray]:
@@ -488,26 +431,17 @@ class Effect(Section):
     def replacement(self, frames: NDArray[np.unsignedinteger]) -> Replacement | None:
         """Return the rule by which it replaces samples by others of their frame; None where it does not.
 
-        The law of a pixel then depends on others: the search learns the sensor by what stands in for each.
-
-        Args:
-            frames: codes (frame, y, x), DN, before any is replaced.
+        The law of a pixel then depends on others: the search learns the sensor by what stands in for each. Of
+        codes (frame, y, x), DN, before any is replaced.
         """
         return None
 
     def added_scatter_e(self, exposure: FloatArray) -> FloatArray | None:
-        """Return the scatter that it adds to electron numbers, e- rms, where that is its size.
-
-        Args:
-            exposure: mean number of electrons of each pixel, e-.
-
-        Returns:
-            One for each pixel; None where samples with and without it tell its size.
-        """
+        """Return the scatter that it adds to electrons of these means, e- rms; None: it has no such size."""
         return None
 
     def halo(self) -> int:
-        """Return how many rows on either side a row depends on, px: :attr:`reach_rows`."""
+        """Return how many rows on either side a row depends on, px."""
         return self.reach_rows
 
     def history(self) -> int:
@@ -521,11 +455,7 @@ def registered_effects() -> dict[str, type[Effect]]:
 
 
 def tag_of(effect: Any) -> str:
-    """Return the tag of an effect class.
-
-    Raises:
-        ConfigError: if the class is not an :class:`Effect` with a tag, a plane and its own ``apply``.
-    """
+    """Return the tag of an effect class; ConfigError: it lacks a tag, a plane or its own ``apply``."""
     where = f"{getattr(effect, '__module__', '?')}.{getattr(effect, '__qualname__', effect)}"
     if not (isinstance(effect, type) and issubclass(effect, Effect)):
         raise ConfigError(

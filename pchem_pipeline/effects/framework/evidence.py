@@ -32,15 +32,7 @@ PLACES = ("next", "before", "early", "late", "lost", "twice")
 
 @dataclass(frozen=True)
 class PixelMaps(PixelParameters):
-    """Fitted parameters of the pixels, each (y, x); NaN where ``usable`` is False.
-
-    Attributes:
-        quanta_exposure: H, e-.
-        conversion_gain: g, e-/DN.
-        bias: mu, DN.
-        read_noise_dn: sigma, DN, quantisation included.
-        usable: pixels with a fit that can be relied upon.
-    """
+    """Fitted parameters of the pixels, each (y, x); NaN where not ``usable``: a fit to be relied upon."""
 
     usable: BoolArray
 
@@ -146,28 +138,22 @@ class Wave(NamedTuple):
 class TimeSeries:
     """What is kept along time; None of it exists for ready-made histograms.
 
-    Frames come in blocks of ``block_frames`` consecutive frames; different blocks may be far apart.
-    Lagged products never cross the edge of a block. Means of rows, columns and quadrants without
-    usable pixels are 0.
+    Frames come in blocks of ``block_frames`` consecutive ones; blocks may be far apart. Lagged products never
+    cross the edge of a block. Means of rows, columns and quadrants without usable pixels are 0.
 
     Attributes:
         frames: frame numbers in the run, increasing, shape (n,).
         n_run: number of frames of the whole run.
         block_frames: frames in a block (the last one may be shorter).
         block_start: frame number of the first frame of each block, shape (n_blocks,).
-        frame_charge: sum over usable pixels of (k - H) divided by the sum of H: relative deviation of the
-            exposure of each frame, shape (n,).
+        frame_charge: sum over usable pixels of (k - H) over that of H: relative deviation of H, shape (n,).
         frame_readout: mean of r over the usable pixels, DN, shape (n,).
         frame_gain: slope of r against k - H over the usable pixels of a frame, in units of 1/g: relative
             deviation of the gain (DN/e-) of each frame, shape (n,).
-        quadrant_readout: mean of r of each quadrant, DN (top left, top right, bottom left, bottom right),
-            shape (n, 4).
-        row_charge: mean of k - H of each row, e-, shape (n, y).
-        row_readout: mean of r of each row, DN, shape (n, y).
-        column_charge: mean of k - H of each column, e-, shape (n, x).
-        column_readout: mean of r of each column, DN, shape (n, x).
-        block_charge: mean of k - H of each pixel in each block, e-, shape (n_blocks, y, x).
-        block_readout: mean of r of each pixel in each block, DN, shape (n_blocks, y, x).
+        quadrant_readout: mean of r of each quadrant, DN (top left and right, bottom left and right), (n, 4).
+        row_charge, row_readout: means of k - H, e-, and of r, DN, of each row, shape (n, y).
+        column_charge, column_readout: the same of each column, shape (n, x).
+        block_charge, block_readout: the same of each pixel in each block, shape (n_blocks, y, x).
         lag_charge: autocorrelation of k in each pixel at lags 1, 2, 3, after the frame's common mode was
             removed as for the neighbours, and without the bias of a centred series, shape (3, y, x).
         lag_readout: autocorrelation of r, shape (3, y, x).
@@ -179,8 +165,7 @@ class TimeSeries:
         neighbour_maps: by the same names the correlation of each pixel with the next one along the axis, over
             its standard error by chance, shape (y, x); NaN without one.
         repeated: frame numbers that are, sample by sample, the frame before, shape (n_repeated,).
-        repeated_rows: number of rows (of frames not in ``repeated``) that are the same row of the frame
-            before.
+        repeated_rows: number of rows (of other frames) that are the same row of the frame before.
         predicted: samples beside what their neighbours predict, by kind of prediction.
         previous_bits: samples beside the bits of those read before; None where there are too few.
         repeated_lines: number of "rows" and of "columns" that are the one before them in the same frame.
@@ -189,9 +174,8 @@ class TimeSeries:
         frame_noise: by how much the squares of r of each frame exceed their mean, over their standard
             deviation by chance, shape (n,); None: not known.
         waves: across rows and columns, in the readout residuals over their standard deviation.
-        hits: samples above a pixel's support: columns frame, y, x, DN; int64, shape (n_hits, 4), at most
-            20,000.
-        low_hits: the same below it.
+        hits, low_hits: samples above, and below, a pixel's support: columns frame, y, x, DN; int64, shape
+            (n_hits, 4), at most 20,000.
     """
 
     frames: IntArray
@@ -224,6 +208,11 @@ class TimeSeries:
     misplaced_lines: Mapping[str, FloatArray] = field(default_factory=dict)
     waves: tuple[Wave, ...] = ()
     low_hits: IntArray = field(default_factory=lambda: np.empty((0, 4), np.int64))
+
+    @property
+    def block_length(self) -> IntArray:
+        """Number of frames of each block, shape (n_blocks,)."""
+        return np.diff(np.append(np.searchsorted(self.frames, self.block_start), self.frames.size))
 
 
 @dataclass(frozen=True)
@@ -271,5 +260,4 @@ class Evidence:
 
     def strongest(self, *names: str) -> float:
         """Return the largest |z| among the named statistics (0 where these data give none of them)."""
-        found: list[Any] = [abs(self.z[name]) for name in names if name in self.z]
-        return float(max(found, default=0.0))
+        return max((abs(self.z[name]) for name in names if name in self.z), default=0.0)

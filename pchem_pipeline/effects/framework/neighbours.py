@@ -61,12 +61,8 @@ _COMPARATORS = (
 def predicted(frames: NDArray[np.unsignedinteger[Any]], predictor: Predictor) -> NDArray[np.int32]:
     """Return what the neighbours predict for the samples inside the border, DN, halves cut off.
 
-    Args:
-        frames: codes (frame, y, x), DN.
-        predictor: median or mean of the eight neighbours, or mean of the left and the right one.
-
-    Returns:
-        Of (frame, y - 2, x - 2) samples: those at the border have not all neighbours.
+    By the median or the mean of the eight neighbours, or the mean of the left and the right one; of frames
+    (frame, y, x), (frame, y - 2, x - 2) samples: those at the border have not all neighbours.
     """
     codes = frames.astype(np.int32)
     rows, columns = codes.shape[1] - 2, codes.shape[2] - 2

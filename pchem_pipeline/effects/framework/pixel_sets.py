@@ -24,16 +24,7 @@ _MOST_RUNS = 20_000
 
 
 def region_mask(region: Region, shape: tuple[int, ...], rows: IntArray | None = None) -> BoolArray:
-    """Return which pixels of a sensor, or of a band of its rows, lie in a region, (y, x).
-
-    Args:
-        region: the region.
-        shape: rows and columns of the sensor.
-        rows: numbers of the band's rows; None: all.
-
-    Raises:
-        ConfigError: it reaches beyond the sensor.
-    """
+    """Return which pixels of a sensor lie in a region, see :meth:`.region.Region.mask`."""
     _check(region, shape)
     y = np.arange(shape[0]) if rows is None else np.asarray(rows)
     x = np.arange(shape[1])
@@ -96,11 +87,7 @@ def overlap(one: BoolArray, other: BoolArray) -> float:
 
 
 def simplest_region(mask: BoolArray) -> dict[str, Any]:
-    """Return the fields of the region of a map of pixels: ranges where it is a product of them, else runs.
-
-    Raises:
-        ConfigError: it holds no pixel, or too many runs.
-    """
+    """Return the fields of the region of a map of pixels, see :meth:`.region.Region.of_mask`."""
     rows, columns = np.asarray(mask.any(axis=1)), np.asarray(mask.any(axis=0))
     if not rows.any():
         raise ConfigError("a region without a pixel; leave it out")
@@ -115,11 +102,7 @@ def simplest_region(mask: BoolArray) -> dict[str, Any]:
 
 
 def runs_of(mask: BoolArray) -> tuple[tuple[int, int, int], ...]:
-    """Return the runs of pixels of a map: row, first column, behind the last.
-
-    Raises:
-        ValueError: they are too many.
-    """
+    """Return the runs of pixels of a map: row, first column, behind the last; ValueError: too many."""
     edges = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     (row, first), last = np.nonzero(edges == 1), np.nonzero(edges == -1)[1]
     if row.size > _MOST_RUNS:
@@ -134,11 +117,7 @@ def _spans_of(lines: BoolArray) -> tuple[Span, ...]:
 
 
 def mask_file(path: Path) -> BoolArray:
-    """Return the map (y, x) in a file of numpy.
-
-    Raises:
-        ValueError: there is none, or it is no map of truth values.
-    """
+    """Return the map (y, x) in a file of numpy; ValueError: there is none, or it holds no truth values."""
     try:
         with path.open("rb") as file:
             content = np.load(file, allow_pickle=False)

@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Field,
     SerializerFunctionWrapHandler,
     ValidationInfo,
-    field_validator,
     model_serializer,
     model_validator,
 )
@@ -76,7 +76,7 @@ def _ascending(spans: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...
 
 #: A range: first and last + 1.
 Span = tuple[int, int]
-Spans = Annotated[tuple[Span, ...], BeforeValidator(_spans)]
+Spans = Annotated[tuple[Span, ...], BeforeValidator(_spans), AfterValidator(_ascending)]
 Numbers = Annotated[tuple[int, ...], BeforeValidator(lambda v: (v,) if isinstance(v, int) else v)]
 
 
@@ -154,11 +154,6 @@ class Region(_Place):
 
         return {**rest, "pixels": runs_of(mask_file(Path(folder or ".") / str(value["mask"])))}
 
-    @field_validator("rows", "columns")
-    @classmethod
-    def _ranges(cls, spans: tuple[Span, ...]) -> tuple[Span, ...]:
-        return _ascending(spans)
-
     @model_validator(mode="after")
     def _somewhere(self) -> Self:
         if not (self.rows or self.columns or self.taps or self.quadrant or self.pixels):
@@ -169,25 +164,13 @@ class Region(_Place):
 
     @classmethod
     def of_mask(cls, mask: BoolArray) -> Region:
-        """Return the region of a map of pixels, in its simplest form: ranges, else single pixels.
-
-        Raises:
-            ConfigError: it holds no pixel, or too many single ones.
-        """
+        """Return the simplest region of a map of pixels; ConfigError: no pixel, or too many runs of them."""
         from pchem_pipeline.effects.framework.pixel_sets import simplest_region
 
         return cls.model_validate(simplest_region(mask))
 
     def mask(self, shape: tuple[int, ...], rows: IntArray | None = None) -> BoolArray:
-        """Return which pixels of a sensor, or of a band of its rows, lie in the region, (y, x).
-
-        Args:
-            shape: rows and columns of the sensor.
-            rows: numbers of the band's rows; None: all.
-
-        Raises:
-            ConfigError: it reaches beyond the sensor.
-        """
+        """Return its pixels of a sensor, or of a band of rows, (y, x); ConfigError: it reaches beyond."""
         from pchem_pipeline.effects.framework.pixel_sets import region_mask
 
         return region_mask(self, shape, rows)
@@ -241,11 +224,6 @@ class When(_Place):
         if when is None or place is not None:
             raise ValueError(f"{value!r} is no time; write {GRAMMAR}")
         return when.numbers()
-
-    @field_validator("range")
-    @classmethod
-    def _ranges(cls, spans: tuple[Span, ...]) -> tuple[Span, ...]:
-        return _ascending(spans)
 
     @model_validator(mode="after")
     def _sometime(self) -> Self:
@@ -302,11 +280,7 @@ class When(_Place):
 
 
 def parse_place(text: str) -> tuple[Region | None, When | None]:
-    """Return the place and the time of one line, for example ``columns=40:50,frames=200:400``.
-
-    Raises:
-        ValueError: it is not of the grammar; says it.
-    """
+    """Return place and time of one line, as ``columns=40:50,frames=200:400``; ValueError: another grammar."""
     region: dict[str, Any] = {}
     when: dict[str, Any] = {}
     if text.startswith("{"):  # as :meth:`Region.text` writes what the grammar has no words for

@@ -1,8 +1,8 @@
-"""Find effects by tag: our own files, and those of other installed packages.
+"""Find effects by tag: our own files, and those of other installed packages, when somebody asks.
 
-Both are looked for only when somebody asks. Our own are in the modules of the folder ``operators``, so that
-adding an effect touches no other file; others' are announced by entry points of the group
-``pchem_pipeline.effects`` (name: the tag; value: ``package.module:Class``).
+Our own are in the modules of the folder ``operators``, so that adding an effect touches no other file;
+others' are announced by entry points of the group ``pchem_pipeline.effects`` (name: the tag; value:
+``package.module:Class``).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import pkgutil
 from collections.abc import Mapping
 from importlib.metadata import entry_points
 from types import MappingProxyType
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from pydantic import BeforeValidator, SerializeAsAny, ValidationInfo
 
@@ -27,44 +27,37 @@ ENTRY_POINT_GROUP = "pchem_pipeline.effects"
 _log = logging.getLogger(__name__)
 
 
-class _Found(NamedTuple):
-    classes: Mapping[str, type[Effect]]
-    broken: Mapping[str, str]
-
-
 def effect_classes() -> Mapping[str, type[Effect]]:
     """Return every effect by tag, ours and others', in alphabetical order."""
-    return _discover().classes
+    return _discover()[0]
 
 
 def broken_plugins() -> Mapping[str, str]:
     """Return the plug-ins that were left out, with the reason, by name of their entry point."""
-    return _discover().broken
+    return _discover()[1]
 
 
 def effect_class(tag: str) -> type[Effect]:
-    """Return the effect of a tag.
-
-    Raises:
-        ConfigError: if there is none; names those there are and the plug-ins left out.
-    """
-    found = _discover()
-    if tag not in found.classes:
-        close = difflib.get_close_matches(tag, found.classes, 1)
-        hint = f"; did you mean {close[0]}?" if close else ""
-        message = (
-            f"effect {tag!r} is unknown{hint}; known are {', '.join(found.classes)}; for one of another "
-            "package, install that package"
-        )
-        if tag in found.broken:
-            message = f"effect {tag!r} comes from a plug-in that was left out: {found.broken[tag]}"
-        raise ConfigError(message)
-    return found.classes[tag]
+    """Return the effect of a tag; ConfigError: there is none; it names those there are."""
+    classes, broken = _discover()
+    if tag in classes:
+        return classes[tag]
+    if tag in broken:
+        raise ConfigError(f"effect {tag!r} comes from a plug-in that was left out: {broken[tag]}")
+    close = difflib.get_close_matches(tag, classes, 1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    raise ConfigError(
+        f"effect {tag!r} is unknown{hint}; known are {', '.join(classes)}; for one of another "
+        "package, install that package"
+    )
 
 
 @functools.cache
-def _discover() -> _Found:
-    _import_own()
+def _discover() -> tuple[Mapping[str, type[Effect]], Mapping[str, str]]:
+    """Return the effects by tag, and the plug-ins left out by name of their entry point, with the reason."""
+    folder = importlib.import_module("pchem_pipeline.effects.operators")
+    for module in pkgutil.iter_modules(folder.__path__, folder.__name__ + "."):
+        importlib.import_module(module.name)
     classes = registered_effects()
     broken: dict[str, str] = {}
     for point in entry_points(group=ENTRY_POINT_GROUP):
@@ -79,13 +72,7 @@ def _discover() -> _Found:
             _log.warning("effect plug-in %s left out: %s", point.name, broken[point.name])
         else:
             classes[tag] = effect
-    return _Found(MappingProxyType(dict(sorted(classes.items()))), MappingProxyType(broken))
-
-
-def _import_own() -> None:
-    folder = importlib.import_module("pchem_pipeline.effects.operators")
-    for module in pkgutil.iter_modules(folder.__path__, folder.__name__ + "."):
-        importlib.import_module(module.name)
+    return MappingProxyType(dict(sorted(classes.items()))), MappingProxyType(broken)
 
 
 def _as_effect(entry: Any, info: ValidationInfo) -> Effect:

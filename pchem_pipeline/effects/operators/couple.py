@@ -79,10 +79,7 @@ class InterpixelCapacitance(Effect, tag="interpixel_capacitance"):
     )
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
-        """Return the signal (frame, y, x), e-, with the neighbours' charge; draws nothing.
-
-        At the edges of the sensor the missing neighbours take and give nothing.
-        """
+        """Return the signal (frame, y, x), e-, with the charge of the neighbours that there are."""
         result: AnyArray = values.copy()
         if context.charge is None:
             return result
@@ -108,10 +105,7 @@ class InterpixelCapacitance(Effect, tag="interpixel_capacitance"):
         return [*(one.model_copy(update=differing) for one in found), *found]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with a smaller step, the neighbours' mean charge and its variance.
-
-        The four neighbours are taken to have the pixel's own exposure.
-        """
+        """Return the law with a smaller step, and charge of neighbours as exposed as the pixel."""
         exposure = np.nan_to_num(maps.quanta_exposure)
         squares = 4.0 * self.coupling**2 * (1.0 + self.anisotropy**2)
         return model.with_levels(
@@ -182,34 +176,25 @@ class AnalogMemory(Effect, tag="analog_memory"):
         The first frame of the block has none before it (it is only the history of the others).
         """
         result: AnyArray = values.copy()
-        if context.charge is not None:
-            result[1:] += self._memories(context) * self._left(context.charge[:-1])
+        if context.charge is None:
+            return result
+        left, memory = context.charge[:-1], np.asarray(self.memory)
+        if self.saturation_e is not None:
+            left = -self.saturation_e * np.expm1(-left / self.saturation_e)
+        if self.spread > 0:
+            normal = special.ndtri(context.random.uniform(("y", "x"), OF_PIXEL[0]))
+            memory = self.memory * np.exp(self.spread * normal - self.spread**2 / 2.0)
+        result[1:] += memory * left
         return result
-
-    def _memories(self, context: EffectContext) -> FloatArray | float:
-        """Return the memory of the pixels, shape (1, y, x), or of all."""
-        if self.spread == 0:
-            return self.memory
-        normal = special.ndtri(context.random.uniform(("y", "x"), OF_PIXEL[0]))
-        return np.asarray(self.memory * np.exp(self.spread * normal - self.spread**2 / 2.0))
-
-    def _left(self, charge: AnyArray) -> AnyArray:
-        """Return what is left of a charge where all of it is remembered, e-."""
-        if self.saturation_e is None:
-            return charge
-        return np.asarray(-self.saturation_e * np.expm1(-charge / self.saturation_e))
-
-    def _left_of(self, exposure: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the mean, e-, and mean square, e-^2, of what is left of Poisson electrons."""
-        if self.saturation_e is None:
-            return exposure, exposure * (1.0 + exposure)
-        # E[exp(-n K / S)], the generating function of K
-        once, twice = (np.exp(exposure * np.expm1(-n / self.saturation_e)) for n in (1.0, 2.0))
-        return self.saturation_e * (1.0 - once), self.saturation_e**2 * (1.0 - 2.0 * once + twice)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the mean of what is left of the frame before, and its variance."""
-        mean, square = self._left_of(np.nan_to_num(maps.quanta_exposure))
+        exposure = np.nan_to_num(maps.quanta_exposure)
+        mean, square = exposure, exposure * (1.0 + exposure)
+        if self.saturation_e is not None:
+            # E[exp(-n K / S)], the generating function of K
+            once, twice = (np.exp(exposure * np.expm1(-n / self.saturation_e)) for n in (1.0, 2.0))
+            mean, square = self.saturation_e * (1.0 - once), self.saturation_e**2 * (1.0 - 2.0 * once + twice)
         # the mean of a pixel's own memory is not told from its bias
         variance = (square - mean**2) * np.exp(self.spread**2)
         return model.with_levels(shift_e=self.memory * mean).with_variance(e2=self.memory**2 * variance)
@@ -538,12 +523,7 @@ class ResponseTerm(Section):
         return what + (f" {where}" if any(self.place) else "")
 
     def seen(self, charge: FloatArray, exposure: FloatArray) -> FloatArray:
-        """Return the charge that each sample follows, about its mean (frame, y, x), e-.
-
-        Args:
-            charge: electrons of the samples (frame, y, x).
-            exposure: mean number of electrons (y, x).
-        """
+        """Return the charge (frame, y, x) that samples follow, less its mean by the exposure (y, x), e-."""
         charge = np.maximum(charge - self.above, 0.0) - excess_moments(exposure, self.above)[0]
         axes = _ALONG[self.of]
         sums = np.broadcast_to(charge.sum(axis=axes, keepdims=True), charge.shape) if axes else charge
@@ -555,12 +535,7 @@ class ResponseTerm(Section):
 
 
 def excess_moments(exposure: FloatArray, above: float) -> tuple[FloatArray, FloatArray]:
-    """Return the mean and the variance of what Poisson counts have above a number, e- and e-^2.
-
-    Args:
-        exposure: mean counts, any shape.
-        above: the number, 0 or more.
-    """
+    """Return the mean and the variance of what Poisson counts of some means have above a number, e-, e-^2."""
     if above == 0.0:
         return exposure, exposure
     largest = float(np.max(np.nan_to_num(exposure), initial=0.0))
@@ -691,9 +666,9 @@ class EmpiricalResponse(Effect, tag="empirical_response"):
             followed.setdefault(term.describe(), []).append(
                 f"{100.0 * self.response * term.weight:+.2g} %{only}"
             )
-        told = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:MOST_TOLD]]
+        words = [f"{_few(parts)} of {what}" for what, parts in list(followed.items())[:MOST_TOLD]]
         more = f", and {len(followed) - MOST_TOLD} more" if len(followed) > MOST_TOLD else ""
-        return f"samples{in_place(self)} depend on the charge of other samples ({', '.join(told)}{more})"
+        return f"samples{in_place(self)} depend on the charge of other samples ({', '.join(words)}{more})"
 
 
 def _few(parts: Sequence[str]) -> str:

@@ -13,7 +13,6 @@ from pydantic import Field, model_validator
 
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.estimators.codes import (
-    Curve,
     Stitch,
     best_bend,
     best_curve,
@@ -55,11 +54,10 @@ Noise = Literal["kept", "bent"]
 class Nonlinearity(Effect, tag="nonlinearity"):
     """Relative change of the step per electron, the same in every pixel.
 
-    The capacitance of the sense node and the gain of the source follower depend on the voltage, so the
-    response of a pixel bends (Janesick 2007, chapter on V/V and V/e- nonlinearity): ``k`` electrons give ``k
-    (1 + b (k - 1) / 2)`` in units of the first step, and the step from ``k`` to ``k + 1`` is ``1 + b k``.
-    What comes after the read noise (an amplifier, a converter) bends that as well: it is ``1 + b k`` times
-    as large at ``k`` electrons.
+    The capacitance of the sense node and the gain of the source follower depend on the voltage (Janesick
+    2007, V/V and V/e- nonlinearity): ``k`` electrons give ``k (1 + b (k - 1) / 2)`` in units of the first
+    step, and the step from ``k`` to ``k + 1`` is ``1 + b k``. What comes after the read noise (an amplifier,
+    a converter) makes that ``1 + b k`` times as large, too.
 
     Signature: the score of position against the square of the electron number (He1C2) has one sign in all
     pixels; then He3C1 and He3; He2C1 where the read noise is bent, too. Nothing in time or space. The gain
@@ -126,8 +124,7 @@ class AdcInl(Effect, tag="adc_inl"):
 
     What the ADC converts is ``x + a d(x)`` instead of x (IEEE Std 1241: INL is the deviation of the transfer
     curve from the best line). The form d is a sine, ``sin(2 pi x / P + phi)``, or a smooth curve through
-    knots: one bend over the codes in use is a half or a whole period; segmented references and ramps have
-    more, of any form. It is fixed in DN, whatever the bias and the gain of a pixel.
+    knots. It is fixed in DN, whatever the bias and the gain of a pixel.
 
     Signature: counts per DN, summed over the pixels, deviate smoothly along DN, beyond what the pixels' own
     bias and gain take up; pixels of different bias show the same pattern at the same DN.
@@ -175,15 +172,11 @@ class AdcInl(Effect, tag="adc_inl"):
     )
 
     @model_validator(mode="after")
-    def _one_form(self) -> Self:
+    def _of_one_form_and_monotone(self) -> Self:
         if (self.form == "curve") != bool(self.curve):
             raise ValueError("adc_inl: form curve and the list `curve` belong together; give both or none")
         if self.curve and len(self.curve) < _FEWEST_KNOTS:
             raise ValueError(f"adc_inl: curve needs at least {_FEWEST_KNOTS} values, got {len(self.curve)}")
-        return self
-
-    @model_validator(mode="after")
-    def _monotone(self) -> Self:
         if self.inl_lsb * self._steepest() >= 1.0:
             form = f"period_dn {self.period_dn}" if self.form == "sine" else f"spacing_dn {self.spacing_dn}"
             raise ValueError(
@@ -233,15 +226,14 @@ class AdcInl(Effect, tag="adc_inl"):
             if 2.0 * math.pi * bend.amplitude < bend.period
         ]
         curve = best_curve(evidence)
-        return sines if curve is None else [*cls._through(curve), *sines]
-
-    @classmethod
-    def _through(cls, curve: Curve) -> list[Self]:
-        """Return the effect with this curve; none where it turns back."""
+        if curve is None:
+            return sines
         size = float(np.abs(curve.values).max())
         listed = tuple(np.round(curve.values / size, 4).tolist())
         form = cls(inl_lsb=0.0, form="curve", first_dn=curve.first, spacing_dn=curve.spacing, curve=listed)
-        return [form.model_copy(update={"inl_lsb": size})] if size * form._steepest() < 1.0 else []
+        if size * form._steepest() < 1.0:  # else it turns back
+            return [form.model_copy(update={"inl_lsb": size}), *sines]
+        return sines
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with the code edges where the bent curve crosses them."""
@@ -271,12 +263,10 @@ _BIT_GAIN = 12.0
 class AdcDnl(Effect, tag="adc_dnl"):
     """Shifts of the code edges.
 
-    The lower edge of code c lies at ``c - 1/2 + d_c`` (IEEE Std 1241): shifts of edges from the matching of
-    comparators and capacitors, the same code by code for everything that goes through that ADC. An error of
-    the weight of one binary bit repeats with the bit's period (period 16 in EMCCD bias frames, Harpsoe et
-    al. 2012, A&A 542, A23; binary offsets in many instruments, Boone et al. 2018, PASP 130, 064504). A
-    missing code, of a converter or of a look-up table behind it, is one whose two edges coincide: a DNL of
-    -1 LSB.
+    The lower edge of code c lies at ``c - 1/2 + d_c`` (IEEE Std 1241), from the matching of comparators and
+    capacitors, the same for everything that goes through that ADC. An error of the weight of one binary bit
+    repeats with the bit's period (Harpsoe et al. 2012; Boone et al. 2018). A missing code, of a converter or
+    of a look-up table behind it, is one whose two edges coincide: a DNL of -1 LSB.
 
     Signature: counts per DN, summed over the pixels, deviate with alternating sign from code to code; every
     pixel's histogram fits worse, since the pattern is fixed in DN and not at a pixel's peaks.
@@ -350,28 +340,20 @@ class AdcDnl(Effect, tag="adc_dnl"):
         """Return the shifts of the edges of codes ``first .. last``, DN: (codes,) or (codes, x)."""
         if self.pattern != "random":
             return self._listed(np.arange(first, last + 1))
-        parts = []
-        for chunk in range(first // _CHUNK, last // _CHUNK + 1):
-            # a negative code has no edge in the ADC, but the signal may lie there before it is cut
-            draw = chunk & 0xFFFF
-            if columns is None:
-                parts.append(context.random.generator(draw=draw).standard_normal(_CHUNK))
-            else:
-                drawn = [
-                    context.random.generator(x=int(x), draw=draw).standard_normal(_CHUNK) for x in columns
-                ]
-                parts.append(np.stack(drawn, axis=1))
-        begin = first - first // _CHUNK * _CHUNK
-        chosen = np.concatenate(parts)[begin : begin + last - first + 1]
+        # a negative code has no edge in the ADC, but the signal may lie there before it is cut
+        draws = [chunk & 0xFFFF for chunk in range(first // _CHUNK, last // _CHUNK + 1)]
+
+        def normal(x: int | None) -> FloatArray:
+            parts = [context.random.generator(x=x, draw=draw).standard_normal(_CHUNK) for draw in draws]
+            return np.concatenate(parts)[first % _CHUNK :][: last - first + 1]
+
+        chosen = normal(None) if columns is None else np.stack([normal(int(x)) for x in columns], axis=1)
         # a width is the difference of two edges
         shift = chosen * (self.dnl_lsb / np.sqrt(2.0))
         return np.asarray(np.clip(shift, -_FARTHEST_RANDOM, _FARTHEST_RANDOM), np.float64)
 
     def _listed(self, wanted: IntArray) -> FloatArray:
-        """Return the shifts of the edges of successive codes that need no random numbers, DN.
-
-        Where a list would change the order of two edges they coincide.
-        """
+        """Return shifts of edges that need no random numbers, DN; edges never change their order."""
         codes = np.arange(wanted[0] - 1, wanted[-1] + 1)
         if self.pattern == "bit":
             shift = (codes >> self.bit & 1) - 0.5
@@ -447,13 +429,12 @@ class GainStitch(Effect, tag="gain_stitch"):
     """Above ``level_dn`` the scale deviates by ``gain_change (x - origin_dn)``, below it by nothing.
 
     Dual-gain sensors read every pixel by a high and a low gain and join the two into one scale at a fixed
-    level (sCMOS cameras: a kink, a change of width and codes that are missing or doubled there); so do ADCs
-    with two slopes. If the gains are not matched exactly, the scale has a kink at the level, and a step
-    where they are matched about another point.
+    level; so do ADCs with two slopes. If the gains are not matched exactly, the scale has a kink at the
+    level, and a step where they are matched about another point.
 
-    Signature: counts per DN, summed over the pixels, deviate on both sides of one DN, beyond what the
-    pixels' own bias and gain take up; pixels of different bias show it at the same DN. A step shows sharply,
-    at one code; a kink without a step is hardly told from a bend of the whole curve (`adc_inl`).
+    Signature: counts per DN, summed over the pixels, deviate on both sides of one DN, beyond what the pixels'
+    own bias and gain take up; pixels of different bias show it at the same DN. A step shows sharply, at one
+    code; a kink alone is hardly told from a bend of the whole curve (`adc_inl`).
     """
 
     plane = Plane.ADC
@@ -572,11 +553,8 @@ class Clipping(Effect, tag="clipping"):
         code = evidence.code
         high = code.maximum if _piles_up(code, code.maximum, above=True) else None
         low = code.minimum if code.minimum > 0 and _piles_up(code, code.minimum, above=False) else None
-        if high is None and low is None:
-            return ()
-        if high is None or low is None:
-            return (cls(low=low, high=high),)
-        return cls(low=low, high=high), cls(high=high), cls(low=low)
+        pairs = dict.fromkeys(((low, high), (None, high), (low, None)))
+        return [cls(low=low, high=high) for low, high in pairs if (low, high) != (None, None)]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law that counts at the limits what lies beyond them."""

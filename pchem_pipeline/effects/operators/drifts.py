@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self, TypeVar
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -77,16 +77,14 @@ class Drift(Effect):
 
     def in_frames(self, context: EffectContext) -> FloatArray:
         """Return the profile at the block's frames, in units of the strength, shape (n,)."""
-        if self.shape == "walk":
-            return _walk(context)
-        return self.profile(run_position(context.frames, context.n_frames))
+        if self.shape != "walk":
+            return self.profile(run_position(context.frames, context.n_frames))
+        steps = context.random.generator().standard_normal(context.n_frames)
+        walk = np.cumsum(steps) / np.sqrt(context.n_frames)
+        return np.asarray(walk[context.frames.clip(0, context.n_frames - 1)] - walk.mean())
 
     def profile(self, position: FloatArray) -> FloatArray:
-        """Return the profile in units of the strength, of mean 0 over the run; none of a walk.
-
-        Args:
-            position: times from 0 (first frame) to 1 (last frame).
-        """
+        """Return the profile at times 0..1 (first to last frame), in units of the strength, of mean 0."""
         if self.shape == "settling":
             return settling(position, self.settling_fraction)
         return along_path(position, self.path or (-0.5, 0.5))
@@ -122,13 +120,6 @@ class Drift(Effect):
         """Return it with a profile that was found, its strength kept within the limits of its field."""
         fields = {"shape": found.shape, "path": found.path, "settling_fraction": found.settling_fraction}
         return cls.model_validate({cls.strength: cls.limited(cls.strength, found.size), **fields})
-
-
-def _walk(context: EffectContext) -> FloatArray:
-    """Return a random walk over the run with an end of unit variance, at the block's frames."""
-    steps = context.random.generator().standard_normal(context.n_frames)
-    walk = np.cumsum(steps) / np.sqrt(context.n_frames)
-    return np.asarray(walk[context.frames.clip(0, context.n_frames - 1)] - walk.mean())
 
 
 class BiasDrift(Drift, OffsetEffect, tag="bias_drift"):
@@ -177,11 +168,9 @@ class BiasDrift(Drift, OffsetEffect, tag="bias_drift"):
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law smeared over the path; of a walk that with its variance."""
-        return (
-            model.with_variance(dn2=self.drift_dn**2 / 6.0)
-            if self.shape == "walk"
-            else super().sample_law(model, maps)
-        )
+        if self.shape == "walk":
+            return model.with_variance(dn2=self.drift_dn**2 / 6.0)
+        return super().sample_law(model, maps)
 
     @classmethod
     def series(cls, evidence: Evidence, time: TimeSeries) -> FloatArray:
@@ -264,16 +253,15 @@ class ExposureDrift(Drift, tag="exposure_drift"):
     """Relative change of H from the first frame to the last, the same in every pixel.
 
     PCH-EM assumes independent, identically distributed frames (Hendrickson et al. 2023, Sec. II-B). Here
-    frame ``n`` of ``N`` sees ``H_n = H (1 + drift s_n)`` with a time profile s of mean 0 and range 1, so
-    they are not. Dark current doubles every 6 to 8 K, about 10 % per kelvin, so a tenth of a kelvin over the
-    run already drifts by 1 %.
+    frame ``n`` of ``N`` sees ``H_n = H (1 + drift s_n)`` with a time profile s of mean 0 and range 1. Dark
+    current doubles every 6 to 8 K, so a tenth of a kelvin over the run already drifts by 1 %.
 
     A ``path`` may be in any unit: its mean and range are taken out. Of a time constant or a path alone, the
     shape need not be told.
 
     Signature: block means of the electron number follow the drift with a slope proportional to H, those of
-    the readout residual do not. The mean over the run stays; for large N the variance grows by ``(drift H /
-    g)^2 / 12`` DN^2 and is no longer that of any single PCD.
+    the readout residual do not. For large N the variance grows by ``(drift H / g)^2 / 12`` DN^2 and is no
+    longer that of any single PCD.
     """
 
     plane = Plane.EXPOSURE
@@ -308,15 +296,13 @@ class ExposureDrift(Drift, tag="exposure_drift"):
         """Return the fields with the shape that a time constant, or a path, is of."""
         if not isinstance(given, Mapping) or "shape" in given:
             return given
-        told = {
-            name: value for name, value in given.items() if name != "settling_fraction" or value is not None
-        }
-        if told.get("path") and "settling_fraction" in told:
+        fields = {k: v for k, v in given.items() if k != "settling_fraction" or v is not None}
+        path, settles = fields.get("path"), "settling_fraction" in fields
+        if path and settles:
             raise ValueError(
                 "exposure_drift: path and settling_fraction are two time profiles; give one of them"
             )
-        shape = "path" if told.get("path") else "settling" if "settling_fraction" in told else "linear"
-        return {**told, "shape": shape}
+        return {**fields, "shape": "path" if path else "settling" if settles else "linear"}
 
     @model_validator(mode="after")
     def _path_has_a_range(self) -> Self:
@@ -347,20 +333,17 @@ class ExposureDrift(Drift, tag="exposure_drift"):
 # cycles in the run below which a change is a drift
 _SLOWEST = 20
 
-_T = TypeVar("_T", bound="ExposureFlicker")
-
 
 class ExposureFlicker(Effect, tag="exposure_flicker"):
     """Relative fluctuation of H from frame to frame, the same in all pixels.
 
-    The intensity noise of a lamp or laser, a shutter that jitters, or a temperature that jumps multiplies
-    the exposure of all pixels of frame t by ``a_t`` of mean 1 and standard deviation s (EMVA Standard 1288,
-    release 4.0, requires the source to be stable for this reason). Successive frames may be alike
-    (``correlation_frames``), or the flicker may be a sine: a lamp on the mains, aliased by the frame rate. A
-    lamp that misses a cycle or a laser that hops between modes takes a few values only (``levels``).
+    The intensity noise of a lamp or laser, a shutter that jitters, or a temperature that jumps multiplies the
+    exposure of all pixels of frame t by ``a_t`` of mean 1 and standard deviation s. Successive frames may be
+    alike (``correlation_frames``), or the flicker may be a sine: a lamp on the mains, aliased by the frame
+    rate. A lamp that misses a cycle or a laser that hops between modes takes a few values only (``levels``).
 
-    Signature: the frame means of the electron number scatter more than their shot noise, those of the
-    readout residual do not, and the two do not vary together.
+    Signature: the frame means of the electron number scatter more than their shot noise, those of the readout
+    residual do not, and the two do not vary together.
     """
 
     plane = Plane.EXPOSURE
@@ -433,8 +416,6 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the flickering exposure (frame, y, x), e-."""
-        if self.rms == 0:
-            return values.copy()
         if self.period_frames is not None:
             phase = context.frames / self.period_frames + self.phase_cycles
             factor = np.maximum(1.0 + self.rms * np.sqrt(2.0) * np.sin(2.0 * np.pi * phase), 0.0)
@@ -471,7 +452,51 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
         profile = exposure_profile(evidence)
         if profile is None or evidence.time is None:
             return ()
-        return [*_sine(cls, profile, evidence.time.n_run), *_random(cls, profile)][:4]
+        return [*cls._sine(profile, evidence.time.n_run), *cls._random(profile)][:4]
+
+    @classmethod
+    def _random(cls, profile: ExposureProfile) -> list[Self]:
+        """Return a flicker new in every frame, and one with a memory, where there is more than shot noise."""
+        n = profile.deviation.size
+        step = np.diff(profile.deviation)[successive(profile.frames)]
+        if step.size < 8:
+            return []
+        # differences do not see a drift; their variance has the kurtosis of a moving average
+        fast = 0.5 * float(np.mean(step**2)) - profile.variance
+        fast_error = profile.variance * np.sqrt(3.0 / step.size)
+        smooth = profile.deviation - profile.deviation.mean()
+        whole = float(smooth @ smooth) / (n - 1) - profile.variance
+        whole_error = profile.variance * np.sqrt(2.0 / n)
+        if max(fast / fast_error, whole / whole_error) < 3.0:
+            return []
+        found: list[Self] = []
+        if fast > SIGNIFICANT * fast_error:
+            found.append(cls(rms=min(float(np.sqrt(fast)), 1.0)))
+        # fast = s^2 (1 - rho): the lag-1 correlation of an exponential memory
+        rho = 1.0 - fast / whole if whole > 3.0 * whole_error else 0.0
+        if 0.0 < rho < 0.98 and whole - fast > 3.0 * np.hypot(fast_error, whole_error):
+            memory = float(-1.0 / np.log(rho))
+            if memory < n / _SLOWEST:
+                found.insert(0, cls(rms=min(float(np.sqrt(whole)), 1.0), correlation_frames=memory))
+        levels = few_levels(profile.deviation, profile.variance)
+        if levels is None:
+            return found
+        rounded = {
+            "rms": min(levels.rms, 1.0),
+            "levels": tuple(np.round((levels.values - levels.values.mean()) / levels.rms, 4).tolist()),
+            "shares": tuple(levels.shares.tolist()),
+        }
+        return [*(cls(**(one.model_dump() | rounded)) for one in found), *found]
+
+    @classmethod
+    def _sine(cls, profile: ExposureProfile, n_run: int) -> list[Self]:
+        """Return a sine at the highest line of the spectrum, if one stands out."""
+        line = coherent_line(profile.deviation[:, None], profile.frames.astype(np.int64), n_run)
+        if line is None or not 0.0 < line.per_frame < 1.0:
+            return []
+        rms = min(line.amplitude / 2.0**0.5, 1.0)
+        cycles = line.phase / (2.0 * np.pi) % 1.0
+        return [cls(rms=rms, period_frames=1.0 / line.per_frame, phase_cycles=cycles)]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law mixed over the exposures of the frames."""
@@ -487,46 +512,3 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
         factors = np.exp(width * nodes - 0.5 * width**2)
         weights = weights / weights.sum()
         return model.with_exposures(weights, factors / (weights @ factors))
-
-
-def _random(cls: type[_T], profile: ExposureProfile) -> list[_T]:
-    """Return a flicker anew in every frame, and one with a memory, where there is more than shot noise."""
-    n = profile.deviation.size
-    step = np.diff(profile.deviation)[successive(profile.frames)]
-    if step.size < 8:
-        return []
-    # differences do not see a drift; their variance has the kurtosis of a moving average
-    fast = 0.5 * float(np.mean(step**2)) - profile.variance
-    fast_error = profile.variance * np.sqrt(3.0 / step.size)
-    smooth = profile.deviation - profile.deviation.mean()
-    whole = float(smooth @ smooth) / (n - 1) - profile.variance
-    whole_error = profile.variance * np.sqrt(2.0 / n)
-    if max(fast / fast_error, whole / whole_error) < 3.0:
-        return []
-    found: list[_T] = []
-    levels = few_levels(profile.deviation, profile.variance)
-    if fast > SIGNIFICANT * fast_error:
-        found.append(cls(rms=min(float(np.sqrt(fast)), 1.0)))
-    # fast = s^2 (1 - rho): the lag-1 correlation of an exponential memory
-    rho = 1.0 - fast / whole if whole > 3.0 * whole_error else 0.0
-    if 0.0 < rho < 0.98 and whole - fast > 3.0 * np.hypot(fast_error, whole_error):
-        memory = float(-1.0 / np.log(rho))
-        if memory < n / _SLOWEST:
-            found.insert(0, cls(rms=min(float(np.sqrt(whole)), 1.0), correlation_frames=memory))
-    if levels is None:
-        return found
-    rounded = {
-        "levels": tuple(np.round((levels.values - levels.values.mean()) / levels.rms, 4).tolist()),
-        "shares": tuple(levels.shares.tolist()),
-    }
-    return [*(cls(**{**one.model_dump(), "rms": min(levels.rms, 1.0), **rounded}) for one in found), *found]
-
-
-def _sine(cls: type[_T], profile: ExposureProfile, n_run: int) -> list[_T]:
-    """Return a sine at the highest line of the spectrum, if one stands out."""
-    line = coherent_line(profile.deviation[:, None], profile.frames.astype(np.int64), n_run)
-    if line is None or not 0.0 < line.per_frame < 1.0:
-        return []
-    rms = min(line.amplitude / 2.0**0.5, 1.0)
-    cycles = line.phase / (2.0 * np.pi) % 1.0
-    return [cls(rms=rms, period_frames=1.0 / line.per_frame, phase_cycles=cycles)]

@@ -36,7 +36,6 @@ _REACH = 3  # of the moving average along an axis, for each of them
 _MOST_TAPS, _SMALLEST_TAP = 200, 0.01  # of the moving average; of the largest weight
 _LINE: dict[Dim, str] = {"frame": "frame", "y": "row", "x": "column"}
 _NODES, _NARROWEST = 5, 0.05  # of the law of noise of changing size; relative, to be a law
-_NYQUIST = 0.5  # cycles
 _CHANGED = {"gain": "gain", "light": "light", "noise": "read noise"}
 
 
@@ -84,7 +83,6 @@ class NoiseMode(Section):
         max_length=32,
         description="relative size along a row or column, at evenly spaced points; empty: uniform",
     )
-
     extent: tuple[Span, Span] | None = Field(
         default=None,
         description="shape, profile: range of rows and of columns, ends excluded; null: all",
@@ -114,7 +112,7 @@ class NoiseMode(Section):
         if self.wave is not None and (
             self.lags
             or self.burst is not None
-            or max(map(abs, self.wave)) > _NYQUIST
+            or max(map(abs, self.wave)) > 0.5
             or any(self.wave[axis] for axis in fixed)
         ):
             raise ValueError(f"wave: at most half a cycle, and 0 within a {self.of}; no lags, no burst")
@@ -199,14 +197,9 @@ class NoiseMode(Section):
         return " and ".join(found)
 
     def relative(self, rows: IntArray, columns: IntArray, shape: tuple[int, int]) -> FloatArray:
-        """Return the size relative to others in pixels of a sensor, in a shape that fits (y, x).
+        """Return the relative size in some rows and columns of a sensor, in a shape that fits (y, x).
 
         Its mean square is 1 where shape and profile reach; beyond there is none.
-
-        Args:
-            rows: of the pixels, shape (y,).
-            columns: likewise, shape (x,).
-            shape: rows and columns of the sensor.
         """
         (top, bottom), (left, right) = self.extent or ((0, shape[0]), (0, shape[1]))
         if self.shape:
@@ -235,12 +228,9 @@ class NoiseMode(Section):
         return np.asarray(found / np.sqrt(np.mean(fine**2)))
 
     def reaching(self, extent: tuple[Span, Span], by: tuple[int, int], whole: tuple[int, int]) -> NoiseMode:
-        """Return it on pixels that are counted differently.
+        """Return it on pixels whose row and column numbers are larger ``by`` so much, ``whole`` of them.
 
-        Args:
-            extent: rows and columns that it reaches over where it says nothing of that.
-            by: how much higher the rows and columns are.
-            whole: rows and columns that there are then.
+        ``extent``: rows and columns that it reaches over where it says nothing of that.
         """
         if not (self.shape or self.profile):
             return self
@@ -380,9 +370,7 @@ class _Average(NamedTuple):
 def spectrum(lags: Sequence[Lag], values: Sequence[float]) -> FloatArray:
     """Return ``2 sum_l values_l cos(w l)`` on a grid of frequencies w, the part of lag 0 left out.
 
-    Args:
-        lags: distances; each stands for its opposite, too.
-        values: covariances or correlations at these.
+    Of covariances or correlations at distances, of which each stands for its opposite, too.
     """
     farthest = np.abs(np.array(lags, np.int64).reshape(-1, 3)).max(axis=0, initial=0)
     sizes = [max(_POINTS * int(far), 1) for far in farthest]
@@ -399,17 +387,13 @@ def _average(mode: NoiseMode) -> _Average:
     power = np.maximum(1.0 + spectrum(mode.lags, mode.correlation), 0.0)
     weights = np.fft.ifftn(np.sqrt(power)).real
     far = [_REACH * size // _POINTS if size > 1 else 0 for size in weights.shape]
-    taps = []
-    for index in np.ndindex(*(2 * n + 1 for n in far)):
-        lag = tuple(i - n for i, n in zip(index, far, strict=True))
-        taps.append(((lag[0], lag[1], lag[2]), float(weights[lag])))
+    frames, rows, columns = (range(-n, n + 1) for n in far)
+    taps = [((t, y, x), float(weights[t, y, x])) for t in frames for y in rows for x in columns]
     taps.sort(key=lambda tap: -abs(tap[1]))
     kept = [tap for tap in taps[:_MOST_TAPS] if abs(tap[1]) >= _SMALLEST_TAP * abs(taps[0][1])]
     norm = sum(weight**2 for _, weight in kept) ** 0.5
-    reach = np.abs([lag for lag, _ in kept]).max(axis=0)
-    return _Average(
-        tuple((lag, weight / norm) for lag, weight in kept), (int(reach[0]), int(reach[1]), int(reach[2]))
-    )
+    t, y, x = np.abs([lag for lag, _ in kept]).max(axis=0).tolist()
+    return _Average(tuple((lag, weight / norm) for lag, weight in kept), (t, y, x))
 
 
 def _of_light(change: FloatArray, number: int, context: EffectContext) -> FloatArray:

@@ -59,8 +59,6 @@ class SpuriousCharge(Effect, tag="spurious_charge"):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, spurious ones included."""
-        if self.mean_e == 0:
-            return values.copy()
         return np.asarray(values + context.random.poisson(np.full(values.shape, self.mean_e)))
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
@@ -72,9 +70,8 @@ class ChargeLag(Effect, tag="charge_lag"):
     """Probability that an electron is read with the next frame instead of its own.
 
     An incomplete transfer out of the photodiode leaves each electron behind with probability f (Fossum and
-    Hondongwa 2014, "A Review of the Pinned Photodiode"; 0.1 e- and less in the pump-gate pixels of Ma et al.
-    2015). Poisson electrons that are delayed independently stay independent Poisson from frame to frame
-    (Mirasol 1963, for the output of the queue M/G/infinity): at constant exposure this is invisible.
+    Hondongwa 2014; 0.1 e- and less in the pump-gate pixels of Ma et al. 2015). Poisson electrons that are
+    delayed independently stay independent Poisson from frame to frame (Mirasol 1963).
 
     Signature: none at constant exposure: what is late in one frame is replaced, on average and in law, by
     what was late in the frame before.
@@ -98,8 +95,6 @@ class ChargeLag(Effect, tag="charge_lag"):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as read; the first frame gets nothing from before."""
-        if self.fraction == 0:
-            return values.copy()
         u = context.random.uniform(("frame", "y", "x"))
         late = binomial_upper(u.reshape(-1), values.reshape(-1), self.fraction).reshape(values.shape)
         result: AnyArray = values - late
@@ -110,13 +105,10 @@ class ChargeLag(Effect, tag="charge_lag"):
 class ChargeDiffusion(Effect, tag="charge_diffusion"):
     """Probability that an electron is collected by one of the four neighbours (each a quarter of it).
 
-    Carriers released below the depleted region wander sideways before they are collected (Janesick 2001,
-    Scientific Charge-Coupled Devices, ch. 4). Each electron moves to one of the four neighbours with
-    probability f, independently of the others. Poisson electrons that are moved independently stay
+    Carriers released below the depleted region wander sideways before they are collected (Janesick 2001, ch.
+    4). One that would leave the sensor at its edge stays. Poisson electrons that are moved independently stay
     independent Poisson (Kingman 1993, Poisson Processes, displacement theorem): in frames of one constant
     exposure this is invisible, and part of H.
-
-    An electron that would leave the sensor at its edge stays.
 
     Signature: none: the map of H is blurred, and nothing tells a blurred map from a smooth one.
     """
@@ -138,8 +130,6 @@ class ChargeDiffusion(Effect, tag="charge_diffusion"):
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, as collected."""
         result = values.copy()
-        if self.fraction == 0:
-            return result
         u = context.random.uniform(("frame", "y", "x"))
         (frame, y, x), (_, to_y, to_x) = sent_to_neighbours(values, u, self.fraction)
         row = context.rows[0] + to_y
@@ -153,14 +143,11 @@ class ChargeDiffusion(Effect, tag="charge_diffusion"):
 class OpticalCrosstalk(Effect, tag="optical_crosstalk"):
     """Probability that an electron makes one more in one of the four neighbours (each a quarter of it).
 
-    Every electron makes, with probability p, one further electron in one of the four neighbours. Electron
-    luminescence does so in image sensors, avalanches in single-photon diode arrays (Rech et al. 2008; Otte
-    et al. 2009). Each pixel's count stays Poisson, of mean ``H + p`` times the mean of its neighbours' H,
-    but neighbours are correlated: ``cov(K_i, K_j) = (p / 4) (H_i + H_j)``. Only the electrons themselves
-    show it, not the readout.
-
-    Photons that leave the sensor at its edge are lost. H is the exposure from outside: the electrons that
-    come from the neighbours are on top of it.
+    Electron luminescence does so in image sensors, avalanches in single-photon diode arrays (Rech et al.
+    2008; Otte et al. 2009). Each pixel's count stays Poisson, of mean ``H + p`` times the mean of its
+    neighbours' H, but neighbours are correlated: ``cov(K_i, K_j) = (p / 4) (H_i + H_j)``. Only the electrons
+    themselves show it, not the readout. Photons that leave the sensor at its edge are lost. H is the exposure
+    from outside.
 
     Signature: electron numbers of neighbours along x and y are correlated by about p / 2; the readout
     residual follows neither the neighbour's residual nor its electrons.
@@ -187,8 +174,6 @@ class OpticalCrosstalk(Effect, tag="optical_crosstalk"):
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return electron numbers (frame, y, x), e-, with those that came from the neighbours."""
         result = values.copy()
-        if self.probability == 0:
-            return result
         u = context.random.uniform(("frame", "y", "x"))
         _, (frame, y, x) = sent_to_neighbours(values, u, self.probability)
         inside = (y >= 0) & (y < values.shape[1]) & (x >= 0) & (x < values.shape[2])
@@ -205,12 +190,9 @@ class BranchingCounts(Effect, tag="branching_counts"):
 
     Avalanches, hot carriers and luminescence that is absorbed in the pixel itself multiply electrons: every
     one, the secondary ones too, makes Poisson many (mean l) more. A primary one then becomes a cluster of
-    Borel size, and Poisson many of them a generalised Poisson number (Consul and Jain 1973), in use for
-    silicon photomultipliers (Vinogradov 2012): ``P(k) = q (q + l k)^(k - 1) exp(-q - l k) / k!`` of mean ``q
-    / (1 - l)`` and variance ``q / (1 - l)^3``.
-
-    H stays the mean number of electrons, ``q = H (1 - l)`` the primary ones: the two cannot be told apart at
-    one exposure.
+    Borel size, and Poisson many of them a generalised Poisson number (Consul and Jain 1973; Vinogradov 2012
+    for silicon photomultipliers): ``P(k) = q (q + l k)^(k - 1) exp(-q - l k) / k!`` of mean ``q / (1 - l)``
+    and variance ``q / (1 - l)^3``. H stays the mean number of electrons, ``q = H (1 - l)`` the primary ones.
 
     Signature: the score of the second Charlier polynomial is positive in all pixels, and per sample the same
     at every H; then that of the third; nothing in time, nothing between neighbours.
@@ -307,8 +289,6 @@ class OverdispersedCounts(Effect, tag="overdispersed_counts"):
         """Return electron numbers (frame, y, x), e-, made of Poisson ones of mean ``context.exposure``."""
         assert context.exposure is not None  # the chain gives it from this plane on
         a, exposure = self.relative_variance, context.exposure
-        if a == 0:
-            return values.copy()
         if self.exposures == "lognormal":
             return self._thinned_or_added(values, exposure, context)
         u = context.random.uniform(("frame", "y", "x"))
@@ -386,9 +366,7 @@ def _logarithmic_beyond_one(v: FloatArray, x: FloatArray) -> IntArray:
         extra[active] += 1
         mass = mass * theta * (n / (n + 1))
         below = below + mass
-        # rounding must not keep the last few alive for ever
-        active = np.where(mass > 1e-17, active, -1)
-        keep = active >= 0
+        keep = mass > 1e-17  # rounding must not keep the last few alive for ever
         active, below, mass, theta = active[keep], below[keep], mass[keep], theta[keep]
         n += 1
     return extra
@@ -526,21 +504,14 @@ class Trapping(Effect, tag="trapping"):
 
     def chance(self, exposure: FloatArray) -> FloatArray:
         """Return m, the chance that a sample with electrons loses one, for exposures H, e-."""
-        return _chance(self.capture, self.release, -np.expm1(-exposure))
-
-
-def _chance(capture: float, release: float, some: FloatArray) -> FloatArray:
-    """Return m, the chance that a sample with electrons loses one, given how probable it is to have any."""
-    return np.asarray(capture * release / (release + capture * some))
+        some = -np.expm1(-exposure)
+        return np.asarray(self.capture * self.release / (self.release + self.capture * some))
 
 
 def _states(filled: BoolArray, emptied: BoolArray, history: int) -> IntArray:
     """Return whether traps are full before and behind each frame, (frame + 1, y, x), 0 or 1.
 
-    Args:
-        filled: in which frames an empty trap is filled, (frame, y, x).
-        emptied: in which frames a full trap is emptied, (frame, y, x).
-        history: frames beyond which a trap is taken for empty.
+    In the frames ``filled`` an empty trap is filled, in those ``emptied`` a full one is emptied.
     """
     start = np.zeros((1, *filled.shape[1:]), np.bool_)
     frame = np.arange(filled.shape[0] + 1)[:, None, None]
@@ -677,8 +648,8 @@ class EmpiricalElectrons(Effect, tag="empirical_electrons"):
 
     def describe(self) -> str:
         """Return what is known of it."""
-        told = [mode.describe(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
-        return f"electron numbers{in_place(self)} are not independent ({'; '.join(told)})"
+        parts = [mode.describe(chance) for mode, chance in zip(self.modes, self._chances(), strict=True)]
+        return f"electron numbers{in_place(self)} are not independent ({'; '.join(parts)})"
 
 
 def _gone(electrons: IntArray, u: FloatArray, chance: float) -> IntArray:

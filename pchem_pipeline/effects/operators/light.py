@@ -47,11 +47,10 @@ class Glow(Effect, tag="glow"):
 
     Output amplifiers, and circuits beside the array, emit near-infrared light that the pixels around them
     collect (amplifier glow of CCDs, circuit glow of CMOS and infrared sensors); a light leak does the same.
-    What is constant is part of the pixels' exposure and in their maps; what bursts now and then, or grows
-    while the electronics warm up, is not.
+    What is constant is part of H; what bursts, or grows while the electronics warm up, is not.
 
-    Signature: means of the electron number of the rows and columns around one place rise, in single frames
-    or along the run, not in proportion to H; nothing in the readout residual.
+    Signature: mean electron numbers of the rows and columns around one place rise, in single frames or along
+    the run, not in proportion to H; nothing in the readout residual.
     """
 
     plane = Plane.EXPOSURE
@@ -119,8 +118,7 @@ class Glow(Effect, tag="glow"):
             size = (context.random.uniform(("frame",))[:, 0, 0] < self.burst_share).astype(np.float64)
         result: AnyArray = values.copy()
         bright = size > 0
-        pattern = self.peak_e * self.pattern(context.rows, context.shape)
-        result[bright] += size[bright, None, None] * pattern
+        result[bright] += size[bright, None, None] * (self.peak_e * self.pattern(context.rows, context.shape))
         return result
 
     def added_exposure(
@@ -144,16 +142,14 @@ class Glow(Effect, tag="glow"):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return a spot that bursts, from rows and columns, and one that grows, from block means."""
-        bursts = best_bursts(evidence)
-        found = [] if bursts is None else [cls._of(*bursts)]
         growing = _growing(evidence)
-        return [*found, *([] if growing is None else [cls._of(growing)])]
-
-    @classmethod
-    def _of(cls, spot: Spot, burst_share: float | None = None) -> Self:
-        return cls.model_validate(
-            {"peak_e": spot.peak, "falloff": spot.falloff, "burst_share": burst_share, **spot.place}
-        )
+        found = (best_bursts(evidence), None if growing is None else (growing, None))
+        return [
+            cls.model_validate(
+                {"peak_e": spot.peak, "falloff": spot.falloff, "burst_share": share, **spot.place}
+            )
+            for spot, share in filter(None, found)
+        ]
 
     def representative(self, frames: IntArray) -> tuple[Self, float]:
         """Return rare bursts more often than they are, and how much rarer they are."""
@@ -187,13 +183,12 @@ _DECAYS = (*SETTLING, 2.0)
 class Persistence(Effect, tag="persistence"):
     """Exposure left over from an earlier image, fading away from the first frame on.
 
-    Traps that a bright exposure has filled empty with their own time constants, and the exposure of frame t
-    becomes ``H + A_p exp(-t / tau)`` with the image A of before (Smith et al. 2008, "A theory for image
-    persistence in HgCdTe photodiodes"). Its map is that of the earlier image and not of H: a spot here, or
-    any image on a coarse grid.
+    Traps that a bright exposure has filled empty with their own time constants: the exposure of frame t
+    becomes ``H + A_p exp(-t / tau)`` with the image A of before (Smith et al. 2008), a spot here, or any
+    image on a coarse grid.
 
-    Signature: block means of the electron number fall along the run in a connected part of the sensor, not
-    in proportion to H; nothing in the readout residual.
+    Signature: block means of the electron number fall along the run in a connected part of the sensor, not in
+    proportion to H; nothing in the readout residual.
     """
 
     plane = Plane.EXPOSURE
@@ -255,44 +250,35 @@ class Persistence(Effect, tag="persistence"):
         return not self.image
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with its spot or image counted from these rows and columns."""
-        if self.image:
-            return self._seen_image(rows, columns, shape)
-        return self.model_copy(update=spot_to_window(vars(self), "gaussian", rows, columns, shape))
+        """Return it with its spot or image, a grid as fine, counted from these rows and columns."""
+        if not self.image:
+            return self.model_copy(update=spot_to_window(vars(self), "gaussian", rows, columns, shape))
+        cells = (len(self.image), len(self.image[0]))
+        y, x = (
+            (low + (np.arange(n) + 0.5) * (high - low) / n) / size
+            for (low, high), n, size in zip((rows, columns), cells, shape, strict=True)
+        )
+        return self._with_image(self._image_at(y, x))
 
     def to_sensor(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with its spot or image counted on the sensor; an image is dark elsewhere."""
-        if self.image:
-            return self._found_image(rows, columns, shape)
-        return self.model_copy(update=spot_to_sensor(vars(self), rows, columns, shape))
-
-    def _seen_image(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with the image as a grid over the window, as fine as that over the sensor."""
-        spans = (rows, columns)
-        cells = (len(self.image), len(self.image[0]))
-        places = [
-            (low + (np.arange(n) + 0.5) * (high - low) / n) / size
-            for (low, high), n, size in zip(spans, cells, shape, strict=True)
-        ]
-        values = self._image_at(*places)
-        brightest = float(values.max())
-        grid = _numbers(values / brightest) if brightest > 0 else ((1.0,),)
-        return self.model_copy(update={"image": grid, "peak_e": self.peak_e * brightest})
-
-    def _found_image(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
-        """Return it with the image as a grid over the sensor, as fine where that takes few cells."""
+        if not self.image:
+            return self.model_copy(update=spot_to_sensor(vars(self), rows, columns, shape))
         parts, cells = [], (len(self.image), len(self.image[0]))
         for (low, high), n, size in zip((rows, columns), cells, shape, strict=True):
-            many = min(-(-n * size // (high - low)), _MOST_CELLS)
+            many = min(-(-n * size // (high - low)), _MOST_CELLS)  # as fine where that takes few cells
             parts.append(((np.arange(many) + 0.5) / many * size - low) / (high - low))
         y, x = parts
         values = self._image_at(y, x) * ((y > 0) & (y < 1))[:, None] * ((x > 0) & (x < 1))
+        if not values.max() > 0:  # it lies between the centres of cells
+            values[np.abs(y - 0.5).argmin(), np.abs(x - 0.5).argmin()] = 1.0
+        return self._with_image(values)
+
+    def _with_image(self, values: FloatArray) -> Self:
+        """Return it with such an image; values are relative to the largest one of the image so far."""
         brightest = float(values.max())
-        if not brightest > 0:  # it lies between the centres of cells
-            values[np.abs(y - 0.5).argmin(), np.abs(x - 0.5).argmin()] = brightest = 1.0
-        return self.model_copy(
-            update={"image": _numbers(values / brightest), "peak_e": self.peak_e * brightest}
-        )
+        grid = _numbers(values / brightest) if brightest > 0 else ((1.0,),)
+        return self.model_copy(update={"image": grid, "peak_e": self.peak_e * brightest})
 
     def _image_at(self, y: FloatArray, x: FloatArray) -> FloatArray:
         """Return the image, relative to its largest value, at places 0..1 of the sensor."""
@@ -308,8 +294,6 @@ class Persistence(Effect, tag="persistence"):
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the exposure with what the earlier image left (frame, y, x), e-; draws nothing."""
-        if self.peak_e == 0:
-            return values.copy()
         left = self._left(context.frames)
         return np.asarray(values + left[:, None, None] * self.pattern(context.rows, context.shape))
 
@@ -397,10 +381,9 @@ _FEW_PIXELS = 0.3
 class DarkCurrentRts(Effect, tag="dark_current_rts"):
     """Two levels of the exposure, H and H + step, in a fraction of the pixels.
 
-    Random telegraph signals of the dark current are found in few pixels of new sensors and in many
-    irradiated ones, with jumps that are exponentially distributed over the pixels (Hopkins and Hopkinson
-    1993; Goiffon et al. 2009; Virmontois et al. 2013). The state is a Markov chain with exponential dwell
-    times.
+    Random telegraph signals of the dark current are found in few pixels of new sensors and in many irradiated
+    ones, with exponentially distributed jumps (Hopkins and Hopkinson 1993; Goiffon et al. 2009; Virmontois et
+    al. 2013). The state is a Markov chain with exponential dwell times.
 
     Signature: block means of the electron number wander in few pixels, strongly, and successive electron
     numbers are alike there; nothing in the readout residual, nothing in the other pixels.
@@ -465,9 +448,8 @@ class DarkCurrentRts(Effect, tag="dark_current_rts"):
         step = self.step_e * (random.exponential() if self.steps == "exponential" else 1.0)
         starts_high = random.random() < high / (low + high)
         # an even number of dwell times, well above what the run holds; the same whatever the block
-        pairs = int(
-            2.0 + context.n_frames / (low + high) * 1.5 + 6.0 * (context.n_frames / (low + high)) ** 0.5
-        )
+        cycles = context.n_frames / (low + high)
+        pairs = int(2.0 + cycles * 1.5 + 6.0 * cycles**0.5)
         dwell = random.exponential(size=(pairs, 2)) * ((high, low) if starts_high else (low, high))
         changes = np.cumsum(dwell.reshape(-1))
         # frames before the run are as the first one
@@ -487,11 +469,10 @@ class DarkCurrentRts(Effect, tag="dark_current_rts"):
             return None
         found: dict[tuple[int, int], Telegraph] = {}
         good = maps.usable
-        columns = maps.maps
         for y in np.flatnonzero(good.any(axis=1)):
             row = np.ascontiguousarray(frames[:, y].T)
             for x in np.flatnonzero(good[y]):
-                telegraph = find_telegraph(row[x], numbers, np.array([values[y, x] for values in columns]))
+                telegraph = find_telegraph(row[x], numbers, np.array([values[y, x] for values in maps.maps]))
                 if telegraph is not None:
                     found[int(y), int(x)] = telegraph
         # where most of them seem to blink, it is something else

@@ -30,11 +30,10 @@ class FlickerNoise(Effect, tag="flicker_noise"):
     """Part of the power of the read noise that is correlated in time; the power of all stays as it is.
 
     The low-frequency noise of a source follower that correlated double sampling does not remove (1/f noise;
-    van Vliet 1976; Kansy 1980 for its passage through double sampling) correlates successive frames of a
-    pixel, each pixel by itself: ``R_t = (1 - share)^(1/2) sigma Z_t + share^(1/2) sigma U_t``. U is a
-    stationary Ornstein-Uhlenbeck process, ``cov(U_t, U_{t+l}) = exp(-l / tau)``, whose spectrum is a
-    Lorentzian, or the sum of three of them with tau spaced by factors of 8, nearly 1/f in between (McWhorter
-    1957).
+    van Vliet 1976; Kansy 1980) correlates successive frames of a pixel, each pixel by itself: ``R_t = (1 -
+    share)^(1/2) sigma Z_t + share^(1/2) sigma U_t``. U is a stationary Ornstein-Uhlenbeck process, ``cov(U_t,
+    U_{t+l}) = exp(-l / tau)``, with a Lorentzian spectrum, or the sum of three of them with tau spaced by
+    factors of 8, nearly 1/f in between (McWhorter 1957).
 
     Signature: residuals of successive frames are alike and block means wander, each pixel by itself: neither
     frame means nor neighbours show anything, and a pixel's own histogram does not either.
@@ -129,13 +128,12 @@ class HeavyTailedNoise(Effect, tag="heavy_tailed_noise"):
 
     The read noise of a source follower is Gaussian only where many traps act together; a few of them, or
     pickup in bursts, make it a scale mixture: ``R`` has the pixel's ``sigma`` with probability ``1 - share``
-    and ``factor sigma`` with probability ``share`` (Tukey 1960, the contaminated normal). Noise histograms
-    of CMOS imagers with such tails are attributed to random telegraph noise of the source followers (Leyris
-    et al. 2006; Wang, Rao, Mierop and Theuwissen 2006).
+    and ``factor sigma`` with probability ``share`` (Tukey 1960). In CMOS imagers such tails come from random
+    telegraph noise of the source followers (Leyris et al. 2006; Wang et al. 2006).
 
-    Signature: the fourth Hermite score is positive in all pixels alike and samples lie below all that the
-    PCD allows (above, the Poisson tail hides them); nothing in time or space. The variance of the noise
-    becomes ``sigma^2 (1 + share (factor^2 - 1))``.
+    Signature: the fourth Hermite score is positive in all pixels alike and samples lie below all that the PCD
+    allows (above, the Poisson tail hides them); nothing in time or space. The variance of the noise becomes
+    ``sigma^2 (1 + share (factor^2 - 1))``.
     """
 
     plane = Plane.ANALOG
@@ -196,10 +194,9 @@ class NoiseSkew(Effect, tag="noise_skew"):
     """Exponential part of the read noise; mean and variance of the noise stay as they are.
 
     What has not settled when it is sampled (a slow source follower, dielectric absorption, a rectifying
-    clamp) leans to one side. The exponentially modified Gaussian is the usual law of such a sum (Grushka
-    1972): ``R = (1 - share^2)^(1/2) sigma Z + share sigma (E - 1)`` with ``Z`` standard normal and ``E``
-    exponential, both of variance 1, so that ``R`` has mean 0, variance ``sigma^2`` and skewness ``2
-    share^3``.
+    clamp) leans to one side, by an exponentially modified Gaussian (Grushka 1972): ``R = (1 - share^2)^(1/2)
+    sigma Z + share sigma (E - 1)`` with ``Z`` standard normal and ``E`` exponential, both of variance 1, so
+    that ``R`` has mean 0, variance ``sigma^2`` and skewness ``2 share^3``.
 
     Signature: the third Hermite score has one sign in all pixels, and with it He4 and He3C1; nothing in time
     or space. Peaks lean to high DN (``share`` positive) or low DN (negative).
@@ -244,15 +241,12 @@ class NoiseSkew(Effect, tag="noise_skew"):
         Mean and variance of the noise stay exact. Its law is to 1e-6 nats per sample up to a share of 0.86,
         and to 1.5e-5 at 0.95.
         """
-        shifts, weights, variances = _exponential_parts(self._lobes)
+        # parts that are as wide in units of the Gaussian part, whatever the share
+        wide = abs(self.share) / max(self._gaussian, 1e-3)
+        parts = int(np.clip(np.ceil(_LOBES * wide / _ENOUGH_FOR), _LOBES, _MOST_LOBES))
+        shifts, weights, variances = _exponential_parts(parts)
         width = np.sqrt(1.0 - self.share**2 * (1.0 - variances))
         return model.with_noise(weights, shift_sigma=self.share * shifts, width=width)
-
-    @property
-    def _lobes(self) -> int:
-        """Parts of the exponential that are as wide in units of the Gaussian part, whatever the share."""
-        wide = abs(self.share) / max(self._gaussian, 1e-3)
-        return int(np.clip(np.ceil(_LOBES * wide / _ENOUGH_FOR), _LOBES, _MOST_LOBES))
 
     @property
     def _gaussian(self) -> float:
@@ -262,8 +256,7 @@ class NoiseSkew(Effect, tag="noise_skew"):
 def _exponential_parts(n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return mean (less 1), weight and variance of n consecutive parts of an exponential of mean 1.
 
-    The edges are at equal steps of the fifth root of the survival, so that the tail is resolved, which makes
-    the skew.
+    Edges at equal steps of the fifth root of the survival resolve the tail, which makes the skew.
     """
     edges = -_ROOT * np.log(1.0 - np.arange(n) / n)
     survival = np.append(np.exp(-edges), 0.0)
@@ -322,12 +315,8 @@ class SignalDependentNoise(Effect, tag="signal_dependent_noise"):
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with variance growing along the peaks."""
-        more = self.noise_e**2
-        return (
-            model.with_variance(per_electron=more)
-            if self.growth == "root"
-            else model.with_variance(per_electron2=more)
-        )
+        growing = "per_electron" if self.growth == "root" else "per_electron2"
+        return model.with_variance(**{growing: self.noise_e**2})
 
 
 _WHERE, _SIZE, _FULL, _EMPTY = OF_PIXEL
@@ -345,17 +334,15 @@ _ALARM = 0.1  # pixels wrongly given levels, of those that have some
 class RtsNoise(Effect, tag="rts_noise"):
     """Telegraph noise of a share of the pixels, each with one trap; zero on average.
 
-    One oxide trap is full or empty; while it is full the source follower reads ``amplitude_e`` more (Kandiah
-    and Whiting 1978; Wang, Rao, Mierop and Theuwissen 2006). Correlated double sampling subtracts the state
-    at reset from that at the signal: three levels, -A, 0 and +A (Leyris et al. 2006), with q/2, 1 - q and
-    q/2. The means of N samples each before and after (correlated multiple sampling) move in steps of A/N,
-    for a jump at a random place among the 2 N samples. Without double sampling the two levels of the slow
-    trap itself are seen.
+    While an oxide trap is full the source follower reads ``amplitude_e`` more (Kandiah and Whiting 1978; Wang
+    et al. 2006). Correlated double sampling subtracts the state at reset from that at the signal: three
+    levels, -A, 0 and +A (Leyris et al. 2006), with q/2, 1 - q and q/2. The means of N samples each before and
+    after (correlated multiple sampling) move in steps of A/N, for a jump at a random place among the 2 N
+    samples. Without double sampling the two levels of the slow trap itself are seen.
 
     Signature: in few pixels the noise is heavy-tailed (He4), the fit is poor and samples lie below the bias
-    by more than the noise, where no electrons hide them. Sampled twice, successive frames are independent
-    and neighbours are too; without double sampling the residuals of these few pixels are alike for many
-    frames.
+    by more than the noise, where no electrons hide them. Sampled twice, successive frames and neighbours are
+    independent; else the residuals of these few pixels are alike for many frames.
     """
 
     plane = Plane.ANALOG

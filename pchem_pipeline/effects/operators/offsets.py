@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, ClassVar, Literal, Self, TypeVar
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,7 +31,6 @@ from pchem_pipeline.effects.framework.effect import (
     SharedOffset,
     Turns,
 )
-from pchem_pipeline.effects.framework.evidence import Wave
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.types import (
     AnyArray,
@@ -95,18 +94,9 @@ def add_offset(values: AnyArray, offset_dn: ArrayLike, context: EffectContext) -
     return np.asarray(values + np.asarray(offset_dn) * context.truth["conversion_gain"])
 
 
-def sine_values(count: int) -> FloatArray:
-    """Return ``count`` values that stand, equally likely, for the sine of a random phase (arcsine law).
-
-    Gauss-Chebyshev quadrature: all moments up to order ``2 count - 1`` are exact.
-    """
-    return np.asarray(np.cos((2.0 * np.arange(count) + 1.0) * np.pi / (2.0 * count)))
-
-
-def quantile_means(values: FloatArray, count: int = 7) -> FloatArray:
-    """Return the means of ``count`` equal parts of the sorted values, stretched to their variance."""
-    ordered = np.sort(values)
-    means = np.array([part.mean() for part in np.array_split(ordered, min(count, ordered.size))])
+def quantile_means(values: FloatArray) -> FloatArray:
+    """Return the means of seven equal parts of the sorted values, stretched to their variance."""
+    means = np.array([part.mean() for part in np.array_split(np.sort(values), min(7, values.size))])
     centre, spread = float(values.mean()), float(means.std())
     return np.asarray(centre + (means - means.mean()) * (values.std() / spread if spread > 0 else 1.0))
 
@@ -114,9 +104,8 @@ def quantile_means(values: FloatArray, count: int = 7) -> FloatArray:
 class SharedNoise(OffsetEffect):
     """Base of noise that the pixels of a frame, row or column share: an offset that is new in every frame.
 
-    A reference, ramp or supply that is sampled once for many pixels shifts them all: ``x += n_t`` with
-    ``n_t ~ N(0, s^2)``; the strength is s. A pixel's own histogram only broadens: its read noise becomes
-    ``(sigma^2 + s^2)^(1/2)`` DN. Offsets that do not change from frame to frame are part of the bias map.
+    What is sampled once for many pixels shifts them all: ``x += n_t`` with ``n_t ~ N(0, s^2)``; the strength
+    is s. A pixel's own histogram only broadens, to ``(sigma^2 + s^2)^(1/2)`` DN.
 
     Attributes:
         shared_by: what has one offset.
@@ -201,9 +190,8 @@ class ColumnNoise(SharedNoise, tag="column_noise"):
 class FrameNoise(SharedNoise, tag="frame_noise"):
     """Random offset per frame: noise of a reference that is sampled once per frame.
 
-    It is what remains of pedestal noise after a correction by rows, and why overscan or optically black
-    pixels are subtracted frame by frame (Janesick 2001, Scientific Charge-Coupled Devices; Rauscher 2015,
-    PASP 127, 1144 draws such pedestals).
+    It remains of pedestal noise after a correction by rows, and is why overscan or optically black pixels are
+    subtracted frame by frame (Janesick 2001; Rauscher 2015 draws such pedestals).
 
     Signature: frame means of the readout residual scatter more than ``n`` independent pixels do, by
     ``frame_noise_dn^2``, white from frame to frame; those of the charge do not.
@@ -232,10 +220,19 @@ class FrameNoise(SharedNoise, tag="frame_noise"):
         Half the mean squared difference of successive frame means, even and odd frames centred apart, less
         what the noise of pixels, rows and columns gives.
         """
-        if evidence.time is None:
+        time = evidence.time
+        if time is None:
             return ()
-        expected = _expected(evidence, evidence.time)
-        steps = _steps(evidence.time)
+        expected = float(mean_variance(evidence))
+        for lines, axis in ((time.row_readout, 1), (time.column_readout, 0)):
+            excess, error = line_excess(lines, mean_variance(evidence, axis))
+            if excess > POSSIBLE * error:
+                expected += excess / lines.shape[1]
+        means = time.frame_readout.astype(np.float64)
+        for chosen in (time.frames % 2 == 0, time.frames % 2 == 1):
+            if chosen.any():
+                means[chosen] -= means[chosen].mean()
+        steps = np.diff(means)[successive(time.frames)]
         if steps.size < 8 or not expected > 0:
             return ()
         excess = float((steps**2).mean() / 2.0 - expected)
@@ -246,36 +243,14 @@ class FrameNoise(SharedNoise, tag="frame_noise"):
         return (cls(frame_noise_dn=float(np.sqrt(excess)) / responsivity(evidence)),)
 
 
-def _expected(evidence: Evidence, time: TimeSeries) -> float:
-    """Return the variance, DN^2, that pixels, rows and columns by themselves give to frame means."""
-    expected = float(mean_variance(evidence))
-    for means, axis in ((time.row_readout, 1), (time.column_readout, 0)):
-        excess, error = line_excess(means, mean_variance(evidence, axis))
-        if excess > POSSIBLE * error:
-            expected += excess / means.shape[1]
-    return expected
-
-
-def _steps(time: TimeSeries) -> FloatArray:
-    """Return differences of the frame means of successive frames, DN, without even-odd contrast."""
-    means = time.frame_readout.astype(np.float64).copy()
-    for parity in (0, 1):
-        chosen = time.frames % 2 == parity
-        if chosen.any():
-            means[chosen] -= means[chosen].mean()
-    return np.asarray(np.diff(means)[successive(time.frames)], np.float64)
-
-
 class ReadoutAlternation(OffsetEffect, tag="readout_alternation"):
     """Offset of alternating sign, the same in every pixel: ``+alternation_dn`` in frames 0, 2, 4, ...
 
-    Two banks of sampling capacitors or ADCs that take turns, or two frame buffers with their own references,
-    leave ``x += (-1)^t d``. (Banks that take turns along columns or rows leave a fixed pattern, which is
-    part of the bias map.)
+    Two banks of capacitors or ADCs, or two frame buffers, that take turns leave ``x += (-1)^t d``. (Along
+    columns or rows such banks leave a fixed pattern, which is part of the bias map.)
 
     Signature: the mean readout residual of even frames exceeds that of odd ones by ``2 alternation_dn``; lag
-    1 is anticorrelated as much as lag 2 is correlated. A pixel's own histogram becomes two copies ``2
-    |alternation_dn|`` apart.
+    1 is anticorrelated as much as lag 2 is correlated. A pixel's histogram becomes two copies that far apart.
     """
 
     title = "even-odd readout alternation (ping-pong offset)"
@@ -307,16 +282,12 @@ class ReadoutAlternation(OffsetEffect, tag="readout_alternation"):
         return SharedOffset("frame", self.alternation_dn**2)
 
 
-Pickup = TypeVar("Pickup", bound="PeriodicPickup")
-
-
 class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
     """Sine along rows, columns and frames.
 
     Switching supplies, clocks and mains reach the video signal, ``x += a sin(2 pi (f_y y + f_x x + f_t t) +
     phi)``. The phase runs on from row to row and frame to frame, or is new in every frame if the frames are
-    not evenly spaced. The herring-bone pattern of the STIS CCD (Jansen et al. 2003, HST Calibration
-    Workshop) is the classic.
+    not evenly spaced. The herring-bone pattern of the STIS CCD (Jansen et al. 2003) is the classic.
 
     Signature: the spectrum of the row means (over frames and rows) of the readout residual has one line, and
     frame means have one where the phase does not advance along the rows; the charge has none. Where samples
@@ -376,8 +347,8 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
         return np.asarray(self.amplitude_dn * along.imag)
 
     def offset_values(self) -> FloatArray:
-        """Return values, DN, of a sine at random phase (arcsine law)."""
-        return self.amplitude_dn * sine_values(5)
+        """Return values, DN, of a sine at random phase (arcsine law): Gauss-Chebyshev quadrature."""
+        return np.asarray(self.amplitude_dn * np.cos((2.0 * np.arange(5) + 1.0) * np.pi / 10.0))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
@@ -400,21 +371,23 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
             if loose is not None and (line is None or line.amplitude < 0.7 * loose.amplitude):
                 fields = {name: loose.along, "amplitude_dn": loose.amplitude / alpha, "random_phase": True}
                 found.append((loose.excess, cls(**fields)))
-        found += [(wave.excess, cls._of_wave(wave, evidence)) for wave in time.waves if not wave.alternates]
-        return _without_doubles(found)
-
-    @classmethod
-    def _of_wave(cls, wave: Wave, evidence: Evidence) -> Self:
-        """Return the pickup that makes a wave across rows and columns."""
-        steady = wave.per_frame is not None
-        return cls(
-            amplitude_dn=wave.amplitude / mean_response(evidence),
-            cycles_per_row=wave.per_row,
-            cycles_per_column=wave.per_column,
-            cycles_per_frame=wave.per_frame or 0.0,
-            phase=wave.phase if steady else 0.0,
-            random_phase=not steady,
-        )
+        for wave in (wave for wave in time.waves if not wave.alternates):
+            pickup = cls(
+                amplitude_dn=wave.amplitude / mean_response(evidence),
+                cycles_per_row=wave.per_row,
+                cycles_per_column=wave.per_column,
+                cycles_per_frame=wave.per_frame or 0.0,
+                phase=0.0 if wave.per_frame is None else wave.phase,
+                random_phase=wave.per_frame is None,
+            )
+            found.append((wave.excess, pickup))
+        kept: list[Self] = []
+        for _, pickup in sorted(found, key=lambda pair: -pair[0]):
+            # rows and columns both see a line along frames alone
+            places = [(p.cycles_per_row, p.cycles_per_column, p.cycles_per_frame) for p in (pickup, *kept)]
+            if not any(np.allclose(places[0], other, rtol=0.0, atol=1e-4) for other in places[1:]):
+                kept.append(pickup)
+        return kept[:4]
 
     def to_window(self, rows: Span, columns: Span, shape: tuple[int, int]) -> Self:
         """Return it with the phase at the first row and column of a window."""
@@ -437,16 +410,6 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
         return SharedOffset("wave", variance, self.cycles_per_row, self.cycles_per_column)
 
 
-def _without_doubles(found: Sequence[tuple[float, Pickup]]) -> list[Pickup]:
-    """Return the hypotheses, the strongest first; rows and columns both see a line along frames alone."""
-    kept: list[Pickup] = []
-    for _, pickup in sorted(found, key=lambda pair: -pair[0]):
-        places = [(p.cycles_per_row, p.cycles_per_column, p.cycles_per_frame) for p in (pickup, *kept)]
-        if not any(np.allclose(places[0], other, rtol=0.0, atol=1e-4) for other in places[1:]):
-            kept.append(pickup)
-    return kept[:4]
-
-
 # frames in a record of noise, of which one is used: what is cut from a longer one has no period
 _RECORD = 4
 
@@ -455,10 +418,9 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
     """Noise with a spectrum of ``1 / f`` along the samples of a tap, from one cycle per frame on.
 
     Where pixels leave the sensor one after the other through one amplifier (CCD, EMCCD, skipper) or few of
-    them, the slow part of that amplifier's noise is common to samples that follow each other: stripes along
-    the rows that are soft at their ends, of all widths. Each tap reads a block of columns, row by row, with
-    noise of its own (correlated pink noise of near-infrared arrays: Rauscher 2015; Pyxel
-    ``correlated_pink_noise_cmos``).
+    them, the slow part of its noise is common to samples that follow each other: stripes along the rows that
+    are soft at their ends. Each tap reads a block of columns, row by row, with noise of its own (Rauscher
+    2015; Pyxel ``correlated_pink_noise_cmos``).
 
     Signature: row means of the readout residual scatter, those of adjacent rows alike, and neighbours along
     the row are correlated more than pixels far apart in it. A pixel's own histogram only broadens.
@@ -524,14 +486,7 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
 
 
 def _pink_amplitudes(n: int) -> FloatArray:
-    """Return factors of the spectrum that make white noise of a record 1/f, of variance 1.
-
-    Args:
-        n: samples of a frame; there is nothing slower than one cycle in so many.
-
-    Returns:
-        (_RECORD n // 2 + 1,), real.
-    """
+    """Return factors of the spectrum that make white noise of a record 1/f from one cycle in n samples on."""
     cycles = np.arange(_RECORD * n // 2 + 1)
     amplitudes = np.where(cycles >= min(_RECORD, cycles[-1]), np.maximum(cycles, 1) ** -0.5, 0.0)
     weight = np.where((cycles == 0) | (2 * cycles == _RECORD * n), 1.0, 2.0)
@@ -552,11 +507,9 @@ _PARTS: dict[Parts, FloatArray] = {
 class BiasJumps(OffsetEffect, tag="bias_jumps"):
     """Piecewise constant offset of each quadrant or half of the sensor, independent of the others.
 
-    Each quadrant or half, as if it had an amplifier of its own, sits on one of several levels and jumps to
-    another. The bias jumps of the CCDs of HST/WFPC2 (a tenth of a DN and more; WFPC2 Data Handbook) and the
-    "popcorn mesa" noise of HgCdTe arrays are of this kind.
-
-    An odd middle row or column belongs to the bottom or right.
+    Each part, as if it had an amplifier of its own, sits on one of several levels and jumps to another, like
+    the bias jumps of the CCDs of HST/WFPC2 (a tenth of a DN and more) and the "popcorn mesa" noise of HgCdTe
+    arrays. An odd middle row or column belongs to the bottom or right.
 
     Signature: means of the readout residual wander in one quadrant and not in the others, in sudden steps;
     the charge does not. A pixel's own histogram becomes copies of itself at the levels.
@@ -617,11 +570,8 @@ class BiasJumps(OffsetEffect, tag="bias_jumps"):
 
     def offset_values(self) -> FloatArray:
         """Return the levels, DN; of paths those of all parts, since the pixels' places are not known here."""
-        if self.path:
-            values = _values(self.path)
-        else:
-            values = np.asarray(np.arange(self.levels) - (self.levels - 1) / 2.0, np.float64)
-        return self.amplitude_dn * quantile_means(values)
+        even = np.asarray(np.arange(self.levels) - (self.levels - 1) / 2.0, np.float64)
+        return self.amplitude_dn * quantile_means(_values(self.path) if self.path else even)
 
     def _levels(self, context: EffectContext) -> FloatArray:
         """Return the levels at the block's frames in units of ``amplitude_dn``, (frame, part)."""
@@ -692,10 +642,8 @@ def _level_steps(path: Path, n_frames: int) -> tuple[IntArray, FloatArray]:
 
 
 def _values(paths: tuple[Path, ...]) -> FloatArray:
-    """Return the levels that the paths go through, each as often as it lasts, zero on average.
-
-    The length of the run is not known here: the last level is taken to last as long as the others do.
-    """
+    """Return the levels that the paths go through, each as often as it lasts, zero on average."""
+    # the length of the run is not known here: the last level is taken to last as long as the others do
     last = max((path[-1][0] for path in paths if path), default=0)
     end = last + max(1, last // max(1, max(len(path) for path in paths) - 1))
     found = [np.zeros(1)]

@@ -120,35 +120,32 @@ class BitErrors(Effect, tag="bit_errors"):
             return (cls(share=1.0, bit=broken[0], fault=broken[1]),)
         bits = range(min(int(codes[-1]).bit_length(), _MOST_BITS))
         faults = [cls(share=1.0, bit=bit, fault=fault) for bit in bits for fault in _FAULTS]
-        seen = [_moved(code, fault.faulty(codes)) for fault in faults]
-        best = max(range(len(seen)), key=lambda i: seen[i].sigmas)
-        same = [i for i, fault in enumerate(faults) if fault.bit == faults[best].bit]
-        likely = sorted((i for i in same if seen[i].sigmas > CERTAIN), key=lambda i: -seen[i].sigmas)
-        return [faults[i].model_copy(update={"share": min(seen[i].value, 1.0)}) for i in likely]
+        seen = {fault: _moved(code, fault.faulty(codes)) for fault in faults}
+        ordered = sorted(faults, key=lambda fault: -seen[fault].sigmas)
+        return [
+            fault.model_copy(update={"share": min(seen[fault].value, 1.0)})
+            for fault in ordered
+            if fault.bit == ordered[0].bit and seen[fault].sigmas > CERTAIN
+        ]
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with satellites at the weight of the bit, of the share that each pixel has there.
 
         Right in how many samples move, and how far; not in from which of a pixel's codes.
         """
-        up, down = self._moving(maps)
-        weight = float(1 << self.bit)
-        weights = self.share * np.stack([down, up], axis=1)
-        weights = np.concatenate([weights, 1.0 - weights.sum(axis=1, keepdims=True)], axis=1)
-        return model.with_noise(weights, shift_dn=np.array([-weight, weight, 0.0]))
-
-    def _moving(self, maps: PixelMaps) -> tuple[FloatArray, FloatArray]:
-        """Return the shares of each pixel's samples whose bit is 0 and goes up, or 1 and goes down, (n,)."""
         from pchem_pipeline.effects.estimators.codes import code_range
         from pchem_pipeline.model.law.mass import sample_mass
-        from pchem_pipeline.model.law.sample_law import SampleLaw
 
         first, last = code_range(maps)
         codes = np.arange(first, last + 1)
         mass = np.nan_to_num(sample_mass(SampleLaw(), maps, codes, smallest=1e-50))
         is_set = (codes >> self.bit & 1).astype(np.float64)
-        up, down = mass @ (1.0 - is_set), mass @ is_set
-        return (up * (self.fault != "zero"), down * (self.fault != "one"))
+        # shares of each pixel's samples whose bit is 0 and goes up, or 1 and goes down
+        up, down = (mass @ (1.0 - is_set)) * (self.fault != "zero"), (mass @ is_set) * (self.fault != "one")
+        weight = float(1 << self.bit)
+        weights = self.share * np.stack([down, up], axis=1)
+        weights = np.concatenate([weights, 1.0 - weights.sum(axis=1, keepdims=True)], axis=1)
+        return model.with_noise(weights, shift_dn=np.array([-weight, weight, 0.0]))
 
 
 def _moved(code: CodeResiduals, to: IntArray) -> Multiple:
@@ -211,7 +208,6 @@ class RepeatedFrames(Effect, tag="repeated_frames"):
     frames: tuple[int, ...] = Field(
         default=(), max_length=1 << 20, description="numbers of further frames that repeat the one before"
     )
-
     rows: tuple[int, int] | None = Field(
         default=None, description="repeated rows: first and last + 1; null: all"
     )
@@ -233,14 +229,8 @@ class RepeatedFrames(Effect, tag="repeated_frames"):
     def history(self) -> int:
         """Return how long a run of repeats can get, frames."""
         random = math.ceil(math.log(_RARE) / math.log(self.probability)) if self.probability > 0 else 0
-        return random + self._longest_listed()
-
-    def _longest_listed(self) -> int:
-        """Return the length of the longest run of successive numbers in ``frames``."""
-        if not self.frames:
-            return 0
         breaks = np.flatnonzero(np.diff(self.frames) != 1) + 1
-        return int(np.diff(np.concatenate([[0], breaks, [len(self.frames)]])).max())
+        return random + int(np.diff([0, *breaks, len(self.frames)]).max())
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
         """Return the digital numbers (frame, y, x), DN, with repeats in place of their frames."""
@@ -489,14 +479,13 @@ class PixelCorrection(Effect, tag="pixel_correction"):
 
     Scientific cameras correct hot and blinking pixels in their firmware, often by default and without a word
     in the file: hot-pixel correction with levels (Hamamatsu ``HOTPIXELCORRECT_LEVEL``), dynamic filters of
-    telegraph noise (Andor ``SpuriousNoiseFilter``), static maps of blemishes. The rule is a threshold: a
-    sample that exceeds the median of its eight neighbours by more than so many DN comes out as that median.
+    telegraph noise (Andor ``SpuriousNoiseFilter``), static maps of blemishes.
 
     Signature: samples equal what their neighbours predict more often than what those of the next frame do,
     and exceed it less often; the upper tail of a pixel is cut, the more so the darker its neighbours. A
     pixel's own histogram has no law of its own, since the cut is where the neighbours put it: the search
-    learns the sensor by what those predict (:meth:`replacement`), and in a fit the pixels keep the
-    parameters of their corrected samples.
+    learns the sensor by what those predict (:meth:`replacement`), and in a fit the pixels keep the parameters
+    of their corrected samples.
     """
 
     plane = Plane.READOUT
@@ -564,10 +553,7 @@ class PixelCorrection(Effect, tag="pixel_correction"):
 
 
 def _threshold(seen: PredictedSamples) -> tuple[int, float] | None:
-    """Return the threshold, DN, and the share of samples replaced above it; None where none is.
-
-    Of all thresholds the one at which a share explains the deficit above it best (Poisson likelihood).
-    """
+    """Return the threshold, DN, that best explains the deficit above it, and the share replaced, or None."""
     own, (one, _, _) = seen.above, seen.above_chance
     with np.errstate(divide="ignore", invalid="ignore"):
         fall = np.where(own > 0, own * np.log(own / one), 0.0) - (own - one)
@@ -583,14 +569,9 @@ def _threshold(seen: PredictedSamples) -> tuple[int, float] | None:
 def _replaced_share(own: float, moments: FloatArray) -> float:
     """Return the share s of replaced samples from how many are above their own and others' predictions.
 
-    A sample x exceeds the prediction of a chance frame with probability q(x). Of the samples before the
-    correction, those that come out are ``1 - s q`` (in other places), so that ``(1 - s) E[q / (1 - s q)]`` of
-    those that came out exceed their own; the expectation is a series in the moments of q.
-
-    Args:
-        own: samples above their own prediction.
-        moments: those above one, two, three given predictions of other frames, as E[q], E[q^2], E[q^3] times
-            the number of samples.
+    A sample x exceeds the prediction of a chance frame with probability q(x); ``moments`` are E[q], E[q^2]
+    and E[q^3] times the number of samples. Of the samples before the correction, those that come out are
+    ``1 - s q`` (in other places), so that ``(1 - s) E[q / (1 - s q)]`` of those exceed their own.
     """
     first, second, third = moments
     ratio = min(third / second, 1.0) if second > 0 else 0.0
@@ -757,9 +738,6 @@ class Empirical(Effect, tag="empirical"):
 
     def describe(self) -> str:
         """Return what is known of it."""
-        what = {
-            "sample": "samples", "row": "rows", "column": "columns", "frame": "frames",
-        }[self.together]  # fmt: skip
         if self.squares:
             rows, columns = (("even", "odd")[parity] for parity in self.squares)
             return (
@@ -768,9 +746,9 @@ class Empirical(Effect, tag="empirical"):
             )
         shares = self.shares()
         order = np.argsort(-shares)[:MOST_TOLD]
-        told = [f"{percent(shares[i])} {self.moves[i].describe()}" for i in order]
-        how = f" {self.moves[0].describe()}" if len(self.moves) == 1 else f" ({', '.join(told)})"
-        return f"{percent(self.share)} of the {what}{in_place(self)} are shifted{how}"
+        parts = [f"{percent(shares[i])} {self.moves[i].describe()}" for i in order]
+        how = f" {self.moves[0].describe()}" if len(self.moves) == 1 else f" ({', '.join(parts)})"
+        return f"{percent(self.share)} of the {self.together}s{in_place(self)} are shifted{how}"
 
 
 def _averaged(values: IntArray, chosen: BoolArray) -> IntArray:

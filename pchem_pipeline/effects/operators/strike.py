@@ -44,20 +44,17 @@ _BEYOND_A_LINE = 2
 _OF_A_PIXEL = 1.0 / 12.0
 
 
-class _Event(NamedTuple):
-    """Hits of a frame that touch each other.
+#: Rows and columns of pixels, and the electrons in each.
+_Electrons = tuple[IntArray, IntArray, IntArray]
 
-    Attributes:
-        pixels: number of them.
-        charge: sum, e-.
-        spread: standard deviation of the charge along an axis, pixels.
-        is_cloud: whether they are more than a straight line crosses.
-    """
+
+class _Event(NamedTuple):
+    """Hits of a frame that touch each other."""
 
     pixels: int
-    charge: float
-    spread: float
-    is_cloud: bool
+    charge: float  # e-
+    spread: float  # standard deviation of the charge along an axis, pixels
+    is_cloud: bool  # they are more than a straight line crosses
 
 
 class CosmicRays(Effect, tag="cosmic_rays"):
@@ -121,9 +118,7 @@ class CosmicRays(Effect, tag="cosmic_rays"):
                 np.add.at(result[i], (row[inside], x[inside]), electrons[inside])
         return result
 
-    def _track(
-        self, shape: tuple[int, int], random: np.random.Generator
-    ) -> tuple[IntArray, IntArray, IntArray]:
+    def _track(self, shape: tuple[int, int], random: np.random.Generator) -> _Electrons:
         """Return rows and columns of the pixels of a track on the whole sensor, and its electrons in each."""
         start = random.random(2) * shape
         angle = 2.0 * np.pi * random.random()
@@ -136,25 +131,18 @@ class CosmicRays(Effect, tag="cosmic_rays"):
         share = length / n * self.pixel_pitch_um * self.electrons_per_um
         return pixels[:, 0], pixels[:, 1], random.poisson(count * share)
 
-    def _cloud(
-        self, shape: tuple[int, int], random: np.random.Generator
-    ) -> tuple[IntArray, IntArray, IntArray]:
+    def _cloud(self, shape: tuple[int, int], random: np.random.Generator) -> _Electrons:
         """Return the same of a cloud; of more electrons it is wider, its density at the middle the same."""
         middle = random.random(2) * shape
         more = float(np.exp(self.cloud_range * random.standard_normal()))
         width = self.cloud_um / self.pixel_pitch_um * np.sqrt(more)
-        ends = [
-            np.clip([c - _REACH * width, c + _REACH * width], 0, n)
-            for c, n in zip(middle, shape, strict=True)
-        ]
-        rows, columns = (np.arange(int(low), int(np.ceil(high))) for low, high in ends)
-        along_y, along_x = (
-            np.diff(special.ndtr((np.append(each, each[-1] + 1) - c) / width))
-            for each, c in zip((rows, columns), middle, strict=True)
-        )
-        electrons = random.poisson(self.cloud_electrons * more * np.outer(along_y, along_x))
+        first = np.clip(middle - _REACH * width, 0, shape).astype(np.int64)
+        end = np.ceil(np.clip(middle + _REACH * width, 0, shape)).astype(np.int64)
+        edges = [np.arange(low, high + 1) for low, high in zip(first, end, strict=True)]
+        along = [np.diff(special.ndtr((each - c) / width)) for each, c in zip(edges, middle, strict=True)]
+        electrons = random.poisson(self.cloud_electrons * more * np.outer(*along))
         i, j = np.nonzero(electrons)
-        return rows[i], columns[j], electrons[i, j]
+        return edges[0][i], edges[1][j], electrons[i, j]
 
     def details(self) -> tuple[str, ...]:
         """Return what tracks are like, and clouds if there are any."""

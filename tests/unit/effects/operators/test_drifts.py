@@ -11,7 +11,6 @@ from pchem_pipeline.effects.operators.drifts import (
     ExposureDrift,
     ExposureFlicker,
     GainDrift,
-    _random,
 )
 
 
@@ -120,7 +119,7 @@ def test_flashes_are_guessed_within_what_the_effect_takes():
     """Their rms is 4 times the mean, more than the effect takes: a guess, and no error."""
     rng = np.random.default_rng(3)
     deviation = np.where(rng.random(400) < 0.05, 19.0, -1.0) + 0.02 * rng.standard_normal(400)
-    found = _random(ExposureFlicker, ExposureProfile(np.arange(400.0), deviation, 4e-4))
+    found = ExposureFlicker._random(ExposureProfile(np.arange(400.0), deviation, 4e-4))
     assert found[0].levels
     assert {each.rms for each in found} == {1.0}
 
