@@ -11,6 +11,7 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.wording import (
+    capitalised,
     count,
     measured,
     plain,
@@ -75,7 +76,7 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
     return Figure(
         f"difference_{name}_{pair.key}",
         "",
-        f"{label[0].upper()}{label[1:]}",
+        capitalised(label),
         f"{pair.other.label} − {pair.one.label}, in standard errors of each pixel. {caption}",
         alt,
         (DataTable({"difference": each.z}, {"difference": "standard errors"}),),

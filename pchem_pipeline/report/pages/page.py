@@ -17,7 +17,7 @@ from markupsafe import Markup, escape
 
 from pchem_pipeline.base.wording import short_name, visible
 from pchem_pipeline.report.charts.on_page import page_charts
-from pchem_pipeline.report.figures.figure import Figure, csv_text
+from pchem_pipeline.report.figures.figure import DataTable, Figure, csv_text
 from pchem_pipeline.report.inspector import content_policy, json_for_html, text_of
 from pchem_pipeline.report.style.palette import dark_rules
 
@@ -35,7 +35,7 @@ class Term:
 
     @property
     def name(self) -> str:
-        """How the list calls it."""
+        """Its name in the glossary."""
         return self.spellings[0]
 
     @property
@@ -87,15 +87,9 @@ class KeyFact:
 
 @dataclass(frozen=True)
 class Finding:
-    """The result that a section states: how serious it is, in a word and in a sentence.
+    """The result that a section states: its level, a word, a sentence, the samples examined, key numbers.
 
-    Attributes:
-        level: good, note, caution or serious (a class of the style sheet).
-        name: of the verdict.
-        sentence: the verdict in one sentence.
-        about: what it is about, for example the samples examined.
-        facts: the key numbers.
-        remarks: evidence for and against it.
+    ``level`` is a class of the style sheet; ``remarks`` are evidence for and against the result.
     """
 
     level: str
@@ -150,12 +144,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure as a page embeds it.
-
-    Attributes:
-        source: data URL.
-        width, height: size on the page, px.
-    """
+    """A figure as a page embeds it: data URL, and size on the page, px."""
 
     source: str
     width: int
@@ -227,15 +216,12 @@ def figure_tables(figures: Sequence[Figure]) -> dict[str, list[tuple[str, str]]]
 
     Maps of large sensors are not among them: ``pchem export`` and ``pchem figures`` write these.
     """
+
+    def packed(table: DataTable) -> str:
+        return base64.b64encode(gzip.compress(csv_text(table).encode(), 6, mtime=0)).decode("ascii")
+
     return {
-        figure.name: [
-            (
-                table.part,
-                base64.b64encode(gzip.compress(csv_text(table).encode(), 6, mtime=0)).decode("ascii"),
-            )
-            for table in figure.tables
-            if table.size <= _LARGEST_TABLE
-        ]
+        figure.name: [(each.part, packed(each)) for each in figure.tables if each.size <= _LARGEST_TABLE]
         for figure in figures
     }
 
