@@ -24,7 +24,7 @@ from pchem_pipeline.model.maps.defects import FAULTS
 from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting, by_change
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, draw_here, render_page
+from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, render_page
 from pchem_pipeline.report.pages.summary import Flag
 from pchem_pipeline.report.pages.tables import RMSES, Table
 
@@ -89,14 +89,13 @@ def _pair_sentence(pair: Pair, tolerance: float) -> str:
     return f"Nothing changed: {count(len(rows), 'array')} with {values:,} values {what}."
 
 
-def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[str, str]:
-    """Return the page and the JSON of a comparison; ``draw`` draws all figures at once, for None here."""
+def render_comparison(found: Comparison, draw: DrawAll) -> tuple[str, str]:
+    """Return the page and the JSON of a comparison; nothing is written."""
     many = len(found.pairs) > _MOST_DRAWN
     maps = {pair.key: [] if many else difference_figures(pair) for pair in found.pairs}
     whole = list(ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]]))
     times = list(history_figures(found.history))
-    every = [*whole, *times, *(each for figures in maps.values() for each in figures)]
-    drawn = (draw or draw_here)(every)
+    drawn = draw([*whole, *times, *(each for figures in maps.values() for each in figures)])
 
     sections = [
         Section(id="verdict", title="Result", verdict=_finding(found.changed, sentence_of(found))),
