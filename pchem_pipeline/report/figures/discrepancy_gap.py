@@ -264,5 +264,5 @@ def _pulls_chart(rows: Sequence[Pull]) -> Chart:
             colour, shape = _ROLES[role]
             marks.append(Points(values[role][known], places[known], shape, 4.5, colour=colour, label=words))
     reach = float(np.nanmax(np.abs([*values.values()]), initial=6.0))
-    x = pull_axis("deviation (sigma)", 1.4 * reach, 4.0)
+    x = pull_axis("deviation (sigma)", 1.4 * reach)
     return Chart((row_stack([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2))

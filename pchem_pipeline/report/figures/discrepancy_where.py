@@ -347,8 +347,6 @@ def _scatter(rms: FloatArray, line: str, first: int) -> Stack:
     return Stack((panel,), x, f"scatter of the {LINE_WORDS[line]}", height_mm=46.0)
 
 
-#: Standard deviations to which the axis of residuals is linear.
-_LINEAR = 4.0
 #: Number of stretches of the run over which frames are averaged.
 _STRETCHES = 24
 #: Factor and unit in which frames are shown, by what is shown of them, and the label of the axis.
@@ -500,7 +498,7 @@ def _codes_chart(table: DataTable, marked: Sequence[Place]) -> Chart:
         below.append(Sticks(dn[where], residual[where], colour=colour, width=width, label=label))
     largest = int(np.argmax(np.abs(residual)))
     reach = 1.25 * max(float(np.abs(residual).max()), 4.0)
-    y = pull_axis("(obs. − exp.) / √exp.", reach, _LINEAR)
+    y = pull_axis("(obs. − exp.) / √exp.", reach)
     note = f"largest: {residual[largest]:+.1f} at {dn[largest]:.0f} DN".replace("-", "−")
     bottom = Panel(
         y, tuple(below), 1.25, legend="upper right", columns=2, room=(1.6, 1.6), note=note,

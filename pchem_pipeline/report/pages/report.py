@@ -15,7 +15,7 @@ from typing import Any
 from pchem_pipeline.base.wording import symbol
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
-from pchem_pipeline.report.figures.figure import Figure
+from pchem_pipeline.report.figures.figure import Figure, is_strip
 from pchem_pipeline.report.figures.samples import AXES, slope_of
 from pchem_pipeline.report.inspector import embedded, text_of
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
@@ -136,7 +136,7 @@ def _page_sections(
 
 def _intro(section: Section, data: ReportData) -> str:
     """Return the introduction of a section; of maps and exposures it depends on the run."""
-    if section.id == "maps" and min(data.shape) < 2:
+    if section.id == "maps" and is_strip(data.shape):
         points = "Points: channels with their standard errors"
         return f"{points}; crosses at the bottom: channels without a value."
     if section.id != "exposures" or data.samples is None:
