@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_classes
-from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus, flags_of
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, flags_of
 from pchem_pipeline.model.maps.defects import Defects
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
@@ -99,8 +99,8 @@ class PixelFit:
 
     def text(self, name: str) -> str:
         """Return a parameter with its standard error and unit."""
-        nan = float("nan")
-        return measured(self.parameters.get(name, nan), self.stderr.get(name, nan), symbol(name)[2])
+        value, error = (numbers.get(name, np.nan) for numbers in (self.parameters, self.stderr))
+        return measured(value, error, symbol(name)[2])
 
 
 @dataclass(frozen=True)
@@ -289,14 +289,11 @@ class ReportData:
     @cached_property
     def flagged(self) -> BoolArray:
         """Pixels with a value that the data leave open by whole electrons, or altogether; shape ``shape``."""
-        return self._with_bits(FLAGGED)
+        return self.flagged_in("quanta_exposure")
 
     def flagged_in(self, name: str) -> BoolArray:
         """Return which pixels the data leave open in one map: a gain is known where the bias is not."""
-        return self._with_bits(flags_of(name))
-
-    def _with_bits(self, bits: FitStatus) -> BoolArray:
-        return np.asarray(~self.failed & (self.status & int(bits) != 0))
+        return np.asarray(~self.failed & (self.status & int(flags_of(name)) != 0))
 
     def flagged_share(self, name: str = "quanta_exposure") -> float:
         """Return the share of flagged pixels among those with a value, in one map; by default all flags."""
@@ -364,11 +361,9 @@ class ReportData:
         return self._ordered[name]
 
     def summary(self, name: str, *, with_flagged: bool = False) -> MapSummary:
-        """Describe a map by order statistics, once: the map is large, and many ask.
+        """Describe a map by order statistics, of all pixels with a value or of those without a flag.
 
-        Args:
-            name: of the map.
-            with_flagged: of all pixels with a value; else flagged ones are left out.
+        This is done once: the map is large, and many ask.
         """
         if (name, with_flagged) not in self._summaries:
             self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
@@ -398,12 +393,7 @@ class ReportData:
         return summarise(known, outlier_sigmas=self.outlier_sigmas)
 
     def pixel_error(self, name: str, *, with_flagged: bool = False) -> float | None:
-        """Return the median standard error of a pixel in a map; None where it is not known.
-
-        Args:
-            name: of the map.
-            with_flagged: of all pixels; else flagged ones are left out.
-        """
+        """Return the median standard error of a pixel, of all or of those without a flag; None if unknown."""
         errors = self.maps.get(f"{name}_stderr")
         if errors is None:
             return None

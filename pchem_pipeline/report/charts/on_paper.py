@@ -140,18 +140,14 @@ def _in(look: Look) -> Iterator[None]:
         mpl.rcParams.update(_STYLE | LIGHT.parameters())
         mpl.rcParams["svg.fonttype"] = "none" if look.svg_text else "path"
         if look.style:
-            _use(look.style)
+            from matplotlib import style  # reads all sheets of matplotlib
+
+            try:
+                style.use(look.style)
+            except OSError:
+                words = "neither a file nor a style of matplotlib that can be read"
+                raise ConfigError(f"--style {look.style}: {words}") from None
         yield
-
-
-def _use(sheet: str) -> None:
-    from matplotlib import style  # reads all sheets of matplotlib
-
-    try:
-        style.use(sheet)
-    except OSError:
-        words = "neither a file nor a style of matplotlib that can be read"
-        raise ConfigError(f"--style {sheet}: {words}") from None
 
 
 def _lay_out(drawing: Drawing) -> None:
@@ -171,11 +167,6 @@ def _lay_out(drawing: Drawing) -> None:
     setp(square, aspect="equal")
     with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         drawing.set_layout_engine(None)
-
-
-def inches(millimetres: float) -> float:
-    """Return a length in inches."""
-    return millimetres / 25.4
 
 
 # of an SVG: outlines of paths, decimals of their numbers beyond the second, and blanks that say nothing
@@ -245,10 +236,6 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
     """Draw a chart: stacks side by side on a page, one above the other in a column.
 
     The layout is then fixed, so that saving in several formats does not compute it again.
-
-    Args:
-        look: width and resolution.
-        chart: what is drawn.
     """
     with _in(look):
         drawing = _drawn(look, chart)
@@ -303,7 +290,7 @@ def _drawn(look: Look, chart: Chart) -> Drawing:
     keys = _keys(chart, look)
     lines = sum(1 + text.count("\n") for text in keys)
     height_mm = sum(heights) + (5.0 + _LINE_MM * lines if keys else 0.0)
-    drawing = Drawing(figsize=(inches(look.width_mm), inches(height_mm)), layout="constrained")
+    drawing = Drawing(figsize=(look.width_mm / 25.4, height_mm / 25.4), layout="constrained")
     drawing.look = look
     FigureCanvasAgg(drawing)  # a canvas of its own
     widths = chart.widths if columns > 1 else (1.0,)
@@ -386,17 +373,11 @@ def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, *, last: boo
 def _note(axes: Axes, text: str, corner: str) -> None:
     """Write a small note into a corner of the axes."""
     vertical, horizontal = corner.split()
-    axes.text(
-        0.985 if horizontal == "right" else 0.015,
-        0.975 if vertical == "upper" else 0.03,
-        text,
-        transform=axes.transAxes,
-        ha="right" if horizontal == "right" else "left",
-        va="top" if vertical == "upper" else "bottom",
-        fontsize=6.5,
-        color=LIGHT.faint,
-        bbox={"facecolor": LIGHT.paper, "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
-    )
+    x, va = 0.985 if horizontal == "right" else 0.015, "top" if vertical == "upper" else "bottom"
+    y = 0.975 if vertical == "upper" else 0.03
+    box = {"facecolor": LIGHT.paper, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
+    style: Any = {"fontsize": 6.5, "color": LIGHT.faint, "bbox": box, "ha": horizontal, "va": va}
+    axes.text(x, y, text, transform=axes.transAxes, **style)
 
 
 def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
@@ -495,7 +476,7 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
     """Draw a map with its bar of colours; those pixels that the resolution can show."""
     beside = axes.get_subplotspec()
     columns = 1 if beside is None else beside.get_topmost_subplotspec().get_gridspec().ncols
-    values, x, y = mark.shown(inches(look.width_mm) * look.dpi / columns)
+    values, x, y = mark.shown(look.width_mm / 25.4 * look.dpi / columns)
     colours = _colours(mark).with_extremes(bad=colour_of(mark.none))
     low, high = mark.ends
     axes.set_facecolor(colour_of(mark.none))

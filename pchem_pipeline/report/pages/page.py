@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import importlib.resources
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -72,7 +71,6 @@ def explained(text: str) -> Markup:
 _LARGEST_TABLE = 6_000
 #: Folder of the library that draws charts.
 _LIBRARY = "vendor/uplot"
-_FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": "Serious"}
 _FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
 
 
@@ -227,19 +225,18 @@ def figure_tables(figures: Sequence[Figure]) -> dict[str, list[tuple[str, str]]]
 
 
 def _template(name: str) -> jinja2.Template:
-    folder = importlib.resources.files("pchem_pipeline.report") / "templates"
     environment = jinja2.Environment(
         autoescape=True,
         finalize=_shown,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        loader=jinja2.FunctionLoader(lambda each: (folder / each).read_text(encoding="utf-8")),
+        loader=jinja2.FunctionLoader(text_of),
     )
     environment.filters["together"] = _together
     environment.filters["explained"] = lambda text: explained(_together(visible(text)))
     environment.filters["name"] = short_name
-    environment.globals |= {"flag_words": _FLAG_WORDS, "flag_signs": _FLAG_SIGNS}
+    environment.globals["flag_signs"] = _FLAG_SIGNS
     return environment.get_template(name)
 
 
