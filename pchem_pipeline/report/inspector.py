@@ -122,12 +122,7 @@ def some_of(values: NDArray[Any], enough: int = 65_537) -> NDArray[Any]:
 
 
 def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
-    """Return a map in few bytes; values are kept to half a step, those outside the range to 1e-7.
-
-    Args:
-        values: shape (ny, nx); NaN where there is no value.
-        scale: from :func:`choose_scale`.
-    """
+    """Return a map in few bytes; values are kept to half a step, those outside the range to 1e-7."""
     flat = np.asarray(values).ravel()
     place = _places(flat, scale)
     bars = None if flat.dtype.kind in "iub" else _bars(place)
@@ -202,11 +197,7 @@ def varints(values: NDArray[Any]) -> bytes:
 def pack_counts(
     origin: NDArray[np.integer[Any]], counts: Sequence[NDArray[np.integer[Any]]]
 ) -> tuple[NDArray[np.int32], NDArray[np.uint32], bytes]:
-    """Cut the empty ends off histograms and join them.
-
-    Args:
-        origin: DN of the first bin of each, shape (n,).
-        counts: n histograms, each of its own length.
+    """Cut the empty ends off n histograms, which begin at the DN of ``origin``, and join them.
 
     Returns:
         DN of the first occupied bin, number of bins from there to the last occupied one, and all counts one

@@ -324,10 +324,7 @@ def points_of(mark: Mark) -> tuple[Values, Values]:
 def window(axis: Axis, values: Iterator[Values], base: float | None = None) -> tuple[float, float]:
     """Return the ends of an axis that shows these values: those given, else the values' with a margin.
 
-    Args:
-        axis: the axis.
-        values: of its marks, any shapes.
-        base: end of the axis if no value is beyond it.
+    The axis ends at ``base`` if no value is beyond it.
     """
     parts = [np.asarray(each, dtype=np.float64).ravel() for each in values]
     known = np.concatenate(parts) if parts else np.empty(0)
@@ -386,11 +383,6 @@ def extremes(x: Values, y: Values, columns: int) -> IntArray:
 
     Drawn that wide or narrower they look like all points, which are kept where they are no more than two a
     stretch, or do not go from left to right. A stretch without a value (NaN) stays a gap.
-
-    Args:
-        x: places, (n,).
-        y: values, (n,).
-        columns: number of stretches.
     """
     if x.size <= 2 * columns or np.any(np.diff(x) < 0):
         return np.arange(x.size)

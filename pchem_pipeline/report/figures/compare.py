@@ -119,13 +119,9 @@ def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
 
 
 def difference_chart(z: FloatArray, n_changed: int, title: str, *, same_data: bool) -> Chart:
-    """Return the difference of a map of two runs in standard errors, and its histogram beside N(0, 1).
+    """Return the difference of a map of two runs in standard errors ``z``, (y, x), and its histogram.
 
-    Args:
-        z: the difference in standard errors, (y, x).
-        n_changed: good pixels that changed.
-        title: what is subtracted from what.
-        same_data: both are fits of the same frames, for which N(0, 1) is not what chance gives.
+    Beside this is N(0, 1), but for fits of the same frames, which have no sampling noise.
     """
     known = finite(z)
     limit = _limit(known, _LEAST if not same_data else 0.0)

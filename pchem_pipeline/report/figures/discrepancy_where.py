@@ -162,11 +162,9 @@ def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
 
 
 class PixelMap(NamedTuple):
-    """A statistic of every pixel in sigma, with its overall significance.
+    """A statistic of every pixel in sigma, (y, x), with its overall significance.
 
     Attributes:
-        title: the statistic in words.
-        z: map (y, x), NaN where there is no value.
         far: the largest of three departures from N(0, 1), each in its own standard errors: of the mean, of
             the mean square, and of the number of pixels beyond 5.
         outliers: pixels beyond 5.
@@ -191,12 +189,7 @@ def regions_of(data: DiscrepancyData) -> dict[str, Region]:
 
 
 def largest_maps(arrays: Arrays, regions: Mapping[str, Region] | None = None) -> list[PixelMap]:
-    """Return three maps: those with a deviating region, then goodness of fit, then the most deviating ones.
-
-    Args:
-        arrays: group ``discrepancy`` of the store.
-        regions: deviating part of the sensor by map.
-    """
+    """Return three maps: any with a deviating region, then goodness of fit, then the most deviating ones."""
     regions = regions or {}
     named = _named_maps(arrays)
     maps = {name: _pixel_map(words, values, regions.get(name)) for name, (words, values) in named.items()}
@@ -508,14 +501,9 @@ def _codes_chart(table: DataTable, marked: Sequence[Place]) -> Chart:
 
 
 def trends(number: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the means of the frames over stretches of the run; none spans a gap between frames.
+    """Return mean frame number, mean value and number of frames of each stretch of the run.
 
-    Args:
-        number: frame numbers, increasing, shape (n,).
-        values: a value of each frame, shape (n,).
-
-    Returns:
-        Mean frame number, mean value, and number of frames of each stretch.
+    No stretch spans a gap between frames, whose numbers increase.
     """
     starts = np.concatenate([[0], np.flatnonzero(np.diff(number) > 1) + 1, [number.size]])
     wanted = max(number.size // _STRETCHES, 4)

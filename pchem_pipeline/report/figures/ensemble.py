@@ -159,10 +159,7 @@ def component_table(
 ) -> DataTable:
     """Return the standard deviations of the components by electron number.
 
-    Args:
-        variance: Var(E | K_e = k), DN^2, shape (n_cases, n_k).
-        cases: names of the rows: the parameters held constant.
-        nuced_variance: Var(E' | K_e = k), e-^2, shape (n_k,).
+    They are the roots of Var(E | K_e = k), DN^2, (n_cases, n_k), and of Var(E' | K_e = k), e-^2, (n_k,).
     """
     width = np.sqrt(np.maximum(variance, 0.0))
     columns = {"k": np.arange(width.shape[1])} | dict(zip(map(_held, cases), width, strict=True))

@@ -191,10 +191,10 @@ def sensor_stack(
         ends: values with the first and the last colour.
         label: what the values are, with their unit.
         others: marks over the map.
-        ringed: pixels that are marked, (y, x); None: none.
+        ringed: pixels that are marked, (y, x).
         ring: colour of the rings.
         origin: row and column of the first pixel.
-        title: over it.
+        title: heading of the map.
         colours: ``scale``, ``none`` and ``whole`` of :class:`Image`.
     """
     rings = np.zeros(values.shape, bool) if ringed is None else ringed
@@ -220,15 +220,9 @@ def pull_stack(
     normal: bool = True,
     part: FloatArray | None = None,
 ) -> Stack:
-    """Return the histogram of standardised values beside N(0, 1); those beyond an edge are in the last bins.
+    """Return the histogram of standardised values, beside N(0, 1) and over it that of some of them, ``part``.
 
-    Args:
-        pulls: any shape; NaN are left out.
-        edge: end of the axis.
-        label: of the axis.
-        note: words in a corner.
-        normal: whether N(0, 1) is drawn.
-        part: some of them, drawn over all.
+    Values beyond ±``edge`` are in the last bins; NaN are left out.
     """
     known = finite(pulls)
     counts, edges = np.histogram(np.clip(known, -edge, edge), 60, (-edge, edge))

@@ -151,14 +151,7 @@ def goodness_figures(data: ReportData) -> Iterator[Figure]:
 def map_tables(
     values: NDArray[Any], name: str, stderr: NDArray[Any] | None, known: Ordered
 ) -> tuple[DataTable, ...]:
-    """Return a map (y, x) with its standard errors, and the histogram of its known values where one is drawn.
-
-    Args:
-        values: the map, NaN where there is no value.
-        name: in the store, e.g. ``"dark_current"``.
-        stderr: standard errors of the values; None: not known.
-        known: the values in increasing order.
-    """
+    """Return a map (y, x) with its standard errors, and the histogram of its known values if one is drawn."""
     unit = stored_unit(name)
     columns = {name: values} if stderr is None else {name: values, "standard error": stderr}
     table = DataTable(columns, dict.fromkeys(columns, unit))

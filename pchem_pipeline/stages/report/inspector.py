@@ -144,7 +144,7 @@ def read_maps(
         store: the run.
         shape: of the sensor.
         index: ``y * nx + x`` of the pixels that are held in full.
-        loaded: maps that were read already, by path; None: none.
+        loaded: maps that were read already, by path.
         threads: that pack a map each.
 
     Returns:
@@ -242,12 +242,7 @@ def _multiple_of_exposure(maps: Arrays, path: str) -> tuple[str, float] | None:
 
 
 def deciding_parameters(columns: Sequence[FloatArray], model: FittedModel) -> FloatArray | None:
-    """Return the parameters whose thresholds are drawn, (4, n); None where these are the fitted ones.
-
-    Args:
-        columns: (H, g, mu, sigma) of n pixels, NaN without parameters.
-        model: of these pixels.
-    """
+    """Return the parameters whose thresholds are drawn, (4, n); None if they are the fitted ``columns``."""
     if not model.effects:
         return None
     known = np.flatnonzero(np.isfinite(columns).all(axis=0))

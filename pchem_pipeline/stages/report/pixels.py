@@ -105,7 +105,7 @@ def pixel_fits(
         maps: parameters and standard errors, (y, x); anything that is indexed so.
         fit: ``fit_status`` and ``goodness_p``, likewise.
         histograms: of these pixels.
-        masses: of :func:`bin_masses`.
+        masses: from :func:`bin_masses`.
         channel: whether they are channels of ready-made histograms.
     """
     names = (*PARAMETERS, "read_noise_e")
@@ -135,12 +135,7 @@ def bin_masses(
 ) -> list[FloatArray]:
     """Return the probability of each bin of n pixels under a model with effects; NaN without parameters.
 
-    None are returned under a model without effects, whose law is the PCD.
-
-    Args:
-        columns: (H, g, mu, sigma), shape (n,) each.
-        histograms: of these pixels.
-        model: of these pixels.
+    None are returned under a model without effects, whose law is the PCD. ``columns`` are (H, g, mu, sigma).
     """
     counts = histograms.counts
     if not counts or not model.effects:

@@ -105,13 +105,7 @@ def gather(
     stages: Sequence[Mapping[str, Any]],
     hand: Beside = functools.cache,
 ) -> ReportData:
-    """Read all that the report shows.
-
-    Args:
-        store: the run.
-        config: its configuration.
-        stages: rows of the table of stages.
-        hand: takes what can be done meanwhile: single pixels, and packing maps for the inspector.
+    """Read all that the report shows; ``hand`` takes what can be done meanwhile.
 
     Raises:
         StoreError: maps or histograms are missing.

@@ -81,13 +81,7 @@ class StoredRun:
 def read_run(
     store: RunStore, config: RunConfig, stages: Sequence[Mapping[str, Any]] = (), threads: int = 1
 ) -> StoredRun:
-    """Read all of a run but its histograms.
-
-    Args:
-        store: the run.
-        config: its configuration.
-        stages: rows of the table of stages.
-        threads: that read an array each.
+    """Read all of a run but its histograms; each thread reads an array.
 
     Raises:
         StoreError: an array is missing or corrupt.
@@ -173,11 +167,9 @@ def verdict_data(found: Verdict, arrays: Arrays) -> DiscrepancyData:
 
 
 def plan_section(maps: Arrays, n_frames: int | None) -> dict[str, Any] | None:
-    """Return the frames that precisions need at the median pixel, or None where no pixel has a value.
+    """Return the frames that precisions need at the median pixel, and what the frames of the run reach.
 
-    Args:
-        maps: of the run.
-        n_frames: frames of the run, or None where pixels differ.
+    None where no pixel has a value.
     """
     names = ("quanta_exposure", "read_noise_e", "conversion_gain")
     medians = [median_of(maps[name]) for name in names if name in maps]
@@ -286,12 +278,7 @@ class PixelHistograms:
 
 
 def read_histograms(store: RunStore, index: IntArray, shape: tuple[int, int]) -> PixelHistograms:
-    """Read the histograms of pixels.
-
-    Args:
-        store: the run.
-        index: ``y * nx + x`` of each.
-        shape: of the sensor.
+    """Read the histograms of the pixels with these places ``y * nx + x``.
 
     Raises:
         StoreError: an array is missing or corrupt.
