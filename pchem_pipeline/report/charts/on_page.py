@@ -66,19 +66,13 @@ def _stack(stack: Stack) -> dict[str, Any]:
 
 def _axis(axis: Axis, ends: Ends) -> dict[str, Any]:
     """Return an axis; what it has as every other is left out."""
-    found: dict[str, Any] = {
+    ticks = [[place, without_formulas(text)] for place, text in axis.ticks]
+    rest = {"log": axis.log, "linear": axis.linear_to, "whole": axis.whole, "ticks": ticks}
+    return {
         "label": without_formulas(axis.label),
         "ends": rounded(np.asarray(ends), ends, axis.log),
+        **{name: value for name, value in rest.items() if value},
     }
-    if axis.log:
-        found["log"] = True
-    if axis.linear_to:
-        found["linear"] = axis.linear_to
-    if axis.whole:
-        found["whole"] = True
-    if axis.ticks:
-        found["ticks"] = [[place, without_formulas(text)] for place, text in axis.ticks]
-    return found
 
 
 def _panel(panel: Panel, x: Axis, across: Ends) -> dict[str, Any]:

@@ -261,13 +261,12 @@ def draw_panels(given: Any, chart: Chart) -> None:
             f"ax: {what}; give {len(panels)} axes of matplotlib, such as plt.subplots({len(panels)})[1]"
         )
     for axes, (stack, panel) in zip(several, panels, strict=True):
-        inch = axes.figure.dpi
-        own = 25.4 * axes.get_window_extent().width / inch
-        look = Look(25.4 * axes.figure.bbox.width / inch)
+        whole, width = (
+            25.4 * box.width / axes.figure.dpi for box in (axes.figure.bbox, axes.get_window_extent())
+        )
         with mpl.rc_context({"legend.fontsize": "small", "legend.frameon": False}):
-            shown = replace(panel, y=tick_rows(panel.y, own))
-            handles = _draw_panel(axes, shown, stack, look, last=panel is stack.panels[-1])
-            if keys := _keys(chart, Look(own)):
+            handles = _draw_panel(axes, panel, stack, Look(whole), width)
+            if keys := _keys(chart, width):
                 axes.legend([*keys.values()], [*keys], loc="upper left", bbox_to_anchor=(0.0, -0.2))
             elif any(chart.legend) and handles:
                 axes.legend([*handles.values()], [*handles])
@@ -277,17 +276,17 @@ def draw_panels(given: Any, chart: Chart) -> None:
 
 def _drawn(look: Look, chart: Chart) -> Drawing:
     columns = len(chart.widths) if look.wide else 1
-    stacks = [stack for stack in chart.stacks if look.wide or not stack.wide]
-    rows = [stacks[i : i + columns] for i in range(0, len(stacks), columns)]
-    titles = {id(stack): _broken(stack.title, look.width_mm / columns - _BESIDE_MM) for stack in stacks}
-    heights = [
-        max(
-            height_of(stack, look.width_mm / columns) + _LINE_MM * titles[id(stack)].count("\n")
-            for stack in row
-        )
-        for row in rows
+    width = look.width_mm / columns
+    stacks = [
+        replace(stack, title=_broken(stack.title, width - _BESIDE_MM))
+        for stack in chart.stacks
+        if look.wide or not stack.wide
     ]
-    keys = _keys(chart, look)
+    rows = [stacks[i : i + columns] for i in range(0, len(stacks), columns)]
+    heights = [
+        max(height_of(each, width) + _LINE_MM * each.title.count("\n") for each in row) for row in rows
+    ]
+    keys = _keys(chart, look.width_mm)
     lines = sum(1 + text.count("\n") for text in keys)
     height_mm = sum(heights) + (5.0 + _LINE_MM * lines if keys else 0.0)
     drawing = Drawing(figsize=(look.width_mm / 25.4, height_mm / 25.4), layout="constrained")
@@ -303,10 +302,9 @@ def _drawn(look: Look, chart: Chart) -> Drawing:
         first: Axes | None = None
         for i, panel in enumerate(stack.panels):
             axes = drawing.add_subplot(inner[i], sharex=first)
-            panel = replace(panel, y=tick_rows(panel.y, look.width_mm / columns))
-            handles |= _draw_panel(axes, panel, stack, look, last=i == len(stack.panels) - 1)
+            handles |= _draw_panel(axes, panel, stack, look, width)
             if first is None:
-                axes.set_title(titles[id(stack)], fontsize=7.0 if "\n" in titles[id(stack)] else None)
+                axes.set_title(stack.title, fontsize=7.0 if "\n" in stack.title else None)
             first = first or axes
     if keys:
         drawing.legend(handles=[*keys.values()], labels=[*keys], loc="outside lower left")
@@ -318,14 +316,10 @@ def _drawn(look: Look, chart: Chart) -> Drawing:
     return drawing
 
 
-def _keys(chart: Chart, look: Look) -> dict[str, Handle]:
+def _keys(chart: Chart, width_mm: float) -> dict[str, Handle]:
     """Return what the legend shows of colours that have a meaning, by this in lines that fit."""
-    return {
-        textwrap.fill(text, int(_LETTERS * look.width_mm)): Patch(
-            facecolor=colour_of(colour), edgecolor="#888888"
-        )
-        for colour, text in chart.keys
-    }
+    keys = ((textwrap.fill(text, int(_LETTERS * width_mm)), colour) for colour, text in chart.keys)
+    return {text: Patch(facecolor=colour_of(colour), edgecolor="#888888") for text, colour in keys}
 
 
 def _broken(title: str, width_mm: float) -> str:
@@ -338,10 +332,10 @@ def _broken(title: str, width_mm: float) -> str:
     return "\n".join(lines)
 
 
-def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, *, last: bool) -> dict[str, Handle]:
-    """Draw a panel and return what its legend shows by label; one of its own is drawn here."""
+def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, width_mm: float) -> dict[str, Handle]:
+    """Draw a panel and return what the legend shows by label; a legend of the panel alone is drawn here."""
     most = 5 if any(isinstance(mark, Image) for mark in panel.marks) else 8
-    both = (("x", stack.x), ("y", panel.y))
+    both = (("x", stack.x), ("y", tick_rows(panel.y, width_mm)))
     for name, axis in both:
         _scale(axes, name, axis, most)
         if axis.low is not None and axis.high is not None:
@@ -358,7 +352,7 @@ def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, *, last: boo
     if room != 1.0:
         axes.set_ylim(top=room * axes.get_ylim()[1])
     axes.set(ylabel=panel.y.label)
-    if last:
+    if panel is stack.panels[-1]:
         axes.set(xlabel=stack.x.label)
     else:
         axes.tick_params(labelbottom=False)

@@ -201,7 +201,7 @@ def _frames_chart(means: DataTable, power: DataTable) -> Chart:
 
 
 def _series(
-    x: FloatArray, y: FloatArray, ends: Sequence[FloatArray], what: str, axis: str, width: float
+    x: FloatArray, y: FloatArray, ends: tuple[FloatArray, FloatArray], what: str, axis: str, width: float
 ) -> Stack:
     """Return a series in DN over the band of 2 sigma of sampling noise."""
     band = Band(x, *ends, colour="band", label="±2 sigma")
@@ -213,8 +213,9 @@ def _profiles_chart(tables: Sequence[DataTable]) -> Chart:
     """Return the chart of the profiles of rows and columns."""
     stacks = []
     for table in tables:
-        name, (place, median, *ends) = next(iter(table.columns)), (table[each] for each in table.columns)
-        stacks.append(_series(place, median, ends, "median", f"{table.part} {name} (pixel)", 0.8))
+        name, ends = next(iter(table.columns)), (table["expected from"], table["expected to"])
+        axis = f"{table.part} {name} (pixel)"
+        stacks.append(_series(table[name], table["mean signal"], ends, "median", axis, 0.8))
     return Chart(tuple(stacks))
 
 

@@ -532,10 +532,10 @@ def _remarks(data: DiscrepancyData) -> Iterator[Flag]:
     if extended:
         yield from _closing(found)
     for step in extended:
-        rival = step.runner_up
-        if rival is not None and rival.why:
-            titles = f"{data.title(step.likeliest)}, {data.title(rival.effect)}"
-            yield Flag("note", f"The next best effect instead of {titles}, is rejected, since {rival.why}.")
+        second = step.runner_up
+        if second is not None and second.why:
+            titles = f"{data.title(step.likeliest)}, {data.title(second.effect)}"
+            yield Flag("note", f"The next best effect instead of {titles}, is rejected, since {second.why}.")
     for step in found.steps:
         for rival, measurement in step.separate.items() if step.verdict == "ambiguous" else ():
             yield Flag("note", f"To distinguish {data.title(rival)}: {measurement}.")
