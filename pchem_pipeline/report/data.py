@@ -176,7 +176,6 @@ class ReportData:
     """All that a report shows.
 
     Attributes:
-        title: heading of the report.
         kind: what made the charge: dark, light or unknown.
         shape: ``(ny, nx)`` of the sensor or region; ``(1, n_channels)`` for ready-made histograms.
         n_frames: frames per pixel, or None if pixels differ or it is unknown.
@@ -184,7 +183,6 @@ class ReportData:
         camera: name, serial number and temperature of the sensor as the files say; empty where they do not.
         maps: ``name`` and ``name_stderr`` of ``variables.py`` group ``maps`` (y, x); NaN where a fit failed.
         fit: ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... (y, x).
-        criteria: limits of the sensor.
         pixels: the shown pixels.
         ensemble: arrays of group ``ensemble``.
         ensemble_facts: numbers that go with them: ``rmse`` (mapping), ``n_frames``, ``error_rate``, ...
@@ -197,7 +195,6 @@ class ReportData:
         channel_names: names of the channels of ready-made histograms.
         outlier_sigmas: robust standard deviations beyond which a pixel is an outlier.
         allowed_failed: fraction of pixels without a value that is accepted.
-        config_yaml: the resolved configuration.
         run: identity of the run: name, started, host, versions, seed, ...
         inputs: one mapping per input file: name, size, hash, ...
         stages: one mapping per stage: ``stage``, ``state``, ``seconds``, ``cpu_seconds``,
@@ -216,7 +213,6 @@ class ReportData:
         methods: content of ``methods.json``, or None where nobody compared.
         plan: frames that precisions need, or None where no pixel has a value.
         samples: the exposures of a run whose input is several samples, or None.
-        regions: parts of the sensor that have a name.
     """
 
     title: str

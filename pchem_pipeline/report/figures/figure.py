@@ -99,11 +99,9 @@ class Figure:
     Attributes:
         name: name of its files.
         section: id of the section that shows it.
-        title: heading on the page.
         caption: what is drawn and how to read it.
         alt: what a reader who does not see it should know, with the numbers.
         tables: its data, the main part first.
-        chart: what is drawn.
         width_mm: width at which it is saved.
     """
 

@@ -104,8 +104,6 @@ class Section:
 
     Attributes:
         id: anchor in the page.
-        title: heading.
-        intro: introduction.
         empty: sentence where there is nothing to show; empty: the section is left out.
         name: in the table of contents; empty: the title.
         verdict: what came out.

@@ -30,7 +30,7 @@ from pchem_pipeline.report.pages.summary import (
     pixel_counts,
     sentence,
 )
-from pchem_pipeline.report.pages.tables import Table, method_tables, provenance_tables, result_tables
+from pchem_pipeline.report.pages.tables import Table, method_tables, result_tables
 
 #: The sections from top to bottom.
 PAGE = (
@@ -181,8 +181,7 @@ def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, st
     others = discrepancy_figures(data.discrepancy)
     drawn = (draw or draw_here)([*shown, *others])
     verdict = None if data.discrepancy is None else finding(data.discrepancy)
-    makers = (result_tables, method_tables, emva_tables, provenance_tables)
-    tables = [table for make in makers for table in make(data)]
+    tables = [*result_tables(data), *method_tables(data), *emva_tables(data)]
     sections = _page_sections(data, shown, tables, verdict)
     files = {}
     if data.discrepancy is not None and verdict is not None:

@@ -54,10 +54,10 @@ class Table:
 
 
 def result_tables(data: ReportData) -> list[Table]:
-    """Return the tables of results that the data allow."""
+    """Return the tables that the data allow: of results, and of what was run on what."""
     makers = (
         _channels, _parameters, _regions, _overscan, _flagged, _against_truth, _moments, _misfits, _intervals,
-        _samples, _plan, _quick_look,
+        _samples, _plan, _quick_look, _run, _stages, _inputs,
     )  # fmt: skip
     return [table for make in makers if (table := make(data)) is not None and table.rows]
 
@@ -391,15 +391,12 @@ def _plan(data: ReportData) -> Table | None:
         return None
     rows = []
     for row in plan["rows"]:
-        reached = plan["reached"].get(row["name"])
+        target = row["target"].replace("_e to", " (e⁻) to").replace("_", " ").replace("e-", "e⁻")
+        frames = f"{row['frames']:,.0f}" if math.isfinite(row["frames"]) else "none suffice"
         unit, scale = ("e⁻", 1.0) if row["name"] == "bias" else ("%", 100.0)
-        rows.append(
-            {
-                "precision": row["target"].replace("_e to", " (e⁻) to").replace("_", " ").replace("e-", "e⁻"),
-                "frames needed": f"{row['frames']:,.0f}" if math.isfinite(row["frames"]) else "none suffice",
-                "this run's": "" if reached is None else f"{short(scale * reached, 2)} {unit}",
-            }
-        )
+        reached = plan["reached"].get(row["name"])
+        text = "" if reached is None else f"{short(scale * reached, 2)} {unit}"
+        rows.append({"precision": target, "frames needed": frames, "this run's": text})
     return Table(
         "plan-table",
         "Frames for a precision",
@@ -409,14 +406,6 @@ def _plan(data: ReportData) -> Table | None:
         rows,
         "plan",
     )
-
-
-_SECTION = "provenance"
-
-
-def provenance_tables(data: ReportData) -> list[Table]:
-    """Return the tables of what was run on what."""
-    return [table for make in (_run, _stages, _inputs) if (table := make(data)).rows]
 
 
 def _bytes_text(size: float) -> str:
@@ -439,12 +428,12 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
 
 def _run(data: ReportData) -> Table:
     rows = [{"item": item, "value": value} for item, value in _flat(data.run)]
-    return Table("run", "Run", "Program and settings of this report.", rows, _SECTION)
+    return Table("run", "Run", "Program and settings of this report.", rows, "provenance")
 
 
 def _stages(data: ReportData) -> Table:
     words = "Wall time, CPU time and largest resident memory of a process."
-    return Table("stages", "Stages", words, [_stage_row(stage) for stage in data.stages], _SECTION)
+    return Table("stages", "Stages", words, [_stage_row(stage) for stage in data.stages], "provenance")
 
 
 def _stage_row(stage: Mapping[str, Any]) -> Row:
@@ -462,7 +451,7 @@ def _stage_row(stage: Mapping[str, Any]) -> Row:
     }
 
 
-#: Files beyond this number are counted, not listed.
+#: Files that are listed at most.
 _MOST_FILES = 200
 
 
@@ -481,7 +470,7 @@ def _inputs(data: ReportData) -> Table:
             }
             for entry in data.inputs[:_MOST_FILES]
         ],
-        _SECTION,
+        "provenance",
     )
 
 
