@@ -415,10 +415,9 @@ def map_facts(entry: MapEntry) -> dict[str, Any]:
 
 def packed_facts(packed: PackedMap) -> dict[str, Any]:
     """Return what the script must know to read a packed map."""
-    scale, bars = packed.scale, packed.bars
-    found: dict[str, Any] = {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": packed.n_odd}
-    if bars is not None:
-        found["bars"] = {"first": bars.first, "parts": bars.parts, "counts": bars.counts.tolist()}
+    found: dict[str, Any] = vars(packed.scale) | {"nOdd": packed.n_odd}
+    if packed.bars is not None:
+        found["bars"] = vars(packed.bars) | {"counts": packed.bars.counts.tolist()}
     return found
 
 

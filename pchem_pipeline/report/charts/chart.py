@@ -189,7 +189,6 @@ class Image(Mark):
         x: left and right end on the axis of x.
         y: end of the first and of the last row on the upright axis.
         scale: name of a scale of colours, or the colours themselves, one more than edges.
-        none: colour of pixels without a value.
         ends: values with the first and the last colour, in equal steps between; others have the nearest one.
         edges: instead of these the values between one colour and the next, rising.
         bar: places along a bar of the colours, 0 to 1, and their texts; empty: as the renderer finds them.
@@ -201,7 +200,6 @@ class Image(Mark):
     x: tuple[float, float]
     y: tuple[float, float]
     scale: str | tuple[str, ...] = ""
-    none: str = "no_value"
     ends: tuple[float, float] = (0.0, 1.0)
     edges: Values | None = None
     bar: tuple[tuple[float, str], ...] = ()

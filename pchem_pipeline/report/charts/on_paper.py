@@ -471,9 +471,9 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
     beside = axes.get_subplotspec()
     columns = 1 if beside is None else beside.get_topmost_subplotspec().get_gridspec().ncols
     values, x, y = mark.shown(look.width_mm / 25.4 * look.dpi / columns)
-    colours = _colours(mark).with_extremes(bad=colour_of(mark.none))
+    colours = _colours(mark).with_extremes(bad=LIGHT.no_value)
     low, high = mark.ends
-    axes.set_facecolor(colour_of(mark.none))
+    axes.set_facecolor(LIGHT.no_value)
     # a vector file keeps the pixels as they are, but for more of them than it can show
     kept = "none" if max(mark.values.shape) <= _MOST_KEPT else "nearest"
     image = axes.imshow(

@@ -193,7 +193,7 @@ def sensor_stack(
         ring: colour of the rings.
         origin: row and column of the first pixel.
         title: heading of the map.
-        colours: ``scale``, ``none`` and ``whole`` of :class:`Image`.
+        colours: ``scale`` and ``whole`` of :class:`Image`.
     """
     rings = np.zeros(values.shape, bool) if ringed is None else ringed
     style: dict[str, Any] = {"size": 5.0, "face": "none", "colour": ring}

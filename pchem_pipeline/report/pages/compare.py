@@ -252,7 +252,18 @@ def run_table(found: Comparison) -> Table:
 
 def pair_tables(pair: Pair) -> list[Table]:
     """Return the tables of a run against the first one; empty ones are left out."""
-    tables = (_map_table(pair), _defects(pair), _transitions(pair), _settings(pair), _versions(pair))
+    settings = [
+        _both("setting", pair, each) | {"read by": ", ".join(each.stages) or "no stage"}
+        for each in pair.settings
+    ]
+    versions = [_both("program or algorithm", pair, each) for each in pair.versions]
+    tables = (
+        _map_table(pair),
+        _defects(pair),
+        _transitions(pair),
+        Table(f"settings-{pair.key}", "Settings that differ", "", settings),
+        Table(f"versions-{pair.key}", "Versions that differ", "", versions),
+    )
     return [table for table in tables if table.rows]
 
 
@@ -307,19 +318,6 @@ def _transitions(pair: Pair) -> Table:
         for grade, row in zip(_GRADES, pair.transitions, strict=False)
     ]
     return Table(f"quality-{pair.key}", "Pixels by quality", "", rows)
-
-
-def _settings(pair: Pair) -> Table:
-    rows = [
-        _both("setting", pair, each) | {"read by": ", ".join(each.stages) or "no stage"}
-        for each in pair.settings
-    ]
-    return Table(f"settings-{pair.key}", "Settings that differ", "", rows)
-
-
-def _versions(pair: Pair) -> Table:
-    rows = [_both("program or algorithm", pair, each) for each in pair.versions]
-    return Table(f"versions-{pair.key}", "Versions that differ", "", rows)
 
 
 def _both(what: str, pair: Pair, each: Setting) -> dict[str, str]:

@@ -317,13 +317,7 @@ def _intervals(data: ReportData) -> Table:
             f" Profile: distance of the ends of the {100 * data.interval_level:g} % profile-likelihood "
             "interval from the estimate, in standard errors."
         )
-    return Table(
-        "uncertainties",
-        "Uncertainties",
-        words,
-        list(_interval_rows(data)),
-        "uncertainty",
-    )
+    return Table("uncertainties", "Uncertainties", words, list(_interval_rows(data)), "uncertainty")
 
 
 def _interval_rows(data: ReportData) -> Iterator[Row]:
@@ -414,21 +408,18 @@ def _bytes_text(size: float) -> str:
     return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    rows: list[tuple[str, str]] = []
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[Row]:
     for key, value in values.items():
         if isinstance(value, Mapping):
-            rows += _flat(value, f"{prefix}{key}: ")
-        elif isinstance(value, Sequence) and not isinstance(value, str):
-            rows.append((f"{prefix}{key}", ", ".join(str(item) for item in value)))
+            yield from _flat(value, f"{prefix}{key}: ")
         else:
-            rows.append((f"{prefix}{key}", "not known" if value is None else str(value)))
-    return rows
+            several = isinstance(value, Sequence) and not isinstance(value, str)
+            text = ", ".join(map(str, value)) if several else "not known" if value is None else str(value)
+            yield {"item": f"{prefix}{key}", "value": text}
 
 
 def _run(data: ReportData) -> Table:
-    rows = [{"item": item, "value": value} for item, value in _flat(data.run)]
-    return Table("run", "Run", "Program and settings of this report.", rows, "provenance")
+    return Table("run", "Run", "Program and settings of this report.", list(_flat(data.run)), "provenance")
 
 
 def _stages(data: ReportData) -> Table:

@@ -90,15 +90,14 @@ def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[MapEntry]:
     These are their words; the maps themselves are not read.
     """
     known = [variable for variable in VARIABLES.values() if variable.dims == ("y", "x")]
-    groups = [*_GROUPS, *dict.fromkeys(v.group for v in known if v.group not in _GROUPS)]
-    places = {path: i for i, path in enumerate(VARIABLES)}
-    known.sort(key=lambda variable: (groups.index(variable.group), places[variable.path]))
-    found = []
-    for variable in known:
-        repeated = variable.group == "fit" and f"maps/{variable.name}" in VARIABLES
-        if not repeated and store.has(variable.path) and store.array(variable.path).shape == shape:
-            found.append(_entry(variable))
-    return found
+    groups = list(dict.fromkeys((*_GROUPS, *(variable.group for variable in known))))
+    return [
+        _entry(variable)
+        for variable in sorted(known, key=lambda variable: groups.index(variable.group))
+        if not (variable.group == "fit" and f"maps/{variable.name}" in VARIABLES)
+        and store.has(variable.path)
+        and store.array(variable.path).shape == shape
+    ]
 
 
 def _entry(variable: Variable) -> MapEntry:
