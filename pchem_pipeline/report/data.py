@@ -105,12 +105,7 @@ class PixelFit:
 
 @dataclass(frozen=True)
 class DiscrepancyData:
-    """A verdict on what the model is missing, with the arrays that show it.
-
-    Attributes:
-        found: the verdict.
-        arrays: arrays of group ``discrepancy`` by name; any may lack.
-    """
+    """A verdict on what the model is missing, and arrays of group ``discrepancy``, of which any may lack."""
 
     found: Verdict
     arrays: Arrays = field(default_factory=dict)
@@ -136,7 +131,6 @@ class Sample:
     """One exposure of the sensor.
 
     Attributes:
-        name: of the sample.
         kind: ``exposed``, or ``bias`` for frames without electrons.
         x: integration time or light level; None where it is not on the line.
         n_frames: frames of a pixel.

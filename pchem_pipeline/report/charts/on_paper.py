@@ -78,6 +78,9 @@ _STYLE: Any = {
     "xtick.major.width": 0.6,
     "ytick.labelsize": 7.0,
     "ytick.major.width": 0.6,
+    "axes.edgecolor": LIGHT.edge,
+    **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), LIGHT.ink),
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), LIGHT.paper),
 }
 
 _METADATA: dict[str, dict[str, Any]] = {
@@ -137,7 +140,7 @@ def _in(look: Look) -> Iterator[None]:
     with mpl.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         mpl.rcdefaults()
-        mpl.rcParams.update(_STYLE | LIGHT.parameters())
+        mpl.rcParams.update(_STYLE)
         mpl.rcParams["svg.fonttype"] = "none" if look.svg_text else "path"
         if look.style:
             from matplotlib import style  # reads all sheets of matplotlib

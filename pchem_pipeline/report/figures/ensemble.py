@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, FloatArray
-from pchem_pipeline.base.wording import measured, percent, power_of_ten, scientific, short
+from pchem_pipeline.base.wording import measured, percent, power_of_ten, scientific, short, unit_text
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
     Axis,
@@ -117,7 +117,7 @@ def component_figures(data: ReportData) -> Iterator[Figure]:
     variance = data.ensemble.get("component_variance")
     if variance is None or not np.isfinite(variance).any():
         return
-    cases = data.component_cases or [f"case {i}" for i in range(variance.shape[0])]
+    cases = data.component_cases
     table = component_table(variance, cases, data.ensemble.get("nuced_component_variance"))
     width = table[_held(cases[0])]
     yield Figure(
@@ -192,7 +192,7 @@ class _Drawn:
 
     def __init__(self, table: DataTable, rmse: Mapping[str, float], n_frames: int | None) -> None:
         _, axis, data, model, unit, words, self.title = next(h for h in HALVES if h.part == table.part)
-        self.unit = unit.replace("e-", "e⁻")
+        self.unit = unit_text(unit)
         self.x = table[axis].astype(np.float64)
         self.step = float(np.median(np.diff(self.x))) if self.x.size > 1 else 1.0
         self.counts = table["counts"].astype(np.float64)

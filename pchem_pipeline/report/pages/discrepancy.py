@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from pchem_pipeline.base.wording import (
+    MAPS,
     capitalised,
     count,
     fitted_or_chosen,
@@ -49,12 +50,8 @@ _SURVEYED = {
 }
 
 
-def parameter_name(name: str) -> str:
-    """Return the name of a map in words."""
-    try:
-        return symbol(name)[1]
-    except KeyError:
-        return name.replace("_", " ")
+def _parameter_name(name: str) -> str:
+    return symbol(name)[1] if name in MAPS else name.replace("_", " ")
 
 
 def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
@@ -248,7 +245,7 @@ def _moved(found: Verdict) -> Table:
             unit = unit_text(each.unit)
             rows.append(
                 {
-                    "parameter": f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
+                    "parameter": f"{_parameter_name(name)}{f' ({unit})' if unit else ''}",
                     "effect added": " + ".join(f"{one.likeliest}{_how(one, found)}" for one in together),
                     "change": short(each.median, 2) if abs(each.in_stderr) >= _NOT_MOVED else "0",
                     "in standard errors": signed(each.in_stderr),
@@ -496,7 +493,7 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
     small = ", negligible" if abs(largest.in_stderr) < _IMMATERIAL else ""
     return [
         KeyFact(
-            f"largest change: {parameter_name(name)}",
+            f"largest change: {_parameter_name(name)}",
             f"{_signed(largest.median, 2)} {unit}".strip(),
             (f"{_signed(largest.in_stderr, 2)} standard errors of one pixel{small}",),
         )

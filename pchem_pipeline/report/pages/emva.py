@@ -95,7 +95,7 @@ def emva_rows(
         kind: what made the charge: dark, light or unknown.
         defects: pixels that are not ordinary.
         outlier_sigmas: robust standard deviations above the median H from which a pixel is hot.
-        samples: several exposures of the pixels.
+        samples: exposures that were fitted together.
     """
     kept = (status & int(FAILED | FLAGGED)) == 0
 

@@ -123,7 +123,6 @@ def map_colours(known: Ordered) -> tuple[FloatArray, tuple[tuple[float, str], ..
 
 def _labels(physical: FloatArray) -> list[str]:
     """Return texts with as many digits as tell the middle labels apart."""
-    texts: list[str] = []
     for digits in range(3, 8):
         texts = [short(float(value), digits) for value in physical]
         if len(set(texts)) == len(set(physical.tolist())):

@@ -59,14 +59,7 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A run as it is stored.
-
-    Attributes:
-        store: where.
-        sensor: its input.
-        model: of the fit.
-        data: all that its report shows, but single pixels and what is made of sums over frames.
-    """
+    """A run as it is stored; ``data`` is its report without single pixels and what is made of frame sums."""
 
     store: RunStore
     sensor: SensorInfo
