@@ -64,7 +64,6 @@ class Mark:
     """What all marks have.
 
     Attributes:
-        colour: of the mark.
         label: in the legend; on the page its values are shown below it.
         listed: whether the legend on paper has it too.
         width: of its line, points (1/72 inch).

@@ -225,8 +225,6 @@ def small_png(png: bytes) -> bytes:
 _LINE_MM, _LETTERS, _BESIDE_MM = 3.5, 0.66, 12.0
 #: Rows or columns of a map up to which a vector file keeps each pixel.
 _MOST_KEPT = 800
-#: Ticks of a bar of colours at most.
-_BAR_TICKS = 5
 _DASHES: dict[Dash, Any] = {"-...": (0, (5, 1, 1, 1, 1, 1)), "..": (0, (1, 1))}
 #: Points beyond which they are an image in a vector file.
 _MOST_POINTS = 1000
@@ -485,7 +483,7 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
     )  # fmt: skip
     if mark.unit:
         places, texts = [place for place, _ in mark.bar], [text for _, text in mark.bar]
-        ticks: Any = places or MaxNLocator(_BAR_TICKS, integer=mark.whole)
+        ticks: Any = places or MaxNLocator(5, integer=mark.whole)
         bar = axes.figure.colorbar(image, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), ticks=ticks)
         if texts:
             bar.ax.set_yticklabels(texts)

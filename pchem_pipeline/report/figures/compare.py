@@ -18,6 +18,7 @@ from pchem_pipeline.base.wording import (
     power_of_ten,
     short,
     signed,
+    stored_unit,
     symbol,
     unit_text,
 )
@@ -223,7 +224,7 @@ def history_figures(rows: Sequence[HistoryRow]) -> Iterator[Figure]:
     for name in shown:
         for words, part in parts.items():
             columns[f"{name} {words}"] = [float(row[f"{name}_{part}"] or "nan") for row in rows]
-            units[f"{name} {words}"] = symbol(name)[2].replace("e⁻", "e-")
+            units[f"{name} {words}"] = stored_unit(name)
     table = DataTable(columns, units)
     words = "; ".join(
         f"{noun} from {short(medians[0])} to {short(medians[-1])} {unit}"

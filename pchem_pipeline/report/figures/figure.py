@@ -184,16 +184,9 @@ def sensor_stack(
 ) -> Stack:
     """Return a value of each pixel as a map with a bar of its colours, of a line of channels as points.
 
-    Args:
-        values: (y, x), NaN where there is none.
-        ends: values with the first and the last colour.
-        label: what the values are, with their unit.
-        others: marks over the map.
-        ringed: pixels that are marked, (y, x).
-        ring: colour of the rings.
-        origin: row and column of the first pixel.
-        title: heading of the map.
-        colours: ``scale`` and ``whole`` of :class:`Image`.
+    Over the map are the other marks, and rings of colour ``ring`` at some pixels. Maps are (y, x) with the
+    first pixel at the row and column ``origin``; ``ends`` have the first and the last colour; ``colours`` are
+    ``scale`` and ``whole`` of :class:`Image`.
     """
     rings = np.zeros(values.shape, bool) if ringed is None else ringed
     style: dict[str, Any] = {"size": 5.0, "face": "none", "colour": ring}

@@ -433,17 +433,13 @@ def frames_text(found: Verdict) -> str:
     rest = seen.frames - seen.train - seen.test - seen.final
     over = f"; {rest} unused" if rest > 0 else ""
     words = f"{count(seen.frames, 'frame')} of {place}{share}: {dealt}{over}."
-    again = "" if seen.elsewhere is None else f" The final model was {seen.elsewhere.says()}."
-    return words + again + _unfitted_text(found)
-
-
-def _unfitted_text(found: Verdict) -> str:
-    seen = found.examined
-    if not seen.unfitted:
-        return ""
-    spot = next((place for place in seen.places if place.map == "unfitted"), None)
-    where = "" if spot is None else f", clustered in {Region.model_validate(spot.region).describe()}"
-    return f" Not compared: {count(seen.unfitted, 'pixel')} without a reliable fit{where}."
+    if seen.elsewhere is not None:
+        words += f" The final model was {seen.elsewhere.says()}."
+    if seen.unfitted:
+        spot = next((place for place in seen.places if place.map == "unfitted"), None)
+        where = "" if spot is None else f", clustered in {Region.model_validate(spot.region).describe()}"
+        words += f" Not compared: {count(seen.unfitted, 'pixel')} without a reliable fit{where}."
+    return words
 
 
 def key_facts(data: DiscrepancyData) -> list[KeyFact]:

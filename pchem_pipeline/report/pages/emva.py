@@ -89,13 +89,8 @@ def emva_rows(
 ) -> list[EmvaRow]:
     """Return the table of a run; pixels without a value and flagged ones are left out.
 
-    Args:
-        stored: the maps with their standard errors by name, (y, x).
-        status: status words of the fit, (y, x).
-        kind: what made the charge: dark, light or unknown.
-        defects: pixels that are not ordinary.
-        outlier_sigmas: robust standard deviations above the median H from which a pixel is hot.
-        samples: exposures that were fitted together.
+    Maps, their standard errors and the status words of the fit are (y, x). ``kind`` is what made the charge:
+    dark, light or unknown; hot pixels are ``outlier_sigmas`` robust standard deviations above the median H.
     """
     kept = (status & int(FAILED | FLAGGED)) == 0
 

@@ -175,14 +175,9 @@ def draw_here(figures: Sequence[Figure]) -> dict[str, Drawn]:
 def render_page(
     name: str, sections: Sequence[Section], drawn: Mapping[str, Drawn], /, *scripts: str, **content: Any
 ) -> str:
-    """Return a page as HTML, complete in itself.
+    """Return a page as HTML, complete in itself; its template extends ``page.html.j2``.
 
-    Args:
-        name: of its template, which extends ``page.html.j2``.
-        sections: from top to bottom.
-        drawn: their figures, by name.
-        scripts: further ones that its template holds.
-        content: what its template shows.
+    ``drawn`` are the figures by name, ``scripts`` further ones in the template, ``content`` what it shows.
     """
     figures = [figure for section in sections for figure in section.figures]
     charts = {figure.name: figure.chart for figure in figures if not figure.chart.still}

@@ -98,15 +98,9 @@ def pixel_fits(
     *,
     channel: bool = False,
 ) -> list[PixelFit]:
-    """Return histograms and fits of chosen pixels.
+    """Return histograms and fits of chosen pixels; ``channel``: they are channels of ready-made histograms.
 
-    Args:
-        chosen: label, y and x of each.
-        maps: parameters and standard errors, (y, x); anything that is indexed so.
-        fit: ``fit_status`` and ``goodness_p``, likewise.
-        histograms: of these pixels.
-        masses: from :func:`bin_masses`.
-        channel: whether they are channels of ready-made histograms.
+    ``maps`` and ``fit`` are indexed by (y, x), ``masses`` are those of :func:`bin_masses`.
     """
     names = (*PARAMETERS, "read_noise_e")
     found = []
