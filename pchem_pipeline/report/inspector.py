@@ -51,13 +51,7 @@ class Scale:
 
 @dataclass(frozen=True)
 class Bars:
-    """Histogram of a map whose codes are too coarse to show one: bars narrower than a step.
-
-    Attributes:
-        first: code with whose values the bars begin.
-        parts: bars of a code.
-        counts: values in each bar.
-    """
+    """Histogram of a map whose codes are too coarse to show one: from code ``first`` on ``parts`` bars each."""
 
     first: int
     parts: int

@@ -33,8 +33,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
 
     The keys ``summary``, ``ensemble`` (with ``rmse``) and ``fit_status`` are always there.
     """
-    facts, remarks = dict(data.ensemble_facts), flags(data)
-    rmse = dict(facts.pop("rmse", {}))
+    remarks = flags(data)
     numbers: dict[str, Any] = plain(
         {
             "report_version": REPORT_VERSION,
@@ -58,7 +57,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
             },
             "fit_status": _fit_status(data),
             "goodness_of_fit": _goodness(data),
-            "ensemble": {"rmse": rmse, **facts},
+            "ensemble": {"rmse": {}, **data.ensemble_facts},
             "moments": list(data.moments),
             "electron_numbers": {
                 name.removeprefix("electron_"): data.ensemble[name]

@@ -205,16 +205,13 @@ def _run_facts(store: RunStore, sensor: SensorInfo, model: FittedModel, config: 
     }
     if config.simulate is not None:
         facts["seed of the simulation"] = config.simulate.seed
-    version = model.version
-    if version is not None and version.effects:
-        facts["model"] = model_words(version.effects)
-    if version is not None:
+    if (version := model.version) is not None:
+        if version.effects:
+            facts["model"] = model_words(version.effects)
         source = "search for missing effects" if version.source == "verdict" else "configuration"
         facts["version of the model"] = f"{version.number} (from the {source})"
-    record = store.records.read("report")
-    if record is not None:
-        facts["report made (UTC)"] = record.started
-        facts["versions"] = record.versions
+    if (record := store.records.read("report")) is not None:
+        facts |= {"report made (UTC)": record.started, "versions": record.versions}
     return facts
 
 
@@ -253,12 +250,9 @@ def _missing(name: str, sensor: SensorInfo, maps: Arrays, ensemble: Arrays, comp
 
 @dataclass(frozen=True)
 class PixelHistograms:
-    """Histograms of n pixels.
+    """Histograms of n pixels, all of one length: DN of the first bin, frames in each bin.
 
-    Attributes:
-        origin: DN of the first bin of each.
-        counts: frames in each bin, all of one length.
-        satellites: amplitude (e-) and weight of the satellite levels that their fits left free; (2, n).
+    ``satellites`` are amplitude (e-) and weight of the satellite levels that the fits left free, (2, n).
     """
 
     origin: IntArray
