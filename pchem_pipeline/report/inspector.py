@@ -51,7 +51,7 @@ class Scale:
 
 @dataclass(frozen=True)
 class Bars:
-    """Histogram of a map whose codes are too coarse to show one: from code ``first`` on ``parts`` bars each."""
+    """Histogram of a map whose codes are too coarse to show one: ``parts`` bars a code, from ``first`` on."""
 
     first: int
     parts: int
