@@ -139,12 +139,8 @@ def read_maps(
 ) -> tuple[list[MapEntry], dict[str, FloatArray]]:
     """Read every stored map: packed, the important ones first, until the page is full; exact for some pixels.
 
-    Args:
-        store: the run.
-        shape: of the sensor.
-        index: ``y * nx + x`` of the pixels that are held in full.
-        loaded: maps that were read already, by path.
-        threads: that pack a map each.
+    ``index`` is ``y * nx + x`` of these, ``loaded`` are maps that were read already, by path; each of the
+    threads packs a map.
 
     Returns:
         The maps, in the order of the list, and by path of those that fit their values, shape (n,).

@@ -154,16 +154,11 @@ def choose_inspected(
     everything: int = 4096,
     most: int = 2400,
 ) -> tuple[IntArray, list[Notable]]:
-    """Choose the pixels that are in the report in full.
+    """Choose the pixels that are in the report in full; ``maps`` and ``fit`` are (y, x).
 
-    Args:
-        maps: parameters and standard errors, (y, x), NaN where there is no value.
-        fit: ``fit_status``, and ``goodness_p`` where it is known, (y, x).
-        shown: pixels (y, x) that the report draws.
-        suspects: pixels (y, x) to which the discrepancy verdict points.
-        bins: of a histogram; all that are taken have at most `MAX_BINS` together.
-        everything: a sensor of at most so many pixels is taken whole.
-        most: number of pixels of a larger one.
+    These are the ``shown`` ones, the ``suspects`` of the search for missing effects, odd ones, and an even
+    sample. A sensor of at most ``everything`` pixels is taken whole, of a larger one ``most``; histograms of
+    so many ``bins`` have at most `MAX_BINS` together.
 
     Returns:
         ``y * nx + x`` of each, each once, the shown and odd ones first, shape (n,); and why they were chosen,
