@@ -152,6 +152,11 @@ def fitted_or_chosen(value: float, error: float, unit: str = "") -> str:
     return number + space + rest
 
 
+def capitalised(text: str) -> str:
+    """Return a text with its first letter as a capital, the others as they are."""
+    return text[:1].upper() + text[1:]
+
+
 def count(number: int, noun: str) -> str:
     """Return ``1 pixel``, ``2 pixels``, ``17,750 frames``."""
     plural = "" if number == 1 else "s"

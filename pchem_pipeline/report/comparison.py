@@ -19,15 +19,11 @@ class RunFacts:
 
     Attributes:
         label: A, B, ...
-        name: of its store.
-        shape: rows and columns.
-        n_frames: of each pixel, or None.
         digest: of the content of its input files.
         summary: map to median, its standard error and the robust scatter of the pixels, in the map's unit.
-        ensemble: arrays of the ensemble that are drawn.
-        rmse: RMSE of the predictions of the ensemble.
+        rmse: of the predictions of the ensemble.
         pixels: number of pixels with a good fit, with caution, and without a value.
-        identity: of its frames and how they were characterised.
+        identity: digest of its frames and of how they were characterised.
     """
 
     label: str
@@ -105,16 +101,13 @@ class Pair:
     """A run compared with the first one, or with the one before it in the history.
 
     Attributes:
-        one, other: the runs.
         since: what the first of them is to the second.
         same_data: both come from the same frames.
         arrays: every array of the results; empty where the frames differ.
         maps: map to its difference; empty where the shapes differ.
         reasons: map to why it changed, for runs on different frames.
         transitions: quality (good, caution, no value) of one by quality of the other: numbers of pixels.
-        settings: settings that differ.
-        versions: versions of programs and algorithms that differ.
-        changed: whether anything changed.
+        settings, versions: those that differ, of versions those of programs and algorithms.
         changes: what changed, one sentence each.
         defects: pixels with other defects in the other run.
         n_changed: pixels with other defects, or of which a value changed beyond its limit.

@@ -24,7 +24,7 @@ from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.verdict import Verdict
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_classes
-from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus, flags_of
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, flags_of
 from pchem_pipeline.model.maps.defects import Defects
 from pchem_pipeline.model.maps.maps import MapSummary, summarise
 from pchem_pipeline.model.maps.ordered import Ordered, median_of
@@ -99,18 +99,13 @@ class PixelFit:
 
     def text(self, name: str) -> str:
         """Return a parameter with its standard error and unit."""
-        nan = float("nan")
-        return measured(self.parameters.get(name, nan), self.stderr.get(name, nan), symbol(name)[2])
+        value, error = (numbers.get(name, np.nan) for numbers in (self.parameters, self.stderr))
+        return measured(value, error, symbol(name)[2])
 
 
 @dataclass(frozen=True)
 class DiscrepancyData:
-    """A verdict on what the model is missing, with the arrays that show it.
-
-    Attributes:
-        found: the verdict.
-        arrays: arrays of group ``discrepancy`` by name; any may lack.
-    """
+    """A verdict on what the model is missing, and arrays of group ``discrepancy``, of which any may lack."""
 
     found: Verdict
     arrays: Arrays = field(default_factory=dict)
@@ -136,7 +131,6 @@ class Sample:
     """One exposure of the sensor.
 
     Attributes:
-        name: of the sample.
         kind: ``exposed``, or ``bias`` for frames without electrons.
         x: integration time or light level; None where it is not on the line.
         n_frames: frames of a pixel.
@@ -176,7 +170,6 @@ class ReportData:
     """All that a report shows.
 
     Attributes:
-        title: heading of the report.
         kind: what made the charge: dark, light or unknown.
         shape: ``(ny, nx)`` of the sensor or region; ``(1, n_channels)`` for ready-made histograms.
         n_frames: frames per pixel, or None if pixels differ or it is unknown.
@@ -184,7 +177,6 @@ class ReportData:
         camera: name, serial number and temperature of the sensor as the files say; empty where they do not.
         maps: ``name`` and ``name_stderr`` of ``variables.py`` group ``maps`` (y, x); NaN where a fit failed.
         fit: ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... (y, x).
-        criteria: limits of the sensor.
         pixels: the shown pixels.
         ensemble: arrays of group ``ensemble``.
         ensemble_facts: numbers that go with them: ``rmse`` (mapping), ``n_frames``, ``error_rate``, ...
@@ -197,7 +189,6 @@ class ReportData:
         channel_names: names of the channels of ready-made histograms.
         outlier_sigmas: robust standard deviations beyond which a pixel is an outlier.
         allowed_failed: fraction of pixels without a value that is accepted.
-        config_yaml: the resolved configuration.
         run: identity of the run: name, started, host, versions, seed, ...
         inputs: one mapping per input file: name, size, hash, ...
         stages: one mapping per stage: ``stage``, ``state``, ``seconds``, ``cpu_seconds``,
@@ -216,7 +207,6 @@ class ReportData:
         methods: content of ``methods.json``, or None where nobody compared.
         plan: frames that precisions need, or None where no pixel has a value.
         samples: the exposures of a run whose input is several samples, or None.
-        regions: parts of the sensor that have a name.
     """
 
     title: str
@@ -289,14 +279,11 @@ class ReportData:
     @cached_property
     def flagged(self) -> BoolArray:
         """Pixels with a value that the data leave open by whole electrons, or altogether; shape ``shape``."""
-        return self._with_bits(FLAGGED)
+        return self.flagged_in("quanta_exposure")
 
     def flagged_in(self, name: str) -> BoolArray:
         """Return which pixels the data leave open in one map: a gain is known where the bias is not."""
-        return self._with_bits(flags_of(name))
-
-    def _with_bits(self, bits: FitStatus) -> BoolArray:
-        return np.asarray(~self.failed & (self.status & int(bits) != 0))
+        return np.asarray(~self.failed & (self.status & int(flags_of(name)) != 0))
 
     def flagged_share(self, name: str = "quanta_exposure") -> float:
         """Return the share of flagged pixels among those with a value, in one map; by default all flags."""
@@ -364,11 +351,9 @@ class ReportData:
         return self._ordered[name]
 
     def summary(self, name: str, *, with_flagged: bool = False) -> MapSummary:
-        """Describe a map by order statistics, once: the map is large, and many ask.
+        """Describe a map by order statistics, of all pixels with a value or of those without a flag.
 
-        Args:
-            name: of the map.
-            with_flagged: of all pixels with a value; else flagged ones are left out.
+        This is done once: the map is large, and many ask.
         """
         if (name, with_flagged) not in self._summaries:
             self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
@@ -398,12 +383,7 @@ class ReportData:
         return summarise(known, outlier_sigmas=self.outlier_sigmas)
 
     def pixel_error(self, name: str, *, with_flagged: bool = False) -> float | None:
-        """Return the median standard error of a pixel in a map; None where it is not known.
-
-        Args:
-            name: of the map.
-            with_flagged: of all pixels; else flagged ones are left out.
-        """
+        """Return the median standard error of a pixel, of all or of those without a flag; None if unknown."""
         errors = self.maps.get(f"{name}_stderr")
         if errors is None:
             return None

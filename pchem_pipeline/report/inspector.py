@@ -51,13 +51,7 @@ class Scale:
 
 @dataclass(frozen=True)
 class Bars:
-    """Histogram of a map whose codes are too coarse to show one: bars narrower than a step.
-
-    Attributes:
-        first: code with whose values the bars begin.
-        parts: bars of a code.
-        counts: values in each bar.
-    """
+    """Histogram of a map whose codes are too coarse to show one: ``parts`` bars a code, from ``first`` on."""
 
     first: int
     parts: int
@@ -69,7 +63,7 @@ class PackedMap:
     """A map in few bytes.
 
     Attributes:
-        scale: meaning of the codes.
+        scale: how codes stand for values.
         n_odd: values outside the range of the codes, at the end of ``data`` as indices and float32.
         data: gzip of the low bytes, the high bytes, ``n_odd`` uint32 and ``n_odd`` float32, little-endian.
         bars: its histogram; None where the codes are fine enough.
@@ -122,12 +116,7 @@ def some_of(values: NDArray[Any], enough: int = 65_537) -> NDArray[Any]:
 
 
 def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
-    """Return a map in few bytes; values are kept to half a step, those outside the range to 1e-7.
-
-    Args:
-        values: shape (ny, nx); NaN where there is no value.
-        scale: from :func:`choose_scale`.
-    """
+    """Return a map in few bytes; values are kept to half a step, those outside the range to 1e-7."""
     flat = np.asarray(values).ravel()
     place = _places(flat, scale)
     bars = None if flat.dtype.kind in "iub" else _bars(place)
@@ -166,13 +155,10 @@ def _codes(place: FloatArray, values: NDArray[Any]) -> FloatArray:
 
 
 def _bars(place: FloatArray) -> Bars | None:
-    """Return the histogram over the bulk of a map; None where codes are narrow enough to be bars.
+    """Return the histogram over the bulk of a map's places; None where codes are narrow enough to be bars.
 
     The axis is that of the script: from the 1st to the 99th percentile and 0.3 of it beyond, where there are
     values; those beyond it are in no bar.
-
-    Args:
-        place: of each value on the scale, in steps, shape (n,).
     """
     known = Ordered.of(some_of(place))
     if known.size < 2:
@@ -205,11 +191,7 @@ def varints(values: NDArray[Any]) -> bytes:
 def pack_counts(
     origin: NDArray[np.integer[Any]], counts: Sequence[NDArray[np.integer[Any]]]
 ) -> tuple[NDArray[np.int32], NDArray[np.uint32], bytes]:
-    """Cut the empty ends off histograms and join them.
-
-    Args:
-        origin: DN of the first bin of each, shape (n,).
-        counts: n histograms, each of its own length.
+    """Cut the empty ends off n histograms, which begin at the DN of ``origin``, and join them.
 
     Returns:
         DN of the first occupied bin, number of bins from there to the last occupied one, and all counts one
@@ -335,9 +317,13 @@ def embedded(data: ReportData) -> dict[str, Any] | None:
     if data.inspector is None:
         return None
     shown = data.inspector()
-    blobs = {name: Markup(text) for name, text in _blobs(shown)}
-    script = Markup(text_of("inspector.js"))
-    return {"facts": json_for_html(_facts(data, shown)), "blobs": blobs, "script": script}
+    content = {f"map-{i}": each.packed.data for i, each in enumerate(shown.maps) if each.packed is not None}
+    content["inspector-sample"] = _sample_bytes(shown.sample)
+    return {
+        "facts": json_for_html(_facts(data, shown)),
+        "blobs": {name: Markup(_base64(each)) for name, each in content.items()},
+        "script": Markup(text_of("inspector.js")),
+    }
 
 
 def text_of(name: str, folder: str = "templates") -> str:
@@ -348,22 +334,17 @@ def text_of(name: str, folder: str = "templates") -> str:
 
 def content_policy(*texts: str) -> str:
     """Return the page's content security policy: no network at all, and no script but these."""
-    digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") for text in texts]
-    scripts = "script-src " + " ".join(f"'sha256-{each}'" for each in digests) + "; "
+    scripts = " ".join(f"'sha256-{_base64(hashlib.sha256(text.encode()).digest())}'" for text in texts)
     return (
-        f"default-src 'none'; {scripts}{_CONNECT_NOWHERE}; img-src data:; style-src 'unsafe-inline'; "
-        "base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src {scripts}; {_CONNECT_NOWHERE}; img-src data:; "
+        "style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
     )
 
 
 def served_page(page: str) -> str | None:
-    """Return a report as ``pchem view`` serves it: it may ask its own server, and knows that there is one.
+    """Return a ``report.html`` as ``pchem view`` serves it: it may ask its own server, and knows of it.
 
-    Args:
-        page: a ``report.html``.
-
-    Returns:
-        The page; None where it holds no inspector of this version.
+    None where the page holds no inspector of this version.
     """
     before, found, after = page.partition(str(escape(_CONNECT_NOWHERE)))
     if not found or 'id="inspector-app"' not in after:
@@ -428,21 +409,10 @@ def map_facts(entry: MapEntry) -> dict[str, Any]:
 
 def packed_facts(packed: PackedMap) -> dict[str, Any]:
     """Return what the script must know to read a packed map."""
-    scale, bars = packed.scale, packed.bars
-    found: dict[str, Any] = {"low": scale.low, "step": scale.step, "log": scale.log, "nOdd": packed.n_odd}
-    if bars is not None:
-        found["bars"] = {"first": bars.first, "parts": bars.parts, "counts": bars.counts.tolist()}
+    found: dict[str, Any] = vars(packed.scale) | {"nOdd": packed.n_odd}
+    if packed.bars is not None:
+        found["bars"] = vars(packed.bars) | {"counts": packed.bars.counts.tolist()}
     return found
-
-
-def _blobs(shown: InspectorData) -> list[tuple[str, str]]:
-    """Return the data of the page: element id and base64 of each."""
-    found = [
-        (f"map-{i}", _base64(entry.packed.data))
-        for i, entry in enumerate(shown.maps)
-        if entry.packed is not None
-    ]
-    return [*found, ("inspector-sample", _base64(_sample_bytes(shown.sample)))]
 
 
 def _sample_bytes(sample: PixelSample) -> bytes:

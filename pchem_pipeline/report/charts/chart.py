@@ -64,7 +64,6 @@ class Mark:
     """What all marks have.
 
     Attributes:
-        colour: of the mark.
         label: in the legend; on the page its values are shown below it.
         listed: whether the legend on paper has it too.
         width: of its line, points (1/72 inch).
@@ -189,7 +188,6 @@ class Image(Mark):
         x: left and right end on the axis of x.
         y: end of the first and of the last row on the upright axis.
         scale: name of a scale of colours, or the colours themselves, one more than edges.
-        none: colour of pixels without a value.
         ends: values with the first and the last colour, in equal steps between; others have the nearest one.
         edges: instead of these the values between one colour and the next, rising.
         bar: places along a bar of the colours, 0 to 1, and their texts; empty: as the renderer finds them.
@@ -201,7 +199,6 @@ class Image(Mark):
     x: tuple[float, float]
     y: tuple[float, float]
     scale: str | tuple[str, ...] = ""
-    none: str = "no_value"
     ends: tuple[float, float] = (0.0, 1.0)
     edges: Values | None = None
     bar: tuple[tuple[float, str], ...] = ()
@@ -324,10 +321,7 @@ def points_of(mark: Mark) -> tuple[Values, Values]:
 def window(axis: Axis, values: Iterator[Values], base: float | None = None) -> tuple[float, float]:
     """Return the ends of an axis that shows these values: those given, else the values' with a margin.
 
-    Args:
-        axis: the axis.
-        values: of its marks, any shapes.
-        base: end of the axis if no value is beyond it.
+    The axis ends at ``base`` if no value is beyond it.
     """
     parts = [np.asarray(each, dtype=np.float64).ravel() for each in values]
     known = np.concatenate(parts) if parts else np.empty(0)
@@ -386,11 +380,6 @@ def extremes(x: Values, y: Values, columns: int) -> IntArray:
 
     Drawn that wide or narrower they look like all points, which are kept where they are no more than two a
     stretch, or do not go from left to right. A stretch without a value (NaN) stays a gap.
-
-    Args:
-        x: places, (n,).
-        y: values, (n,).
-        columns: number of stretches.
     """
     if x.size <= 2 * columns or np.any(np.diff(x) < 0):
         return np.arange(x.size)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import MISSING, asdict, fields, replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from pchem_pipeline.report.charts.chart import (
     x_window,
     y_window,
 )
-from pchem_pipeline.report.style.palette import DARK, LIGHT, Palette
+from pchem_pipeline.report.style.palette import DARK, LIGHT
 
 #: Columns of a curve that the page keeps, with two values each, and steps of a histogram.
 _COLUMNS, _STEPS = 2000, 4000
@@ -39,7 +39,7 @@ Ends = tuple[float, float]
 def page_charts(charts: Mapping[str, Chart]) -> dict[str, Any]:
     """Return charts by figure, and the colours for light and dark paper, as plain data."""
     return {
-        "colours": {"light": _colours(LIGHT), "dark": _colours(DARK)},
+        "colours": {"light": asdict(LIGHT), "dark": asdict(DARK)},
         "charts": {name: page_chart(chart) for name, chart in charts.items()},
     }
 
@@ -47,11 +47,6 @@ def page_charts(charts: Mapping[str, Chart]) -> dict[str, Any]:
 def page_chart(chart: Chart) -> dict[str, Any]:
     """Return a chart as plain data: numbers rounded to what a screen shows, long curves thinned."""
     return {"widths": list(chart.widths), "stacks": [_stack(stack) for stack in chart.stacks]}
-
-
-def _colours(palette: Palette) -> dict[str, str]:
-    values = {each.name: getattr(palette, each.name) for each in fields(palette)}
-    return {name: value for name, value in values.items() if value.startswith("#")}
 
 
 def _stack(stack: Stack) -> dict[str, Any]:
@@ -66,19 +61,13 @@ def _stack(stack: Stack) -> dict[str, Any]:
 
 def _axis(axis: Axis, ends: Ends) -> dict[str, Any]:
     """Return an axis; what it has as every other is left out."""
-    found: dict[str, Any] = {
+    ticks = [[place, without_formulas(text)] for place, text in axis.ticks]
+    rest = {"log": axis.log, "linear": axis.linear_to, "whole": axis.whole, "ticks": ticks}
+    return {
         "label": without_formulas(axis.label),
         "ends": rounded(np.asarray(ends), ends, axis.log),
+        **{name: value for name, value in rest.items() if value},
     }
-    if axis.log:
-        found["log"] = True
-    if axis.linear_to:
-        found["linear"] = axis.linear_to
-    if axis.whole:
-        found["whole"] = True
-    if axis.ticks:
-        found["ticks"] = [[place, without_formulas(text)] for place, text in axis.ticks]
-    return found
 
 
 def _panel(panel: Panel, x: Axis, across: Ends) -> dict[str, Any]:

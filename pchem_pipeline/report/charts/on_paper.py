@@ -78,6 +78,9 @@ _STYLE: Any = {
     "xtick.major.width": 0.6,
     "ytick.labelsize": 7.0,
     "ytick.major.width": 0.6,
+    "axes.edgecolor": LIGHT.edge,
+    **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), LIGHT.ink),
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), LIGHT.paper),
 }
 
 _METADATA: dict[str, dict[str, Any]] = {
@@ -137,21 +140,17 @@ def _in(look: Look) -> Iterator[None]:
     with mpl.rc_context(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         mpl.rcdefaults()
-        mpl.rcParams.update(_STYLE | LIGHT.parameters())
+        mpl.rcParams.update(_STYLE)
         mpl.rcParams["svg.fonttype"] = "none" if look.svg_text else "path"
         if look.style:
-            _use(look.style)
+            from matplotlib import style  # reads all sheets of matplotlib
+
+            try:
+                style.use(look.style)
+            except OSError:
+                words = "neither a file nor a style of matplotlib that can be read"
+                raise ConfigError(f"--style {look.style}: {words}") from None
         yield
-
-
-def _use(sheet: str) -> None:
-    from matplotlib import style  # reads all sheets of matplotlib
-
-    try:
-        style.use(sheet)
-    except OSError:
-        words = "neither a file nor a style of matplotlib that can be read"
-        raise ConfigError(f"--style {sheet}: {words}") from None
 
 
 def _lay_out(drawing: Drawing) -> None:
@@ -171,11 +170,6 @@ def _lay_out(drawing: Drawing) -> None:
     setp(square, aspect="equal")
     with mpl.rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
         drawing.set_layout_engine(None)
-
-
-def inches(millimetres: float) -> float:
-    """Return a length in inches."""
-    return millimetres / 25.4
 
 
 # of an SVG: outlines of paths, decimals of their numbers beyond the second, and blanks that say nothing
@@ -231,8 +225,6 @@ def small_png(png: bytes) -> bytes:
 _LINE_MM, _LETTERS, _BESIDE_MM = 3.5, 0.66, 12.0
 #: Rows or columns of a map up to which a vector file keeps each pixel.
 _MOST_KEPT = 800
-#: Ticks of a bar of colours at most.
-_BAR_TICKS = 5
 _DASHES: dict[Dash, Any] = {"-...": (0, (5, 1, 1, 1, 1, 1)), "..": (0, (1, 1))}
 #: Points beyond which they are an image in a vector file.
 _MOST_POINTS = 1000
@@ -245,10 +237,6 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
     """Draw a chart: stacks side by side on a page, one above the other in a column.
 
     The layout is then fixed, so that saving in several formats does not compute it again.
-
-    Args:
-        look: width and resolution.
-        chart: what is drawn.
     """
     with _in(look):
         drawing = _drawn(look, chart)
@@ -274,13 +262,12 @@ def draw_panels(given: Any, chart: Chart) -> None:
             f"ax: {what}; give {len(panels)} axes of matplotlib, such as plt.subplots({len(panels)})[1]"
         )
     for axes, (stack, panel) in zip(several, panels, strict=True):
-        inch = axes.figure.dpi
-        own = 25.4 * axes.get_window_extent().width / inch
-        look = Look(25.4 * axes.figure.bbox.width / inch)
+        whole, width = (
+            25.4 * box.width / axes.figure.dpi for box in (axes.figure.bbox, axes.get_window_extent())
+        )
         with mpl.rc_context({"legend.fontsize": "small", "legend.frameon": False}):
-            shown = replace(panel, y=tick_rows(panel.y, own))
-            handles = _draw_panel(axes, shown, stack, look, last=panel is stack.panels[-1])
-            if keys := _keys(chart, Look(own)):
+            handles = _draw_panel(axes, panel, stack, Look(whole), width)
+            if keys := _keys(chart, width):
                 axes.legend([*keys.values()], [*keys], loc="upper left", bbox_to_anchor=(0.0, -0.2))
             elif any(chart.legend) and handles:
                 axes.legend([*handles.values()], [*handles])
@@ -290,20 +277,20 @@ def draw_panels(given: Any, chart: Chart) -> None:
 
 def _drawn(look: Look, chart: Chart) -> Drawing:
     columns = len(chart.widths) if look.wide else 1
-    stacks = [stack for stack in chart.stacks if look.wide or not stack.wide]
-    rows = [stacks[i : i + columns] for i in range(0, len(stacks), columns)]
-    titles = {id(stack): _broken(stack.title, look.width_mm / columns - _BESIDE_MM) for stack in stacks}
-    heights = [
-        max(
-            height_of(stack, look.width_mm / columns) + _LINE_MM * titles[id(stack)].count("\n")
-            for stack in row
-        )
-        for row in rows
+    width = look.width_mm / columns
+    stacks = [
+        replace(stack, title=_broken(stack.title, width - _BESIDE_MM))
+        for stack in chart.stacks
+        if look.wide or not stack.wide
     ]
-    keys = _keys(chart, look)
+    rows = [stacks[i : i + columns] for i in range(0, len(stacks), columns)]
+    heights = [
+        max(height_of(each, width) + _LINE_MM * each.title.count("\n") for each in row) for row in rows
+    ]
+    keys = _keys(chart, look.width_mm)
     lines = sum(1 + text.count("\n") for text in keys)
     height_mm = sum(heights) + (5.0 + _LINE_MM * lines if keys else 0.0)
-    drawing = Drawing(figsize=(inches(look.width_mm), inches(height_mm)), layout="constrained")
+    drawing = Drawing(figsize=(look.width_mm / 25.4, height_mm / 25.4), layout="constrained")
     drawing.look = look
     FigureCanvasAgg(drawing)  # a canvas of its own
     widths = chart.widths if columns > 1 else (1.0,)
@@ -316,10 +303,9 @@ def _drawn(look: Look, chart: Chart) -> Drawing:
         first: Axes | None = None
         for i, panel in enumerate(stack.panels):
             axes = drawing.add_subplot(inner[i], sharex=first)
-            panel = replace(panel, y=tick_rows(panel.y, look.width_mm / columns))
-            handles |= _draw_panel(axes, panel, stack, look, last=i == len(stack.panels) - 1)
+            handles |= _draw_panel(axes, panel, stack, look, width)
             if first is None:
-                axes.set_title(titles[id(stack)], fontsize=7.0 if "\n" in titles[id(stack)] else None)
+                axes.set_title(stack.title, fontsize=7.0 if "\n" in stack.title else None)
             first = first or axes
     if keys:
         drawing.legend(handles=[*keys.values()], labels=[*keys], loc="outside lower left")
@@ -331,14 +317,10 @@ def _drawn(look: Look, chart: Chart) -> Drawing:
     return drawing
 
 
-def _keys(chart: Chart, look: Look) -> dict[str, Handle]:
+def _keys(chart: Chart, width_mm: float) -> dict[str, Handle]:
     """Return what the legend shows of colours that have a meaning, by this in lines that fit."""
-    return {
-        textwrap.fill(text, int(_LETTERS * look.width_mm)): Patch(
-            facecolor=colour_of(colour), edgecolor="#888888"
-        )
-        for colour, text in chart.keys
-    }
+    keys = ((textwrap.fill(text, int(_LETTERS * width_mm)), colour) for colour, text in chart.keys)
+    return {text: Patch(facecolor=colour_of(colour), edgecolor="#888888") for text, colour in keys}
 
 
 def _broken(title: str, width_mm: float) -> str:
@@ -351,10 +333,10 @@ def _broken(title: str, width_mm: float) -> str:
     return "\n".join(lines)
 
 
-def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, *, last: bool) -> dict[str, Handle]:
-    """Draw a panel and return what its legend shows by label; one of its own is drawn here."""
+def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, width_mm: float) -> dict[str, Handle]:
+    """Draw a panel and return what the legend shows by label; a legend of the panel alone is drawn here."""
     most = 5 if any(isinstance(mark, Image) for mark in panel.marks) else 8
-    both = (("x", stack.x), ("y", panel.y))
+    both = (("x", stack.x), ("y", tick_rows(panel.y, width_mm)))
     for name, axis in both:
         _scale(axes, name, axis, most)
         if axis.low is not None and axis.high is not None:
@@ -371,7 +353,7 @@ def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, *, last: boo
     if room != 1.0:
         axes.set_ylim(top=room * axes.get_ylim()[1])
     axes.set(ylabel=panel.y.label)
-    if last:
+    if panel is stack.panels[-1]:
         axes.set(xlabel=stack.x.label)
     else:
         axes.tick_params(labelbottom=False)
@@ -386,17 +368,11 @@ def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, *, last: boo
 def _note(axes: Axes, text: str, corner: str) -> None:
     """Write a small note into a corner of the axes."""
     vertical, horizontal = corner.split()
-    axes.text(
-        0.985 if horizontal == "right" else 0.015,
-        0.975 if vertical == "upper" else 0.03,
-        text,
-        transform=axes.transAxes,
-        ha="right" if horizontal == "right" else "left",
-        va="top" if vertical == "upper" else "bottom",
-        fontsize=6.5,
-        color=LIGHT.faint,
-        bbox={"facecolor": LIGHT.paper, "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
-    )
+    x, va = 0.985 if horizontal == "right" else 0.015, "top" if vertical == "upper" else "bottom"
+    y = 0.975 if vertical == "upper" else 0.03
+    box = {"facecolor": LIGHT.paper, "alpha": 0.75, "edgecolor": "none", "pad": 1.0}
+    style: Any = {"fontsize": 6.5, "color": LIGHT.faint, "bbox": box, "ha": horizontal, "va": va}
+    axes.text(x, y, text, transform=axes.transAxes, **style)
 
 
 def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
@@ -495,10 +471,10 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
     """Draw a map with its bar of colours; those pixels that the resolution can show."""
     beside = axes.get_subplotspec()
     columns = 1 if beside is None else beside.get_topmost_subplotspec().get_gridspec().ncols
-    values, x, y = mark.shown(inches(look.width_mm) * look.dpi / columns)
-    colours = _colours(mark).with_extremes(bad=colour_of(mark.none))
+    values, x, y = mark.shown(look.width_mm / 25.4 * look.dpi / columns)
+    colours = _colours(mark).with_extremes(bad=LIGHT.no_value)
     low, high = mark.ends
-    axes.set_facecolor(colour_of(mark.none))
+    axes.set_facecolor(LIGHT.no_value)
     # a vector file keeps the pixels as they are, but for more of them than it can show
     kept = "none" if max(mark.values.shape) <= _MOST_KEPT else "nearest"
     image = axes.imshow(
@@ -507,7 +483,7 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
     )  # fmt: skip
     if mark.unit:
         places, texts = [place for place, _ in mark.bar], [text for _, text in mark.bar]
-        ticks: Any = places or MaxNLocator(_BAR_TICKS, integer=mark.whole)
+        ticks: Any = places or MaxNLocator(5, integer=mark.whole)
         bar = axes.figure.colorbar(image, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), ticks=ticks)
         if texts:
             bar.ax.set_yticklabels(texts)

@@ -11,12 +11,14 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.wording import (
+    capitalised,
     count,
     measured,
     plain,
     power_of_ten,
     short,
     signed,
+    stored_unit,
     symbol,
     unit_text,
 )
@@ -45,17 +47,12 @@ _HUES = ("ink", "blue", "vermilion", "green", "orange", "purple", "sky")
 _LINES: tuple[Dash, ...] = ("-", "--", "-.", ":")
 #: Colours end at the 99 % quantile of the differences, at least here, standard errors.
 _LEAST = 4.0
-#: Strips of differences reach at least so far, standard errors: beyond their band of two.
-_LEAST_STRIP = 3.0
 
 
 def difference_figures(pair: Pair) -> list[Figure]:
     """Return the maps of differences of two runs, those that are not zero throughout."""
-    return [
-        _difference(pair, name, each)
-        for name, each in pair.maps.items()
-        if np.nan_to_num(each.difference).any()
-    ]
+    shown = {name: each for name, each in pair.maps.items() if np.nan_to_num(each.difference).any()}
+    return [_difference(pair, name, each) for name, each in shown.items()]
 
 
 def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
@@ -75,7 +72,7 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
     return Figure(
         f"difference_{name}_{pair.key}",
         "",
-        f"{label[0].upper()}{label[1:]}",
+        capitalised(label),
         f"{pair.other.label} − {pair.one.label}, in standard errors of each pixel. {caption}",
         alt,
         (DataTable({"difference": each.z}, {"difference": "standard errors"}),),
@@ -123,29 +120,21 @@ def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
 
 
 def difference_chart(z: FloatArray, n_changed: int, title: str, *, same_data: bool) -> Chart:
-    """Return the difference of a map of two runs in standard errors, and its histogram beside N(0, 1).
+    """Return the difference of a map of two runs in standard errors ``z``, (y, x), and its histogram.
 
-    Args:
-        z: the difference in standard errors, (y, x).
-        n_changed: good pixels that changed.
-        title: what is subtracted from what.
-        same_data: both are fits of the same frames, for which N(0, 1) is not what chance gives.
+    Beside this is N(0, 1), but for fits of the same frames, which have no sampling noise.
     """
     known = finite(z)
     limit = _limit(known, _LEAST if not same_data else 0.0)
-    unit, label = _unit(limit)
+    # a power of ten in which the differences have few digits
+    power = int(np.floor(np.log10(limit))) if limit < 0.01 else 0
+    unit, label = 10.0**power, f"{power_of_ten(power)} standard errors".strip()
     end = limit / unit
     top = sensor_stack(z / unit, (-end, end), label, scale=DIVERGING, title=plain(title))
     edge = limit if same_data else max(limit, LIMIT)
     note = f"{count(n_changed, 'good pixel')} changed"
     pulls = pull_stack(known / unit, edge / unit, f"difference ({label})", note, normal=not same_data)
     return Chart((top, pulls))
-
-
-def _unit(limit: float) -> tuple[float, str]:
-    """Return a power of ten in which differences up to ``limit`` have few digits, and its words."""
-    power = int(np.floor(np.log10(limit))) if limit < 0.01 else 0
-    return 10.0**power, f"{power_of_ten(power)} standard errors".strip()
 
 
 def _limit(known: FloatArray, least: float) -> float:
@@ -188,7 +177,8 @@ def _one_half(table: DataTable, unit: str, title: str) -> Stack:
             differences.append(Line(first[0], z, colour=colour, width=0.8, label=label, listed=False))
     margin = 0.04 * (high - low)
     marks = (Span(-2.0, 2.0, colour="band"), *differences, Level(0.0, colour="ink", width=0.5))
-    reach = max(_LEAST_STRIP, *(1.1 * float(np.max(np.abs(line.y), initial=0.0)) for line in differences))
+    # beyond the band of two standard errors at least
+    reach = max(3.0, *(1.1 * float(np.max(np.abs(line.y), initial=0.0)) for line in differences))
     panels = (
         Panel(Axis(f"density (1/{unit})", low=0.0), tuple(lines), 3.0, legend="upper right", room=(1.3, 1.3)),
         Panel(Axis("difference\n(std. errors)", -reach, reach), marks, 1.0),
@@ -208,12 +198,8 @@ def _curve(run: RunFacts, axis: str, prefix: str) -> tuple[FloatArray, FloatArra
 
 
 _SHOWN = ("quanta_exposure", "charge_rate", "dark_current", "conversion_gain", "bias", "read_noise_e")
-
-
 #: Letters of the labels of all runs that an axis has room for, and ticks at most.
 _LETTERS, _MOST_TICKS = 48, 12
-#: Days of a history that is drawn against time.
-_SHORTEST = 0.04
 
 
 def history_figures(rows: Sequence[HistoryRow]) -> Iterator[Figure]:
@@ -226,26 +212,23 @@ def history_figures(rows: Sequence[HistoryRow]) -> Iterator[Figure]:
     places = np.array([_place(row, labelled) for row in rows])
     ordered = bool(np.isfinite(places).all() and np.unique(places).size > 1)
     by_date = ordered and not labelled
-    if by_date and np.ptp(places) < _SHORTEST:  # runs within an hour are drawn in their order
+    if by_date and np.ptp(places) < 0.04:  # runs within an hour are drawn in their order
         ordered = by_date = False
     at = places - (places.min() if by_date else 0.0) if ordered else np.arange(len(rows), dtype=np.float64)
     axis = "days since the first" if by_date else "label" if ordered else "run"
     heads = ("run", "label") if by_date else ("name", "text")
     columns: dict[str, Any] = {
-        heads[0]: [row["run"] for row in rows],
-        heads[1]: [row["label"] for row in rows],
+        head: [row[key] for row in rows] for head, key in zip(heads, ("run", "label"), strict=True)
     }
-    columns[axis] = at
-    units = {}
+    columns[axis], units = at, {}
     for name in shown:
         for words, part in parts.items():
             columns[f"{name} {words}"] = [float(row[f"{name}_{part}"] or "nan") for row in rows]
-            units[f"{name} {words}"] = symbol(name)[2].replace("e⁻", "e-")
+            units[f"{name} {words}"] = stored_unit(name)
     table = DataTable(columns, units)
     words = "; ".join(
-        f"{symbol(name)[1]} from {short(medians[0])} to {short(medians[-1])} {symbol(name)[2]}"
-        for name in shown
-        for medians in [columns[f"{name} median"]]
+        f"{noun} from {short(medians[0])} to {short(medians[-1])} {unit}"
+        for medians, (_, noun, unit) in ((columns[f"{name} median"], symbol(name)) for name in shown)
     )
     yield Figure(
         "history",

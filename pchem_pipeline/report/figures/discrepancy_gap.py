@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,10 +45,14 @@ _FAMILY_WORDS = {
 
 def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the gap before and after, against its floor."""
-    found = data.found
-    tables = _gap_tables(found)
-    if not tables:
+    bars, parts, floor = gap_bars(data.found), families(data.found), data.found.gap.floor
+    if not bars:
         return
+    words = [
+        f"{bar.label} {short(bar.gap)}"
+        + (f" ({short(bar.low)} to {short(bar.high)})" if math.isfinite(bar.low + bar.high) else "")
+        for bar in bars
+    ]
     yield Figure(
         "discrepancy_gap",
         "shown",
@@ -56,9 +60,9 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "Gap before and after with 95 % intervals, the floor (gray: sampling noise), and the remaining gap "
         "with the next best effect instead, fitted in the same way. Open triangles at the edge are gaps "
         "below the axis. By family of statistics: before and after.",
-        f"Gap in micronats (10⁻⁶ nats) per sample: {_gap_alt(found)}.",
-        tables,
-        _gap_chart(gap_bars(found), families(found), MICRO * found.gap.floor),
+        f"Gap in micronats (10⁻⁶ nats) per sample: {'; '.join(words)}; floor {micronats(floor)}.",
+        _gap_tables(bars, parts, MICRO * floor),
+        _gap_chart(bars, parts, MICRO * floor),
         PAGE_MM,
     )
 
@@ -68,41 +72,36 @@ def pull_figures(data: DiscrepancyData) -> Iterator[Figure]:
     rows = largest_pulls(data)
     if not rows:
         return
-    columns: dict[str, Sequence[Any]] = {
-        "statistic": [row.statistic for row in rows],
-        "sentence": [row.sentence for row in rows],
-        "before": [row.before for row in rows],
-        "after": [row.after for row in rows],
-    }
+    names = ("statistic", "sentence", "before", "after")
+    columns = {name: [getattr(row, name) for row in rows] for name in names}
+    words = []
+    for row in rows[:6]:
+        after = f", after {row.after:+.1f}" if math.isfinite(row.after) else ""
+        before = f"{row.before:+.1f}" if math.isfinite(row.before) else "not known"
+        words.append(f"{row.sentence or row.statistic}: before {before}{after}")
     yield Figure(
         "discrepancy_pulls",
         "shown",
         "Largest deviations, before and after",
         "The largest deviations from the model, before (circles) and after effects were added (diamonds). "
         "The gray band is 2 sigma; the largest of some hundred statistics is near 3 sigma by sampling noise.",
-        f"In sigma. {_pull_text(rows)}.",
+        f"In sigma. {'; '.join(words).replace('-', '−')}.",
         (DataTable(columns, dict.fromkeys(("before", "after"), "standard deviations")),),
         _pulls_chart(rows),
         PAGE_MM,
     )
 
 
-_GAP_UNIT = "1e-6 nats/sample"
-
-
-def _gap_tables(found: Verdict) -> tuple[DataTable, ...]:
+def _gap_tables(bars: Sequence[GapBar], parts: Sequence[Family], floor: float) -> tuple[DataTable, ...]:
     """Return the gap of each model, with its interval and the floor, and by family of statistics."""
-    bars, parts = gap_bars(found), families(found)
-    if not bars:
-        return ()
-    names = ("model", *GapBar._fields[1:])
+    names, unit = ("model", *GapBar._fields[1:]), "1e-6 nats/sample"
     columns = dict(zip(names, map(list, zip(*bars, strict=True)), strict=True))
-    columns["floor"] = [MICRO * found.gap.floor] * len(bars)
-    tables = [DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), _GAP_UNIT))]
-    if parts:
-        shares = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
-        tables.append(DataTable(shares, dict.fromkeys(("before", "after"), _GAP_UNIT), "families"))
-    return tuple(tables)
+    columns["floor"] = [floor] * len(bars)
+    whole = DataTable(columns, dict.fromkeys(("gap", "low", "high", "floor"), unit))
+    if not parts:
+        return (whole,)
+    shares = dict(zip(("family", "before", "after"), map(list, zip(*parts, strict=True)), strict=True))
+    return whole, DataTable(shares, dict.fromkeys(("before", "after"), unit), "families")
 
 
 def largest_pulls(data: DiscrepancyData) -> list[Pull]:
@@ -112,12 +111,11 @@ def largest_pulls(data: DiscrepancyData) -> list[Pull]:
     """
     rows: dict[str, Pull] = {}
     if "z_before" in data.arrays:
-        before = np.asarray(data.arrays["z_before"], dtype=np.float64)
-        after_all = np.asarray(data.arrays.get("z_after", np.full(before.size, np.nan)), dtype=np.float64)
-        for i, (name, (_, sentence)) in enumerate(data.statistics.items()):
-            if i < before.size and np.isfinite(before[i]):
-                later = float(after_all[i]) if i < after_all.size else math.nan
-                rows[name] = Pull(statistic=name, sentence=sentence, before=float(before[i]), after=later)
+        before = data.arrays["z_before"]
+        both = before.tolist(), data.arrays.get("z_after", np.full(before.size, np.nan)).tolist()
+        for (name, (_, sentence)), z, after in zip(data.statistics.items(), *both, strict=False):
+            if math.isfinite(z):
+                rows[name] = Pull(statistic=name, sentence=sentence, before=z, after=after)
     whole = not rows
     for pull in [pull for step in data.found.steps for pull in step.pulls if whole or "@" in pull.statistic]:
         known = rows.get(pull.statistic, pull)
@@ -130,24 +128,6 @@ def largest_pulls(data: DiscrepancyData) -> list[Pull]:
     return sorted(rows.values(), key=far, reverse=True)[:MOST_PULLS]
 
 
-def _pull_text(rows: Sequence[Pull]) -> str:
-    words = []
-    for row in rows[:6]:
-        after = f", after {row.after:+.1f}" if math.isfinite(row.after) else ""
-        before = f"{row.before:+.1f}" if math.isfinite(row.before) else "not known"
-        words.append(f"{row.sentence or row.statistic}: before {before}{after}")
-    return "; ".join(words).replace("-", "−")
-
-
-def _gap_alt(found: Verdict) -> str:
-    words = [
-        f"{bar.label} {short(bar.gap)}"
-        + (f" ({short(bar.low)} to {short(bar.high)})" if math.isfinite(bar.low + bar.high) else "")
-        for bar in gap_bars(found)
-    ]
-    return "; ".join([*words, f"floor {micronats(found.gap.floor)}"])
-
-
 class GapBar(NamedTuple):
     """One line of the gap's figure: its label, its role, the gap and its interval in 1e-6 nats."""
 
@@ -156,6 +136,10 @@ class GapBar(NamedTuple):
     gap: float
     low: float
     high: float
+
+
+#: Name of a family of statistics, its gap before and after, 1e-6 nats.
+Family = tuple[str, float, float]
 
 
 def gap_bars(found: Verdict) -> list[GapBar]:
@@ -170,8 +154,7 @@ def gap_bars(found: Verdict) -> list[GapBar]:
         bars.append(_bar(f"{lead}{words}", after, interval, "after"))
     for step, _ in extended[-1:]:
         if (other := step.runner_up) is not None:
-            interval = (math.nan, math.nan)
-            bars.append(_bar(f"next best: {other.effect}", other.gap_after, interval, "runner-up"))
+            bars.append(_bar(f"next best: {other.effect}", other.gap_after, (math.nan,) * 2, "runner-up"))
     return [bar for bar in bars if math.isfinite(bar.gap)]
 
 
@@ -179,7 +162,7 @@ def _bar(words: str, value: float, interval: tuple[float, float], role: str) -> 
     return GapBar(words, role, MICRO * value, MICRO * interval[0], MICRO * interval[1])
 
 
-def families(found: Verdict) -> list[tuple[str, float, float]]:
+def families(found: Verdict) -> list[Family]:
     """Return the gap of each family of statistics before and after, 1e-6 nats, largest first."""
     with_families = [step for step in found.steps if step.families.before]
     if not with_families:
@@ -200,18 +183,14 @@ _ROLES: dict[str, tuple[str, Shape]] = {
 }
 
 
-def _gap_chart(bars: Sequence[GapBar], families: Sequence[tuple[str, float, float]], floor: float) -> Chart:
+def _gap_chart(bars: Sequence[GapBar], parts: Sequence[Family], floor: float) -> Chart:
     """Return the gap before and after against its floor (1e-6 nats), with rivals, and by family."""
-    ends = _limits(bars, families, floor)
-    stacks = [_gap_rows(bars, floor, ends)]
-    if families:
-        stacks.append(_family_rows(families, ends))
-    return Chart(tuple(stacks), (1.0,) * len(stacks), legend=(2, 2) if families else (0, 0))
+    ends = _limits(bars, parts, floor)
+    rows = _gap_rows(bars, floor, ends)
+    return Chart((rows, _family_rows(parts, ends)), (1.0, 1.0), (2, 2)) if parts else Chart((rows,))
 
 
-def _limits(
-    bars: Sequence[GapBar], parts: Sequence[tuple[str, float, float]], floor: float
-) -> tuple[float, float]:
+def _limits(bars: Sequence[GapBar], parts: Sequence[Family], floor: float) -> tuple[float, float]:
     values = [v for bar in bars for v in (bar.gap, bar.low, bar.high)]
     values += [floor, *(v for _, before, after in parts for v in (before, after))]
     positive = [v for v in values if math.isfinite(v) and v > 0]
@@ -245,9 +224,9 @@ def _gap_rows(bars: Sequence[GapBar], floor: float, ends: tuple[float, float]) -
     return row_stack([bar.label for bar in bars], marks, x)
 
 
-def _family_rows(parts: Sequence[tuple[str, float, float]], ends: tuple[float, float]) -> Stack:
+def _family_rows(parts: Sequence[Family], ends: tuple[float, float]) -> Stack:
     x, marks = _gap_axis(ends)
-    labels = {"before": "before", "after": "after"}
+    labels = {"before": "before", "after": "after"}  # each stands once in the legend
     for row, (_, before, after) in enumerate(parts):
         marks += _bar_line(row, max(before, ends[0]), max(after, ends[0]), "bars", 1.2)
         for value, role in ((before, "before"), (after, "after")):
@@ -284,7 +263,6 @@ def _pulls_chart(rows: Sequence[Pull]) -> Chart:
         if known.any():
             colour, shape = _ROLES[role]
             marks.append(Points(values[role][known], places[known], shape, 4.5, colour=colour, label=words))
-    known_values = np.concatenate(list(values.values()))
-    reach = max(float(np.nanmax(np.abs(known_values), initial=0.0)), 6.0)
-    x = pull_axis("deviation (sigma)", 1.4 * reach, 4.0)
+    reach = float(np.nanmax(np.abs([*values.values()]), initial=6.0))
+    x = pull_axis("deviation (sigma)", 1.4 * reach)
     return Chart((row_stack([row.sentence or row.statistic for row in rows], marks, x),), legend=(2, 2))

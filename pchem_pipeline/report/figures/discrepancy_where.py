@@ -162,11 +162,9 @@ def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
 
 
 class PixelMap(NamedTuple):
-    """A statistic of every pixel in sigma, with its overall significance.
+    """A statistic of every pixel in sigma, (y, x), with its overall significance.
 
     Attributes:
-        title: the statistic in words.
-        z: map (y, x), NaN where there is no value.
         far: the largest of three departures from N(0, 1), each in its own standard errors: of the mean, of
             the mean square, and of the number of pixels beyond 5.
         outliers: pixels beyond 5.
@@ -191,12 +189,7 @@ def regions_of(data: DiscrepancyData) -> dict[str, Region]:
 
 
 def largest_maps(arrays: Arrays, regions: Mapping[str, Region] | None = None) -> list[PixelMap]:
-    """Return three maps: those with a deviating region, then goodness of fit, then the most deviating ones.
-
-    Args:
-        arrays: group ``discrepancy`` of the store.
-        regions: deviating part of the sensor by map.
-    """
+    """Return three maps: any with a deviating region, then goodness of fit, then the most deviating ones."""
     regions = regions or {}
     named = _named_maps(arrays)
     maps = {name: _pixel_map(words, values, regions.get(name)) for name, (words, values) in named.items()}
@@ -226,13 +219,12 @@ def _named_maps(arrays: Arrays) -> dict[str, tuple[str, NDArray[Any]]]:
     return found
 
 
-def _pixel_map(words: str, values: NDArray[Any], region: Region | None = None) -> PixelMap:
+def _pixel_map(words: str, values: NDArray[Any], region: Region | None) -> PixelMap:
     z = np.asarray(values, dtype=np.float64)
     known = finite(z)
-    n = max(known.size, 1)
-    outliers = int((np.abs(known) > BEYOND_DOUBT).sum())
-    if known.size == 0:
-        return PixelMap(words, z, float("nan"), 0, region)
+    n, outliers = known.size, int((np.abs(known) > BEYOND_DOUBT).sum())
+    if not n:
+        return PixelMap(words, z, math.nan, 0, region)
     # fewer than one pixel in a million is beyond 5 sigma by sampling noise: each counts fully
     departures = (
         abs(float(known.mean())) * np.sqrt(n),
@@ -243,14 +235,14 @@ def _pixel_map(words: str, values: NDArray[Any], region: Region | None = None) -
 
 
 def _sensor_chart(
-    maps: Sequence[PixelMap], flagged: Sequence[tuple[int, int]] = (), origin: tuple[int, int] = (0, 0)
+    maps: Sequence[PixelMap], flagged: Sequence[tuple[int, int]], origin: tuple[int, int]
 ) -> Chart:
     """Return maps of statistics of each pixel, and below their histograms with that under the model."""
     shown, below = [], []
     for each in maps:
         inside = _inside(each, origin)
         known = finite(each.z)
-        edge = float(np.clip(np.abs(known).max() if known.size else 5.0, 5.0, 15.0))
+        edge = float(np.clip(np.abs(known).max(), 5.0, 15.0))
         part = None if inside is None else each.z[inside]
         note = f"{count(each.outliers, 'pixel')} beyond ±5"
         shown.append(_map_stack(each, inside, flagged, origin))
@@ -264,9 +256,7 @@ def _map_stack(
     flagged: Sequence[tuple[int, int]],
     origin: tuple[int, int],
 ) -> Stack:
-    limit = _LEAST
-    if each.far > 0:
-        limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
+    limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
     beyond: BoolArray = np.abs(np.nan_to_num(each.z)) > BEYOND_DOUBT
     rings = np.zeros_like(beyond)
     for y, x in ((y - origin[0], x - origin[1]) for y, x in flagged):
@@ -282,10 +272,7 @@ def _map_stack(
 
 
 def _inside(each: PixelMap, origin: tuple[int, int]) -> BoolArray | None:
-    """Return the pixels of a map that its region holds, (y, x); None without a region.
-
-    The region may go on beyond the map.
-    """
+    """Return the pixels of a map in its region, which may extend beyond the map; None without a region."""
     region = each.region
     if region is None:
         return None
@@ -311,7 +298,7 @@ def _outline(inside: BoolArray, origin: tuple[int, int]) -> Line:
     return Line(xs, ys, colour="ink", width=1.1)
 
 
-def _lines_chart(arrays: Arrays, origin: tuple[int, int] = (0, 0)) -> Chart:
+def _lines_chart(arrays: Arrays, origin: tuple[int, int]) -> Chart:
     """Return the means of rows and columns: the first frames as a picture, and the scatter of each line."""
     stacks = []
     for line in _lines(arrays):
@@ -326,18 +313,14 @@ def _lines_chart(arrays: Arrays, origin: tuple[int, int] = (0, 0)) -> Chart:
 def _frames(image: NDArray[Any] | None, line: str, channel: str, first: int) -> Stack:
     """Return the means of the rows or columns of the first frames as a picture."""
     title, axis = f"{channel}: means of {LINE_WORDS[line]}", "y (pixel)" if line == "row" else "x (pixel)"
-    x, y = Axis("frame (the first ones examined)", whole=True), Axis(axis, whole=True)
-    if image is None or image.size == 0:
-        return Stack((Panel(y, (), note="not kept"),), x, title, height_mm=46.0)
-    across, down = place_of(image.T.shape, (first, 0))
-    marks = (Image(image.T, across, down, scale=DIVERGING, ends=(-_LEAST, _LEAST), unit="sigma"),)
-    x = replace(x, low=across[0], high=across[1])
-    panel = Panel(replace(y, low=down[0], high=down[1], down=True), marks)
+    x = Axis("frame (the first ones examined)", whole=True)
+    panel = Panel(Axis(axis, whole=True), (), note="not kept")
+    if image is not None and image.size:
+        across, down = place_of(image.T.shape, (first, 0))
+        mark = Image(image.T, across, down, scale=DIVERGING, ends=(-_LEAST, _LEAST), unit="sigma")
+        panel = Panel(Axis(axis, *down, whole=True, down=True), (mark,))
+        x = replace(x, low=across[0], high=across[1])
     return Stack((panel,), x, title, height_mm=46.0)
-
-
-#: By how much an axis reaches beyond its largest point, so that a legend above covers none.
-_LEGEND_ROOM = 1.35
 
 
 def _scatter(rms: FloatArray, line: str, first: int) -> Stack:
@@ -350,14 +333,13 @@ def _scatter(rms: FloatArray, line: str, first: int) -> Stack:
     marks.append(Level(1.0, colour="ink", width=0.8))
     known = finite(rms) if np.isfinite(rms).any() else np.ones(1)
     bottom, high = min(0.85, float(known.min()) - 0.05), float(known.max())
-    y = Axis("rms / expected rms", bottom, max(1.25, bottom + _LEGEND_ROOM * (high - bottom)))
+    # the legend above the points needs a third more
+    y = Axis("rms / expected rms", bottom, max(1.25, bottom + 1.35 * (high - bottom)))
     panel = Panel(y, tuple(marks), legend="upper right", columns=2)
     x = Axis(f"{'y' if line == 'row' else 'x'} (pixel)", whole=True)
     return Stack((panel,), x, f"scatter of the {LINE_WORDS[line]}", height_mm=46.0)
 
 
-#: Standard deviations to which the axis of residuals is linear.
-_LINEAR = 4.0
 #: Number of stretches of the run over which frames are averaged.
 _STRETCHES = 24
 #: Factor and unit in which frames are shown, by what is shown of them, and the label of the axis.
@@ -366,7 +348,6 @@ _SCALES = {
     "readout": (1.0, "DN", "readout: mean (DN)"),
     "noise": (1.0, "sigma", "noise (sigma)"),
 }
-_PANEL_MM, _AXIS_MM = 42.0, 12.0
 
 
 def code_figures(data: DiscrepancyData) -> Iterator[Figure]:
@@ -383,11 +364,6 @@ def code_figures(data: DiscrepancyData) -> Iterator[Figure]:
     comb = "not known"
     if even.any() and (~even).any():
         comb = f"{residual[even].mean():+.2f} on even and {residual[~even].mean():+.2f} on odd DN"
-    alt = (
-        f"Counts from {dn[0]:.0f} to {dn[-1]:.0f} DN and their residuals in standard deviations: root mean "
-        f"square {np.sqrt(np.mean(residual**2)):.2f} (expected below 1); largest {largest}; mean "
-        f"{comb.replace('-', '−')}."
-    )
     yield Figure(
         "discrepancy_codes",
         "where",
@@ -397,7 +373,9 @@ def code_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "odd DN in two colours; the gray band is 2 sigma. Hints: a tall line at an end, clipping; "
         "alternating colours, differential nonlinearity of the ADC; a slow wave, integral nonlinearity. "
         "Yellow: codes named in the verdict.",
-        alt,
+        f"Counts from {dn[0]:.0f} to {dn[-1]:.0f} DN and their residuals in standard deviations: root mean "
+        f"square {np.sqrt(np.mean(residual**2)):.2f} (expected below 1); largest {largest}; mean "
+        f"{comb.replace('-', '−')}.",
         (table,),
         _codes_chart(table, data.found.where),
         PAGE_MM,
@@ -409,8 +387,8 @@ def frame_figures(data: DiscrepancyData) -> Iterator[Figure]:
     if not _has(data, "frame_number", "frame_charge", "frame_readout"):
         return
     frames, stretches = _frame_tables(data.arrays)
-    by_channel = np.asarray(data.arrays.get("frame_sd", np.full(2, np.nan)), dtype=np.float64)
-    sds = {**dict(zip(CHANNELS, by_channel.tolist(), strict=True)), "noise": 1.0}
+    by_channel = data.arrays.get("frame_sd", np.full(2, np.nan)).tolist()
+    sds = dict(zip((*CHANNELS, "noise"), (*by_channel, 1.0), strict=True))
     sds = {shown: sd for shown, sd in sds.items() if shown in frames}
     words = []
     for channel, sd in sds.items():
@@ -484,7 +462,7 @@ def _model(channel: str) -> str:
     return f"{channel}, named effects"
 
 
-def _codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
+def _codes_chart(table: DataTable, marked: Sequence[Place]) -> Chart:
     """Return the chart of counts per DN and their residuals; even and odd codes differ in colour."""
     dn, observed, expected, residual = (table[name] for name in ("dn", "observed", "expected", "residual"))
     edges = np.append(dn - 0.5, dn[-1] + 0.5)
@@ -507,11 +485,13 @@ def _codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
     )  # fmt: skip
     even = dn % 2 == 0
     below: list[Mark] = [Span(-2.0, 2.0, colour="band"), *shaded]
+    # in points, so that lines do not touch on a page
+    width = float(np.clip(0.62 * (PAGE_MM - 22.0) / 25.4 * 72.0 / dn.size, 0.35, 4.0))
     for where, colour, label in ((even, "blue", "even DN"), (~even, "vermilion", "odd DN")):
-        below.append(Sticks(dn[where], residual[where], colour=colour, width=_bar(dn.size), label=label))
+        below.append(Sticks(dn[where], residual[where], colour=colour, width=width, label=label))
     largest = int(np.argmax(np.abs(residual)))
     reach = 1.25 * max(float(np.abs(residual).max()), 4.0)
-    y = pull_axis("(obs. − exp.) / √exp.", reach, _LINEAR)
+    y = pull_axis("(obs. − exp.) / √exp.", reach)
     note = f"largest: {residual[largest]:+.1f} at {dn[largest]:.0f} DN".replace("-", "−")
     bottom = Panel(
         y, tuple(below), 1.25, legend="upper right", columns=2, room=(1.6, 1.6), note=note,
@@ -520,27 +500,15 @@ def _codes_chart(table: DataTable, marked: Sequence[Place] = ()) -> Chart:
     return Chart((Stack((top, bottom), Axis("DN", float(edges[0]), float(edges[-1])), height_mm=86.0),))
 
 
-def _bar(n: int) -> float:
-    """Return the width of a bar in points, so that bars do not touch on a page."""
-    return float(np.clip(0.62 * (PAGE_MM - 22.0) / 25.4 * 72.0 / max(n, 1), 0.35, 4.0))
-
-
 def trends(number: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the means of the frames over stretches of the run; none spans a gap between frames.
+    """Return mean frame number, mean value and number of frames of each stretch of the run.
 
-    Args:
-        number: frame numbers, increasing, shape (n,).
-        values: a value of each frame, shape (n,).
-
-    Returns:
-        Mean frame number, mean value, and number of frames of each stretch.
+    No stretch spans a gap between frames, whose numbers increase.
     """
     starts = np.concatenate([[0], np.flatnonzero(np.diff(number) > 1) + 1, [number.size]])
     wanted = max(number.size // _STRETCHES, 4)
     pieces = [np.linspace(a, b, max((b - a) // wanted, 1) + 1)[:-1] for a, b in itertools.pairwise(starts)]
     edges = np.append(np.unique(np.concatenate(pieces).astype(np.int64)), number.size)
-    if number.size == 0:
-        return np.empty(0), np.empty(0), np.empty(0)
     n = np.diff(edges).astype(np.float64)
     centre, mean = (
         np.add.reduceat(np.asarray(v, dtype=np.float64), edges[:-1]) / n for v in (number, values)
@@ -559,7 +527,7 @@ def parity_difference(number: NDArray[Any], values: FloatArray, sd: float) -> fl
 
 
 def _frames_chart(
-    frames: DataTable, stretches: DataTable, sds: Mapping[str, float], marked: Sequence[Place] = ()
+    frames: DataTable, stretches: DataTable, sds: Mapping[str, float], marked: Sequence[Place]
 ) -> Chart:
     """Return the chart of the frames in both channels and of their noise, with the path of named effects."""
     panels = []
@@ -572,11 +540,9 @@ def _frames_chart(
         ]
         scale, _, label = _SCALES[channel]
         marks, ends, note = _channel(frames, stretches, channel, scale * sd)
-        panel = Panel(Axis(label, *ends), (*shaded, *marks), note=note, corner="lower right")
-        panels.append(panel)
-    return Chart(
-        (Stack(tuple(panels), Axis("frame"), height_mm=len(panels) * _PANEL_MM + _AXIS_MM),), legend=(5, 2)
-    )
+        panels.append(Panel(Axis(label, *ends), (*shaded, *marks), note=note, corner="lower right"))
+    stack = Stack(tuple(panels), Axis("frame"), height_mm=len(panels) * 42.0 + 12.0)
+    return Chart((stack,), legend=(5, 2))
 
 
 def _channel(
@@ -584,14 +550,13 @@ def _channel(
 ) -> tuple[list[Mark], tuple[float, float], str]:
     """Return the marks of a channel, the ends of its axis, and how many frames lie beyond them."""
     number, values = frames["frame"], frames[channel]
-    path = frames.get(_model(channel))
-    even = number % 2 == 0
-    alternates = abs(parity_difference(number, values, sd)) > 4.0
-    groups = ((even, "sky", "even frames"), (~even, "orange", "odd frames"))
-    all_frames = ((np.ones(even.size, bool), "bars", "frames"),)
+    path, even = frames.get(_model(channel)), number % 2 == 0
+    groups = [(np.ones(even.size, bool), "bars", "frames")]
+    if abs(parity_difference(number, values, sd)) > 4.0:
+        groups = [(even, "sky", "even frames"), (~even, "orange", "odd frames")]
     marks: list[Mark] = [
         Points(number[where], values[where], colour=colour, size=0.8, label=label)
-        for where, colour, label in (groups if alternates else all_frames)
+        for where, colour, label in groups
     ]
     centre, mean, n = (stretches[name] for name in ("frame", channel, "frames"))
     if np.isfinite(sd):
@@ -604,8 +569,8 @@ def _channel(
     marks.append(Line(x, y, width=1.2, dots=1.8, label="mean of a stretch"))
     if path is not None:
         marks.append(Line(number, path, colour="vermilion", width=1.4, dash="--", label="named effects"))
-    low, high = np.quantile(values, [0.001, 0.999]) if values.size else (-1.0, 1.0)
-    extremes = [low, high, *mean, *((path.min(), path.max()) if path is not None else ())]
+    extremes = [*np.quantile(values, [0.001, 0.999]), *mean]
+    extremes += [] if path is None else [path.min(), path.max()]
     margin = 0.08 * max(float(max(extremes) - min(extremes)), 1e-12)
     ends = float(min(extremes)) - margin, float(max(extremes)) + margin
     outside = int(((values < ends[0]) | (values > ends[1])).sum())

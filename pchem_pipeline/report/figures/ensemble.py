@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, FloatArray
-from pchem_pipeline.base.wording import measured, percent, power_of_ten, scientific, short
+from pchem_pipeline.base.wording import measured, percent, power_of_ten, scientific, short, unit_text
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
     Axis,
@@ -92,7 +92,7 @@ def electron_figures(data: ReportData) -> Iterator[Figure]:
     mass, pmf = arrays["electron_mass"], arrays["electron_pmf"]
     words, facts = "", data.ensemble_facts
     if facts.get("error_rate") is not None:
-        rate, error = 100.0 * float(facts["error_rate"]), 100.0 * float(facts.get("error_rate_stderr") or 0.0)
+        rate, error = (100.0 * float(facts.get(key) or 0.0) for key in ("error_rate", "error_rate_stderr"))
         words += f" Wrong estimates (truth known): {measured(rate, error, '%')}."
     if facts.get("expected_error_rate") is not None:
         words += f" Expected from the fit: {percent(float(facts['expected_error_rate']))} wrong."
@@ -117,7 +117,7 @@ def component_figures(data: ReportData) -> Iterator[Figure]:
     variance = data.ensemble.get("component_variance")
     if variance is None or not np.isfinite(variance).any():
         return
-    cases = data.component_cases or [f"case {i}" for i in range(variance.shape[0])]
+    cases = data.component_cases
     table = component_table(variance, cases, data.ensemble.get("nuced_component_variance"))
     width = table[_held(cases[0])]
     yield Figure(
@@ -129,8 +129,7 @@ def component_figures(data: ReportData) -> Iterator[Figure]:
         "pixels; gray: the remaining of the sixteen sets. Where a line is flat the peaks are resolved at "
         "every signal.",
         "Standard deviation of the ensemble's component k, nothing held constant: "
-        f"{short(float(width[0]))} DN at k = 0, "
-        f"{short(float(width[-1]))} DN at k = {variance.shape[1] - 1}.",
+        f"{short(float(width[0]))} DN at k = 0, {short(float(width[-1]))} DN at k = {width.size - 1}.",
         (table,),
         components_chart(table, [c for c in _HIGHLIGHTED if c in cases]),
         PAGE_MM,
@@ -160,16 +159,13 @@ def component_table(
 ) -> DataTable:
     """Return the standard deviations of the components by electron number.
 
-    Args:
-        variance: Var(E | K_e = k), DN^2, shape (n_cases, n_k).
-        cases: names of the rows: the parameters held constant.
-        nuced_variance: Var(E' | K_e = k), e-^2, shape (n_k,).
+    They are the roots of Var(E | K_e = k), DN^2, (n_cases, n_k), and of Var(E' | K_e = k), e-^2, (n_k,).
     """
-    width = np.sqrt(np.maximum(np.asarray(variance, np.float64), 0.0))
+    width = np.sqrt(np.maximum(variance, 0.0))
     columns = {"k": np.arange(width.shape[1])} | dict(zip(map(_held, cases), width, strict=True))
     units = dict.fromkeys(columns, "DN") | {"k": "e-", "sd after correction": "e-"}
     if nuced_variance is not None:
-        columns["sd after correction"] = np.sqrt(np.maximum(np.asarray(nuced_variance, np.float64), 0.0))
+        columns["sd after correction"] = np.sqrt(np.maximum(nuced_variance, 0.0))
     return DataTable(columns, units)
 
 
@@ -196,7 +192,7 @@ class _Drawn:
 
     def __init__(self, table: DataTable, rmse: Mapping[str, float], n_frames: int | None) -> None:
         _, axis, data, model, unit, words, self.title = next(h for h in HALVES if h.part == table.part)
-        self.unit = unit.replace("e-", "e⁻")
+        self.unit = unit_text(unit)
         self.x = table[axis].astype(np.float64)
         self.step = float(np.median(np.diff(self.x))) if self.x.size > 1 else 1.0
         self.counts = table["counts"].astype(np.float64)
@@ -260,7 +256,7 @@ def _strip(half: _Drawn, where: slice) -> Panel:
 
 def _power(values: Sequence[FloatArray]) -> int:
     """Return the power of ten in which values are drawn, so that tick labels have few digits."""
-    largest = max((float(np.max(np.abs(v), initial=0.0)) for v in values), default=0.0)
+    largest = float(np.max(np.abs(values), initial=0.0))
     return int(np.floor(np.log10(largest))) if largest > 0 else 0
 
 

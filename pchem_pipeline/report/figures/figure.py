@@ -99,11 +99,9 @@ class Figure:
     Attributes:
         name: name of its files.
         section: id of the section that shows it.
-        title: heading on the page.
         caption: what is drawn and how to read it.
         alt: what a reader who does not see it should know, with the numbers.
         tables: its data, the main part first.
-        chart: what is drawn.
         width_mm: width at which it is saved.
     """
 
@@ -146,28 +144,15 @@ def _known(column: list[Any]) -> list[Any]:
     return ["" if isinstance(value, float) and value != value else value for value in column]
 
 
-#: Sensors with so few rows or columns are drawn as points, not as an image.
-_STRIP = 2
-#: Most channels of which each has a tick.
-_FEW_TICKS = 12
-#: Bins of a histogram of pulls, and points of the normal distribution over it.
-_BINS, _POINTS = 60, 301
-
-
 def is_strip(shape: tuple[int, ...]) -> bool:
     """Return whether a sensor is a line of channels, drawn as points instead of an image."""
-    return min(shape) < _STRIP
+    return min(shape) < 2
 
 
 def place_of(
     shape: tuple[int, ...], origin: tuple[int, int] = (0, 0)
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the ends of a map on the axes x and y.
-
-    Args:
-        shape: rows and columns.
-        origin: row and column of its first pixel.
-    """
+    """Return the ends of a map on the axes x and y; ``origin`` is row and column of its first pixel."""
     y, x = ((first - 0.5, first + n - 0.5) for first, n in zip(origin, shape, strict=True))
     return x, y
 
@@ -181,8 +166,8 @@ def image_stack(image: Image, *others: Mark, title: str = "") -> Stack:
 
 
 def channel_axis(n_channels: int) -> Axis:
-    """Return the axis of a line of channels."""
-    ticks = tuple((float(i), str(i)) for i in range(n_channels)) if n_channels <= _FEW_TICKS else ()
+    """Return the axis of a line of channels; of a few each has a tick."""
+    ticks = tuple((float(i), str(i)) for i in range(n_channels)) if n_channels <= 12 else ()
     return Axis("channel", -0.5, n_channels - 0.5, whole=True, ticks=ticks)
 
 
@@ -199,25 +184,18 @@ def sensor_stack(
 ) -> Stack:
     """Return a value of each pixel as a map with a bar of its colours, of a line of channels as points.
 
-    Args:
-        values: (y, x), NaN where there is none.
-        ends: values with the first and the last colour.
-        label: what the values are, with their unit.
-        others: marks over the map.
-        ringed: pixels that are marked, (y, x); None: none.
-        ring: colour of the rings.
-        origin: row and column of the first pixel.
-        title: over it.
-        colours: ``scale``, ``none`` and ``whole`` of :class:`Image`.
+    Over the map are the other marks, and rings of colour ``ring`` at some pixels. Maps are (y, x) with the
+    first pixel at the row and column ``origin``; ``ends`` have the first and the last colour; ``colours`` are
+    ``scale`` and ``whole`` of :class:`Image`.
     """
     rings = np.zeros(values.shape, bool) if ringed is None else ringed
     style: dict[str, Any] = {"size": 5.0, "face": "none", "colour": ring}
     if is_strip(values.shape):
         flat, x = values.ravel(), np.flatnonzero(rings)
-        marks = (Points(np.arange(flat.size), flat, size=3.0, label=label, listed=False),)
+        points = Points(np.arange(flat.size), flat, size=3.0, label=label, listed=False)
         found = (Points(x, flat[x], **style),) if x.size else ()
         band = (Span(-2.0, 2.0, colour="band"),) if colours.get("scale") == DIVERGING else ()
-        return Stack((Panel(Axis(label), (*band, *marks, *found)),), channel_axis(flat.size), title)
+        return Stack((Panel(Axis(label), (*band, points, *found)),), channel_axis(flat.size), title)
     y, x = np.nonzero(rings)
     found = (Points(origin[1] + x, origin[0] + y, **style),) if x.size else ()
     image = Image(values, *place_of(values.shape, origin), ends=ends, unit=label, **colours)
@@ -233,25 +211,19 @@ def pull_stack(
     normal: bool = True,
     part: FloatArray | None = None,
 ) -> Stack:
-    """Return the histogram of standardised values beside N(0, 1); those beyond an edge are in the last bins.
+    """Return the histogram of standardised values, beside N(0, 1) and over it that of some of them, ``part``.
 
-    Args:
-        pulls: any shape; NaN are left out.
-        edge: end of the axis.
-        label: of the axis.
-        note: words in a corner.
-        normal: whether N(0, 1) is drawn.
-        part: some of them, drawn over all.
+    Values beyond ±``edge`` are in the last bins; NaN are left out.
     """
     known = finite(pulls)
-    counts, edges = np.histogram(np.clip(known, -edge, edge), _BINS, (-edge, edge))
+    counts, edges = np.histogram(np.clip(known, -edge, edge), 60, (-edge, edge))
     marks: list[Mark] = [Steps(edges, counts, filled=True, colour="bars")]
     highest = float(np.max(counts, initial=1))
     if part is not None:
         some = np.histogram(np.clip(finite(part), -edge, edge), edges)[0]
         marks.append(Steps(edges, some, colour="vermilion", width=0.9))
     if normal:
-        x = np.linspace(-edge, edge, _POINTS)
+        x = np.linspace(-edge, edge, 301)
         expected = known.size * (edges[1] - edges[0]) * np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
         marks.append(Line(x, expected, width=0.9))
         highest = max(highest, float(expected.max()))
@@ -266,17 +238,11 @@ def row_stack(labels: Sequence[str], marks: Sequence[Mark], x: Axis, title: str 
     return Stack((Panel(y, tuple(marks)),), x, title, height_mm=30.0)
 
 
-def pull_axis(label: str, reach: float, linear_to: float) -> Axis:
-    """Return an axis of standardised values, logarithmic to both sides where it reaches far.
-
-    Args:
-        label: of the axis.
-        reach: its end.
-        linear_to: end of the linear part.
-    """
-    if reach <= 3.0 * linear_to:
+def pull_axis(label: str, reach: float) -> Axis:
+    """Return an axis of standardised values up to ``reach``; one beyond 12 is logarithmic beyond 4."""
+    if reach <= 12.0:
         return Axis(label, -reach, reach)
     some = [tick for tick in (4, 10, 100, 1000, 10_000, 100_000) if tick <= reach]
     ticks = [*(-tick for tick in reversed(some)), 0, *some]
     texts = tuple((float(tick), f"{tick:g}".replace("-", "−")) for tick in ticks)
-    return Axis(label, -reach, reach, linear_to=linear_to, ticks=texts)
+    return Axis(label, -reach, reach, linear_to=4.0, ticks=texts)

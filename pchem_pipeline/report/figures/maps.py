@@ -40,7 +40,6 @@ from pchem_pipeline.report.figures.figure import (
     sensor_stack,
 )
 from pchem_pipeline.report.style.ranges import (
-    DisplayRange,
     finite,
     histogram_edges,
     map_colours,
@@ -76,34 +75,27 @@ _CAPTIONS = {
 }
 
 
-#: Maps that have a figure, in their order.
-DRAWN_MAPS = (*MAP_NAMES, *LINE_MAPS)
-
-
-def map_figures(data: ReportData) -> list[Figure]:
+def map_figures(data: ReportData) -> Iterator[Figure]:
     """Return a figure of each map of Appendix C, and of the line of several exposures, that has values."""
-    return [_map(data, name) for name in DRAWN_MAPS if data.has_values(name)]
+    for name in filter(data.has_values, (*MAP_NAMES, *LINE_MAPS)):
+        known = data.ordered(name)
+        tables = map_tables(data.maps[name], name, data.maps.get(f"{name}_stderr"), known)
+        yield Figure(
+            f"map_{name}",
+            "summary" if name in ("read_noise_e", "conversion_gain") else "maps",
+            symbol(name)[1].capitalize(),
+            _CAPTIONS[name],
+            _map_alt(data, name),
+            tables,
+            map_chart(tables, name, known),
+        )
 
 
-def _map(data: ReportData, name: str) -> Figure:
-    values, known = data.maps[name], data.ordered(name)
-    strip = is_strip(values.shape)
-    tables = map_tables(values, name, data.maps.get(f"{name}_stderr"), known)
-    return Figure(
-        f"map_{name}",
-        "summary" if name in ("read_noise_e", "conversion_gain") else "maps",
-        symbol(name)[1].capitalize(),
-        _CAPTIONS[name],
-        _map_alt(data, name, "Values of the channels" if strip else "Histogram and map"),
-        tables,
-        map_chart(tables, name, known),
-    )
-
-
-def _map_alt(data: ReportData, name: str, what: str) -> str:
+def _map_alt(data: ReportData, name: str) -> str:
     _, words, unit = symbol(name)
     summary = data.summary(name)
     low, high = summary.percentiles[5.0], summary.percentiles[95.0]
+    what = "Values of the channels" if is_strip(data.shape) else "Histogram and map"
     return (
         f"{what} of the {words}: median {measured(summary.median, summary.median_stderr, unit)}, "
         f"5 to 95 % of the {data.noun}s from {short(low)} to {short(high)} {unit}, "
@@ -137,15 +129,10 @@ def goodness_figures(data: ReportData) -> Iterator[Figure]:
     names = ("p", "chi2", "dof", "q")
     if not data.misfits or any(f"goodness_{name}" not in data.fit for name in names):
         return
-    facts = data.misfits
-    rate = float(facts["false_discovery_rate"])
+    tested, misfits, rate = (data.misfits[each] for each in ("tested", "misfits", "false_discovery_rate"))
     columns = {name: data.fit[f"goodness_{name}"] for name in names}
     columns["misfit"] = misfit(columns["chi2"], columns["dof"])
     table = DataTable(columns, {"misfit": "standard deviations"})
-    text = (
-        f"p-values and misfit of {count(int(facts['tested']), data.noun)}; "
-        f"{count(int(facts['misfits']), 'misfit')} at a false-discovery rate of {rate:g}."
-    )
     yield Figure(
         "goodness",
         "goodness",
@@ -153,7 +140,8 @@ def goodness_figures(data: ReportData) -> Iterator[Figure]:
         "p-values of the goodness of fit of all pixels (blue): uniform where the model holds (line; gray: 2 "
         "sigma), with a peak at 0 from pixels that the model does not describe. Map: chi-square as standard "
         f"normal deviate, clipped at −4 and 6; circles: misfits at a false-discovery rate of {rate:g}.",
-        text,
+        f"p-values and misfit of {count(tested, data.noun)}; {count(misfits, 'misfit')} at a false-discovery "
+        f"rate of {rate:g}.",
         (table,),
         _goodness_chart(table, rate),
         PAGE_MM,
@@ -163,14 +151,7 @@ def goodness_figures(data: ReportData) -> Iterator[Figure]:
 def map_tables(
     values: NDArray[Any], name: str, stderr: NDArray[Any] | None, known: Ordered
 ) -> tuple[DataTable, ...]:
-    """Return a map (y, x) with its standard errors, and the histogram of its known values where one is drawn.
-
-    Args:
-        values: NaN where there is no value.
-        name: in the store, e.g. ``"dark_current"``.
-        stderr: of the values; None: not known.
-        known: the values in their order.
-    """
+    """Return a map (y, x) with its standard errors, and the histogram of its known values if one is drawn."""
     unit = stored_unit(name)
     columns = {name: values} if stderr is None else {name: values, "standard error": stderr}
     table = DataTable(columns, dict.fromkeys(columns, unit))
@@ -233,7 +214,10 @@ def _channels_chart(tables: Sequence[DataTable], values: FloatArray, label: str)
     )
     y = Axis(label, log=shown.logarithmic)
     if many or shown.n_outside:
-        low, high = _padded(shown)
+        margin = 0.06 * (shown.high - shown.low)
+        low, high = shown.low - margin, shown.high + margin
+        if shown.logarithmic:
+            low, high = shown.low / 1.1, shown.high * 1.1
         y = replace(y, low=low, high=high)
     missing, remark = channels[~np.isfinite(values)], shown.remark()
     marks: tuple[Mark, ...] = (points,)
@@ -246,13 +230,6 @@ def _channels_chart(tables: Sequence[DataTable], values: FloatArray, label: str)
     if not many:
         return Chart((stack,))
     return Chart((_histogram_stack(Ordered.of(values), tables[1], label, 40.0), stack))
-
-
-def _padded(shown: DisplayRange) -> tuple[float, float]:
-    if shown.logarithmic:
-        return shown.low / 1.1, shown.high * 1.1
-    margin = 0.06 * (shown.high - shown.low)
-    return shown.low - margin, shown.high + margin
 
 
 def status_chart(

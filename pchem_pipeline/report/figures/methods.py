@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.wording import short
 from pchem_pipeline.report.charts.chart import (
     PAGE_MM,
@@ -27,6 +28,9 @@ from pchem_pipeline.report.charts.chart import (
 )
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure, row_stack
+
+#: Points of a study at several read noises, or methods with their errors, as in ``methods.json``.
+_Rows = Sequence[Mapping[str, Any]]
 
 #: Method to the hue, or colour, of its line, and its marker.
 _MARKS: dict[str, tuple[str, Shape]] = {
@@ -50,15 +54,16 @@ _RANGE = (0.03, 60.0)  # %
 
 def method_figures(data: ReportData) -> Iterator[Figure]:
     """Return the figure of the comparison, where one was made."""
-    result = data.methods
-    known = [] if result is None else [method for method in result["methods"] if method["errors"]]
-    if result is None or not (known or result["study"]):
+    if (result := data.methods) is None:
+        return
+    study, known = result["study"], [method for method in result["methods"] if method["errors"]]
+    if not (known or study):
         return
     words = [
-        f"{method['title']}: {percent_text(method['errors']['conversion_gain'].get('rmse'))} %"
+        f"{method['title']}: {percent_text(method['errors']['conversion_gain']['rmse'])} %"
         for method in known
     ]
-    crossing = f" {crossing_text(result['study'])}." if result["study"] else ""
+    crossing = f" {crossing_text(study)}." if study else ""
     yield Figure(
         "methods_gain_error",
         "methods",
@@ -70,32 +75,30 @@ def method_figures(data: ReportData) -> Iterator[Figure]:
         "bottom: pixels of this run; filled: root mean square error, hollow: robust scatter, bar: bound. "
         "Errors are clipped at 180 %.",
         f"Root mean square error of the gain on this run's pixels. {'; '.join(words)}.{crossing}",
-        _method_tables(result),
-        _methods_chart(result),
+        _method_tables(study, known),
+        _methods_chart(study, known),
         PAGE_MM,
     )
 
 
-def _method_tables(result: Mapping[str, Any]) -> tuple[DataTable, ...]:
+def _method_tables(study: _Rows, known: _Rows) -> tuple[DataTable, ...]:
     """Return the errors on simulated pixels, where there are any, and on the pixels of the run."""
     tables = []
-    if result["study"]:
-        study = result["study"]
+    if study:
         columns: dict[str, Any] = {"read_noise_e": [point["read_noise_e"] for point in study]}
         for name in study[0]["methods"]:
             gain = [point["methods"][name]["errors"]["conversion_gain"] for point in study]
-            columns[f"{name}: rms error of g"] = [_number(each["rmse"]) for each in gain]
+            columns[f"{name}: rms error of g"] = _numbers(each["rmse"] for each in gain)
         for name in study[0]["bounds"]:
-            columns[f"limit, {name}"] = [_number(point["bounds"][name]) for point in study]
+            columns[f"limit, {name}"] = _numbers(point["bounds"][name] for point in study)
         tables.append(DataTable(columns, {"read_noise_e": "e-"}, "simulated"))
-    known = [method for method in result["methods"] if method["errors"]]
     gain = [method["errors"]["conversion_gain"] for method in known]
-    numbers = {key: [_number(each[key]) for each in gain] for key in ("bias", "rmse", "robust_sd", "bound")}
+    numbers = {key: _numbers(each[key] for each in gain) for key in ("bias", "rmse", "robust_sd", "bound")}
     return (*tables, DataTable({"method": [method["name"] for method in known], **numbers}, part="run"))
 
 
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
+def _numbers(values: Iterable[float | None]) -> FloatArray:
+    return np.array(list(values), np.float64)  # None becomes NaN
 
 
 def percent_text(value: float | None) -> str:
@@ -103,16 +106,14 @@ def percent_text(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.3g}"
 
 
-def _methods_chart(result: Mapping[str, Any]) -> Chart:
-    """Return the error of the gain against the read noise (simulated), and that on the run's own pixels."""
-    study, known = result["study"], [m for m in result["methods"] if m["errors"]]
-    letters = ("(a) ", "(b) ") if study and known else ("", "")
-    stacks = [_study(study, letters[0])] if study else []
-    stacks += [_run(known, letters[1])] if known else []
-    return Chart(tuple(stacks), (2.3, 1.0) if len(stacks) > 1 else (1.0,))
+def _methods_chart(study: _Rows, known: _Rows) -> Chart:
+    """Return the error of the gain against the read noise (simulated), and that on the pixels of the run."""
+    if study and known:
+        return Chart((_study(study, "(a) "), _run(known, "(b) ")), (2.3, 1.0))
+    return Chart((_study(study, "") if study else _run(known, ""),))
 
 
-def _study(study: Sequence[Mapping[str, Any]], letter: str) -> Stack:
+def _study(study: _Rows, letter: str) -> Stack:
     noise = np.array([point["read_noise_e"] for point in study])
     marks: list[Mark] = []
     for name, method in study[0]["methods"].items():
@@ -125,9 +126,8 @@ def _study(study: Sequence[Mapping[str, Any]], letter: str) -> Stack:
             Points(noise[~many], rmse[~many], shape, 4.0, face="paper", colour=colour),
         ]
     for name, dash, label in _BOUNDS:
-        values = [point["bounds"][name] for point in study]
-        shown = np.array([np.nan if v is None else 100 * v for v in values])
-        marks.append(Line(noise, shown, colour="ink", dash=dash, label=label))
+        bound = 100 * _numbers(point["bounds"][name] for point in study)
+        marks.append(Line(noise, bound, colour="ink", dash=dash, label=label))
     crossing = bound_crossing(study)
     if crossing is not None:
         words = Words(crossing, 0.02, f" {crossing:.2f} e⁻", "left", colour="faint")
@@ -139,9 +139,7 @@ def _study(study: Sequence[Mapping[str, Any]], letter: str) -> Stack:
     return Stack((panel,), Axis("read noise (e⁻)"), title, height_mm=86.0)
 
 
-def _curve(
-    study: Sequence[Mapping[str, Any]], name: str
-) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+def _curve(study: _Rows, name: str) -> tuple[FloatArray, FloatArray]:
     """Return the rms error of the gain in % and the share of pixels with an answer, at every read noise."""
     rmse, share = [], []
     for point in study:
@@ -153,7 +151,7 @@ def _curve(
     return np.array(rmse), np.array(share)
 
 
-def _run(known: Sequence[Mapping[str, Any]], letter: str) -> Stack:
+def _run(known: _Rows, letter: str) -> Stack:
     marks: list[Mark] = [Level(float(row), colour="grid", width=0.5) for row in range(len(known))]
     for row, method in enumerate(known):
         gain = method["errors"]["conversion_gain"]
@@ -172,50 +170,37 @@ def _run(known: Sequence[Mapping[str, Any]], letter: str) -> Stack:
     return replace(stack, x=replace(stack.x, low=max(low, _RANGE[0]), high=high))
 
 
-def gain_rmse(point: Mapping[str, Any], name: str) -> float | None:
-    """Return the rms error of the gain by a method; None where it answered for less than half the pixels."""
-    method = point["methods"][name]
-    # of few answered pixels the easy ones are left
-    if method["n_answered"] < 0.5 * method["n_pixels"]:
-        return None
-    found = method["errors"]["conversion_gain"]["rmse"]
-    return None if found is None else float(found)
-
-
-def bound_crossing(study: Sequence[Mapping[str, Any]]) -> float | None:
+def bound_crossing(study: _Rows) -> float | None:
     """Return the read noise, e-, at which photon transfer's error falls below the bound of one sample."""
-    return _crossing(
-        study,
-        [point["bounds"]["one sample"] for point in study],
-        [point["bounds"]["photon_transfer"] for point in study],
-    )
+    bounds = ((point["read_noise_e"], point["bounds"]) for point in study)
+    return _crossing((noise, bound["one sample"], bound["photon_transfer"]) for noise, bound in bounds)
 
 
-def measured_crossing(study: Sequence[Mapping[str, Any]]) -> float | None:
+def measured_crossing(study: _Rows) -> float | None:
     """Return the same from the simulated pixels: PCH-EM of one sample against two-sample photon transfer."""
+    methods = ((point["read_noise_e"], point["methods"]) for point in study)
     return _crossing(
-        study,
-        [gain_rmse(point, "pchem_em") for point in study],
-        [gain_rmse(point, "photon_transfer") for point in study],
+        (noise, _gain_rmse(found["pchem_em"]), _gain_rmse(found["photon_transfer"]))
+        for noise, found in methods
     )
 
 
-def _crossing(
-    study: Sequence[Mapping[str, Any]], one: Sequence[float | None], other: Sequence[float | None]
-) -> float | None:
-    """Interpolate where ``one`` grows above ``other``; None where it does not, or is above from the start."""
-    known = sorted(
-        (point["read_noise_e"], np.log(a / b))
-        for point, a, b in zip(study, one, other, strict=True)
-        if a and b
-    )
+def _gain_rmse(method: Mapping[str, Any]) -> float | None:
+    """Return the rms error of the gain; None where only the easy pixels, less than half, have a value."""
+    found: float | None = method["errors"]["conversion_gain"]["rmse"]
+    return found if method["n_answered"] >= 0.5 * method["n_pixels"] else None
+
+
+def _crossing(rows: Iterable[tuple[float, float | None, float | None]]) -> float | None:
+    """Interpolate the read noise at which one error grows above another; None if they do not cross."""
+    known = sorted((noise, np.log(one / other)) for noise, one, other in rows if one and other)
     for (x0, y0), (x1, y1) in itertools.pairwise(known):
         if y0 < 0 <= y1:
             return float(x0 + (x1 - x0) * y0 / (y0 - y1))
     return None
 
 
-def crossing_text(study: Sequence[Mapping[str, Any]]) -> str:
+def crossing_text(study: _Rows) -> str:
     """Say up to which read noise one-sample PCH-EM beats photon transfer with as many frames."""
     expected, measured = bound_crossing(study), measured_crossing(study)
     if expected is None and measured is None:

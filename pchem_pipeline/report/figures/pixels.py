@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.base.wording import cut, plain, short, stored_unit, symbol
 from pchem_pipeline.model.law.pcd import pcd, thresholds
@@ -32,11 +33,6 @@ from pchem_pipeline.report.charts.chart import (
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import DataTable, Figure
 
-#: Letters of a line of the status.
-_STATUS_LETTERS = 52
-_LETTERS = "abcdefghijklmnop"
-#: Cells whose number is written.
-_MOST_NUMBERS = 18
 _TITLE_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 
 
@@ -89,17 +85,15 @@ def _fit_tables(pixels: Sequence[PixelFit]) -> tuple[DataTable, DataTable]:
     parts = [pixel_columns(pixel) for pixel in pixels]
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     units = {"y": "pixel", "x": "pixel", "dn": "DN", "residual": "standard deviations"}
-    facts: dict[str, list[Any]] = {
-        "y": [pixel.y for pixel in pixels],
-        "x": [pixel.x for pixel in pixels],
-        "shown as": [pixel.label for pixel in pixels],
-    }
-    for name in (*PARAMETERS, "read_noise_e"):
-        units |= dict.fromkeys((name, f"{name} standard error"), stored_unit(name))
-        facts[name] = [pixel.parameters.get(name, np.nan) for pixel in pixels]
-        facts[f"{name} standard error"] = [pixel.stderr.get(name, np.nan) for pixel in pixels]
-    facts["goodness_p"] = [pixel.goodness_p for pixel in pixels]
-    facts["fit_status"] = [pixel.status for pixel in pixels]
+    rows = []
+    for pixel in pixels:
+        row: dict[str, Any] = {"y": pixel.y, "x": pixel.x, "shown as": pixel.label}
+        for name in (*PARAMETERS, "read_noise_e"):
+            units |= dict.fromkeys((name, f"{name} standard error"), stored_unit(name))
+            row[name] = pixel.parameters.get(name, np.nan)
+            row[f"{name} standard error"] = pixel.stderr.get(name, np.nan)
+        rows.append(row | {"goodness_p": pixel.goodness_p, "fit_status": pixel.status})
+    facts = {name: [row[name] for row in rows] for name in rows[0]}
     return DataTable(columns, units), DataTable(facts, units, "parameters")
 
 
@@ -112,7 +106,9 @@ def pixel_columns(pixel: PixelFit) -> dict[str, NDArray[Any]]:
     dn, n = _codes(pixel), pixel.counts.size
     expected = np.full(n, np.nan)
     if has_fit(pixel.parameters):
-        expected = pixel.counts.sum() * _density(pixel, dn)
+        # under a model with effects the mass of each code, else the density there
+        mass = pcd(dn.astype(np.float64), *_theta(pixel.parameters)) if pixel.mass is None else pixel.mass
+        expected = pixel.counts.sum() * mass
     with np.errstate(divide="ignore", invalid="ignore"):
         residual = np.where(expected >= 1.0, (pixel.counts - expected) / np.sqrt(expected), np.nan)
     return {
@@ -123,11 +119,6 @@ def pixel_columns(pixel: PixelFit) -> dict[str, NDArray[Any]]:
         "expected frames": expected,
         "residual": residual,
     }
-
-
-def _density(pixel: PixelFit, dn: IntArray) -> FloatArray:
-    """Return the density, or under a model with effects the mass, that a pixel's fit gives its codes."""
-    return pcd(dn.astype(np.float64), *_theta(pixel.parameters)) if pixel.mass is None else pixel.mass
 
 
 def has_fit(parameters: Mapping[str, float]) -> bool:
@@ -175,11 +166,10 @@ def pixels_chart(pixels: Sequence[PixelFit]) -> Chart:
     effects the mass of each DN. The strip below shows ``(count - expected) / sqrt(expected)`` where at least
     one frame is expected. Of several pixels two are in a row on a page.
     """
-    many = len(pixels) > 1
-    stacks = [
-        _one_pixel(pixel, _LETTERS[i % len(_LETTERS)] if many else "") for i, pixel in enumerate(pixels)
-    ]
-    return Chart(tuple(stacks), (1.0, 1.0) if many else (1.0,))
+    if len(pixels) == 1:
+        return Chart((_one_pixel(pixels[0], ""),))
+    letters = itertools.cycle("abcdefghijklmnop")
+    return Chart(tuple(map(_one_pixel, pixels, letters)), (1.0, 1.0))
 
 
 def _one_pixel(pixel: PixelFit, letter: str) -> Stack:
@@ -191,7 +181,9 @@ def _one_pixel(pixel: PixelFit, letter: str) -> Stack:
     where = shown_bins(pixel.counts)
     dn = _codes(pixel)
     low, high = dn[where][0] - 0.5, dn[where][-1] + 0.5
-    marks: list[Mark] = [_bars(pixel.counts, pixel.origin, where)]
+    bars = _bars(pixel.counts, pixel.origin, where)
+    marks: list[Mark] = [bars]
+    tallest = float(np.max(bars.values))
     remarks = [f"{total:,} {'samples' if pixel.channel else 'frames'}"]
     outside = total - int(pixel.counts[where].sum())
     if outside:
@@ -203,13 +195,13 @@ def _one_pixel(pixel: PixelFit, letter: str) -> Stack:
             y = pcd(x, *_theta(pixel.parameters))
         else:
             x, y = dn[where].astype(np.float64), pixel.mass[where]
+        tallest = max(tallest, float(np.nanmax(y)))
         marks.append(Line(x, y, colour="ink", label="fit"))
         if np.isfinite(pixel.goodness_p):
             remarks.append(f"goodness of fit p = {pixel.goodness_p:.2g}")
         strip = _residual_strip(pixel, where, residual)
     else:
         remarks.append("no fit")
-    tallest = max(float(np.nanmax(y)) for y in (marks[0].values, *(m.y for m in marks[1:])))  # type: ignore[attr-defined]
     top = Panel(Axis(density, 0.0, 1.3 * max(tallest, 1e-12)), tuple(marks), 3.4, note="\n".join(remarks))
     return Stack((top, strip), Axis("signal (DN)", float(low), float(high)), title, height_mm=62.0)
 
@@ -241,9 +233,7 @@ def _title(pixel: PixelFit, letter: str) -> str:
         words = [f"{symbol(name)[0]} = {pixel.text(name)}" for name in known]
         lines += ["   ".join(words[i : i + 2]) for i in range(0, len(words), 2)]
     if pixel.status:
-        lines += textwrap.wrap(
-            f"status: {plain(pixel.status)}", _STATUS_LETTERS, max_lines=5, placeholder=" …"
-        )
+        lines += textwrap.wrap(f"status: {plain(pixel.status)}", 52, max_lines=5, placeholder=" …")
     return "\n".join(lines)
 
 
@@ -258,11 +248,8 @@ def cell_tables(pixel: PixelFit) -> tuple[DataTable, ...]:
     edges = edges[edges < high]
     density = DataTable({"signal": x, "density": pcd(x, *theta)}, {"signal": "DN", "density": "1/DN"})
     between = DataTable({"below k": np.arange(1, edges.size + 1), "edge": edges}, {"edge": "DN"}, "edges")
-    return (
-        density,
-        between,
-        DataTable({"dn": _codes(pixel), "frames": pixel.counts}, {"dn": "DN"}, "histogram"),
-    )
+    histogram = DataTable({"dn": _codes(pixel), "frames": pixel.counts}, {"dn": "DN"}, "histogram")
+    return density, between, histogram
 
 
 def cells_chart(tables: Sequence[DataTable]) -> Chart:
@@ -278,7 +265,7 @@ def cells_chart(tables: Sequence[DataTable]) -> Chart:
     ends = np.full(edges.size, 0.86 * top)
     dashed = Sticks(edges, ends, colour="blue", dash="--", width=0.9, label="limit between numbers k")
     cells = np.concatenate([[low], edges, [high]])
-    every = max(1, int(np.ceil(len(cells) / _MOST_NUMBERS)))
+    every = -(-len(cells) // 18)  # of more cells not each has its number
     words = [
         Words((cells[k] + cells[k + 1]) / 2, 0.87, f"k = {k}" if k == 0 else str(k))
         for k in range(0, len(cells) - 1, every)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -27,25 +27,22 @@ AXES = {
 
 def exposure_figures(data: ReportData) -> Iterator[Figure]:
     """Return the exposures on their line, where samples lie on one."""
-    samples = data.samples
-    if samples is None or samples.against not in AXES:
+    samples, slope = data.samples, slope_of(data)
+    if samples is None or slope is None or not samples.on_line:
         return
-    slope = slope_of(data)
-    if slope is None or not samples.on_line:
-        return
-    words, noun = AXES[samples.against][0], symbol(slope)[1]
+    words, _, _, offset = AXES[samples.against]
+    _, noun, unit = symbol(slope)
     table = _exposure_table(samples)
     centre, error = middle(data.maps[slope])[:2]
-    line = (centre, *middle(data.maps[AXES[samples.against][3]])[:2])
     yield Figure(
         "exposures",
         "exposures",
         f"{noun.capitalize()} as the slope of H",
         f"Quanta exposure against {words}, with the median line of the pixels. Below: median residual "
         "with its standard error.",
-        f"Exposures on a line; median {noun} {measured(centre, error, symbol(slope)[2])}.",
+        f"Exposures on a line; median {noun} {measured(centre, error, unit)}.",
         (table,),
-        _exposures_chart(table, line),
+        _exposures_chart(table, centre, *middle(data.maps[offset])[:2]),
     )
 
 
@@ -62,7 +59,7 @@ def transfer_figures(data: ReportData) -> Iterator[Figure]:
     if samples is None or not data.has_values("conversion_gain"):
         return
     table = _transfer_table(samples, data.maps["bias"])
-    fitted = {name: middle(data.maps[name])[0] for name in ("conversion_gain", "read_noise_dn")}
+    gain, noise = (middle(data.maps[name])[0] for name in ("conversion_gain", "read_noise_dn"))
     medians = zip(table["sample"], table["variance"], strict=True)
     yield Figure(
         "photon_transfer",
@@ -73,7 +70,7 @@ def transfer_figures(data: ReportData) -> Iterator[Figure]:
         "Variance against mean above the bias: "
         + "; ".join(f"{name} {short(float(value))} DN²" for name, value in medians),
         (table,),
-        _transfer_chart(table, fitted),
+        _transfer_chart(table, gain, noise),
     )
 
 
@@ -119,14 +116,14 @@ def middle(values: NDArray[Any]) -> tuple[float, float, float, float]:
     return found.median, found.median_stderr, low, high
 
 
-def _exposures_chart(table: DataTable, line: tuple[float, float, float]) -> Chart:
+def _exposures_chart(table: DataTable, slope: float, offset: float, error: float) -> Chart:
     """Return the chart of H against time or light with its line, and the residuals below.
 
     Points are medians over the pixels, bars the 16 to 84 % range between pixels; the error bars of the
     residuals are standard errors of the median.
     """
     against = list(table.columns)[1]
-    places, exposures, (slope, offset) = table[against].astype(np.float64), table["H"], line[:2]
+    places, exposures = table[against].astype(np.float64), table["H"]
     grid = np.linspace(0.0, 1.05 * places.max(), 50)
     marks = (
         Line(grid, offset + slope * grid, colour="vermilion", label="median line of the pixels"),
@@ -135,7 +132,7 @@ def _exposures_chart(table: DataTable, line: tuple[float, float, float]) -> Char
     )
     top = Panel(
         Axis("quanta exposure $H$ (e⁻)", low=min(0.0, 1.1 * offset)), marks, 2.0, legend="upper left",
-        note=f"offset {measured(*line[1:], 'e⁻')}", corner="lower right",
+        note=f"offset {measured(offset, error, 'e⁻')}", corner="lower right",
     )  # fmt: skip
     x = Axis(table.heading(against), 0.0, float(grid[-1]))
     return Chart((Stack((top, _residuals(places, table)), x, height_mm=92.0),))
@@ -158,14 +155,13 @@ def _residuals(places: FloatArray, table: DataTable) -> Panel:
     return Panel(Axis(label, -most, most), (zero, points))
 
 
-def _transfer_chart(table: DataTable, fitted: Mapping[str, float]) -> Chart:
+def _transfer_chart(table: DataTable, gain: float, noise: float) -> Chart:
     """Return the chart of variance against mean above the bias with the curve of the joint fit.
 
     Photon transfer: ``variance = sigma^2 + (mean - mu) / g`` in DN. Points are medians over the pixels; the
     curve has the median parameters.
     """
     x, y, kinds = (table[name] for name in ("mean above the bias", "variance", "kind"))
-    gain, noise = fitted["conversion_gain"], fitted["read_noise_dn"]
     known = finite(x[kinds == "exposed"])
     most = 1.15 * float(np.max(known, initial=1e-3))
     least = float(np.min(known[known > 0], initial=most))

@@ -6,7 +6,7 @@ Made of the sums that the stage ``histogram`` keeps, with their expectation from
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -30,44 +30,40 @@ def stability_figures(sums: StackSums | None) -> list[Figure]:
     """Return means against frame, row and column, and their spectra, where the run has the sums."""
     if sums is None:
         return []
-    makers = (_frame_figure, _profile_figure, _spectrum_figure)
-    return [figure for make in makers if (figure := make(sums)) is not None]
+    return [*_frame_figure(sums), *_profile_figure(sums), *_spectrum_figure(sums)]
 
 
-def _frame_figure(sums: StackSums) -> Figure:
+def _frame_figure(sums: StackSums) -> Iterator[Figure]:
     means, power = frame_table(sums), power_table(sums)
     together = math.ceil(sums.n_frames / _MOST_POINTS)
     averaged = f" over {together} frames each" if together > 1 else " of each frame"
     error = float(means["expected error"][0])
     scatter = float(means["mean"].std())
-    alt = (
-        f"Mean of {count(sums.n_frames, 'frame')}: {short(float(means['mean'].mean()), 5)} DN, scatter "
-        f"{short(scatter)} DN ({short(error)} DN for independent pixels); largest power "
-        f"{short(float(power['largest'].max()), 2)} times the expected one."
-    )
-    return Figure(
+    yield Figure(
         "frame_means",
         "stability",
         "Mean of the frames",
         f"Top: mean of all pixels{averaged}; gray: 2 sigma for independent pixels. Below: power spectrum "
         "relative to independent pixels (1): mean and maximum of neighbouring frequencies.",
-        alt,
+        f"Mean of {count(sums.n_frames, 'frame')}: {short(float(means['mean'].mean()), 5)} DN, scatter "
+        f"{short(scatter)} DN ({short(error)} DN for independent pixels); largest power "
+        f"{short(float(power['largest'].max()), 2)} times the expected one.",
         (means, power),
         _frames_chart(means, power),
     )
 
 
-def _profile_figure(sums: StackSums) -> Figure | None:
+def _profile_figure(sums: StackSums) -> Iterator[Figure]:
     tables = [profile_table(sums, axis) for axis in (0, 1) if sums.shape[1 - axis] > 1]
     tables = [table for table in tables if table["mean signal"].size > 1]
     if not tables:
-        return None
+        return
     words = []
     for table in tables:
         low, high = (table[name] for name in ("expected from", "expected to"))
         outside = int(((table["mean signal"] < low) | (table["mean signal"] > high)).sum())
         words.append(f"{outside} of {count(low.size, table.part)} outside 2 sigma")
-    return Figure(
+    yield Figure(
         "profiles",
         "stability",
         "Profiles of rows and columns",
@@ -79,15 +75,15 @@ def _profile_figure(sums: StackSums) -> Figure | None:
     )
 
 
-def _spectrum_figure(sums: StackSums) -> Figure | None:
+def _spectrum_figure(sums: StackSums) -> Iterator[Figure]:
     fixed, temporal = pattern_spectra(sums), line_spectra(sums)
     if not fixed or not temporal:
-        return None
+        return
     largest = [
         f"{table.part.replace('_', ' of ')}s {short(float(table['power'].max()), 2)}"
         for table in (*fixed, *temporal)
     ]
-    return Figure(
+    yield Figure(
         "spatial_spectra",
         "stability",
         "Spectra of rows and columns",
@@ -217,8 +213,7 @@ def _profiles_chart(tables: Sequence[DataTable]) -> Chart:
     """Return the chart of the profiles of rows and columns."""
     stacks = []
     for table in tables:
-        name = next(iter(table.columns))
-        ends = table["expected from"], table["expected to"]
+        name, ends = next(iter(table.columns)), (table["expected from"], table["expected to"])
         axis = f"{table.part} {name} (pixel)"
         stacks.append(_series(table[name], table["mean signal"], ends, "median", axis, 0.8))
     return Chart(tuple(stacks))

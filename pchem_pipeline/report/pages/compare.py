@@ -24,11 +24,10 @@ from pchem_pipeline.model.maps.defects import FAULTS
 from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting, by_change
 from pchem_pipeline.report.figures.compare import difference_figures, ensembles_figures, history_figures
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, draw_here, render_page
-from pchem_pipeline.report.pages.summary import Flag, Level
+from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, render_page
+from pchem_pipeline.report.pages.summary import Flag
 from pchem_pipeline.report.pages.tables import RMSES, Table
 
-#: Names of the files.
 COMPARE_PAGE, COMPARE_JSON = "compare.html", "compare.json"
 #: Version of the layout of ``compare.json``.
 COMPARE_VERSION = 1
@@ -67,7 +66,6 @@ def sentence_of(found: Comparison) -> str:
 
 
 def _shown(pair: Pair) -> list[str]:
-    """Return what changed, as many sentences as are shown."""
     more = len(pair.changes) - _MOST_WORDS
     rest = [f"And {more} more; see {COMPARE_JSON}."] if more > 0 else []
     return [*pair.changes[:_MOST_WORDS], *rest]
@@ -91,19 +89,13 @@ def _pair_sentence(pair: Pair, tolerance: float) -> str:
     return f"Nothing changed: {count(len(rows), 'array')} with {values:,} values {what}."
 
 
-def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[str, str]:
-    """Return the page and the JSON of a comparison; nothing is written.
-
-    Args:
-        found: the comparison.
-        draw: draws all figures at once; None: one after the other, here.
-    """
+def render_comparison(found: Comparison, draw: DrawAll) -> tuple[str, str]:
+    """Return the page and the JSON of a comparison; nothing is written."""
     many = len(found.pairs) > _MOST_DRAWN
     maps = {pair.key: [] if many else difference_figures(pair) for pair in found.pairs}
     whole = list(ensembles_figures([found.runs[0], *found.runs[1:][-_MOST_DRAWN:]]))
     times = list(history_figures(found.history))
-    every = [*whole, *times, *(each for figures in maps.values() for each in figures)]
-    drawn = (draw or draw_here)(every)
+    drawn = draw([*whole, *times, *(each for figures in maps.values() for each in figures)])
 
     sections = [
         Section(id="verdict", title="Result", verdict=_finding(found.changed, sentence_of(found))),
@@ -113,13 +105,13 @@ def render_comparison(found: Comparison, draw: DrawAll | None = None) -> tuple[s
         Section(id="all-runs", title="Runs", tables=[run_table(found)]),
     ]
     page = render_page("compare.html.j2", sections, drawn, title=" · ".join(run.title for run in found.runs))
-    return page, json.dumps(_numbers(found), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    numbers = json.dumps(plain(_numbers(found)), indent=2, allow_nan=False, ensure_ascii=False)
+    return page, f"{numbers}\n"
 
 
 def _finding(changed: bool, sentence: str, changes: Sequence[str] = ()) -> Finding:
-    level: Level = "caution" if changed else "good"
-    remarks = [Flag(level, text) for text in changes]
-    name = "Changed" if changed else "No change"
+    level, name = ("caution", "Changed") if changed else ("good", "No change")
+    remarks = [Flag("caution", text) for text in changes]
     return Finding(level, name, sentence.replace(" -", " −"), remarks=remarks)
 
 
@@ -138,32 +130,27 @@ def _pair_section(pair: Pair, found: Comparison, figures: Sequence[Figure]) -> S
 
 
 def _numbers(found: Comparison) -> dict[str, Any]:
-    numbers: dict[str, Any] = plain(
-        {
-            "compare_version": COMPARE_VERSION,
-            "changed": found.changed,
-            "sentence": sentence_of(found),
-            "tolerance": found.tolerance,
-            "runs": [
-                {
-                    "label": run.label,
-                    "name": run.name,
-                    "shape": run.shape,
-                    "n_frames": run.n_frames,
-                    "data": run.digest,
-                    "medians": {k: dict(zip(_MEDIAN, v, strict=True)) for k, v in run.summary.items()},
-                    "pixels": dict(zip(("good", "caution", "no_value"), run.pixels, strict=True)),
-                    "rmse": run.rmse,
-                }
-                for run in found.runs
-            ],
-            "comparisons": [_pair_numbers(pair) for pair in found.pairs],
-        }
-    )
-    return numbers
-
-
-_MEDIAN = ("median", "median_stderr", "robust_sd")
+    parts = ("median", "median_stderr", "robust_sd")
+    return {
+        "compare_version": COMPARE_VERSION,
+        "changed": found.changed,
+        "sentence": sentence_of(found),
+        "tolerance": found.tolerance,
+        "runs": [
+            {
+                "label": run.label,
+                "name": run.name,
+                "shape": run.shape,
+                "n_frames": run.n_frames,
+                "data": run.digest,
+                "medians": {name: dict(zip(parts, row, strict=True)) for name, row in run.summary.items()},
+                "pixels": dict(zip(("good", "caution", "no_value"), run.pixels, strict=True)),
+                "rmse": run.rmse,
+            }
+            for run in found.runs
+        ],
+        "comparisons": [_pair_numbers(pair) for pair in found.pairs],
+    }
 
 
 def _pair_numbers(pair: Pair) -> dict[str, Any]:
@@ -232,8 +219,7 @@ def _nonzero_counts(numbers: Mapping[str, str]) -> str:
 
 def _defect_words(row: HistoryRow) -> str:
     """Return the number of defects by kind, and where they differ from those of the first run."""
-    kinds = {kind: row[f"{kind}_pixels"] for kind in map(words_of, FAULTS)}
-    parts = [_nonzero_counts(kinds) or "none"]
+    parts = [_nonzero_counts({kind: row[f"{kind}_pixels"] for kind in map(words_of, FAULTS)}) or "none"]
     for change in by_change(()):
         if places := row[f"defects_{change.replace(' ', '_')}"].split():
             shown = ", ".join(places[:_MOST_PLACES])
@@ -249,9 +235,8 @@ def run_table(found: Comparison) -> Table:
         "pixels": [f"{run.shape[0]} × {run.shape[1]}" for run in runs],
         "frames": ["not known" if run.n_frames is None else f"{run.n_frames:,}" for run in runs],
     }
-    for place, grade in enumerate(_GRADES):
-        counts = [(run.pixels[place], sum(run.pixels)) for run in runs]
-        rows[grade] = [f"{n:,} ({percent(n, total)})" for n, total in counts]
+    for grade, counts in zip(_GRADES, zip(*(run.pixels for run in runs), strict=True), strict=True):
+        rows[grade] = [f"{n:,} ({percent(n, sum(r.pixels))})" for n, r in zip(counts, runs, strict=True)]
     for name in dict.fromkeys(each for run in runs for each in run.summary):
         medians = [run.summary.get(name, (math.nan, math.nan))[:2] for run in runs]
         rows[f"{heading(name)}, median"] = [measured(*median, symbol(name)[2]) for median in medians]
@@ -267,16 +252,26 @@ def run_table(found: Comparison) -> Table:
 
 def pair_tables(pair: Pair) -> list[Table]:
     """Return the tables of a run against the first one; empty ones are left out."""
-    tables = (_map_table(pair), _defects(pair), _transitions(pair), _settings(pair), _versions(pair))
+    settings = [
+        _both("setting", pair, each) | {"read by": ", ".join(each.stages) or "no stage"}
+        for each in pair.settings
+    ]
+    versions = [_both("program or algorithm", pair, each) for each in pair.versions]
+    tables = (
+        _map_table(pair),
+        _defects(pair),
+        _transitions(pair),
+        Table(f"settings-{pair.key}", "Settings that differ", "", settings),
+        Table(f"versions-{pair.key}", "Versions that differ", "", versions),
+    )
     return [table for table in tables if table.rows]
 
 
 def _map_table(pair: Pair) -> Table:
     rows = []
     for name, each in pair.maps.items():
-        reason = pair.reasons.get(name)
         same = "within the limit" if pair.limits else "within sampling noise"
-        verdict = "" if reason is None else "changed" if reason else same
+        reason = pair.reasons.get(name)
         rows.append(
             {
                 "map": heading(name),
@@ -285,7 +280,7 @@ def _map_table(pair: Pair) -> Table:
                 "scatter (σ)": f"{each.spread_z:.3f}",
                 "pixels changed": f"{each.n_changed:,} of {each.n_counted:,}",
                 "largest (σ)": short(each.largest_z),
-                "": verdict,
+                "": "" if reason is None else "changed" if reason else same,
             }
         )
     unit_words = (
@@ -303,15 +298,14 @@ def _map_table(pair: Pair) -> Table:
 
 
 def _defects(pair: Pair) -> Table:
-    shown = pair.defects[:_MOST_PIXELS]
+    shown, one, other = pair.defects[:_MOST_PIXELS], pair.one.label, pair.other.label
     rest = f" The first {len(shown)} of {len(pair.defects):,}." if len(shown) < len(pair.defects) else ""
     return Table(
         f"defects-{pair.key}",
         "Defects that changed",
         f"Kinds as in pchem export --format defects; all pixels: compare.json.{rest}",
         [
-            {"y": f"{each.y}", "x": f"{each.x}"}
-            | {run.label: kinds or "none" for run, kinds in ((pair.one, each.before), (pair.other, each.now))}
+            {"y": f"{each.y}", "x": f"{each.x}", one: each.before or "none", other: each.now or "none"}
             for each in shown
         ],
     )
@@ -324,19 +318,6 @@ def _transitions(pair: Pair) -> Table:
         for grade, row in zip(_GRADES, pair.transitions, strict=False)
     ]
     return Table(f"quality-{pair.key}", "Pixels by quality", "", rows)
-
-
-def _settings(pair: Pair) -> Table:
-    rows = [
-        _both("setting", pair, each) | {"read by": ", ".join(each.stages) or "no stage"}
-        for each in pair.settings
-    ]
-    return Table(f"settings-{pair.key}", "Settings that differ", "", rows)
-
-
-def _versions(pair: Pair) -> Table:
-    rows = [_both("program or algorithm", pair, each) for each in pair.versions]
-    return Table(f"versions-{pair.key}", "Versions that differ", "", rows)
 
 
 def _both(what: str, pair: Pair, each: Setting) -> dict[str, str]:

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from pchem_pipeline.base.wording import (
+    MAPS,
+    capitalised,
     count,
     fitted_or_chosen,
     measured,
@@ -21,7 +23,6 @@ from pchem_pipeline.base.wording import (
 )
 from pchem_pipeline.discrepancy.verdict import (
     FACTORS,
-    GapChange,
     Place,
     Step,
     Verdict,
@@ -34,7 +35,7 @@ from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.report.data import DiscrepancyData
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.pages.page import Finding, KeyFact, Section
-from pchem_pipeline.report.pages.summary import VERDICT_LEVELS, Flag, Level, gravest_first
+from pchem_pipeline.report.pages.summary import VERDICT_LEVELS, Flag, gravest_first
 from pchem_pipeline.report.pages.tables import Table
 
 #: Longer lists are in ``discrepancy.json`` only.
@@ -49,12 +50,8 @@ _SURVEYED = {
 }
 
 
-def parameter_name(name: str) -> str:
-    """Return the name of a map in words."""
-    try:
-        return symbol(name)[1]
-    except KeyError:
-        return name.replace("_", " ")
+def _parameter_name(name: str) -> str:
+    return symbol(name)[1] if name in MAPS else name.replace("_", " ")
 
 
 def discrepancy_tables(data: DiscrepancyData) -> dict[str, list[Table]]:
@@ -84,22 +81,20 @@ def place_text(place: Place) -> str:
     if place.dn is not None:
         low, high = place.dn
         words.append(f"{low:g} DN" if low == high else f"{low:g} to {high:g} DN")
-    if place.frames:
-        words.append(_frame_text(place.frames))
+    if len(place.frames) > 4:
+        words.append(f"{count(len(place.frames), 'frame')} from {min(place.frames)} to {max(place.frames)}")
+    elif place.frames:
+        words.append(f"frames {', '.join(map(str, place.frames))}")
     return "; ".join(words)
 
 
-def _frame_text(frames: Sequence[int]) -> str:
-    if len(frames) <= 4:
-        return "frames " + ", ".join(str(frame) for frame in frames)
-    return f"{count(len(frames), 'frame')} from {min(frames)} to {max(frames)}"
-
-
 def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
-    rows = []
-    for place in places[:_MOST_PLACES]:
-        channel, sentence = data.statistics.get(place.statistic, ("", ""))
-        rows.append(
+    more = f" The first {_MOST_PLACES} of {len(places)}." if len(places) > _MOST_PLACES else ""
+    return Table(
+        "discrepancy-where",
+        "Statistics that disagree",
+        f"Deviation of each from the plain model in sigma, with its p-value; the largest first.{more}",
+        [
             {
                 "disagreement": place.sentence or sentence or place.statistic,
                 "channel": place.channel or channel,
@@ -107,13 +102,9 @@ def _where(data: DiscrepancyData, places: Sequence[Place]) -> Table:
                 "p": probability_text(place.p),
                 "where": place_text(place) or "everywhere",
             }
-        )
-    more = f" The first {_MOST_PLACES} of {len(places)}." if len(places) > _MOST_PLACES else ""
-    return Table(
-        "discrepancy-where",
-        "Statistics that disagree",
-        f"Deviation of each from the plain model in sigma, with its p-value; the largest first.{more}",
-        rows,
+            for place in places[:_MOST_PLACES]
+            for channel, sentence in [data.statistics.get(place.statistic, ("", ""))]
+        ],
     )
 
 
@@ -124,11 +115,11 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     several = len(step.candidates) > 1 and step.verdict != "described"
     for candidate in step.candidates[: _MOST_CANDIDATES if several else 0]:
         behind = candidate.score - best
-        given = {
-            name: f"{value:.3g}" if isinstance(value, int | float) else str(value)
+        given = [
+            f"{name} {f'{value:.3g}' if isinstance(value, int | float) else value}"
             for name, value in candidate.parameters.items()
             if value is not None and not isinstance(value, list | dict)
-        }
+        ]
         rows.append(
             {
                 "effect": candidate.effect,
@@ -136,7 +127,7 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
                 "log-likelihood": measured(candidate.score, candidate.stderr),
                 "difference": short(behind) if -math.inf < behind < 0 else "best" if behind == 0 else "",
                 "probability": probability_text(candidate.probability),
-                "parameters": ", ".join(f"{name} {value}" for name, value in given.items()),
+                "parameters": ", ".join(given),
             }
         )
     if step.effect:
@@ -146,12 +137,7 @@ def _candidates(data: DiscrepancyData, step: Step, index: int) -> Table:
     else:
         outcome = f"none explains the data{f'; of the first: {step.why}' if step.why else ''}"
     title = f"Candidates, step {index + 1}" if len(data.found.steps) > 1 else "Candidates"
-    return Table(
-        f"discrepancy-candidates-{index + 1}",
-        f"{title}: {outcome}",
-        "",
-        rows,
-    )
+    return Table(f"discrepancy-candidates-{index + 1}", f"{title}: {outcome}", "", rows)
 
 
 def _rivals(data: DiscrepancyData) -> Table:
@@ -259,7 +245,7 @@ def _moved(found: Verdict) -> Table:
             unit = unit_text(each.unit)
             rows.append(
                 {
-                    "parameter": f"{parameter_name(name)}{f' ({unit})' if unit else ''}",
+                    "parameter": f"{_parameter_name(name)}{f' ({unit})' if unit else ''}",
                     "effect added": " + ".join(f"{one.likeliest}{_how(one, found)}" for one in together),
                     "change": short(each.median, 2) if abs(each.in_stderr) >= _NOT_MOVED else "0",
                     "in standard errors": signed(each.in_stderr),
@@ -398,12 +384,7 @@ def finding(data: DiscrepancyData) -> Finding:
 
 
 def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
-    """Return the sections of the page below the verdict.
-
-    Args:
-        data: verdict and arrays.
-        figures: of the verdict.
-    """
+    """Return the sections of the page below the verdict."""
     tables = discrepancy_tables(data)
     first = _signature(data.found)
     words = {"where": {} if data.found.where else {"title": "Data and model side by side"}}
@@ -433,7 +414,7 @@ _PICTURES = (
 
 
 def _signature(found: Verdict) -> tuple[str, ...]:
-    """Return the first figures: that of the most important statistic, and all before and after."""
+    """Return the first figures: that of the most important statistic, and that of all statistics."""
     pulls = [pull for step in found.steps[:1] for pull in step.pulls]
     statistic = pulls[0].statistic if pulls else next((place.statistic for place in found.where), "")
     if not statistic:
@@ -452,18 +433,13 @@ def frames_text(found: Verdict) -> str:
     rest = seen.frames - seen.train - seen.test - seen.final
     over = f"; {rest} unused" if rest > 0 else ""
     words = f"{count(seen.frames, 'frame')} of {place}{share}: {dealt}{over}."
-    again = "" if seen.elsewhere is None else f" The final model was {seen.elsewhere.says()}."
-    return words + again + _unfitted_text(found)
-
-
-def _unfitted_text(found: Verdict) -> str:
-    """State how many pixels are not compared, and where they cluster; empty if none."""
-    seen = found.examined
-    if not seen.unfitted:
-        return ""
-    spot = next((place for place in seen.places if place.map == "unfitted"), None)
-    where = "" if spot is None else f", clustered in {Region.model_validate(spot.region).describe()}"
-    return f" Not compared: {count(seen.unfitted, 'pixel')} without a reliable fit{where}."
+    if seen.elsewhere is not None:
+        words += f" The final model was {seen.elsewhere.says()}."
+    if seen.unfitted:
+        spot = next((place for place in seen.places if place.map == "unfitted"), None)
+        where = "" if spot is None else f", clustered in {Region.model_validate(spot.region).describe()}"
+        words += f" Not compared: {count(seen.unfitted, 'pixel')} without a reliable fit{where}."
+    return words
 
 
 def key_facts(data: DiscrepancyData) -> list[KeyFact]:
@@ -482,16 +458,12 @@ def _gap_fact(found: Verdict) -> list[KeyFact]:
     unit, chance = "micronats per sample", f"sampling noise up to {micronats(gap.floor)}"
     if not extended or gap.after <= gap.floor:
         return [KeyFact("gap between data and model", nats, (unit, chance))]
-    more = (f"{nats} {unit}", chance + _interval(gap))
-    nearest = " by the closest effect, which is rejected" if found.verdict == "unexplained" else ""
-    return [KeyFact(f"of the gap closed{nearest}", percent(gap.closed_fraction), more)]
-
-
-def _interval(gap: GapChange) -> str:
     low, high = gap.interval_after
-    if not (math.isfinite(low) and 0.0 < high < math.inf):
-        return ""  # of a gap below 0 nothing remains
-    return f"; remaining: {f'{micronats(low)} to ' if low > 0.0 else 'at most '}{micronats(high)}"
+    if math.isfinite(low) and 0.0 < high < math.inf:  # of a gap below 0 nothing remains
+        chance += f"; remaining: {f'{micronats(low)} to ' if low > 0.0 else 'at most '}{micronats(high)}"
+    nearest = " by the closest effect, which is rejected" if found.verdict == "unexplained" else ""
+    more = (f"{nats} {unit}", chance)
+    return [KeyFact(f"of the gap closed{nearest}", percent(gap.closed_fraction), more)]
 
 
 def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
@@ -517,7 +489,7 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
     small = ", negligible" if abs(largest.in_stderr) < _IMMATERIAL else ""
     return [
         KeyFact(
-            f"largest change: {parameter_name(name)}",
+            f"largest change: {_parameter_name(name)}",
             f"{_signed(largest.median, 2)} {unit}".strip(),
             (f"{_signed(largest.in_stderr, 2)} standard errors of one pixel{small}",),
         )
@@ -553,7 +525,10 @@ def _remarks(data: DiscrepancyData) -> Iterator[Flag]:
     if extended:
         yield from _closing(found)
     for step in extended:
-        yield from _next_best(step, data)
+        second = step.runner_up
+        if second is not None and second.why:
+            titles = f"{data.title(step.likeliest)}, {data.title(second.effect)}"
+            yield Flag("note", f"The next best effect instead of {titles}, is rejected, since {second.why}.")
     for step in found.steps:
         for rival, measurement in step.separate.items() if step.verdict == "ambiguous" else ():
             yield Flag("note", f"To distinguish {data.title(rival)}: {measurement}.")
@@ -563,7 +538,7 @@ def _remarks(data: DiscrepancyData) -> Iterator[Flag]:
     for name, why in found.defects.items():
         yield Flag("serious", f"Defect: candidate {name} failed and was not compared: {why}.")
     if found.limit:
-        yield Flag("note", f"{found.limit[:1].upper()}{found.limit[1:]}.")
+        yield Flag("note", f"{capitalised(found.limit)}.")
     if found.untestable:
         titles = ", ".join(map(data.title, found.untestable))
         yield Flag("note", f"Not testable with these data: {titles}.")
@@ -582,13 +557,6 @@ def _closing(found: Verdict) -> Iterator[Flag]:
     elif gap.after > gap.floor:
         left = percent(1.0 - gap.closed_fraction)
         words = f"{micronats(gap.after)} micronats per sample, sampling noise up to {micronats(gap.floor)}"
-        level: Level = "caution" if found.verdict == "named_in_part" else "note"
-        yield Flag(level, f"{left} of the gap remains: {words}.")
-
-
-def _next_best(step: Step, data: DiscrepancyData) -> Iterator[Flag]:
-    """State why the next best effect is rejected."""
-    rival = step.runner_up
-    if rival is not None and rival.why:
-        titles = f"{data.title(step.likeliest)}, {data.title(rival.effect)}"
-        yield Flag("note", f"The next best effect instead of {titles}, is rejected, since {rival.why}.")
+        yield Flag(
+            "caution" if found.verdict == "named_in_part" else "note", f"{left} of the gap remains: {words}."
+        )

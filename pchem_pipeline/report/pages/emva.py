@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,6 @@ from pchem_pipeline.model.fit.status import FAILED, FLAGGED
 from pchem_pipeline.model.maps.defects import Defects
 from pchem_pipeline.report.data import ReportData, Samples
 from pchem_pipeline.report.pages.tables import Table
-
-COLUMNS = ("quantity", "symbol", "value", "standard_error", "unit", "definition_here", "where_it_differs")
-
-
-_NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
 
 
 @dataclass(frozen=True)
@@ -46,15 +41,19 @@ class EmvaRow:
 
     def cells(self) -> list[str]:
         """Return the row as text; what is not known is empty."""
-        numbers = [
-            f"{x:.6g}" if x is not None and np.isfinite(x) else "" for x in (self.value, self.standard_error)
+        return [
+            each if isinstance(each, str) else "" if each is None or not np.isfinite(each) else f"{each:.6g}"
+            for each in astuple(self)
         ]
-        return [self.quantity, self.symbol, *numbers, self.unit, self.definition_here, self.where_it_differs]
+
+
+COLUMNS = tuple(field.name for field in fields(EmvaRow))
 
 
 def emva_tables(data: ReportData) -> list[Table]:
     """Return the table of the report; of a line of channels or without values there is none."""
-    defects, known = data.defects, all(map(data.has_values, _NAMES))
+    names = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn", "read_noise_e")
+    defects, known = data.defects, all(map(data.has_values, names))
     if data.shape[0] == 1 or data.mostly_flagged or defects is None or not known:
         return []
     rows = [
@@ -90,13 +89,8 @@ def emva_rows(
 ) -> list[EmvaRow]:
     """Return the table of a run; pixels without a value and flagged ones are left out.
 
-    Args:
-        stored: the maps with their standard errors by name, (y, x).
-        status: status words of the fit, (y, x).
-        kind: what made the charge: dark, light or unknown.
-        defects: pixels that are not ordinary.
-        outlier_sigmas: robust standard deviations above the median H from which a pixel is hot.
-        samples: several exposures of the pixels.
+    Maps, their standard errors and the status words of the fit are (y, x). ``kind`` is what made the charge:
+    dark, light or unknown; hot pixels are ``outlier_sigmas`` robust standard deviations above the median H.
     """
     kept = (status & int(FAILED | FLAGGED)) == 0
 
@@ -106,8 +100,8 @@ def emva_rows(
 
     gain, exposure = of("conversion_gain"), stored["quanta_exposure"]
     hot = defects.counts().get("hot", 0) / max(int(np.isfinite(exposure).sum()), 1)
-    unknown: tuple[float | None, float | None] = (None, None)
-    response, current = unknown, unknown
+    response: tuple[float | None, float | None] = (None, None)
+    current = response
     if kind == "light":
         response = _relative_spread(of("quanta_exposure"), of("quanta_exposure_stderr"))
     if kind == "dark" and "dark_current" in stored and kept.any():

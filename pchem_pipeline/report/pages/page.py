@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import importlib.resources
 import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +16,7 @@ from markupsafe import Markup, escape
 
 from pchem_pipeline.base.wording import short_name, visible
 from pchem_pipeline.report.charts.on_page import page_charts
-from pchem_pipeline.report.figures.figure import Figure, csv_text
+from pchem_pipeline.report.figures.figure import DataTable, Figure, csv_text
 from pchem_pipeline.report.inspector import content_policy, json_for_html, text_of
 from pchem_pipeline.report.style.palette import dark_rules
 
@@ -35,7 +34,7 @@ class Term:
 
     @property
     def name(self) -> str:
-        """How the list calls it."""
+        """Its name in the glossary."""
         return self.spellings[0]
 
     @property
@@ -72,7 +71,6 @@ def explained(text: str) -> Markup:
 _LARGEST_TABLE = 6_000
 #: Folder of the library that draws charts.
 _LIBRARY = "vendor/uplot"
-_FLAG_WORDS = {"good": "Good", "note": "Note", "caution": "Caution", "serious": "Serious"}
 _FLAG_SIGNS = {"good": "✓", "note": "ℹ", "caution": "▲", "serious": "✕"}
 
 
@@ -87,15 +85,9 @@ class KeyFact:
 
 @dataclass(frozen=True)
 class Finding:
-    """The result that a section states: how serious it is, in a word and in a sentence.
+    """The result that a section states: its level, a word, a sentence, the samples examined, key numbers.
 
-    Attributes:
-        level: good, note, caution or serious (a class of the style sheet).
-        name: of the verdict.
-        sentence: the verdict in one sentence.
-        about: what it is about, for example the samples examined.
-        facts: the key numbers.
-        remarks: evidence for and against it.
+    ``level`` is a class of the style sheet; ``remarks`` are evidence for and against the result.
     """
 
     level: str
@@ -112,8 +104,6 @@ class Section:
 
     Attributes:
         id: anchor in the page.
-        title: heading.
-        intro: introduction.
         empty: sentence where there is nothing to show; empty: the section is left out.
         name: in the table of contents; empty: the title.
         verdict: what came out.
@@ -150,12 +140,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure as a page embeds it.
-
-    Attributes:
-        source: data URL.
-        width, height: size on the page, px.
-    """
+    """A figure as a page embeds it: data URL, and size on the page, px."""
 
     source: str
     width: int
@@ -190,14 +175,9 @@ def draw_here(figures: Sequence[Figure]) -> dict[str, Drawn]:
 def render_page(
     name: str, sections: Sequence[Section], drawn: Mapping[str, Drawn], /, *scripts: str, **content: Any
 ) -> str:
-    """Return a page as HTML, complete in itself.
+    """Return a page as HTML, complete in itself; its template extends ``page.html.j2``.
 
-    Args:
-        name: of its template, which extends ``page.html.j2``.
-        sections: from top to bottom.
-        drawn: their figures, by name.
-        scripts: further ones that its template holds.
-        content: what its template shows.
+    ``drawn`` are the figures by name, ``scripts`` further ones in the template, ``content`` what it shows.
     """
     figures = [figure for section in sections for figure in section.figures]
     charts = {figure.name: figure.chart for figure in figures if not figure.chart.still}
@@ -227,33 +207,29 @@ def figure_tables(figures: Sequence[Figure]) -> dict[str, list[tuple[str, str]]]
 
     Maps of large sensors are not among them: ``pchem export`` and ``pchem figures`` write these.
     """
+
+    def packed(table: DataTable) -> str:
+        return base64.b64encode(gzip.compress(csv_text(table).encode(), 6, mtime=0)).decode("ascii")
+
     return {
-        figure.name: [
-            (
-                table.part,
-                base64.b64encode(gzip.compress(csv_text(table).encode(), 6, mtime=0)).decode("ascii"),
-            )
-            for table in figure.tables
-            if table.size <= _LARGEST_TABLE
-        ]
+        figure.name: [(each.part, packed(each)) for each in figure.tables if each.size <= _LARGEST_TABLE]
         for figure in figures
     }
 
 
 def _template(name: str) -> jinja2.Template:
-    folder = importlib.resources.files("pchem_pipeline.report") / "templates"
     environment = jinja2.Environment(
         autoescape=True,
         finalize=_shown,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        loader=jinja2.FunctionLoader(lambda each: (folder / each).read_text(encoding="utf-8")),
+        loader=jinja2.FunctionLoader(text_of),
     )
     environment.filters["together"] = _together
     environment.filters["explained"] = lambda text: explained(_together(visible(text)))
     environment.filters["name"] = short_name
-    environment.globals |= {"flag_words": _FLAG_WORDS, "flag_signs": _FLAG_SIGNS}
+    environment.globals["flag_signs"] = _FLAG_SIGNS
     return environment.get_template(name)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from pchem_pipeline.base.wording import symbol
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.figures.catalogue import discrepancy_figures, report_figures
-from pchem_pipeline.report.figures.figure import Figure
+from pchem_pipeline.report.figures.figure import Figure, is_strip
 from pchem_pipeline.report.figures.samples import AXES, slope_of
 from pchem_pipeline.report.inspector import embedded, text_of
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
@@ -30,7 +30,7 @@ from pchem_pipeline.report.pages.summary import (
     pixel_counts,
     sentence,
 )
-from pchem_pipeline.report.pages.tables import Table, method_tables, provenance_tables, result_tables
+from pchem_pipeline.report.pages.tables import Table, method_tables, result_tables
 
 #: The sections from top to bottom.
 PAGE = (
@@ -40,7 +40,12 @@ PAGE = (
         name="Summary",
         kind="summary",
     ),
-    Section("maps", "Parameter maps"),
+    Section(
+        "maps",
+        "Parameter maps",
+        "Rank-based colours (histogram-equalised); labels at minimum, median ± 1 sigma and maximum. Blue "
+        "line: median.",
+    ),
     # its data are at the end of the page
     Section("inspector", "Look at pixels", kind="inspector"),
     Section(
@@ -106,29 +111,11 @@ PAGE = (
 #: Parts of the run that a section needs, where it is not the one of its name.
 _NEEDS = {"maps": ("maps", "charge_rate"), "ensemble": ("ensemble", "nuced")}
 
-#: How to read the figures of the section ``maps``: images, or lines of channels.
-_READ_IMAGES = (
-    "Rank-based colours (histogram-equalised); labels at minimum, median ± 1 sigma and maximum. "
-    "Blue line: median."
-)
-_READ_CHANNELS = (
-    "Points: channels with their standard errors; crosses at the bottom: channels without a value."
-)
 
-_NO_LINE = "The samples share g, μ and σ; no line was fitted (input.against: none)."
-
-
-def page_sections(
-    data: ReportData, figures: Sequence[Figure], tables: Sequence[Table], verdict: Finding | None = None
+def _page_sections(
+    data: ReportData, figures: Sequence[Figure], tables: Sequence[Table], verdict: Finding | None
 ) -> list[Section]:
-    """Return the sections of a run's page, those that have nothing to show left out.
-
-    Args:
-        data: what the run found.
-        figures: all of the page; each names its section.
-        tables: all tables of results; each names its section.
-        verdict: on what the model is missing, or None where nobody looked.
-    """
+    """Return the sections of a run's page, those that have nothing to show left out."""
     found = []
     for each in PAGE:
         parts = _NEEDS.get(each.id, (each.id,))
@@ -149,15 +136,17 @@ def page_sections(
 
 def _intro(section: Section, data: ReportData) -> str:
     """Return the introduction of a section; of maps and exposures it depends on the run."""
-    if section.id == "maps":
-        return _READ_CHANNELS if min(data.shape) < 2 else _READ_IMAGES
+    if section.id == "maps" and is_strip(data.shape):
+        points = "Points: channels with their standard errors"
+        return f"{points}; crosses at the bottom: channels without a value."
     if section.id != "exposures" or data.samples is None:
         return section.intro
-    words, slope = AXES.get(data.samples.against), slope_of(data)
-    if words is None:
-        return _NO_LINE
+    if data.samples.against not in AXES:
+        return "The samples share g, μ and σ; no line was fitted (input.against: none)."
+    against, _, _, offset = AXES[data.samples.against]
+    slope = slope_of(data)
     noun = symbol(slope)[1] if slope else "charge"
-    return section.intro.format(against=words[0], noun=noun, offset=symbol(words[3])[1])
+    return section.intro.format(against=against, noun=noun, offset=symbol(offset)[1])
 
 
 def _summary(data: ReportData) -> dict[str, Any]:
@@ -185,18 +174,15 @@ def _discrepancy(data: ReportData) -> dict[str, Any]:
 def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, str]:
     """Draw everything and return the files of the report by name; nothing is written.
 
-    Args:
-        data: what the run found.
-        draw: draws all figures at once, for example by several workers; None: one after the other, here.
+    ``draw`` draws all figures; None: one after the other, in this process.
     """
     # those without a section are drawn by ``pchem figures`` alone
     shown = [figure for figure in report_figures(data) if figure.section]
     others = discrepancy_figures(data.discrepancy)
     drawn = (draw or draw_here)([*shown, *others])
     verdict = None if data.discrepancy is None else finding(data.discrepancy)
-    makers = (result_tables, method_tables, emva_tables, provenance_tables)
-    tables = [table for make in makers for table in make(data)]
-    sections = page_sections(data, shown, tables, verdict)
+    tables = [*result_tables(data), *method_tables(data), *emva_tables(data)]
+    sections = _page_sections(data, shown, tables, verdict)
     files = {}
     if data.discrepancy is not None and verdict is not None:
         parts = evidence(data.discrepancy, others)

@@ -33,8 +33,7 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
 
     The keys ``summary``, ``ensemble`` (with ``rmse``) and ``fit_status`` are always there.
     """
-    facts, remarks = dict(data.ensemble_facts), flags(data)
-    rmse = dict(facts.pop("rmse", {}))
+    remarks = flags(data)
     numbers: dict[str, Any] = plain(
         {
             "report_version": REPORT_VERSION,
@@ -52,17 +51,27 @@ def report_numbers(data: ReportData) -> dict[str, Any]:
                 "camera": data.camera or None,
             },
             "summary": _summary(data),
-            "regions": _regions(data),
+            "regions": {
+                region: {name: _numbers_of(name, each) for name, each in data.in_region(region).items()}
+                for region in data.regions
+            },
             "fit_status": _fit_status(data),
             "goodness_of_fit": _goodness(data),
-            "ensemble": {"rmse": rmse, **facts},
+            "ensemble": {"rmse": {}, **data.ensemble_facts},
             "moments": list(data.moments),
-            "electron_numbers": _electron_numbers(data),
+            "electron_numbers": {
+                name.removeprefix("electron_"): data.ensemble[name]
+                for name in ("k", "electron_counts", "electron_mass", "electron_pmf", "electron_pmf_map")
+                if name in data.ensemble
+            },
             "truth": _truth(data),
             "samples": _samples(data),
             "overscan": data.overscan_medians or None,
             "missing": dict(data.missing),
-            "discrepancy": _discrepancy(data),
+            # its evidence is in discrepancy.json
+            "discrepancy": None
+            if data.discrepancy is None
+            else data.discrepancy.found.model_dump(include={"verdict", "sentence", "effects"}),
             "quick_look": None if data.quick_look is None else data.quick_look.to_dict(),
             "run": dict(data.run),
             "inputs": list(data.inputs),
@@ -78,17 +87,18 @@ def report_json(data: ReportData) -> str:
 
 
 def _summary(data: ReportData) -> dict[str, Any]:
-    found = {}
-    for name in (name for name in data.maps if not name.endswith("_stderr")):
-        found[name] = {
-            **_numbers_of(name, data.summary(name), data),
+    return {
+        name: {
+            **_numbers_of(name, data.summary(name)),
             "pixel_stderr": data.pixel_error(name),
             "parts": [asdict(parts) for parts in data.parts.get(name, ())],
         }
-    return found
+        for name in data.maps
+        if not name.endswith("_stderr")
+    }
 
 
-def _numbers_of(name: str, summary: MapSummary, data: ReportData) -> dict[str, Any]:
+def _numbers_of(name: str, summary: MapSummary) -> dict[str, Any]:
     return {
         "unit": stored_unit(name),
         "median": summary.median,
@@ -102,13 +112,6 @@ def _numbers_of(name: str, summary: MapSummary, data: ReportData) -> dict[str, A
         "n_flagged": summary.n_left_out,
         "n_outliers_low": summary.n_low,
         "n_outliers_high": summary.n_high,
-    }
-
-
-def _regions(data: ReportData) -> dict[str, Any]:
-    return {
-        region: {name: _numbers_of(name, summary, data) for name, summary in data.in_region(region).items()}
-        for region in data.regions
     }
 
 
@@ -163,11 +166,6 @@ def _goodness(data: ReportData) -> dict[str, Any]:
     }
 
 
-def _electron_numbers(data: ReportData) -> dict[str, Any]:
-    names = ("k", "electron_counts", "electron_mass", "electron_pmf", "electron_pmf_map")
-    return {name.removeprefix("electron_"): data.ensemble[name] for name in names if name in data.ensemble}
-
-
 def _truth(data: ReportData) -> dict[str, Any]:
     return {
         name: {
@@ -178,11 +176,3 @@ def _truth(data: ReportData) -> dict[str, Any]:
         }
         for name, found in truth_errors(data).items()
     }
-
-
-def _discrepancy(data: ReportData) -> dict[str, Any] | None:
-    """Return the verdict; its evidence is in ``discrepancy.json``."""
-    if data.discrepancy is None:
-        return None
-    found = data.discrepancy.found
-    return {"verdict": found.verdict, "sentence": found.sentence, "effects": found.effects}

@@ -11,6 +11,7 @@ import numpy as np
 
 from pchem_pipeline.base.variables import CHARGE_RATES
 from pchem_pipeline.base.wording import (
+    capitalised,
     count,
     measured,
     p_value_text,
@@ -20,7 +21,7 @@ from pchem_pipeline.base.wording import (
     symbol,
     typeset,
 )
-from pchem_pipeline.discrepancy.quick.checks import Check, QuickLook
+from pchem_pipeline.discrepancy.quick.checks import Check, Level, QuickLook
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.checks.map_parts import Parts
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of, words_of
@@ -31,15 +32,7 @@ from pchem_pipeline.report.style.ranges import finite
 
 @dataclass(frozen=True)
 class Criterion:
-    """One limit beside what was found.
-
-    Attributes:
-        setting: its key in ``report.criteria``.
-        words: what is judged.
-        found: the number, as text.
-        limit: the limit, as text.
-        met: whether the sensor meets it.
-    """
+    """A criterion by its key in ``report.criteria``: what is judged, the value and the limit as text."""
 
     setting: str
     words: str
@@ -124,38 +117,26 @@ def _gain_spread(data: ReportData) -> _Found:
     return float(spread / summary.median), "non-uniformity of the gain"
 
 
-def _share(value: float) -> str:
-    return percent(value)
-
-
-def _electrons(value: float) -> str:
-    return f"{short(value, 3)} e⁻"
-
-
 _MEASURES: dict[str, tuple[Callable[[ReportData], _Found], Callable[[float], str]]] = {
-    "read_noise_e": (_read_noise, _electrons),
-    "failed_pixels": (_failed, _share),
-    "flagged_pixels": (_flagged_share, _share),
-    "hot_pixels": (_hot, _share),
-    "outlying_pixels": (_outlying, _share),
-    "gain_nonuniformity": (_gain_spread, _share),
+    "read_noise_e": (_read_noise, lambda value: f"{short(value)} e⁻"),
+    "failed_pixels": (_failed, percent),
+    "flagged_pixels": (_flagged_share, percent),
+    "hot_pixels": (_hot, percent),
+    "outlying_pixels": (_outlying, percent),
+    "gain_nonuniformity": (_gain_spread, percent),
 }
-
-
-def check_title(check: Check) -> str:
-    """Return the title of a check with a capital."""
-    return f"{check.title[:1].upper()}{check.title[1:]}"
 
 
 def check_sentence(check: Check) -> str:
     """State title, size, place and consequence of a check, without a full stop."""
+    title, size = capitalised(check.title), size_text(check)
     advice = "the model includes such an effect" if check.in_model else check.advice
     if check.unit in ("DN", "LSB") and check.name != "levels":
         place = f", {check.where}" if check.where else ""
-        return f"{check_title(check)} of {size_text(check)}{place}{f': {advice}' if advice else ''}"
+        return f"{title} of {size}{place}{f': {advice}' if advice else ''}"
     place = f" ({check.where})" if check.where else ""
     place = f" at {check.where}" if check.name.endswith("_code") else place
-    return f"{check_title(check)}: {size_text(check)}{place}{f'; {advice}' if advice else ''}"
+    return f"{title}: {size}{place}{f'; {advice}' if advice else ''}"
 
 
 def size_text(check: Check) -> str:
@@ -171,13 +152,7 @@ def size_text(check: Check) -> str:
         return f"{short(check.size, 2)} LSB rms" if math.isfinite(check.size) else "unknown size"
     if check.name in ("lag", "frame_lag", "neighbours_x", "neighbours_y"):
         return short(check.size, 2)
-    noun = (
-        "frames"
-        if check.name.endswith("frames")
-        else "pixels"
-        if check.name.endswith("pixels")
-        else "samples"
-    )
+    noun = next((noun for noun in ("frames", "pixels") if check.name.endswith(noun)), "samples")
     return f"{percent(check.size)} of the {noun}"
 
 
@@ -192,8 +167,6 @@ def nothing_found(look: QuickLook) -> str:
         text += f"; row noise above {short(rows.limit, 2)} DN is excluded (95 %)"
     return f"{text}."
 
-
-Level = Literal["good", "note", "caution", "serious"]
 
 KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "quanta_exposure", "bias")
 
@@ -249,12 +222,9 @@ def pixel_counts(data: ReportData) -> PixelCounts:
 
 
 def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumber]:
-    """Return the numbers of the first screen.
+    """Return the numbers of the first screen, of all pixels with a value or of those without a flag.
 
-    Args:
-        data: what the run found.
-        with_flagged: of all pixels with a value; else flagged ones are left out, and of a sensor of which
-            most are flagged nothing is said.
+    If most are flagged, nothing is said of the others.
     """
     if data.mostly_flagged and not with_flagged:
         return []
@@ -314,9 +284,8 @@ def _medians(data: ReportData) -> str:
     parts = []
     for name in ("read_noise_e", "conversion_gain", *CHARGE_RATES):
         if data.has_median(name):
-            summary = data.summary(name)
-            unit = symbol(name)[2]
-            parts.append(f"{symbol(name)[1]} {measured(summary.median, summary.median_stderr, unit)}")
+            summary, (_, words, unit) = data.summary(name), symbol(name)
+            parts.append(f"{words} {measured(summary.median, summary.median_stderr, unit)}")
     left_out = (
         f" ({count(flagged, 'flagged one')} excluded where a flag concerns the quantity)" if flagged else ""
     )
@@ -412,28 +381,22 @@ def _flagged(data: ReportData) -> Iterator[Flag]:
     yield Flag(level, f"{share} of the {data.noun}s with a value are flagged{why}. Take {cure}.")
 
 
-def _left_out_words(bit: FitStatus) -> str:
-    if bit not in FLAGGED:
-        return ""
-    which = "" if bit in flags_of("conversion_gain") else " of exposure and bias"
-    return f" (excluded from medians and tables{which})"
-
-
 def _cautions(data: ReportData) -> Iterator[Flag]:
     # what else is odd about a pixel without a value misleads nobody
     kept = data.status[~data.failed]
     for bit, text, n in reasons_in(kept):
         if n > _CAUTION_SHARE * kept.size:
             share = f"{percent(n, kept.size)} of the {data.noun}s with a value"
-            yield Flag("caution", f"{share}: {text}{_left_out_words(bit)}.")
+            which = "" if bit in flags_of("conversion_gain") else " of exposure and bias"
+            excluded = f" (excluded from medians and tables{which})" if bit in FLAGGED else ""
+            yield Flag("caution", f"{share}: {text}{excluded}.")
 
 
 def _goodness(data: ReportData) -> Iterator[Flag]:
     p = finite(data.fit.get("goodness_p", np.empty(0)))
     if p.size == 0:
         return
-    poor = int((p < SIGNIFICANCE).sum())
-    expected = SIGNIFICANCE * p.size
+    poor, expected = int((p < SIGNIFICANCE).sum()), SIGNIFICANCE * p.size
     text = (
         f"{percent(poor, p.size)} of the {data.noun}s fail the goodness-of-fit test (p < {SIGNIFICANCE:g}); "
         f"{percent(expected, p.size)} expected"
@@ -481,9 +444,8 @@ def _agreement(data: ReportData) -> Iterator[Flag]:
             continue
         ratio = rmse[name] / rmse[floor]
         p = (data.ensemble_facts.get(f"{prefix}chi_square") or {}).get("p")
-        tested = "" if p is None else f" (chi-square: {p_value_text(p)})"
         text = f"The RMSE of the predicted {words} ensemble is {short(ratio, 2)} times the sampling noise"
-        text += tested
+        text += "" if p is None else f" (chi-square: {p_value_text(p)})"
         if ratio <= _RMSE_GOOD or (p is not None and p >= SIGNIFICANCE):
             yield Flag("good", f"{text}: the model describes the data.")
         elif ratio <= _RMSE_BAD:
@@ -522,7 +484,7 @@ def _quick_look(data: ReportData) -> Iterator[Flag]:
     closer = "" if known else f"; to look closer: {look.command}"
     for number, check in enumerate(look.found):
         if check.name != "levels":
-            # what the model has already speaks for it
+            # an effect that the model includes speaks for the model
             level = "good" if check.in_model else check.level
             yield Flag(level, f"{check_sentence(check)}{'' if number else closer}.")
 
@@ -533,8 +495,9 @@ def _conditions(data: ReportData) -> Iterator[Flag]:
             yield Flag("note", _as_sentence(data.missing[part]))
     noisy = data.has_values("read_noise_e") and data.summary("read_noise_e").median > _TOO_NOISY
     if data.samples is None and noisy:
-        words = "Read noise above 0.5 e⁻: one exposure does not suffice. Combine several exposures."
-        yield Flag("caution", words)
+        yield Flag(
+            "caution", "Read noise above 0.5 e⁻: one exposure does not suffice. Combine several exposures."
+        )
     if data.mostly_coarse:
         yield Flag("caution", "Rounding to whole DN biases the estimates: set fit.likelihood: auto.")
     for stage in data.stages:
@@ -555,19 +518,14 @@ CHECKS: tuple[Callable[[ReportData], Iterator[Flag]], ...] = (
 
 
 def _as_sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+    return f"{capitalised(text).rstrip('.')}."
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A question with its answer; ``level`` is the class of the style sheet.
+    """The answer to a question: a word, the reason in a sentence, and the criteria that it rests on, if any.
 
-    Attributes:
-        question: what is asked.
-        level: good, note, caution or serious.
-        word: the answer.
-        text: why, in a sentence.
-        criteria: the limits that the answer rests on, where it rests on such.
+    ``level`` is the class of the style sheet.
     """
 
     question: str
@@ -578,12 +536,7 @@ class Answer:
 
 
 def answers(data: ReportData, remarks: list[Flag] | None = None) -> tuple[Answer, Answer]:
-    """Answer 'is the sensor within limits' and 'are the results reliable' from the maps and the remarks.
-
-    Args:
-        data: what the run found.
-        remarks: of :func:`flags`; None: they are made.
-    """
+    """Answer 'is the sensor within limits' and 'are the results reliable' by the remarks of `flags`."""
     sensor, belief = _sensor(data), _belief(data, flags(data) if remarks is None else remarks)
     if belief.level == "serious" and sensor.level != "serious":
         text = f"{sensor.text.rstrip('.')}, but the results are not reliable."
@@ -606,7 +559,8 @@ def _sensor(data: ReportData) -> Answer:
         f"{each.words} {each.found} (limit {each.limit.removeprefix('≤ ')})" for each in missed
     )
     met = f"all {len(judged)} criteria pass" if judged else "no limits are set (report.criteria)"
-    text = f"{_value_share(data)}; {limits or met}."
+    share = "All" if pixels.failed == 0 else f"{percent(pixels.fitted, pixels.total)} of"
+    text = f"{share} {count(pixels.total, data.noun)} have a value; {limits or met}."
     if pixels.failed > data.allowed_failed * pixels.total:
         return Answer(question, "serious", "No", text, judged)
     if any(each.setting == "read_noise_e" for each in missed):
@@ -618,13 +572,6 @@ def _sensor(data: ReportData) -> Answer:
     if missed:
         return Answer(question, "caution", "Mostly", text, judged)
     return Answer(question, "good", "Yes", text, judged)
-
-
-def _value_share(data: ReportData) -> str:
-    pixels = pixel_counts(data)
-    if pixels.failed == 0:
-        return f"All {count(pixels.total, data.noun)} have a value"
-    return f"{percent(pixels.fitted, pixels.total)} of {count(pixels.total, data.noun)} have a value"
 
 
 def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
@@ -640,18 +587,16 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
             return Answer(question, level, word, f"{texts[0]}{more}")
     passed = sum(flag.level == "good" for flag in about)
     checks = f"{count(passed, 'check')} of the model against the data passed" if passed else "No check fails"
-    looked = "" if data.discrepancy is not None else _not_looked_for(data)
+    looked, yes = "", "Yes"
+    if data.discrepancy is None:
+        looked, yes = _not_looked_for(data), "No problem found by the quick checks"
     pixels = pixel_counts(data)
     if pixels.failed > data.allowed_failed * pixels.total:
         word = f"For the {data.noun}s with a value"
         return Answer(
             question, "caution", word, f"{checks}; {count(pixels.failed, data.noun)} without a value.{looked}"
         )
-    quick = data.discrepancy is None
-    return Answer(question, "good", _QUICK_YES if quick else "Yes", f"{checks}.{looked}")
-
-
-_QUICK_YES = "No problem found by the quick checks"
+    return Answer(question, "good", yes, f"{checks}.{looked}")
 
 
 def _not_looked_for(data: ReportData) -> str:
@@ -712,13 +657,16 @@ def next_steps(data: ReportData) -> list[Step]:
         ]
     found = []
     if data.often_flagged and data.samples is None:
+        noise = "0.6"  # a guess, where the median would be that of a biased selection
+        if not data.mostly_flagged and data.has_values("read_noise_e"):
+            noise = f"{data.summary('read_noise_e').median:.2g}"
         found += [
             Step(
                 f"pchem joint {RUN} BRIGHTER.yaml --bias BIAS.yaml --store joint.zarr",
                 "fit several exposures together: a second exposure, or bias frames, fix the electron number",
             ),
             Step(
-                f"pchem plan --read-noise {_noise_to_plan(data)} --samples 0,2,8 --target conversion_gain=1%",
+                f"pchem plan --read-noise {noise} --samples 0,2,8 --target conversion_gain=1%",
                 "compute how many frames at which exposures are needed, at the read noise that you expect",
             ),
         ]
@@ -729,10 +677,3 @@ def next_steps(data: ReportData) -> list[Step]:
     if not found:
         found.append(Step(f"pchem view {RUN}", "view every pixel in the browser"))
     return found
-
-
-def _noise_to_plan(data: ReportData) -> str:
-    """Return the read noise to plan for, e-: the median's, or where most pixels are open a guess above it."""
-    if data.mostly_flagged or not data.has_values("read_noise_e"):
-        return "0.6"
-    return f"{data.summary('read_noise_e').median:.2g}"

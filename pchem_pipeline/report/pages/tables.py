@@ -13,6 +13,7 @@ import numpy as np
 
 from pchem_pipeline.base.wording import (
     MAPS,
+    capitalised,
     count,
     heading,
     measured,
@@ -29,8 +30,7 @@ from pchem_pipeline.report.data import ReportData, Samples, truth_errors
 from pchem_pipeline.report.figures.ensemble import HALVES, PREDICTIONS
 from pchem_pipeline.report.figures.methods import crossing_text, percent_text
 from pchem_pipeline.report.figures.samples import AXES, middle
-from pchem_pipeline.report.pages.summary import check_title
-from pchem_pipeline.report.pages.summary import size_text as check_size
+from pchem_pipeline.report.pages.summary import size_text
 from pchem_pipeline.report.style.ranges import finite
 
 #: A row of a table: cells by the heading of their column.
@@ -39,10 +39,7 @@ Row = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Table:
-    """A table: rows of the same columns, of which the first has the heading of the row.
-
-    ``section`` is the id of the section that shows it.
-    """
+    """A table: rows of the same columns, the first with the headings of the rows; ``section`` is an id."""
 
     id: str
     title: str
@@ -57,10 +54,10 @@ class Table:
 
 
 def result_tables(data: ReportData) -> list[Table]:
-    """Return the tables of results that the data allow."""
+    """Return the tables that the data allow: of results, and of what was run on what."""
     makers = (
         _channels, _parameters, _regions, _overscan, _flagged, _against_truth, _moments, _misfits, _intervals,
-        _samples, _plan, _quick_look,
+        _samples, _plan, _quick_look, _run, _stages, _inputs,
     )  # fmt: skip
     return [table for make in makers if (table := make(data)) is not None and table.rows]
 
@@ -75,9 +72,9 @@ def _quick_look(data: ReportData) -> Table:
         f"pixels from sums that every run keeps; p-values are corrected for the number of checks.{missing}",
         [
             {
-                "check": check_title(check),
+                "check": capitalised(check.title),
                 "found": ("in the model" if check.in_model else "yes") if check.found else "no",
-                "size": check_size(check) if check.found else "",
+                "size": size_text(check) if check.found else "",
                 "detection limit": _limit_text(check),
                 "p-value": _chance_text(check.p_global),
                 "where": check.where if check.found else "",
@@ -91,7 +88,7 @@ def _quick_look(data: ReportData) -> Table:
 def _limit_text(check: Check) -> str:
     if not math.isfinite(check.limit):
         return "not known"
-    return check_size(replace(check, size=check.limit, size_e=math.nan, share=math.nan))
+    return size_text(replace(check, size=check.limit, size_e=math.nan, share=math.nan))
 
 
 def _chance_text(p: float) -> str:
@@ -110,18 +107,13 @@ def _parameters(data: ReportData) -> Table:
 
 
 def _regions(data: ReportData) -> Table:
-    rows = []
-    for name, region in data.regions.items():
-        found = data.in_region(name)
-        medians = {heading(m): measured(found[m].median, found[m].median_stderr) for m in MAPS if m in found}
-        rows.append(
-            {
-                "region": name,
-                "where": region.describe(),
-                **medians,
-                "pixels": f"{region.mask(data.shape).sum():,}",
-            }
-        )
+    rows = [
+        {"region": name, "where": region.describe()}
+        | {heading(m): measured(found[m].median, found[m].median_stderr) for m in MAPS if m in found}
+        | {"pixels": f"{region.mask(data.shape).sum():,}"}
+        for name, region in data.regions.items()
+        for found in [data.in_region(name)]
+    ]
     return Table(
         "regions",
         "Regions",
@@ -179,12 +171,9 @@ def _flagged(data: ReportData) -> Table:
         if not flagged.any():
             continue
         summary = summarise(data.maps[name][flagged], percentiles=(5.0, 95.0))
-        numbers = {
-            "median": summary.median,
-            **{f"{p:g} %": value for p, value in summary.percentiles.items()},
-            "smallest": summary.minimum,
-            "largest": summary.maximum,
-        }
+        numbers = {"median": summary.median}
+        numbers |= {f"{p:g} %": value for p, value in summary.percentiles.items()}
+        numbers |= {"smallest": summary.minimum, "largest": summary.maximum}
         cells = {head: short(number, 4) for head, number in numbers.items()}
         rows.append({"parameter": heading(name), **cells, f"{data.noun}s": f"{summary.n_valid:,}"})
     return Table(
@@ -320,18 +309,15 @@ def _misfits(data: ReportData) -> Table | None:
 
 def _intervals(data: ReportData) -> Table:
     words = (
-        f" Profile: distance of the ends of the {100 * data.interval_level:g} % profile-likelihood interval "
-        "from the estimate, in standard errors."
-    )
-    return Table(
-        "uncertainties",
-        "Uncertainties",
         f"Median 1 sigma error per {data.noun}, and the share of the map's variance that is noise of the "
         "estimates; near 100 % the map shows only noise: take more frames."
-        + (words if data.intervals else ""),
-        list(_interval_rows(data)),
-        "uncertainty",
     )
+    if data.intervals:
+        words += (
+            f" Profile: distance of the ends of the {100 * data.interval_level:g} % profile-likelihood "
+            "interval from the estimate, in standard errors."
+        )
+    return Table("uncertainties", "Uncertainties", words, list(_interval_rows(data)), "uncertainty")
 
 
 def _interval_rows(data: ReportData) -> Iterator[Row]:
@@ -399,15 +385,12 @@ def _plan(data: ReportData) -> Table | None:
         return None
     rows = []
     for row in plan["rows"]:
-        reached = plan["reached"].get(row["name"])
+        target = row["target"].replace("_e to", " (e⁻) to").replace("_", " ").replace("e-", "e⁻")
+        frames = f"{row['frames']:,.0f}" if math.isfinite(row["frames"]) else "none suffice"
         unit, scale = ("e⁻", 1.0) if row["name"] == "bias" else ("%", 100.0)
-        rows.append(
-            {
-                "precision": row["target"].replace("_e to", " (e⁻) to").replace("_", " ").replace("e-", "e⁻"),
-                "frames needed": f"{row['frames']:,.0f}" if math.isfinite(row["frames"]) else "none suffice",
-                "this run's": "" if reached is None else f"{short(scale * reached, 2)} {unit}",
-            }
-        )
+        reached = plan["reached"].get(row["name"])
+        text = "" if reached is None else f"{short(scale * reached, 2)} {unit}"
+        rows.append({"precision": target, "frames needed": frames, "this run's": text})
     return Table(
         "plan-table",
         "Frames for a precision",
@@ -419,45 +402,29 @@ def _plan(data: ReportData) -> Table | None:
     )
 
 
-_SECTION = "provenance"
+def _bytes_text(size: float) -> str:
+    if size >= 1e9:
+        return f"{size / 1e9:.2f} GB"
+    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
 
 
-def provenance_tables(data: ReportData) -> list[Table]:
-    """Return the tables of what was run on what."""
-    return [table for make in (_run, _stages, _inputs) if (table := make(data)).rows]
-
-
-def size_text(size: float) -> str:
-    """Return a number of bytes in MB or GB."""
-    return (
-        f"{size / 1e9:.2f} GB"
-        if size >= 1e9
-        else f"{size / 1e6:.1f} MB"
-        if size >= 1e5
-        else f"{size / 1e3:.1f} kB"
-    )
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
-    rows: list[tuple[str, str]] = []
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[Row]:
     for key, value in values.items():
         if isinstance(value, Mapping):
-            rows += _flat(value, f"{prefix}{key}: ")
-        elif isinstance(value, Sequence) and not isinstance(value, str):
-            rows.append((f"{prefix}{key}", ", ".join(str(item) for item in value)))
+            yield from _flat(value, f"{prefix}{key}: ")
         else:
-            rows.append((f"{prefix}{key}", "not known" if value is None else str(value)))
-    return rows
+            several = isinstance(value, Sequence) and not isinstance(value, str)
+            text = ", ".join(map(str, value)) if several else "not known" if value is None else str(value)
+            yield {"item": f"{prefix}{key}", "value": text}
 
 
 def _run(data: ReportData) -> Table:
-    rows = [{"item": item, "value": value} for item, value in _flat(data.run)]
-    return Table("run", "Run", "Program and settings of this report.", rows, _SECTION)
+    return Table("run", "Run", "Program and settings of this report.", list(_flat(data.run)), "provenance")
 
 
 def _stages(data: ReportData) -> Table:
     words = "Wall time, CPU time and largest resident memory of a process."
-    return Table("stages", "Stages", words, [_stage_row(stage) for stage in data.stages], _SECTION)
+    return Table("stages", "Stages", words, [_stage_row(stage) for stage in data.stages], "provenance")
 
 
 def _stage_row(stage: Mapping[str, Any]) -> Row:
@@ -475,7 +442,7 @@ def _stage_row(stage: Mapping[str, Any]) -> Row:
     }
 
 
-#: Files beyond this number are counted, not listed.
+#: Files that are listed at most.
 _MOST_FILES = 200
 
 
@@ -489,12 +456,12 @@ def _inputs(data: ReportData) -> Table:
         [
             {
                 "file": str(entry.get("name", "")),
-                "size": size_text(float(entry["size"])) if entry.get("size") is not None else "",
+                "size": _bytes_text(float(entry["size"])) if entry.get("size") is not None else "",
                 "hash": str(entry.get("hash", "")),
             }
             for entry in data.inputs[:_MOST_FILES]
         ],
-        _SECTION,
+        "provenance",
     )
 
 
@@ -515,11 +482,7 @@ _HEADS = {
 
 
 def methods_text(result: Mapping[str, Any]) -> str:
-    """Return the comparison as the command prints it.
-
-    Args:
-        result: content of ``methods.json``.
-    """
+    """Return the comparison in ``methods.json`` as the command prints it."""
     against = {"truth": "the truth", "fit": "this run's fit of the same frames"}[result["reference"]]
     lines = [f"{result['pixels']:,} pixels, errors against {against}"]
     lines += [f"sample {i}: {_sample(sample)}" for i, sample in enumerate(result["samples"])]
@@ -542,33 +505,25 @@ def _sample(sample: Mapping[str, Any]) -> str:
 
 
 def method_rows(result: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Return a row of text for every method: title and numbers, or title and why it was not run.
+    """Return a row for every method in ``methods.json``: title and numbers, or title and why it was not run.
 
     Against a fit of the same frames an error is no multiple of the bound: the reference errs too.
-
-    Args:
-        result: content of ``methods.json``.
     """
     rows: list[tuple[str, ...]] = []
     for method in result["methods"]:
         if method["missing"]:
             rows.append((method["title"], method["missing"]))
             continue
-        errors = method["errors"]
-        gain = errors.get("conversion_gain", {})
-        known = result["reference"] == "truth" and gain.get("rmse") is not None and gain.get("bound")
-        ratio = f"{gain['rmse'] / gain['bound']:.2f}" if known else "-"
-        if not errors:
-            cells = ["reference", *[""] * 6]
-        else:
-            cells = [percent_text(gain.get(name)) for name in ("bias", "rmse", "robust_sd", "bound")]
-            cells += [
-                ratio,
-                *(percent_text(errors[name]["rmse"]) for name in ("read_noise_e", "quanta_exposure")),
-            ]
+        cells = ["reference", *[""] * 6]
+        if errors := method["errors"]:
+            gain = errors["conversion_gain"]
+            known = result["reference"] == "truth" and gain["rmse"] is not None and gain["bound"]
+            cells = [percent_text(gain[name]) for name in ("bias", "rmse", "robust_sd", "bound")]
+            cells.append(f"{gain['rmse'] / gain['bound']:.2f}" if known else "-")
+            cells += [percent_text(errors[name]["rmse"]) for name in ("read_noise_e", "quanta_exposure")]
+        median = method["medians"]["conversion_gain"]
+        value = "-" if median is None else f"{median:.5g}"
         time = f"{1e6 * method['seconds_per_pixel']:.0f}"
-        gain_value = method["medians"]["conversion_gain"]
-        value = "-" if gain_value is None else f"{gain_value:.5g}"
         rows.append((method["title"], f"{method['n_answered']:,}", value, *cells, time))
     return rows
 
@@ -580,11 +535,10 @@ def method_tables(data: ReportData) -> list[Table]:
         return []
     against = {"truth": "the truth", "fit": "the fit of this run, from the same frames"}[result["reference"]]
     rows = [dict(zip_longest(_HEADS, row, fillvalue="")) for row in method_rows(result)]
-    remarks = " ".join(f"{remark[0].upper()}{remark[1:]}." for remark in result["remarks"])
-    verdict = crossing_text(result["study"]) if result["study"] else ""
+    remarks = " ".join(f"{capitalised(remark)}." for remark in result["remarks"])
+    verdict = f"{capitalised(crossing_text(result['study']))}." if result["study"] else ""
     caption = (
         f"The same {result['pixels']:,} {data.noun}s for every method; errors against {against}. "
-        f"{f'{verdict[0].upper()}{verdict[1:]}.' if verdict else ''} {remarks}"
-    ).strip()
-    caption = caption.replace(" e-", " e⁻")
-    return [Table("methods-table", "Methods", caption, rows, "methods")]
+        f"{verdict} {remarks}"
+    )
+    return [Table("methods-table", "Methods", caption.strip().replace(" e-", " e⁻"), rows, "methods")]

@@ -7,7 +7,6 @@ rises evenly, differences a diverging scale.
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,12 +54,6 @@ class Palette:
     grid: str = "#DDDDDD"
     no_value: str = "#D9D9D9"
     mark: str = "#F0E442"
-
-    def parameters(self) -> dict[str, Any]:
-        """Return the parameters of matplotlib that hold colours."""
-        ink = dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), self.ink)
-        paper = dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), self.paper)
-        return {"axes.edgecolor": self.edge, **ink, **paper}
 
 
 LIGHT = Palette()

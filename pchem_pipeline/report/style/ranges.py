@@ -54,12 +54,9 @@ def finite(values: NDArray[Any]) -> FloatArray:
 def robust_range(values: NDArray[Any] | Ordered) -> DisplayRange:
     """Choose the range of an axis from the bulk of the values.
 
-    The range between the 1st and the 99th percentile, widened by 0.3 of it on each side (on a
-    logarithmic axis by 0.3 of its decades), and cut to the values that occur. Where that leaves out
-    only a thin margin, all values are drawn.
-
-    Args:
-        values: any shape; NaN and infinities are counted, not drawn.
+    It is the range between the 1st and the 99th percentile, widened by 0.3 of it on each side (on a
+    logarithmic axis by 0.3 of its decades), and cut to the values that occur. NaN and infinities are counted,
+    not drawn.
     """
     known = Ordered.of(values)
     if known.size == 0:
@@ -87,13 +84,7 @@ def _widened(low: float, high: float) -> tuple[float, float]:
 
 
 def histogram_edges(values: NDArray[Any] | Ordered, shown: DisplayRange, most: int) -> FloatArray:
-    """Return 6 to ``most`` bins over the drawn range, by the rule of Freedman and Diaconis.
-
-    Args:
-        values: any shape.
-        shown: range from :func:`robust_range`.
-        most: largest number of bins.
-    """
+    """Return the edges of 6 to ``most`` bins over the drawn range, by the rule of Freedman and Diaconis."""
     known = Ordered.of(values).within(shown.low, shown.high)
     low, high = shown.low, shown.high
     if shown.logarithmic:
@@ -108,21 +99,16 @@ def histogram_edges(values: NDArray[Any] | Ordered, shown: DisplayRange, most: i
     return np.exp(edges) if shown.logarithmic else edges
 
 
-Bar = tuple[tuple[float, str], ...]
-
 #: Levels at which the bar of colours is labelled.
 _LEVELS = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
 
 
-def map_colours(known: Ordered) -> tuple[FloatArray, Bar]:
+def map_colours(known: Ordered) -> tuple[FloatArray, tuple[tuple[float, str], ...]]:
     """Return the values between the colours of a map, and places and texts of the bar of its colours.
 
     The level of a colour is the Beta(2,2) quantile of the value's rank, so that the levels 0, 1/4, 1/2, 3/4,
     1 are the minimum, the 15.6, 50 and 84.4 % quantiles and the maximum (Hendrickson et al. 2023, Appendix
     C).
-
-    Args:
-        known: the values.
     """
     if known.size == 0:
         return np.zeros(SHADES - 1), ()
@@ -137,7 +123,6 @@ def map_colours(known: Ordered) -> tuple[FloatArray, Bar]:
 
 def _labels(physical: FloatArray) -> list[str]:
     """Return texts with as many digits as tell the middle labels apart."""
-    texts: list[str] = []
     for digits in range(3, 8):
         texts = [short(float(value), digits) for value in physical]
         if len(set(texts)) == len(set(physical.tolist())):

@@ -90,15 +90,14 @@ def listed_maps(store: RunStore, shape: tuple[int, int]) -> list[MapEntry]:
     These are their words; the maps themselves are not read.
     """
     known = [variable for variable in VARIABLES.values() if variable.dims == ("y", "x")]
-    groups = [*_GROUPS, *dict.fromkeys(v.group for v in known if v.group not in _GROUPS)]
-    places = {path: i for i, path in enumerate(VARIABLES)}
-    known.sort(key=lambda variable: (groups.index(variable.group), places[variable.path]))
-    found = []
-    for variable in known:
-        repeated = variable.group == "fit" and f"maps/{variable.name}" in VARIABLES
-        if not repeated and store.has(variable.path) and store.array(variable.path).shape == shape:
-            found.append(_entry(variable))
-    return found
+    groups = list(dict.fromkeys((*_GROUPS, *(variable.group for variable in known))))
+    return [
+        _entry(variable)
+        for variable in sorted(known, key=lambda variable: groups.index(variable.group))
+        if not (variable.group == "fit" and f"maps/{variable.name}" in VARIABLES)
+        and store.has(variable.path)
+        and store.array(variable.path).shape == shape
+    ]
 
 
 def _entry(variable: Variable) -> MapEntry:
@@ -140,12 +139,8 @@ def read_maps(
 ) -> tuple[list[MapEntry], dict[str, FloatArray]]:
     """Read every stored map: packed, the important ones first, until the page is full; exact for some pixels.
 
-    Args:
-        store: the run.
-        shape: of the sensor.
-        index: ``y * nx + x`` of the pixels that are held in full.
-        loaded: maps that were read already, by path; None: none.
-        threads: that pack a map each.
+    ``index`` is ``y * nx + x`` of these, ``loaded`` are maps that were read already, by path; each of the
+    threads packs a map.
 
     Returns:
         The maps, in the order of the list, and by path of those that fit their values, shape (n,).
@@ -242,12 +237,7 @@ def _multiple_of_exposure(maps: Arrays, path: str) -> tuple[str, float] | None:
 
 
 def deciding_parameters(columns: Sequence[FloatArray], model: FittedModel) -> FloatArray | None:
-    """Return the parameters whose thresholds are drawn, (4, n); None where these are the fitted ones.
-
-    Args:
-        columns: (H, g, mu, sigma) of n pixels, NaN without parameters.
-        model: of these pixels.
-    """
+    """Return the parameters whose thresholds are drawn, (4, n); None if they are the fitted ``columns``."""
     if not model.effects:
         return None
     known = np.flatnonzero(np.isfinite(columns).all(axis=0))

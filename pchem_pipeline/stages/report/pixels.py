@@ -45,22 +45,13 @@ def choose_pixels(
 
     Ranks are taken among the pixels with a good fit (with any value, if fewer than four are good); the
     pixel nearest to the 10 or 90 % rank of both is taken, each once. Where no pixel has a value, one of each
-    reason for it is shown, the most frequent reasons first.
-
-    Args:
-        read_noise_e: sigma_e-, e-, shape (ny, nx), NaN where there is no value.
-        quanta_exposure: H, e-, shape (ny, nx).
-        fit_status: status words, shape (ny, nx).
-
-    Returns:
-        Label, y and x of each; at most four.
+    reason for it is shown, the most frequent reasons first. All maps have the shape (ny, nx).
     """
     known = np.isfinite(read_noise_e) & np.isfinite(quanta_exposure)
     if not known.any():
-        words, first, counts = np.unique(fit_status, return_index=True, return_counts=True)
-        order = np.argsort(-counts, kind="stable")[:4]
-        places = [divmod(int(first[i]), fit_status.shape[1]) for i in order]
-        return [("no fit", y, x) for (y, x), _ in zip(places, words[order], strict=True)]
+        _, first, counts = np.unique(fit_status, return_index=True, return_counts=True)
+        commonest = first[np.argsort(-counts, kind="stable")[:4]].tolist()
+        return [("no fit", *divmod(place, fit_status.shape[1])) for place in commonest]
     good = known & (fit_status == 0)
     free = good if good.sum() >= len(_CORNERS) else known
     maps = read_noise_e, quanta_exposure
@@ -74,15 +65,9 @@ def choose_pixels(
 
 
 def _nearest(
-    maps: Sequence[FloatArray],
-    ordered: Sequence[Ordered],
-    ranks: Sequence[float],
-    free: BoolArray,
+    maps: Sequence[FloatArray], ordered: Sequence[Ordered], ranks: Sequence[float], free: BoolArray
 ) -> tuple[int, int]:
-    """Return the free pixel whose values have ranks nearest to given ones; ranks are in 0..1.
-
-    Looked at are the pixels with ranks about these, twice as far until the nearest lies among them.
-    """
+    """Return the free pixel whose values have ranks (0 to 1) nearest to given ones, in windows that grow."""
     reach = 0.02
     while True:
         inside = free.copy()
@@ -113,15 +98,9 @@ def pixel_fits(
     *,
     channel: bool = False,
 ) -> list[PixelFit]:
-    """Return histograms and fits of chosen pixels.
+    """Return histograms and fits of chosen pixels; ``channel``: they are channels of ready-made histograms.
 
-    Args:
-        chosen: label, y and x of each.
-        maps: parameters and standard errors, (y, x); anything that is indexed so.
-        fit: ``fit_status`` and ``goodness_p``, likewise.
-        histograms: of these pixels.
-        masses: of :func:`bin_masses`.
-        channel: whether they are channels of ready-made histograms.
+    ``maps`` and ``fit`` are indexed by (y, x), ``masses`` are those of :func:`bin_masses`.
     """
     names = (*PARAMETERS, "read_noise_e")
     found = []
@@ -150,12 +129,7 @@ def bin_masses(
 ) -> list[FloatArray]:
     """Return the probability of each bin of n pixels under a model with effects; NaN without parameters.
 
-    None are returned under a model without effects, whose law is the PCD.
-
-    Args:
-        columns: (H, g, mu, sigma), shape (n,) each.
-        histograms: of these pixels.
-        model: of these pixels.
+    None are returned under a model without effects, whose law is the PCD. ``columns`` are (H, g, mu, sigma).
     """
     counts = histograms.counts
     if not counts or not model.effects:
@@ -164,10 +138,9 @@ def bin_masses(
     known = np.flatnonzero(np.isfinite(columns).all(axis=0))
     if known.size:
         kept = [column[known] for column in columns]
-        law = model.at(known).law(kept)
         codes = histograms.origin[known][:, None] + np.arange(counts[0].size)
         amplitude, weight = histograms.satellites[:, known]
-        found[known] = sample_mass(law, kept, codes, satellites=(amplitude, weight))
+        found[known] = sample_mass(model.at(known).law(kept), kept, codes, satellites=(amplitude, weight))
     return list(found)
 
 
@@ -181,16 +154,11 @@ def choose_inspected(
     everything: int = 4096,
     most: int = 2400,
 ) -> tuple[IntArray, list[Notable]]:
-    """Choose the pixels that are in the report in full.
+    """Choose the pixels that are in the report in full; ``maps`` and ``fit`` are (y, x).
 
-    Args:
-        maps: parameters and standard errors, (y, x), NaN where there is no value.
-        fit: ``fit_status``, and ``goodness_p`` where it is known, (y, x).
-        shown: pixels (y, x) that the report draws.
-        suspects: pixels (y, x) to which the discrepancy verdict points.
-        bins: of a histogram; all that are taken have at most `MAX_BINS` together.
-        everything: a sensor of at most so many pixels is taken whole.
-        most: number of pixels of a larger one.
+    These are the ``shown`` ones, the ``suspects`` of the search for missing effects, odd ones, and an even
+    sample. A sensor of at most ``everything`` pixels is taken whole, of a larger one ``most``; histograms of
+    so many ``bins`` have at most `MAX_BINS` together.
 
     Returns:
         ``y * nx + x`` of each, each once, the shown and odd ones first, shape (n,); and why they were chosen,
@@ -203,11 +171,7 @@ def choose_inspected(
     reasons = [
         ("shown in the report", "", pixel_index(shown, nx)),
         ("from the search for missing effects", "", pixel_index(suspects, nx)),
-        (
-            "poorest goodness of fit",
-            "fit/goodness_p",
-            _smallest(np.asarray(p, dtype=np.float64).ravel(), _POOR),
-        ),
+        ("poorest goodness of fit", "fit/goodness_p", _smallest(p, _POOR)),
         *_flagged(status, rng),
         *_extreme(maps),
     ]
@@ -224,8 +188,9 @@ def choose_inspected(
     return index, [each for each in found if each.pixels]
 
 
-def _smallest(values: FloatArray, n: int) -> IntArray:
+def _smallest(numbers: NDArray[Any], n: int) -> IntArray:
     """Return the places of the n smallest values in their order, of equal ones the first."""
+    values = np.asarray(numbers, dtype=np.float64).ravel()
     some = some_of(values)
     some = some[np.isfinite(some)]
     # of all pixels there are as many below the n-th of some, and few more: sorting all takes long
@@ -256,8 +221,7 @@ def _extreme(maps: Arrays) -> list[tuple[str, str, IntArray]]:
             (f"{name}_stderr", -1.0, _UNSURE, f"largest standard error of the {words}"),
         ):
             if path in maps:
-                values = sign * np.asarray(maps[path], dtype=np.float64).ravel()
-                found.append((what, f"maps/{path}", _smallest(values, n)))
+                found.append((what, f"maps/{path}", _smallest(sign * maps[path], n)))
     return found
 
 

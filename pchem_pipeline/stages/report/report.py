@@ -41,7 +41,6 @@ from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.store.records import StageRecord
 
 
 def run(context: StageContext) -> None:
@@ -76,12 +75,7 @@ def run(context: StageContext) -> None:
 
 
 def _write(
-    unit: Unit,
-    store: RunStore,
-    *,
-    config: RunConfig,
-    stages: list[dict[str, Any]],
-    draw: DrawAll,
+    unit: Unit, store: RunStore, *, config: RunConfig, stages: list[dict[str, Any]], draw: DrawAll
 ) -> dict[str, Any]:
     """Gather, draw and write."""
     with beside(_workers(config.compute)) as hand:
@@ -111,13 +105,7 @@ def gather(
     stages: Sequence[Mapping[str, Any]],
     hand: Beside = functools.cache,
 ) -> ReportData:
-    """Read all that the report shows.
-
-    Args:
-        store: the run.
-        config: its configuration.
-        stages: rows of the table of stages.
-        hand: takes what can be done meanwhile: single pixels, and packing maps for the inspector.
+    """Read all that the report shows; ``hand`` takes what can be done meanwhile.
 
     Raises:
         StoreError: maps or histograms are missing.
@@ -181,23 +169,21 @@ def _inspector(run: StoredRun, sample: PixelSample, threads: int) -> InspectorDa
 
 def _stage_rows(context: StageContext) -> list[dict[str, Any]]:
     """Return what the table of stages shows, the report itself left out."""
-    names = [name for name in pipeline() if name != context.stage]
-    records = [context.store.records.read(name) for name in names]
-    return [_stage_row(context.store, record) for record in records if record is not None]
-
-
-def _stage_row(store: RunStore, record: StageRecord) -> dict[str, Any]:
-    done = len(store.records.done(record.stage, record.fingerprint))
-    complete = done >= record.keys > 0
-    return {
-        "stage": record.stage,
-        "state": "complete" if complete else f"{done} of {record.keys} units",
-        "seconds": record.seconds,
-        "cpu_seconds": record.cpu_seconds,
-        "peak_memory_bytes": record.peak_rss_bytes,
-        "started": record.started,
-        "notes": list(record.notes),
-    }
+    records, rows = context.store.records, []
+    for record in (records.read(name) for name in pipeline() if name != context.stage):
+        if record is not None:
+            done = len(records.done(record.stage, record.fingerprint))
+            row = {
+                "stage": record.stage,
+                "state": "complete" if done >= record.keys > 0 else f"{done} of {record.keys} units",
+                "seconds": record.seconds,
+                "cpu_seconds": record.cpu_seconds,
+                "peak_memory_bytes": record.peak_rss_bytes,
+                "started": record.started,
+                "notes": list(record.notes),
+            }
+            rows.append(row)
+    return rows
 
 
 def _workers(settings: ComputeSettings) -> int:

@@ -58,14 +58,7 @@ _ARRAYS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A run as it is stored.
-
-    Attributes:
-        store: where.
-        sensor: its input.
-        model: of the fit.
-        data: all that its report shows, but single pixels and what is made of sums over frames.
-    """
+    """A run as it is stored; ``data`` is its report without single pixels and what is made of frame sums."""
 
     store: RunStore
     sensor: SensorInfo
@@ -80,13 +73,7 @@ class StoredRun:
 def read_run(
     store: RunStore, config: RunConfig, stages: Sequence[Mapping[str, Any]] = (), threads: int = 1
 ) -> StoredRun:
-    """Read all of a run but its histograms.
-
-    Args:
-        store: the run.
-        config: its configuration.
-        stages: rows of the table of stages.
-        threads: that read an array each.
+    """Read all of a run but its histograms; each thread reads an array.
 
     Raises:
         StoreError: an array is missing or corrupt.
@@ -172,11 +159,9 @@ def verdict_data(found: Verdict, arrays: Arrays) -> DiscrepancyData:
 
 
 def plan_section(maps: Arrays, n_frames: int | None) -> dict[str, Any] | None:
-    """Return the frames that precisions need at the median pixel, or None where no pixel has a value.
+    """Return the frames that precisions need at the median pixel, and what the frames of the run reach.
 
-    Args:
-        maps: of the run.
-        n_frames: frames of the run, or None where pixels differ.
+    None where no pixel has a value.
     """
     names = ("quanta_exposure", "read_noise_e", "conversion_gain")
     medians = [median_of(maps[name]) for name in names if name in maps]
@@ -219,16 +204,13 @@ def _run_facts(store: RunStore, sensor: SensorInfo, model: FittedModel, config: 
     }
     if config.simulate is not None:
         facts["seed of the simulation"] = config.simulate.seed
-    version = model.version
-    if version is not None and version.effects:
-        facts["model"] = model_words(version.effects)
-    if version is not None:
+    if (version := model.version) is not None:
+        if version.effects:
+            facts["model"] = model_words(version.effects)
         source = "search for missing effects" if version.source == "verdict" else "configuration"
         facts["version of the model"] = f"{version.number} (from the {source})"
-    record = store.records.read("report")
-    if record is not None:
-        facts["report made (UTC)"] = record.started
-        facts["versions"] = record.versions
+    if (record := store.records.read("report")) is not None:
+        facts |= {"report made (UTC)": record.started, "versions": record.versions}
     return facts
 
 
@@ -267,12 +249,9 @@ def _missing(name: str, sensor: SensorInfo, maps: Arrays, ensemble: Arrays, comp
 
 @dataclass(frozen=True)
 class PixelHistograms:
-    """Histograms of n pixels.
+    """Histograms of n pixels, all of one length: DN of the first bin, frames in each bin.
 
-    Attributes:
-        origin: DN of the first bin of each.
-        counts: frames in each bin, all of one length.
-        satellites: amplitude (e-) and weight of the satellite levels that their fits left free; (2, n).
+    ``satellites`` are amplitude (e-) and weight of the satellite levels that the fits left free, (2, n).
     """
 
     origin: IntArray
@@ -285,12 +264,7 @@ class PixelHistograms:
 
 
 def read_histograms(store: RunStore, index: IntArray, shape: tuple[int, int]) -> PixelHistograms:
-    """Read the histograms of pixels.
-
-    Args:
-        store: the run.
-        index: ``y * nx + x`` of each.
-        shape: of the sensor.
+    """Read the histograms of the pixels with these places ``y * nx + x``.
 
     Raises:
         StoreError: an array is missing or corrupt.
