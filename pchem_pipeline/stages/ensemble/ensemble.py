@@ -83,24 +83,10 @@ class _Job:
     effects: tuple[Effect, ...]
     limits: tuple[int, int] | None
 
-    @property
-    def counts_anew(self) -> bool:
-        """Whether the chosen frames are some of those in the histograms."""
-        return self.frames not in (None, (0, self.sensor.n_frames))
-
 
 @dataclass(frozen=True)
 class _Fitted:
-    """What the fit and the histograms of some tiles hold, of the pixels with a value.
-
-    Attributes:
-        pixels: their parameters.
-        place: which pixels of the sensor they are, (y, x).
-        origin: DN of bin 0.
-        low: smallest DN.
-        high: largest DN.
-        bins: bins of a histogram.
-    """
+    """Parameters and histogram ranges (DN) of the pixels with a value, at ``place`` (y, x) of the sensor."""
 
     pixels: UsablePixels
     place: BoolArray
@@ -113,7 +99,8 @@ class _Fitted:
     def read(cls, store: RunStore, tiles: list[Tile]) -> _Fitted:
         """Read them from the run."""
         fit, histogram = store.at(group="fit"), store.at(group="histogram")
-        maps, place = [fit[name] for name in PARAMETERS], np.zeros(store.array("fit/bias").shape, np.bool_)
+        maps = [fit[name] for name in PARAMETERS]
+        place = np.zeros(maps[0].shape, np.bool_)
         for tile in tiles:
             place[tile.region] = True
         pixels, known = UsablePixels.from_maps([values[place] for values in maps])
@@ -226,8 +213,7 @@ def _place_in_truth(
 def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
     """Make the rows of sums; start anew where more pixels have moved the axes."""
     context.begin()
-    store = context.store
-    content = asdict(axes)
+    store, content = context.store, asdict(axes)
     if store.attributes("ensemble_tiles").get("axes") != content:
         done = store.records.done(context.stage, context.fingerprint)
         store.records.unmark(context.stage, context.fingerprint, done)
@@ -241,14 +227,13 @@ def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
 
 def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
     """Sum over each tile of a band; frames, where they are needed, are read once for all of them."""
-    chosen = _count(store, job, band) if job.counts_anew else None
+    some_frames = job.frames not in (None, (0, job.sensor.n_frames))
+    chosen = _count(store, job, band) if some_frames else None
     errors = {} if job.truth is None else _compare(store, job, band)
     for key in markers(band):
         number, tile = job.tiles[key]
-        own = None
-        if chosen is not None:
-            own = chosen.of((slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1)))
-        integers, floats = _sum_tile(store, tile, job, own)
+        of_tile = None if chosen is None else chosen.of(_in_band(tile, band))
+        integers, floats = _sum_tile(store, tile, job, of_tile)
         if key in errors:
             integers[job.axes.integers["error_sizes"]] = errors[key].by_size
             integers[job.axes.integers["compared"]] = errors[key].n_samples
@@ -257,17 +242,15 @@ def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
             store.write(f"ensemble_tiles/{name}", (slice(number, number + 1), slice(None)), row[None])
 
 
+def _in_band(tile: Tile, band: Band | Tile) -> tuple[slice, slice]:
+    """Return the index of a tile's pixels in its band."""
+    return slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1)
+
+
 def _sum_tile(
     store: RunStore, tile: Tile, job: _Job, chosen: PixelHistograms | None
 ) -> tuple[IntArray, FloatArray]:
-    """Return what a tile adds to the ensemble.
-
-    Args:
-        store: the run.
-        tile: the tile.
-        job: what is summed.
-        chosen: histograms of the chosen frames; None: all frames.
-    """
+    """Return what a tile adds to the ensemble; ``chosen``: histograms of some frames, None: of all."""
     fit, histogram = (store.at(tile.region, group) for group in ("fit", "histogram"))
     maps = [fit[name] for name in PARAMETERS]
     origin, low, high = (histogram[name].astype(np.int64) for name in _HISTOGRAM)
@@ -277,7 +260,7 @@ def _sum_tile(
     else:  # only the number of the samples matters
         outside = np.full(origin.shape, job.sensor.n_frames, np.uint32)
         counted = PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
-    errors = _errors(fit, tile, job.sensor.shape)
+    errors, numbers = _errors(fit, tile, job.sensor.shape), np.arange(origin.size).reshape(origin.shape)
     rows = []
     for part in parts_told(tile.parts(store.array("histogram/counts").shape[2])):
         everything = counted.of(part).cut(low[part], high[part])
@@ -290,7 +273,7 @@ def _sum_tile(
             job.axes,
             FittedModel.read(store, place).law(of_pixels).between(*(job.limits or (None, None))),
             fitted_satellites(store, place) if job.effects else None,
-            None if errors is None else errors.of(_inside(tile, part)),
+            None if errors is None else errors.of(numbers[part].ravel()),
         )
         rows.append(row)
     integers, floats = (np.sum(each, axis=0) for each in zip(*rows, strict=True))
@@ -316,20 +299,11 @@ def _errors(fit: Arrays, tile: Tile, shape: tuple[int, int]) -> PixelErrors | No
     """Return the errors of the pixels of a tile in C order; None where they are not known."""
     if "correlation" not in fit:
         return None
-    ny, nx = shape
     stderr = [fit[f"{name}_stderr"].ravel() for name in PARAMETERS]
     correlation = fit["correlation"]
-    place = np.arange(tile.y0, tile.y1)[:, None] * nx + np.arange(tile.x0, tile.x1)
-    share = min(1.0, WANTED / (ny * nx))
-    flat = correlation.reshape(-1, correlation.shape[2])
-    return PixelErrors(np.stack(stderr, axis=1), flat, place.ravel(), share)
-
-
-def _inside(tile: Tile, part: tuple[slice, slice]) -> BoolArray:
-    """Return which pixels of a tile, in C order, are in a part of it."""
-    mask = np.zeros((tile.y1 - tile.y0, tile.x1 - tile.x0), np.bool_)
-    mask[part] = True
-    return mask.ravel()
+    place = (np.arange(tile.y0, tile.y1)[:, None] * shape[1] + np.arange(tile.x0, tile.x1)).ravel()
+    share = min(1.0, WANTED / math.prod(shape))
+    return PixelErrors(np.stack(stderr, axis=1), correlation.reshape(place.size, -1), place, share)
 
 
 def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStream:
@@ -376,20 +350,14 @@ def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, ErrorTa
             numbers = tables.convert(block).number
             for key in markers(band):
                 tile = job.tiles[key][1]
-                part = (slice(None), slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
+                part = (slice(None), *_in_band(tile, band))
                 tally = compare_electron_numbers(numbers[part], true[part], ERROR_SIZES)
                 found[key] = found[key] + tally if key in found else tally
     return found
 
 
 def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
-    """Add the rows of the finished tiles; without frames every pixel counts the same.
-
-    Args:
-        store: the run.
-        job: what is summed.
-        rows: of the finished tiles in the sums.
-    """
+    """Add the rows of the finished tiles; without frames every pixel counts the same."""
     samples = (1, 1)
     if job.frames is not None:
         gone = uncounted_frames(odd_frames_of(store)[0])
@@ -402,27 +370,15 @@ def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
 
 
 def _write_result(
-    store: RunStore,
-    totals: EnsembleTotals,
-    fitted: _Fitted,
-    job: _Job,
-    facts: dict[str, Any],
+    store: RunStore, totals: EnsembleTotals, fitted: _Fitted, job: _Job, facts: dict[str, Any]
 ) -> None:
     """Write the arrays of the group ``ensemble`` and its numbers (attributes of the group).
 
     The attributes are the facts (``rmse``, counts, error rates), ``moments`` (rows of Appendix A),
     ``component_cases`` (parameters held constant, a list for each row of ``component_variance``) and
     ``missing`` (part to reason).
-
-    Args:
-        store: the run.
-        totals: sums over the tiles.
-        fitted: pixels of the finished tiles.
-        job: what the ensemble is of.
-        facts: further attributes.
     """
-    missing, settings, frames = _missing(job, totals), job.config.ensemble, job.frames
-    pixels = fitted.pixels
+    settings, frames, pixels = job.config.ensemble, job.frames, fitted.pixels
     per_pixel: int | NDArray[Any] = totals.samples[0]
     if frames is None:
         per_pixel = store.read("histogram/counts")[fitted.place].sum(axis=1, dtype=np.int64)
@@ -449,7 +405,7 @@ def _write_result(
             totals, pixels, per_pixel, weight, extended=bool(job.effects) or job.limits is not None
         ),
         "component_cases": COMPONENT_CASES,
-        "missing": missing,
+        "missing": _missing(job, totals),
     }
     if job.effects:
         found["model"] = model_words(job.effects)
@@ -465,9 +421,8 @@ def _true_pixels(store: RunStore, job: _Job, place: BoolArray) -> UsablePixels |
         return None
     y0, x0, _ = job.truth
     ny, nx = job.sensor.shape
-    region = (slice(y0, y0 + ny), slice(x0, x0 + nx))
-    maps = [store.read(f"truth/{name}", region)[place] for name in PARAMETERS]
-    true, known = UsablePixels.from_maps(maps)
+    truth = store.at((slice(y0, y0 + ny), slice(x0, x0 + nx)), "truth")
+    true, known = UsablePixels.from_maps([truth[name][place] for name in PARAMETERS])
     return true if known.all() else None
 
 
