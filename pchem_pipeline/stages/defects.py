@@ -19,12 +19,7 @@ if TYPE_CHECKING:
 
 
 def stored_defects(store: RunStore, config: RunConfig, maps: Arrays | None = None) -> Defects:
-    """Return the defects of a run that has maps.
-
-    Args:
-        store: the run.
-        config: its configuration.
-        maps: the maps by name, where they are read already.
+    """Return the defects of a run that has maps; give these, by name, where they are read already.
 
     Raises:
         StoreError: an array is missing or corrupt.

@@ -17,11 +17,9 @@ if TYPE_CHECKING:
 
 
 def input_content(context: StageContext) -> dict[str, Any]:
-    """Return what the content of the input is.
+    """Return what the content of the input is, see `known_identity`.
 
-    The files are hashed once; afterwards names, sizes and times of change are compared first, and they are
-    hashed again only where these differ. Where the files are gone, the last known content counts: what was
-    made of them stays valid.
+    Where the files are gone, the last known content counts: what was made of them stays valid.
 
     Raises:
         InputError: files are missing or bad, and nothing is known of them from before.
@@ -83,10 +81,7 @@ def verdict(context: StageContext) -> dict[str, str] | None:
 
 
 def discrepancy_state(store: RunStore) -> str | None:
-    """Return in words which verdict a run has, None without one that can be read.
-
-    It changes whenever the verdict was redone.
-    """
+    """Return which verdict a run has, in words that change when it is redone; None without a readable one."""
     from pchem_pipeline.base.errors import StoreError
     from pchem_pipeline.discrepancy.verdict import read_verdict
 

@@ -118,22 +118,24 @@ def create_frames(context: StageContext, reader: FrameSequence) -> None:
     shard = shard_shape(reader.shape, chunk)
     lengths, chunks = (dict(zip(("frame", "y", "x"), each, strict=True)) for each in (reader.shape, chunk))
     context.create("frames/dn", lengths=lengths, chunks=chunks, shards=shard, dtype=reader.dtype)
-    _warn_of_a_small_disk(context, reader)
-
-
-def _stored_bytes(config: RunConfig, shape: tuple[int, int, int], itemsize: int) -> float:
-    """Return about how many bytes the store takes."""
-    n, ny, nx = shape
-    blocks = n / config.histogram.block_length(n)
-    series = 16 * (n * ny + blocks * ny * nx) + 4 * n * math.ceil(ny / ROW_GROUP) * nx
-    total = _STORED_PIXEL * ny * nx + (_STORED_SERIES * series if config.histogram.summaries else 0)
-    return total + (math.prod(shape) * itemsize / _COPY_RATIO if config.input.mode == "copy" else 0)
+    free = context.store.free_bytes()
+    if context.fresh and math.prod(reader.shape) * reader.dtype.itemsize > free:  # if they compress badly
+        words = disk_words(context.config, reader)
+        context.note(f"{words}, {free / 1e9:.1f} GB free; if this does not fit, set input.mode: reference")
 
 
 def disk_words(config: RunConfig, frames: FrameSequence) -> str:
-    """Return where the frames are to be, and how much disk the store takes."""
-    how = "are copied from" if config.input.mode == "copy" else "stay in"
-    held = _stored_bytes(config, frames.shape, frames.dtype.itemsize)
+    """Return where the frames are to be, and about how much disk the store takes."""
+    n, ny, nx = frames.shape
+    held: float = _STORED_PIXEL * ny * nx
+    if config.histogram.summaries:
+        blocks = n / config.histogram.block_length(n)
+        series = 16 * (n * ny + blocks * ny * nx) + 4 * n * math.ceil(ny / ROW_GROUP) * nx
+        held += _STORED_SERIES * series
+    how = "stay in"
+    if config.input.mode == "copy":
+        how = "are copied from"
+        held += n * ny * nx * frames.dtype.itemsize / _COPY_RATIO
     return (
         f"frames {how} their files ({sum(map(file_size, frames.paths)) / 1e9:.2g} GB); "
         f"the store will hold about {held / 1e9:.2g} GB"
@@ -182,14 +184,6 @@ def _copy(unit: Named[_Copied], store: RunStore, *, reader: FrameReader) -> None
         store.write("frames/dn", (slice(t0, t1), slice(y, end), slice(None)), reader.read(t0, t1, y, end))
 
 
-def _warn_of_a_small_disk(context: StageContext, reader: FrameSequence) -> None:
-    """Say beforehand that the frames may not fit; how well they compress is not known."""
-    free = context.store.free_bytes()
-    if context.fresh and math.prod(reader.shape) * reader.dtype.itemsize > free:
-        words = disk_words(context.config, reader)
-        context.note(f"{words}, {free / 1e9:.1f} GB free; if this does not fit, set input.mode: reference")
-
-
 def _run_whole(context: StageContext) -> None:
     """Finish the stage where nothing is copied."""
     context.run_units([WHOLE], unit_name="input")
@@ -204,14 +198,13 @@ def _record_histograms(context: StageContext) -> None:
     context.begin()
     for note in given.notes:
         context.note(note)
-    lowest, highest = int(given.origin.min()), int(given.origin.max()) + given.counts.shape[2] - 1
-    dtype = "int32" if lowest < 0 else np.min_scalar_type(highest).name
+    highest = int(given.origin.max()) + given.counts.shape[2] - 1
     SensorInfo(
         kind="histograms",
         n_frames=int(given.counts.sum(axis=2).max()),
         ny=given.shape[0],
         nx=given.shape[1],
-        dtype=dtype,
+        dtype="int32" if given.origin.min() < 0 else np.min_scalar_type(highest).name,
         bit_depth=context.config.input.bit_depth,
         seen_limits=limits_in(given.counts, given.origin),
         integration_time=None,

@@ -29,11 +29,7 @@ _PIXELS, _PIECES, _FEWEST = 1024, 8, 16
 
 
 def run_quick_look(run: StoredRun, sums: StackSums | None) -> QuickLook | None:
-    """Return the quick look at a run; None where no pixel has parameters.
-
-    Args:
-        run: that is looked at.
-        sums: of :func:`read_sums`.
+    """Return the quick look at a run and its sums (`read_sums`); None where no pixel has parameters.
 
     Raises:
         StoreError: an array is missing or corrupt.
@@ -95,22 +91,21 @@ def read_sums(store: RunStore) -> StackSums | None:
     chosen = usable[_spread(usable.size, most)]
     groups = store.array("summary/column_sum").shape[1]
     some = _spread(chosen.size, _MOST_LINE_SUMS // (groups * nx * int(lengths[0])))
-    blocks = (np.s_[:], np.s_[:])
 
-    def lines(name: str, of: IntArray, rest: slice | tuple[slice, ...]) -> IntArray:
+    def lines(name: str, of: IntArray) -> IntArray:
         first, end = starts[of], (starts + lengths)[of]
         there = np.concatenate([np.arange(*each) for each in zip(first, end, strict=True)])
-        return _read(store, name, first, end, rest)[~np.isin(there, out)]
+        return _read(store, name, first, end)[~np.isin(there, out)]
 
     return StackSums(
         numbers,
         usable.size,
         known[chosen],
-        _read(store, "block_sum", chosen, chosen + 1, blocks),
-        _read(store, "block_sum_square", chosen, chosen + 1, blocks),
-        lines("row_sum", chosen, np.s_[:]),
+        _read(store, "block_sum", chosen, chosen + 1),
+        _read(store, "block_sum_square", chosen, chosen + 1),
+        lines("row_sum", chosen),
         some,
-        lines("column_sum", chosen[some], blocks),
+        lines("column_sum", chosen[some]),
         mean,
         variance,
         store.read("summary/lag1_covariance"),
@@ -126,16 +121,10 @@ def _spread(n: int, most: int) -> IntArray:
     return np.unique(np.linspace(0, n - 1, min(n, max(most, 1))).astype(np.int64))
 
 
-def _read(
-    store: RunStore,
-    name: str,
-    first: IntArray,
-    end: IntArray,
-    rest: slice | tuple[slice, ...],
-) -> IntArray:
+def _read(store: RunStore, name: str, first: IntArray, end: IntArray) -> IntArray:
     """Read ranges along the first axis, those that follow each other at once."""
     cuts = np.flatnonzero(first[1:] != end[:-1]) + 1
-    others = rest if isinstance(rest, tuple) else (rest,)
+    others = (slice(None),) * (store.array(f"summary/{name}").ndim - 1)
     parts = [
         store.read(f"summary/{name}", (slice(int(a[0]), int(b[-1])), *others))
         for a, b in zip(np.split(first, cuts), np.split(end, cuts), strict=True)
@@ -160,8 +149,7 @@ def _codes(store: RunStore, maps: PixelMaps, sensor: SensorInfo) -> CodeSample |
         rows, columns = np.divmod(inside, maps.usable[part].shape[1])
         counts.append(store.read_pixels("histogram/counts", y + rows, x + columns))
         origins.append(origin[part].ravel()[inside].astype(np.int64))
-        values = maps.maps
-        parameters.append(np.stack([each[part].ravel()[inside] for each in values], axis=1))
+        parameters.append(np.stack([each[part].ravel()[inside] for each in maps.maps], axis=1))
     if sum(part.size for part in origins) < _FEWEST:
         return None
     joined = np.concatenate(counts), np.concatenate(origins), np.concatenate(parameters)

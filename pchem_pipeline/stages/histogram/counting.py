@@ -40,15 +40,8 @@ _OPEN = ("open_sums", "open_covariances")
 class _AlongTime:
     """Gathers the pieces of one array along its first axis, and writes them by whole chunks."""
 
-    def __init__(self, store: Path, name: str, rows: slice, done: int = 0) -> None:
-        """Begin at the first frame or block that is not counted yet.
-
-        Args:
-            store: path of the run.
-            name: the array.
-            rows: its rows that are written, whole chunks.
-            done: frames or blocks that are in the store; those of the last chunk are written again.
-        """
+    def __init__(self, store: Path, name: str, rows: slice, done: int) -> None:
+        """Begin after ``done`` frames or blocks; those of the last chunk are written again."""
         self._store, self._name, self._rows = open_store(store), name, rows
         array = self._store.array(name)
         self._length = array.chunks[0]
@@ -106,17 +99,14 @@ class StackCounter:
 
         Args:
             job: what is counted.
-            bands: bands of rows as the blocks have them, whole tiles and whole groups of rows.
+            bands: of the blocks, whole tiles and whole groups of rows.
             workers: threads that share the bands.
         """
-        self._job, self._bands, self._workers = job, bands, workers
+        self._job, self._workers = job, workers
         self._counters = [_BandCounter(job, rows) for rows in bands]
 
     def resume(self, n_frames: int) -> None:
-        """Continue after the frames that the run has counted.
-
-        Args:
-            n_frames: their number.
+        """Continue after the ``n_frames`` frames that the run has counted.
 
         Raises:
             StoreError: an array is missing or damaged.
@@ -137,23 +127,13 @@ class StackCounter:
         """
         for start, parts in blocks:
             check()
-            tasks = [
-                functools.partial(counter.add, part)
-                for counter, part in zip(self._counters, parts, strict=True)
-            ]
+            pairs = list(zip(self._counters, parts, strict=True))
+            tasks = [functools.partial(counter.add, part) for counter, part in pairs]
             if self._job.copies:
-                tasks += [
-                    functools.partial(self._copy, start, rows, part)
-                    for rows, part in zip(self._bands, parts, strict=True)
-                ]
+                tasks += [functools.partial(counter.copy, start, part) for counter, part in pairs]
             call_all(tasks, self._workers)
-            del parts, tasks  # the frames are not held any more while results are written
+            del parts, pairs, tasks  # the frames are not held any more while results are written
         call_all([counter.finish for counter in self._counters], self._workers)
-
-    def _copy(self, start: int, rows: Rows, part: NDArray[Any]) -> None:
-        """Write a band of a block of frames, whole chunks, into the store."""
-        region = (slice(start, start + part.shape[0]), slice(*rows), slice(None))
-        open_store(self._job.store).write("frames/dn", region, part)
 
 
 class _BandCounter:
@@ -216,6 +196,11 @@ class _BandCounter:
             self._spectrum.add(frames[:, :ROW_GROUP])
         if self._moved is not None:
             self._moved.add(frames[:, :ROW_GROUP])
+
+    def copy(self, start: int, frames: NDArray[Any]) -> None:
+        """Write frames from ``start`` on, whole chunks, into the store."""
+        region = (slice(start, start + len(frames)), self._rows, slice(None))
+        open_store(self._store).write("frames/dn", region, frames)
 
     def finish(self) -> None:
         """Write all that was not written on the way."""

@@ -67,13 +67,7 @@ class Plan:
 
 
 def plan_lines(config: RunConfig, base_dir: Path, todo: Sequence[str]) -> list[str]:
-    """Return what it takes to go through the camera files, where they are there; else nothing.
-
-    Args:
-        config: of the run.
-        base_dir: folder to which its paths refer.
-        todo: the stages that are to be done.
-    """
+    """Return what it takes to go through the camera files, where they are there; else nothing."""
     if "simulate" in todo or config.input.samples or is_histogram_input(config.input, base_dir):
         return []
     return make_plan(config, base_dir).words()
@@ -88,8 +82,7 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     from pchem_pipeline.frames.open import open_frames
 
     frames = open_frames(config.input, base_dir)
-    ny, nx = frames.shape[1:]
-    workers = config.compute.count()
+    (ny, nx), workers = frames.shape[1:], config.compute.count()
     limit = most_bins(config.histogram.max_bins, frames.dtype)
     rows = min(ny, math.lcm(ROW_GROUP, min(frames.rows_per_read, ny)))
     bins = bins_of(frames, config.histogram.window_frames, limit, rows)

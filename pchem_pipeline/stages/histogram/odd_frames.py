@@ -43,13 +43,9 @@ def uncounted_frames(odd: Mapping[str, IntArray]) -> IntArray:
 def leave_out_odd_frames(
     context: StageContext, odd: dict[str, IntArray], mean: FloatArray, variance: FloatArray
 ) -> None:
-    """Leave odd frames out; the result is the same where that was done in part before.
+    """Leave odd frames (by kind) out once all bands are done; again where that was done in part before.
 
-    Args:
-        context: of the stage, whose bands are all done.
-        odd: frames by kind.
-        mean: of each frame over its pixels, DN, (frame,).
-        variance: likewise, DN^2.
+    ``mean`` (DN) and ``variance`` (DN^2) are those of each frame over its pixels.
 
     Raises:
         InputError: frames cannot be read again.
@@ -114,13 +110,7 @@ def _leave_out_of_spectrum(context: StageContext, out: IntArray) -> None:
 
 
 def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) -> None:
-    """Write block sums and covariances without odd frames, from what all gave and the frames of their blocks.
-
-    Args:
-        context: of the stage.
-        changed: frames whose blocks are done again.
-        out: frames that are left out.
-    """
+    """Write block sums and covariances without frames ``out``; blocks of ``changed`` ones are read again."""
     store, source = context.store, open_source(context)
     n_frames, ny, _ = source.shape
     length = with_block_length(context.config.histogram, store).block_length(n_frames)
