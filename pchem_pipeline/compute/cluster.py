@@ -10,12 +10,7 @@ from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pchem_pipeline.base.errors import (
-    ConfigError,
-    IncompleteRunError,
-    MissingDependencyError,
-    install_hint,
-)
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, MissingDependencyError, install_hint
 from pchem_pipeline.compute.environment import prepare_environment, versions_of
 from pchem_pipeline.compute.executor import OnResult, Outcome, guarded, out_of_memory
 from pchem_pipeline.compute.settings import ComputeSettings
@@ -35,11 +30,7 @@ class DistributedExecutor:
     shares_memory = False
 
     def __init__(
-        self,
-        settings: ComputeSettings,
-        workers: int,
-        say: Callable[[str], None],
-        check: Callable[[], None],
+        self, settings: ComputeSettings, say: Callable[[str], None], check: Callable[[], None]
     ) -> None:
         """Connect to the cluster, or make it, and wait for its first worker.
 
@@ -67,7 +58,10 @@ class DistributedExecutor:
                 self._client = distributed.Client(**_address(settings.scheduler), timeout="20s")
             else:
                 self._cluster = distributed.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1"
+                    n_workers=settings.count(),
+                    threads_per_worker=1,
+                    dashboard_address="127.0.0.1:0",
+                    host="127.0.0.1",
                 )
                 self._client = distributed.Client(self._cluster)
         except OSError as error:

@@ -199,10 +199,10 @@ def make_executor(
     say: Callable[[str], None] = lambda text: None,
     check: Callable[[], None] = lambda: None,
 ) -> Executor:
-    """Return the executor that the settings ask for.
+    """Return the executor that the section ``compute`` asks for.
 
     Args:
-        settings: the section ``compute``.
+        settings: the section.
         say: takes one line for people while workers are waited for.
         check: called meanwhile; raises where the wait shall end.
 
@@ -214,12 +214,10 @@ def make_executor(
     match settings.backend:
         case "serial":
             return SerialExecutor()
-        case "threads":
-            return PoolExecutor(settings.count(), processes=False)
-        case "processes":
-            return PoolExecutor(settings.count(), processes=True)
+        case "threads" | "processes":
+            return PoolExecutor(settings.count(), processes=settings.backend == "processes")
         case "distributed":
             from pchem_pipeline.compute.cluster import DistributedExecutor
 
-            return DistributedExecutor(settings, settings.count(), say, check)
+            return DistributedExecutor(settings, say, check)
     raise PchEmError(f"unknown backend {settings.backend}")

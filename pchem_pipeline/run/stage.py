@@ -162,17 +162,14 @@ def allowed_bytes(config: RunConfig, workers: int) -> int:
 def band_bytes(config: RunConfig, workers: int, limit: int | None = None) -> int:
     """Return the memory of a worker that counts a band of rows.
 
-    Args:
-        config: of the run.
-        workers: number of workers.
-        limit: bytes that the process of a worker may take, above which it is killed; None: no limit.
+    ``limit``: bytes that the process of a worker may take, above which it is killed; None: no limit.
     """
-    bytes_each = config.histogram.band_memory << 20
+    bytes_each = [config.histogram.band_memory << 20]
     if limit is not None:
-        bytes_each = min(bytes_each, max(16 << 20, limit - BASE_BYTES))
-    if config.compute.max_memory is None:
-        return bytes_each
-    return min(bytes_each, max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))
+        bytes_each.append(max(16 << 20, limit - BASE_BYTES))
+    if config.compute.max_memory is not None:
+        bytes_each.append(max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))
+    return min(bytes_each)
 
 
 @dataclass
@@ -301,7 +298,7 @@ class StageContext:
         sizes, parts = {**LENGTHS, **(lengths or {})}, dict(chunks or {})
         if "y" not in sizes:
             sizes |= zip(("y", "x"), self.sensor.shape, strict=True)
-            parts = {**dict(zip(("y", "x"), self.tile, strict=True)), **parts}
+            parts = dict(zip(("y", "x"), self.tile, strict=True)) | parts
         for name in names:
             self.created[name] = self.stage
             if self.fresh or not self.store.has(name):
@@ -368,9 +365,8 @@ class StageContext:
         self.begin()
         self._know_total(sum(len(markers(unit)) for unit in units) if total is None else total)
         todo = self._ready(self.pending(units, resumes=total is not None), needs)
-        self.store.records.unmark(
-            self.stage, self.fingerprint, (key for unit in todo for key in markers(unit))
-        )
+        again = (key for unit in todo for key in markers(unit))
+        self.store.records.unmark(self.stage, self.fingerprint, again)
         fatal: list[BaseException] = []
         shown = len(self.selected(units))
         undivided = list(units) == [WHOLE]
@@ -381,23 +377,23 @@ class StageContext:
         with self.reporter.progress(
             self.stage, shown, unit_name, shown - len(todo), hidden=undivided
         ) as advance:
-            told: dict[str, float] = {}
+            shares: dict[str, float] = {}  # of the running units, that are done
 
             def tell(key: str, share: float) -> None:
-                share = min(share, 1.0 - told.get(key, 0.0))
-                told[key] = told.get(key, 0.0) + share
+                share = min(share, 1.0 - shares.get(key, 0.0))
+                shares[key] = shares.get(key, 0.0) + share
                 advance(share)
 
             def on_result(unit: AnyUnit, outcome: Outcome) -> None:
-                advance(1.0 - told.pop(unit.key, 0.0))
+                advance(1.0 - shares.pop(unit.key, 0.0))
                 if outcome.error is not None:
                     self._failed(unit, outcome, fatal)
                 if fatal or self.stop.signal is not None:
                     raise Stop
 
             self.stop.check()
-            heard = tell if executor.shares_memory else None
-            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard)
+            listener = tell if executor.shares_memory else None
+            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, listener)
             try:
                 with self.stop.at_once() if undivided else contextlib.nullcontext():
                     executor.map(marked, todo, on_result)
@@ -428,17 +424,18 @@ class StageContext:
         """Split off the units that an upstream stage has not finished."""
         if needs is None:
             return units
-        there = self.tiles_done(needs)
+        ready, finished = [], self.tiles_done(needs)
         for unit in units:
-            if not set(markers(unit)) <= there:
+            if set(markers(unit)) <= finished:
+                ready.append(unit)
+            else:
                 self.failed[unit.key] = f"stage {needs} of {self.store.path} is not finished"
-        return [unit for unit in units if set(markers(unit)) <= there]
+        return ready
 
     def _failed(self, unit: Unit, outcome: Outcome, fatal: list[BaseException]) -> None:
         error = outcome.error
         assert error is not None
-        reason = error_words(error)
-        self.failed[unit.key] = reason
+        self.failed[unit.key] = reason = error_words(error)
         self.reporter.event("failed", stage=self.stage, unit=unit.key, reason=reason, trace=outcome.trace)
         full = (isinstance(error, StoreError) and is_fatal(error.__cause__ or error)) or is_fatal(error)
         # camera files that vanished or changed are gone for all units, too

@@ -23,6 +23,7 @@ from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, Named, StageContext, Task
 from pchem_pipeline.stages.overscan import write_overscan
 from pchem_pipeline.stages.samples import check_samples, sample_sensor
+from pchem_pipeline.store.tiles import equal_rows
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
@@ -170,9 +171,8 @@ def copy_units(
     n_frames, ny, nx = shape
     band = chunk[0] * chunk[1] * nx * itemsize
     rows = chunk[1] * max(1, _UNIT_BYTES // band)
-    for t0 in range(0, n_frames, chunk[0]):
-        for y0 in range(0, ny, rows):
-            t1, y1 = min(t0 + chunk[0], n_frames), min(y0 + rows, ny)
+    for t0, t1 in equal_rows(n_frames, chunk[0]):
+        for y0, y1 in equal_rows(ny, rows):
             yield Named(f"frames-{t0}-{t1 - 1}-rows-{y0}-{y1 - 1}", (t0, t1, y0, y1))
 
 

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
     from pchem_pipeline.frames.settings import InputSettings
 
-#: The stage up to which the run of each sample must be brought, before they are fitted together.
-SAMPLES_UNTIL = "histogram"
-
 
 @dataclass(frozen=True)
 class OpenSample:

@@ -32,6 +32,7 @@ from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
 from pchem_pipeline.store.files import in_storage
+from pchem_pipeline.store.tiles import equal_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -192,11 +193,9 @@ def _files(settings: SimulateSettings) -> list[tuple[str, int, int]]:
     suffix = reader_class(settings.format).suffixes[0]
     if per_file >= n:
         return [(f"frames{suffix}", 0, n)]
-    width = max(5, len(str(math.ceil(n / per_file))))
-    return [
-        (f"frames_{i:0{width}d}{suffix}", start, min(start + per_file, n))
-        for i, start in enumerate(range(0, n, per_file), 1)
-    ]
+    parts = equal_rows(n, per_file)
+    width = max(5, len(str(len(parts))))
+    return [(f"frames_{i:0{width}d}{suffix}", *part) for i, part in enumerate(parts, 1)]
 
 
 def _frame_units(files: list[tuple[str, int, int]]) -> list[_Unit]:
@@ -209,8 +208,7 @@ def _frame_units(files: list[tuple[str, int, int]]) -> list[_Unit]:
 def _electron_units(settings: SimulateSettings) -> list[_Unit]:
     n = min(settings.truth_frames, settings.n_frames)
     step = max(1, min(n, _CHUNK // (4 * math.prod(settings.shape))))
-    parts = [(start, min(start + step, n)) for start in range(0, n, step)]
-    return [Named(f"electrons-{start}-{end}", [(None, start, end)]) for start, end in parts]
+    return [Named(f"electrons-{start}-{end}", [(None, start, end)]) for start, end in equal_rows(n, step)]
 
 
 def _prepare(folder: Path, settings: SimulateSettings) -> None:

@@ -117,11 +117,7 @@ def _acquired(run: Path, lock: RemotePath) -> bytes:
 
 
 def _owner(run: Path, lock: RemotePath) -> dict[str, Any]:
-    """Return what the object says of its owner.
-
-    Raises:
-        LockedError: it is damaged.
-    """
+    """Return what the object says of its owner; raise LockedError where it is damaged."""
     with contextlib.suppress(ValueError):
         held = json.loads(lock.read_bytes())
         if isinstance(held, dict):

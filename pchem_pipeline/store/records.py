@@ -11,12 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import LockedError, StoreError, quoted
-from pchem_pipeline.store.files import (
-    read_record,
-    remove_files,
-    remove_folder,
-    write_record,
-)
+from pchem_pipeline.store.files import read_record, remove_files, remove_folder, write_record
 
 #: seconds for which a look at the record holds: a worker that hung for less was not overtaken
 _LOOK = 1.0
@@ -48,11 +43,7 @@ def working(records: Records, stage: str, fingerprint: str | None) -> Iterator[N
 
 
 def check_work(path: Path) -> None:
-    """Refuse to write into a run where the work of this thread was overtaken.
-
-    Raises:
-        LockedError: it was.
-    """
+    """Raise LockedError where the work of this thread on a run was overtaken, so that it writes no more."""
     work = _WORK.get()
     if work is None or time.monotonic() - work.looked < _LOOK:
         return

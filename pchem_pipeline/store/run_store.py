@@ -106,10 +106,6 @@ class RunStore:
         Raises:
             StoreError: there is none, it is damaged, or it has another schema version.
         """
-        import zarr
-
-        from pchem_pipeline.store.zarr_store import zarr_store
-
         path = place_of(path)
         if not (path / DESCRIPTION).exists():
             if (path / _PRIVATE / "stages").is_dir():
@@ -120,7 +116,7 @@ class RunStore:
         _refuse_links(path)
         try:
             with _one_line(path, path):
-                root = zarr.open_group(zarr_store(path, writable=writable), mode="r+" if writable else "r")
+                root = _opened(path, writable=writable)
                 schema = root.attrs.get("pchem_schema")
         except (KeyError, *_DAMAGE) as error:
             raise StoreError(f"{path / DESCRIPTION} is damaged ({error}); {cure_of(path, '')}") from error
@@ -177,9 +173,8 @@ class RunStore:
         """
         variable = variable_at(name)
         kind = np.dtype(variable.dtype if dtype is None else dtype)
-        attrs = {"units": variable.unit, "long_name": variable.long_name}
-        if variable.symbol:
-            attrs["symbol"] = variable.symbol
+        symbol = {"symbol": variable.symbol} if variable.symbol else {}
+        attrs = {"units": variable.unit, "long_name": variable.long_name, **symbol, **(attributes or {})}
         with self._translated(name):
             self._root.create_array(
                 name,
@@ -190,7 +185,7 @@ class RunStore:
                 fill_value=np.nan if kind.kind == "f" else variable.fill,
                 compressors=_compressors(name, kind),
                 dimension_names=variable.dims,
-                attributes={**attrs, **(attributes or {})},
+                attributes=attrs,
                 config={"write_empty_chunks": True},
                 overwrite=True,
             )
@@ -204,11 +199,7 @@ class RunStore:
     @functools.cached_property
     def _writer(self) -> zarr.Group:
         """The root through which chunks are written: zarr looks for what is in their place before."""
-        import zarr
-
-        from pchem_pipeline.store.zarr_store import zarr_store
-
-        return zarr.open_group(zarr_store(self.path, writable=True, begins=True), mode="r+")
+        return _opened(self.path, writable=True, begins=True)
 
     def array(self, name: str, *, to_write: bool = False) -> zarr.Array[Any]:
         """Return the zarr array ``name``, for its shape, chunks and attributes.
@@ -257,15 +248,7 @@ class RunStore:
         return array.shards or array.chunks
 
     def read_pixels(self, name: str, y: IntArray, x: IntArray) -> NDArray[Any]:
-        """Return the elements of an array (y, x, ...) at some pixels, file by file.
-
-        Args:
-            name: of the array.
-            y: row of each, shape (n,).
-            x: column of each, shape (n,).
-
-        Returns:
-            Shape (n, ...).
+        """Return the elements of an array (y, x, ...) at rows y and columns x of n pixels, shape (n, ...).
 
         Raises:
             StoreError: it is missing or a chunk is corrupt.
@@ -380,6 +363,16 @@ class RunStore:
             raise StoreError(f"{where} is damaged ({error}); {self.cure(name)}") from error
 
 
+def _opened(path: Path, *, writable: bool, begins: bool = False) -> zarr.Group:
+    """Return the root of a store; ``begins`` to write chunks."""
+    import zarr
+
+    from pchem_pipeline.store.zarr_store import zarr_store
+
+    store = zarr_store(path, writable=writable, begins=begins)
+    return zarr.open_group(store, mode="r+" if writable else "r")
+
+
 def stored_config(path: Path) -> str | None:
     """Return the resolved YAML that made a run, or None.
 
@@ -466,14 +459,12 @@ def _one_line(path: Path, where: object) -> Iterator[None]:
     except PchEmError:
         raise
     except OSError as error:
-        raise (
-            refused(where, error) if isinstance(path, RemotePath) else storage_error(error, where)
-        ) from error
+        remote = isinstance(path, RemotePath)
+        raise (refused(where, error) if remote else storage_error(error, where)) from error
+    except (ValueError, RuntimeError, KeyError, TypeError):  # a matter of the content
+        raise
     except Exception as error:
-        # each kind of storage has errors of its own; wrong values are a matter of the content
-        if isinstance(path, RemotePath) and not isinstance(
-            error, (ValueError, RuntimeError, KeyError, TypeError)
-        ):
+        if isinstance(path, RemotePath):  # each kind of storage has errors of its own
             raise refused(where, error) from error
         raise
 
