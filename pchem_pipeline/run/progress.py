@@ -337,7 +337,9 @@ def read_progress(store: Path) -> dict[str, Any] | None:
     numbers = {
         name: value
         for name in numbers_of
-        if type(value := content.get(name)) in (int, float) and 0 <= value < 1e15
+        if isinstance(value := content.get(name), int | float)
+        and not isinstance(value, bool)
+        and 0 <= value < 1e15
     }
     return {**words, **numbers}
 
