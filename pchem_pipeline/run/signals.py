@@ -58,11 +58,7 @@ class StopRequest:
             self._at_once = before and self.signal is None
 
     def check(self) -> None:
-        """Raise if a stop was asked for.
-
-        Raises:
-            InterruptedRunError: a signal arrived.
-        """
+        """Raise InterruptedRunError if a signal asked for a stop."""
         if self.signal is not None:
             raise InterruptedRunError(self.signal)
 

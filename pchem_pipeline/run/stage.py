@@ -112,30 +112,26 @@ def open_store(path: Path) -> RunStore:
     return RunStore.open(path, writable=True)
 
 
-@dataclass(frozen=True)
-class MarkedTask:
-    """A task that sets the markers of its unit once it is done, in the worker.
+def _do_unit(
+    path: Path,
+    stage: str,
+    fingerprint: str,
+    task: Task[AnyUnit] | None,
+    tell: Callable[[str, float], None] | None,
+    unit: AnyUnit,
+) -> None:
+    """Do a unit of a run, in the worker, and set its markers once it is done.
 
     ``tell`` hears by key what share of a unit is done, where the worker shares the memory. Where it does not
     (None), the worker may be overtaken by a later command, and writes no more then.
     """
-
-    store: Path
-    stage: str
-    fingerprint: str
-    task: Task[Any] | None
-    tell: Callable[[str, float], None] | None = None
-
-    def __call__(self, unit: Unit) -> Mapping[str, Any]:
-        """Do the unit, then mark it."""
-        store = open_store(self.store)
-        with working(store.records, self.stage, self.fingerprint if self.tell is None else None):
-            with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
-                summary = {} if self.task is None else dict(self.task(unit, store) or {})
-            check_work(self.store)
-            for key in markers(unit):
-                store.records.mark(self.stage, self.fingerprint, key, summary)
-        return summary
+    store = open_store(path)
+    with working(store.records, stage, fingerprint if tell is None else None):
+        with telling_parts(None if tell is None else functools.partial(tell, unit.key)):
+            summary = {} if task is None else dict(task(unit, store) or {})
+        check_work(path)
+        for key in markers(unit):
+            store.records.mark(stage, fingerprint, key, summary)
 
 
 @dataclass(frozen=True)
@@ -393,10 +389,10 @@ class StageContext:
 
             self.stop.check()
             listener = tell if executor.shares_memory else None
-            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, listener)
+            place = self.store.path, self.stage, self.fingerprint
             try:
                 with self.stop.at_once() if undivided else contextlib.nullcontext():
-                    executor.map(marked, todo, on_result)
+                    executor.map(functools.partial(_do_unit, *place, task, listener), todo, on_result)
             except Stop:
                 if fatal:
                     raise fatal[0] from fatal[0].__cause__

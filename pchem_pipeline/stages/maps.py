@@ -144,9 +144,7 @@ def _do_tile(tile: Tile, store: RunStore, *, arrays: Callable[..., dict[str, NDA
 def line_tile(samples: Arrays, line: Line) -> dict[str, NDArray[Any]]:
     """Return the results of a line through the exposures of each pixel, by path.
 
-    Args:
-        samples: ``quanta_exposure`` (sample, y, x) and ``covariance`` (y, x, parameter, parameter) of a tile.
-        line: that is drawn.
+    ``samples`` has ``quanta_exposure`` (sample, y, x) and ``covariance`` (y, x, parameter, parameter).
     """
     exposure, covariance = samples["quanta_exposure"], samples["covariance"]
     n, *shape = exposure.shape

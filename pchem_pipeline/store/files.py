@@ -236,23 +236,23 @@ def _mark_of(chunk: str, array: str) -> bytes:
 # -- records of a run: JSON with a digest of itself ------------------------------------------------
 
 _DIGEST = "digest_of_content"
-#: groups of arrays that are not called like the stage which writes them
+_SAME_NAME = ("histogram", "fit", "maps", "ensemble", "electrons", "discrepancy", "methods")
+#: the stage which writes a group of arrays
 _STAGE_OF = {
+    **{name: name for name in _SAME_NAME},
     "frames": "ingest",
     "summary": "histogram",
     "truth": "simulate",
     "samples": "fit",
     "ensemble_tiles": "ensemble",
 }
-_COMMANDS = frozenset({"histogram", "fit", "maps", "ensemble", "electrons", "discrepancy", "methods"})
 
 
 def cure_of(run: Path, name: str) -> str:
     """Return what to do where an array or a group of a run is damaged."""
     group = name.partition("/")[0]
-    stage = _STAGE_OF.get(group, group)
-    if stage in _COMMANDS or group in _STAGE_OF:
-        return f"run it again: pchem {stage} {quoted(run)} --force"
+    if group in _STAGE_OF:
+        return f"run it again: pchem {_STAGE_OF[group]} {quoted(run)} --force"
     if group == "model":
         return f"delete {run / group} and run again; the model is then taken from the configuration"
     return "run it again with --force" if group else "delete it and run again"

@@ -95,13 +95,7 @@ class StackCounter:
     """Counts the blocks of a stack, each band of rows apart, and copies the frames where that is asked."""
 
     def __init__(self, job: CountJob, bands: Sequence[Rows], workers: int = 1) -> None:
-        """Begin with no frames.
-
-        Args:
-            job: what is counted.
-            bands: of the blocks, whole tiles and whole groups of rows.
-            workers: threads that share the bands.
-        """
+        """Begin with no frames; ``workers`` threads share the bands, whole tiles and whole groups of rows."""
         self._job, self._workers = job, workers
         self._counters = [_BandCounter(job, rows) for rows in bands]
 
@@ -114,12 +108,10 @@ class StackCounter:
         call_all([functools.partial(each.resume, n_frames) for each in self._counters], self._workers)
 
     def count(self, blocks: Iterable[Block], check: Callable[[], None] = lambda: None) -> None:
-        """Count all blocks, and write what they give into the run.
+        """Count all blocks, in the order of time, and write what they give into the run.
 
-        Args:
-            blocks: in the order of time; the first of a stack decides the windows, so let it always have
-                the same number of frames.
-            check: called before each block; raises where the work shall end.
+        The first of a stack decides the windows, so let it always have the same number of frames. ``check``
+        is called before each block; it raises where the work shall end.
 
         Raises:
             InputError: DN of more than 24 bits, or the frames cannot be read.

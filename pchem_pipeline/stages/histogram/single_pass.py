@@ -87,14 +87,9 @@ def prepared(frames: FrameSequence, clock: tuple[float, float]) -> dict[str, Pre
 def hashed_frames(
     context: StageContext, frames: FrameSequence, step: int, files: Sequence[Path], first: int = 0
 ) -> Iterator[HashedFrameStream]:
-    """Open the stream of frames whose files are hashed as they are read, by bands that the workers share.
+    """Open the stream of frames, ``step`` in a block, whose files are hashed as they are read.
 
-    Args:
-        context: of the run.
-        frames: all of them.
-        step: frames of a block.
-        files: that are read.
-        first: frame that they begin with.
+    Workers share its bands. Of all frames, those from ``first`` on are read, and lie in ``files``.
     """
     workers = context.config.compute.count()
     # rows that stay together: of a tile, of a group, of a chunk of the copy
