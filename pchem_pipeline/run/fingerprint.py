@@ -5,20 +5,18 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.config.load import setting_of, states
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.run.declaration import Stage, imported
 from pchem_pipeline.run.model_versions import model_of_content, model_versions
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.files import DESCRIPTION, digest_of, fingerprint_of
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import RemotePath
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.run.stage import StageContext
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 _NEWS = {f"input.{name}": f"new result of pchem {name}" for name in ("discrepancy", "methods")}
 

@@ -13,7 +13,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -24,9 +24,7 @@ from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.store.files import fingerprint_of, read_record, write_record
-
-if TYPE_CHECKING:
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 _GROUP = "model"
 _EXPOSURE, _WEIGHT = "added_exposure", "added_weight"

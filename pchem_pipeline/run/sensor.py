@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.frames.camera import CameraFacts
+from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.frames.settings import InputSettings
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,10 @@ large as the stack.
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.base.variables import PARAMETERS
-from pchem_pipeline.frames.stream import FrameStream
+from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.electrons.electrons import (
     LARGEST_NUMBER,
     NO_NUMBER,
@@ -22,13 +21,9 @@ from pchem_pipeline.model.electrons.electrons import (
 )
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.stages.bands import BAND_BYTES, tile_bands
+from pchem_pipeline.stages.bands import BAND_BYTES, Band, tile_bands
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_satellites
-
-if TYPE_CHECKING:
-    from pchem_pipeline.frames.stream import FrameSource
-    from pchem_pipeline.stages.bands import Band
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 #: Frames and columns of a chunk; its rows are those of a tile.
 _CHUNK_FRAMES, _CHUNK_COLUMNS = 256, 128

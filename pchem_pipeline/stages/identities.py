@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic_core import to_jsonable_python
 
+from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.frames.identity import digest_of
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.run.input import known_identity
 from pchem_pipeline.run.model_versions import model_versions, with_digest
-
-if TYPE_CHECKING:
-    from pchem_pipeline.methods.settings import MethodsSettings
-    from pchem_pipeline.run.stage import StageContext
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.stages.samples import exposure_axis, sample_facts
+from pchem_pipeline.store.run_store import RunStore
 
 
 def input_content(context: StageContext) -> dict[str, Any]:
@@ -26,17 +27,12 @@ def input_content(context: StageContext) -> dict[str, Any]:
     """
     if context.config.input.samples:
         return _sample_content(context)
-    from pchem_pipeline.frames.identity import digest_of
-
     identity = known_identity(context)
     return {"content": digest_of([file["xxh3_128"] for file in identity["files"]])}
 
 
 def _sample_content(context: StageContext) -> dict[str, Any]:
     """Return what the histograms of the samples are; as last known where their runs are gone."""
-    from pchem_pipeline.base.errors import ConfigError, StoreError
-    from pchem_pipeline.stages.samples import sample_facts
-
     try:
         return sample_facts(context.config, context.base_dir)
     except (ConfigError, StoreError):
@@ -62,8 +58,6 @@ def integration_time(context: StageContext) -> dict[str, Any]:
     """Return what the files may say and the settings of the maps do not: time, or the samples' exposures."""
     if not context.config.input.samples:
         return {"integration_time": context.sensor.integration_time, "rate": context.charge_rate}
-    from pchem_pipeline.stages.samples import exposure_axis
-
     settings = context.config.input
     x = exposure_axis(settings, context.sensor.samples)
     known = None if x is None else [None if math.isnan(each) else each for each in x.tolist()]
@@ -82,7 +76,6 @@ def verdict(context: StageContext) -> dict[str, str] | None:
 
 def discrepancy_state(store: RunStore) -> str | None:
     """Return which verdict a run has, in words that change when it is redone; None without a readable one."""
-    from pchem_pipeline.base.errors import StoreError
     from pchem_pipeline.discrepancy.verdict import read_verdict
 
     try:
@@ -118,9 +111,6 @@ def _chosen(context: StageContext) -> dict[str, Any]:
 
 def other_samples(context: StageContext) -> dict[str, Any]:
     """Return which histograms of other runs join a comparison of methods, and what the command line chose."""
-    from pchem_pipeline.base.errors import StoreError
-    from pchem_pipeline.store.run_store import RunStore
-
     found: dict[str, Any] = {}
     for name in methods_settings(context).with_runs:
         try:

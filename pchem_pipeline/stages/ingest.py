@@ -9,27 +9,25 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.first_look import limits_in
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.reader import FrameReader
+from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.input import keep_ingested, listed_identity
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, Named, StageContext, Task
 from pchem_pipeline.stages.overscan import write_overscan
 from pchem_pipeline.stages.samples import check_samples, sample_sensor
+from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import equal_rows
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.frames.reader import FrameReader
-    from pchem_pipeline.frames.sequence import FrameSequence
-    from pchem_pipeline.store.run_store import RunStore
 
 #: frames, rows, columns: streams in the order of time and by tile alike
 _CHUNK = (256, 128, 128)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,8 @@ from pchem_pipeline.model.maps.sample_maps import line_map_names, line_maps
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.samples import exposure_axis
-
-if TYPE_CHECKING:
-    from pchem_pipeline.store.run_store import RunStore
-    from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import Tile
 
 #: Why there is no charge rate.
 NO_TIME = "unknown integration time: no charge rate. Set input.integration_time (--integration-time), s"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quot
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.methods.base import PixelSamples, Sample, methods
 from pchem_pipeline.methods.compare import compare
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
 from pchem_pipeline.run.sensor import SensorInfo
@@ -25,9 +26,6 @@ from pchem_pipeline.run.stage import Named, StageContext
 from pchem_pipeline.stages.identities import methods_settings
 from pchem_pipeline.store.files import read_json, write_json
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.methods.settings import MethodsSettings
 
 #: File of the result in the folder of a run.
 METHODS_FILE = "methods.json"

@@ -10,17 +10,17 @@ import numpy as np
 from pchem_pipeline.base.arrays import Arrays, FloatArray, IntArray
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
+from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.quick.codes import CodeSample
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
+from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
-    from pchem_pipeline.discrepancy.quick.checks import QuickLook
-    from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.stages.report.stored import StoredRun
-    from pchem_pipeline.store.run_store import RunStore
 
 #: Sums of pixels over blocks, of rows over frames, of columns over frames, that are read at most.
 _MOST_BLOCK_SUMS, _MOST_LINE_SUMS = 1 << 22, 1 << 22

@@ -7,21 +7,19 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.camera import shared_facts
+from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.run.input import LISTED_FILES
 from pchem_pipeline.run.sensor import Sample, SensorInfo
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.frames.settings import InputSettings
 
 
 @dataclass(frozen=True)

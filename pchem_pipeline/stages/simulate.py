@@ -14,10 +14,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.frames.formats.map_files import read_image, write_npz
@@ -32,12 +33,8 @@ from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
 from pchem_pipeline.store.files import in_storage
+from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import equal_rows
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.store.run_store import RunStore
 
 TRUTH_FILE = "truth.npz"
 # memory for the frames in the making, over all workers

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,10 @@ from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.framework.compose import model_words
-from pchem_pipeline.frames.stream import FrameStream
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.electrons.electrons import ErrorTally, compare_electron_numbers
 from pchem_pipeline.model.electrons.error_rates import error_rates
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES, bias_weight
@@ -28,28 +30,22 @@ from pchem_pipeline.model.ensemble.curves import electron_numbers as electron_nu
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_axis
 from pchem_pipeline.model.ensemble.error_sample import WANTED, PixelErrors
 from pchem_pipeline.model.ensemble.moments import moment_rows
+from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
 from pchem_pipeline.model.fit.status import flags_of
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.progress import parts_told
+from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import StageContext, markers
-from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
+from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, Band, tile_bands
 from pchem_pipeline.stages.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_effects, fitted_satellites
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of, uncounted_frames
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.frames.stream import FrameSource
-    from pchem_pipeline.model.ensemble.settings import EnsembleSettings
-    from pchem_pipeline.run.sensor import SensorInfo
-    from pchem_pipeline.stages.bands import Band
-    from pchem_pipeline.store.run_store import RunStore
-    from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import Tile
 
 _SUMS = ("integers", "floats")
 _HISTOGRAM = ("origin", "minimum", "maximum")

@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +29,7 @@ from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.tiles import Tile
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
 

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.variables import FREE_SATELLITES
-from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
+from pchem_pipeline.effects.framework.compose import AddedExposure, PixelPlaces, pixel_maps, sample_law
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.run.model_versions import ModelVersion, Region, model_of, read_added_exposure
 from pchem_pipeline.run.sensor import SensorInfo
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pchem_pipeline.effects.framework.compose import AddedExposure
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 
 def fitted_effects(store: RunStore) -> tuple[Effect, ...]:

@@ -10,14 +10,16 @@ import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import call_all
+from pchem_pipeline.frames.stream import Block, Rows
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
 from pchem_pipeline.model.histogram.moved_frames import MovedFrames
+from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
@@ -28,10 +30,6 @@ from pchem_pipeline.model.histogram.summaries import (
 )
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.stages.histogram.arrays import with_block_length
-
-if TYPE_CHECKING:
-    from pchem_pipeline.frames.stream import Block, Rows
-    from pchem_pipeline.model.histogram.settings import HistogramSettings
 
 _ALONG_TIME = ("block_sum", "block_sum_square", "row_sum", "row_sum_square", "column_sum")
 _OPEN = ("open_sums", "open_covariances")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pchem_pipeline.compute.memory import BASE_BYTES
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.model.histogram.count import most_bins
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
@@ -15,12 +17,6 @@ from pchem_pipeline.stages.histogram.histogram import bins_of
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.ingest import disk_words
 from pchem_pipeline.store.tiles import tile_grid, tile_shape
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pchem_pipeline.config.tree import RunConfig
 
 #: the program with what the later stages hold, and that for each pixel
 _REPORT_BYTES, _REPORT_PIXEL_BYTES = 400 << 20, 400

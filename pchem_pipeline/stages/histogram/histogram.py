@@ -10,10 +10,12 @@ from __future__ import annotations
 import functools
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.frames.histogram_files import HistogramInput, read_histograms
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_scores, odd_frames
@@ -27,13 +29,7 @@ from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.store.tiles import equal_rows
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pchem_pipeline.frames.histogram_files import HistogramInput
-    from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.tiles import Tile, equal_rows
 
 # -- the stage ----------------------------------------------------------------------------------
 
@@ -167,8 +163,6 @@ def _copy_histograms(context: StageContext) -> None:
 
     So report and ensemble need no run of a sample; the fit reads the histograms of all in their own runs.
     """
-    from pchem_pipeline.frames.histogram_files import read_histograms
-
     counts: Any
     task: Task[Tile]
     if context.sensor.samples:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pchem_pipeline.compute.memory import BASE_BYTES
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.histogram.count import counts_dtype
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.stages.histogram.arrays import CHUNK_BLOCKS, COLUMN_FRAMES, ROW_FRAMES
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
 
 
 def bytes_per_row(columns: int, n_frames: int, itemsize: int, bins: int, settings: HistogramSettings) -> int:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,14 +16,11 @@ from pchem_pipeline.model.histogram.odd_frames import KINDS, left_out, odd_words
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
 from pchem_pipeline.run.input import open_source
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
 from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
-from pchem_pipeline.store.tiles import equal_rows
-
-if TYPE_CHECKING:
-    from pchem_pipeline.run.stage import StageContext
-    from pchem_pipeline.store.run_store import RunStore
-    from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import Tile, equal_rows
 
 
 def odd_frames_of(store: RunStore) -> tuple[dict[str, IntArray], IntArray]:

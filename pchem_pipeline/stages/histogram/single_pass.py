@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.frames.identity import file_size, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
+from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.stream import HashedFrameStream
 from pchem_pipeline.model.histogram.count import choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
@@ -39,11 +40,6 @@ from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.tiles import tile_shape
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pchem_pipeline.frames.sequence import FrameSequence
 
 #: the stages whose arrays one pass makes
 PREPARED = ("ingest", "histogram")
