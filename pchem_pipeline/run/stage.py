@@ -79,19 +79,16 @@ Task = Callable[[AnyUnit, RunStore], Mapping[str, Any] | None]
 
 @dataclass(frozen=True)
 class Command:
-    """What the command line asked for, beside the configuration.
+    """What the command line asked for, beside the configuration, whose section ``compute`` it overrides.
 
     Attributes:
         force: do it again.
         dry_run: say what would be done.
         roi: only the tiles of this region.
         settings: of a stage on demand, in place of those of its section; None: those of its last result.
-        workers: overrides ``compute.workers``.
-        backend: overrides ``compute.backend``.
-        progress: auto | on | off.
         quiet: say warnings only.
         log_json: file for JSON lines.
-        max_memory: overrides ``compute.max_memory``, MiB.
+        max_memory: MiB.
     """
 
     force: bool = False
@@ -173,13 +170,9 @@ class StageContext:
     """All that a stage is given.
 
     Attributes:
-        config: the whole configuration.
         base_dir: folder to which relative paths of the configuration refer.
         store: the run's store, writable.
-        executor: who does the work.
-        reporter: where to say what happens.
         stop: raised signals; checked between units.
-        command: of the command line.
         stage: name of the running stage.
         fingerprint: of the running stage.
         fresh: True where the stage starts anew and must create its arrays.
@@ -250,7 +243,7 @@ class StageContext:
     @property
     def tile_pixels(self) -> int:
         """Pixels of the largest tile."""
-        return math.prod(min(size, length) for size, length in zip(self.tile, self.sensor.shape, strict=True))
+        return math.prod(self.tiles()[0].shape)
 
     @property
     def band_bytes(self) -> int:

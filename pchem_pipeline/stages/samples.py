@@ -24,15 +24,7 @@ from pchem_pipeline.store.run_store import RunStore
 
 @dataclass(frozen=True)
 class OpenSample:
-    """The run of a sample, with its histograms.
-
-    Attributes:
-        where: what messages call it.
-        target: its configuration.
-        store: opened for reading.
-        sensor: its input, with the bit depth and integration time of its configuration.
-        histogram: fingerprint of its histograms.
-    """
+    """The run of a sample, with the fingerprint of its histograms; messages call it ``where``."""
 
     where: str
     target: Target

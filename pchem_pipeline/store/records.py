@@ -58,8 +58,7 @@ class StageRecord:
     """How a stage was last run.
 
     Attributes:
-        stage: its name.
-        version: version of its algorithm.
+        version: of its algorithm.
         fingerprint: digest of all that decides the result.
         content: what the digest was taken of: settings read, upstream fingerprints, input identity.
         keys: how many unit markers the complete stage has.
@@ -70,7 +69,7 @@ class StageRecord:
         peak_rss_bytes: largest resident set of a process.
         failed: key and reason of each unit that failed.
         notes: one-line remarks that the report repeats.
-        versions: versions of Python and of the libraries.
+        versions: of Python and of the libraries.
         model: number of the version of the run's model that the result rests on; None: of none.
         files: names of the files of the run that it wrote, beside arrays, with their digests.
     """

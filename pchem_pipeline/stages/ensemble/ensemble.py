@@ -56,9 +56,6 @@ class _Job:
     """What the ensemble is of.
 
     Attributes:
-        config: of the run.
-        sensor: the input.
-        axes: axes of the ensemble.
         tiles: number and place of each tile by its key.
         frames: the chosen frames (first, end), or None where there are none to choose from.
         codes: by tile the samples of all frames, where the fit has counted them; see `code_sums`.
@@ -104,12 +101,6 @@ class _Fitted:
         origin, low, high = (histogram[name][place] for name in _HISTOGRAM)
         return cls(pixels, place, origin, low, high, store.array("histogram/counts").shape[2])
 
-    def limits(self, known: tuple[int, int] | None) -> tuple[int, int] | None:
-        """Return the known limits of the codes where samples lie at one of them; else None."""
-        if known is None or not np.any((self.low <= known[0]) | (self.high >= known[1])):
-            return None
-        return known
-
     def axes(self, settings: EnsembleSettings) -> EnsembleAxes | None:
         """Choose the axes of the ensemble; None where no pixel has a value."""
         if len(self.pixels) == 0:
@@ -140,7 +131,9 @@ def run(context: StageContext) -> None:
     source = open_source(context) if frames is not None and (truth or not everything) else None
     fitted_tiles = [tile for tile in tiles if tile.key in ready]
     fitted = _Fitted.read(store, fitted_tiles)
-    limits = fitted.limits(context.sensor.adc_limits)
+    limits = sensor.adc_limits
+    if limits is not None and not np.any((fitted.low <= limits[0]) | (fitted.high >= limits[1])):
+        limits = None  # no samples lie there
     axes = fitted.axes(settings)
     if sensor.kind == "histograms":
         context.note("input is histograms: the ensemble has all samples, with equal weight per channel")
@@ -331,8 +324,9 @@ def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, ErrorTa
     """Compare estimated with true electron numbers of the chosen frames, tile by tile."""
     assert job.truth is not None
     assert job.source is not None
+    assert job.frames is not None
     y0, x0, t0 = job.truth
-    first, end = job.frames or (0, job.source.shape[0])
+    first, end = job.frames
     known = min(end, store.array("truth/electron_number").shape[0] - t0)
     found: dict[str, ErrorTally] = {}
     if known <= first:
@@ -356,9 +350,9 @@ def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
     """Add the rows of the finished tiles; without frames every pixel counts the same."""
     samples = (1, 1)
     if job.frames is not None:
-        gone = uncounted_frames(odd_frames_of(store)[0])
-        chosen, first = gone[gone < job.frames[1]], job.frames[0]
-        samples = job.frames[1] - first - int((chosen >= first).sum()), job.sensor.n_frames - gone.size
+        gone, (first, end) = uncounted_frames(odd_frames_of(store)[0]), job.frames
+        left_out = int(((gone >= first) & (gone < end)).sum())
+        samples = end - first - left_out, job.sensor.n_frames - gone.size
     integers, floats = (
         sum(store.read(f"ensemble_tiles/{name}", (number, slice(None))) for number in rows) for name in _SUMS
     )

@@ -77,8 +77,7 @@ class CountJob:
     Attributes:
         store: path of the run, which has the arrays.
         shape: frames, rows and columns of the whole stack.
-        bins: bins of a pixel.
-        settings: the section ``histogram``.
+        bins: of a pixel.
         copies: the frames go into ``frames/dn``, too.
     """
 

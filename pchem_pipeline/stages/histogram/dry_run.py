@@ -28,10 +28,9 @@ class Plan:
 
     Attributes:
         shape: frames, rows, columns.
-        bins: bins of a pixel.
-        tiles: number of tiles.
+        bins: of a pixel.
+        tiles: their number.
         tile: rows and columns of one.
-        workers: number of workers.
         single_pass: the camera files are read once; else twice, by bands of rows.
         disk: where the frames are to be, and how much disk the store takes.
         held_bytes: largest resident memory of the process.
