@@ -352,7 +352,10 @@ class StageContext:
             StoreError: the store cannot be written.
         """
         self.begin()
-        self._know_total(sum(len(markers(unit)) for unit in units) if total is None else total)
+        self.n_keys = sum(len(markers(unit)) for unit in units) if total is None else total
+        record = self.store.records.read(self.stage)
+        if record is not None and record.keys != self.n_keys:  # a kill must not lose it
+            self.store.records.write(replace(record, keys=self.n_keys))
         todo = self._ready(self.pending(units, resumes=total is not None), needs)
         again = (key for unit in todo for key in markers(unit))
         self.store.records.unmark(self.stage, self.fingerprint, again)
@@ -401,13 +404,6 @@ class StageContext:
         for name, stage in self.created.items():
             if stage == self.stage and "frame" not in VARIABLES[name].dims:
                 self.store.fill(name)
-
-    def _know_total(self, n_keys: int) -> None:
-        """Record how many markers the stage will have, before the first is set: a kill must not lose it."""
-        self.n_keys = n_keys
-        record = self.store.records.read(self.stage)
-        if record is not None and record.keys != n_keys:
-            self.store.records.write(replace(record, keys=n_keys))
 
     def _ready(self, units: list[AnyUnit], needs: str | None) -> list[AnyUnit]:
         """Split off the units that an upstream stage has not finished."""

@@ -18,24 +18,18 @@ from pchem_pipeline.store.run_store import RunStore
 
 
 def input_content(context: StageContext) -> dict[str, Any]:
-    """Return what the content of the input is, see `known_identity`.
+    """Return what the content of the input is, see `known_identity`, or what the samples' histograms are.
 
     Where the files are gone, the last known content counts: what was made of them stays valid.
 
     Raises:
         InputError: files are missing or bad, and nothing is known of them from before.
     """
-    if context.config.input.samples:
-        return _sample_content(context)
-    identity = known_identity(context)
-    return {"content": digest_of([file["xxh3_128"] for file in identity["files"]])}
-
-
-def _sample_content(context: StageContext) -> dict[str, Any]:
-    """Return what the histograms of the samples are; as last known where their runs are gone."""
+    if not context.config.input.samples:
+        return {"content": digest_of([file["xxh3_128"] for file in known_identity(context)["files"]])}
     try:
         return sample_facts(context.config, context.base_dir)
-    except (ConfigError, StoreError):
+    except (ConfigError, StoreError):  # the runs of the samples are gone
         record = context.store.records.known("ingest")
         if record is None or not record.content.get("input"):
             raise

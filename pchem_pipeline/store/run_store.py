@@ -337,15 +337,10 @@ class RunStore:
             StoreError: the lock file cannot be written.
         """
         with locked(self.path, self.path / _PRIVATE):
-            self._remove_unfinished()
+            if not isinstance(self.path, RemotePath):  # where no killed process leaves half files
+                found = (Path(folder) / name for folder, _, names in os.walk(self.path) for name in names)
+                remove_files(*(path for path in found if path.name.endswith(".partial")))
             yield
-
-    def _remove_unfinished(self) -> None:
-        """Remove the half files that a killed process left."""
-        if isinstance(self.path, RemotePath):  # which has none
-            return
-        found = (Path(folder) / name for folder, _, names in os.walk(self.path) for name in names)
-        remove_files(*(path for path in found if path.name.endswith(".partial")))
 
     def free_bytes(self) -> int:
         """Return the free space of the disk that holds the store; an object storage is never full."""
@@ -408,14 +403,15 @@ class Part(MutableMapping[str, NDArray[Any]]):
     def __init__(self, store: RunStore, region: tuple[slice, slice] | None, prefix: str) -> None:
         self._store, self._region, self._prefix = store, region, prefix
 
-    def _index(self, path: str) -> _Region | None:
-        return None if self._region is None else variable_at(path).index(self._region)
+    def _place(self, name: str) -> tuple[str, _Region | None]:
+        path = self._prefix + name
+        return path, None if self._region is None else variable_at(path).index(self._region)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        return self._store.read(self._prefix + name, self._index(self._prefix + name))
+        return self._store.read(*self._place(name))
 
     def __setitem__(self, name: str, values: NDArray[Any]) -> None:
-        self._store.write(self._prefix + name, self._index(self._prefix + name), values)
+        self._store.write(*self._place(name), values)
 
     def __delitem__(self, name: str) -> None:
         self._store.delete(self._prefix + name)
