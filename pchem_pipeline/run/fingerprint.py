@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pkgutil import resolve_name
 from typing import Any
 
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.config.load import setting_of, states
 from pchem_pipeline.config.tree import RunConfig
-from pchem_pipeline.run.declaration import Stage, imported
+from pchem_pipeline.run.declaration import Stage
 from pchem_pipeline.run.model_versions import model_of_content, model_versions
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.files import DESCRIPTION, digest_of, fingerprint_of
@@ -54,7 +55,7 @@ def fingerprint_content(stage: Stage, context: StageContext) -> dict[str, Any]:
         "version": stage.version,
         "settings": setting_values(stage, context),
         "upstream": {name: _state_of_result(context.store, name) for name in stage.upstream},
-        "input": None if stage.identity is None else imported(stage.identity)(context),
+        "input": None if stage.identity is None else resolve_name(stage.identity)(context),
     }
 
 

@@ -7,10 +7,11 @@ import time
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from pkgutil import resolve_name
 
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds, peak_rss_bytes, versions_of
-from pchem_pipeline.run.declaration import Stage, imported
+from pchem_pipeline.run.declaration import Stage
 from pchem_pipeline.run.fingerprint import StageState, changed_file, fingerprint_content, rests_on, status
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.table import STAGES
@@ -99,7 +100,7 @@ def _perform(
     context.reporter.event("start", stage=stage.name, why=before.words())
     wall, cpu = clock
     try:
-        imported(stage.run)(context)
+        resolve_name(stage.run)(context)
         begin()
         record = replace(record, finished=True, files=written_files(stage, context.store.path))
     finally:

@@ -7,12 +7,12 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from pkgutil import resolve_name
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputError, StoreError
 from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.load import dump_config, effects_file, found_model
-from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.model_versions import keep_in_force, model_in_force
 from pchem_pipeline.run.progress import ProgressFile, Reporter
@@ -117,7 +117,7 @@ def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageSt
     passes = [STAGES[later].single_pass for later in stages if name in STAGES[later].upstream]
     with context.reporter.compilation(name, context.config.compute.max_memory):
         for single_pass in filter(None, passes if of_files else ()):
-            imported(single_pass)(context)
+            resolve_name(single_pass)(context)
         return execute(name, context)
 
 
@@ -206,7 +206,7 @@ def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[St
         reporter.info(f"{state.stage}: {words} ({state.words()})")
     target = with_overrides(target, command)
     for plan in filter(None, (STAGES[name].plan for name in todo)):
-        for line in imported(plan)(target.config, target.base_dir, todo):
+        for line in resolve_name(plan)(target.config, target.base_dir, todo):
             reporter.info(line)
     return states
 
