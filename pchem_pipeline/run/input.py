@@ -54,13 +54,13 @@ def known_identity(context: StageContext) -> dict[str, Any]:
         _inspect_input(context)
     size = sum(int(file["size"]) for file in quick["files"])
     with context.reporter.progress("ingest: hash", size >> 20, "MiB") as advance:
-        told = whole_mebibytes(advance)
+        show = whole_mebibytes(advance)
 
-        def hear(count: int) -> None:
+        def on_bytes(count: int) -> None:
             context.stop.check()
-            told(count)
+            show(count)
 
-        identity = content_identity(paths, hear)
+        identity = content_identity(paths, on_bytes)
     with suppress(StoreError):  # a store that cannot be written is a matter for those who write to it
         keep_identity(context, quick, identity)
     return identity

@@ -81,8 +81,8 @@ def stop_on_signals() -> Iterator[StopRequest]:
             signal.raise_signal(number)
         request.ask(number)
 
-    heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
-    old = {number: signal.signal(number, handle) for number in heard}
+    handled = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
+    old = {number: signal.signal(number, handle) for number in handled}
     try:
         yield request
     finally:

@@ -125,7 +125,8 @@ def search_start(context: StageContext) -> dict[str, Any]:
     record, model = context.store.records.known("discrepancy"), context.model
     kept = {} if record is None else record.content["input"]
     before = with_digest(model_versions(context.store), kept.get("model"))
-    own = model.source == "verdict" and before is not None and before.number == model.parent
-    start = before if own and before is not None else model
+    start = model
+    if before is not None and (model.source, model.parent) == ("verdict", before.number):
+        start = before
     roi = context.command.roi or (() if context.command.force else kept.get("roi", ()))
     return {"model": start.digest, "roi": list(roi)}

@@ -94,8 +94,8 @@ def read_sums(store: RunStore) -> StackSums | None:
 
     def lines(name: str, of: IntArray) -> IntArray:
         first, end = starts[of], (starts + lengths)[of]
-        there = np.concatenate([np.arange(*each) for each in zip(first, end, strict=True)])
-        return _read(store, name, first, end)[~np.isin(there, out)]
+        frames_read = np.concatenate([np.arange(*each) for each in zip(first, end, strict=True)])
+        return _read(store, name, first, end)[~np.isin(frames_read, out)]
 
     return StackSums(
         numbers,

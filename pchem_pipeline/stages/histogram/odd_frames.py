@@ -70,9 +70,9 @@ def _leave_out_of_histograms(context: StageContext, frames: IntArray) -> None:
         before = {name: held[name] for name in ("counts", *MAPS)}
         counts, origin, under, over, low, high = (values.astype(np.int64) for values in before.values())
         last = origin + counts.shape[2] - 1
-        there = counts.sum(axis=2) + under + over - (context.sensor.n_frames - frames.size)
+        surplus = counts.sum(axis=2) + under + over - (context.sensor.n_frames - frames.size)
         for t, dn in _samples(source, tile, newer):
-            some = there > newer[t]
+            some = surplus > newer[t]
             inside = some & (dn >= origin) & (dn <= last)
             counts[inside, (dn - origin)[inside]] -= 1
             under -= some & (dn < origin)
