@@ -96,8 +96,7 @@ def _chosen(context: StageContext) -> dict[str, Any]:
     the YAML says.
     """
     if context.command.settings is not None:
-        chosen: dict[str, Any] = to_jsonable_python(dict(context.command.settings))
-        return chosen
+        return dict(to_jsonable_python(dict(context.command.settings)))
     record = context.store.records.known("methods")
     kept = {} if record is None else record.content.get("input") or {}
     return dict(kept.get("chosen", {}))
