@@ -201,10 +201,7 @@ def make_executor(
 ) -> Executor:
     """Return the executor that the section ``compute`` asks for.
 
-    Args:
-        settings: the section.
-        say: takes one line for people while workers are waited for.
-        check: called meanwhile; raises where the wait shall end.
+    While workers are waited for, ``say`` gets lines for people, and ``check`` raises to end the wait.
 
     Raises:
         PchEmError: it cannot be had; the message says why.

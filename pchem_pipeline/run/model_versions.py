@@ -188,14 +188,10 @@ def verdict_version(
     group: str = "",
     closed_fraction: float | None = None,
 ) -> ModelVersion:
-    """Return the version that a verdict makes: one that is there, or a new one; reads only.
+    """Return the version that a verdict with these settings makes: one that is there, or new; reads only.
 
-    Args:
-        store: the run.
-        settings: the model of the verdict.
-        start: the version that the search started from.
-        group: of the store, where the search left what the effects add to pixels; empty: nowhere.
-        closed_fraction: of the gap.
+    The search began with ``start``, closed a fraction of the gap, and left in ``group`` of the store what the
+    effects add to pixels (empty: nothing).
     """
     versions = model_versions(store)
     added = AddedArrays.of_group(store, group) if group else None

@@ -67,9 +67,8 @@ def _maps(fit: Arrays, maps: Mapping[str, FloatArray]) -> PixelMaps | None:
 def read_sums(store: RunStore) -> StackSums | None:
     """Read the summaries of a run: all covariances, and sums of blocks of frames spread over it.
 
-    Returns:
-        None where the stage histogram has not made them, or frames are fewer than two in each block. Odd
-        frames are in none of the sums.
+    Odd frames are in none of the sums. None where the stage histogram has not made them, or frames are fewer
+    than two in each block.
 
     Raises:
         StoreError: an array is corrupt.

@@ -31,11 +31,7 @@ _FILE, _OBJECT = "lock", "lock.json"
 
 @contextlib.contextmanager
 def locked(run: Path, private: Path) -> Iterator[None]:
-    """Hold the lock of a run.
-
-    Args:
-        run: its store, for messages.
-        private: its folder for the lock.
+    """Hold the lock of a run, which lies in its folder ``private``.
 
     Raises:
         LockedError: another process holds it.

@@ -78,19 +78,16 @@ def ensemble_tile(
     satellites: tuple[FloatArray, FloatArray] | None = None,
     errors: PixelErrors | None = None,
 ) -> tuple[IntArray, FloatArray]:
-    """Return what some pixels add to the ensemble.
+    """Return what some pixels add to the ensemble: rows of integers and floats, in the places of ``axes``.
 
     Args:
         maps: (H, g, mu, sigma) of the pixels, each of shape (n,); NaN where the fit failed.
         chosen: histograms of the chosen frames.
         everything: histograms of all frames.
-        axes: axes of the ensemble.
+        axes: of the ensemble.
         law: of the samples; None: that of the PCD.
         satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n,); None: none.
         errors: of the maps; None: not known.
-
-    Returns:
-        A row of integers and a row of floats, in the places that ``axes`` gives.
     """
     integers = np.zeros(list(axes.integers.values())[-1].stop, dtype=np.int64)
     floats = np.zeros(list(axes.floats.values())[-1].stop)
