@@ -106,6 +106,10 @@ class RunStore:
         Raises:
             StoreError: there is none, it is damaged, or it has another schema version.
         """
+        import zarr
+
+        from pchem_pipeline.store.zarr_store import zarr_store
+
         path = place_of(path)
         if not (path / DESCRIPTION).exists():
             if (path / _PRIVATE / "stages").is_dir():
@@ -116,7 +120,7 @@ class RunStore:
         _refuse_links(path)
         try:
             with _one_line(path, path):
-                root = _opened(path, writable=writable)
+                root = zarr.open_group(zarr_store(path, writable=writable), mode="r+" if writable else "r")
                 schema = root.attrs.get("pchem_schema")
         except (KeyError, *_DAMAGE) as error:
             raise StoreError(f"{path / DESCRIPTION} is damaged ({error}); {cure_of(path, '')}") from error
@@ -199,7 +203,11 @@ class RunStore:
     @functools.cached_property
     def _writer(self) -> zarr.Group:
         """The root through which chunks are written: zarr looks for what is in their place before."""
-        return _opened(self.path, writable=True, begins=True)
+        import zarr
+
+        from pchem_pipeline.store.zarr_store import zarr_store
+
+        return zarr.open_group(zarr_store(self.path, writable=True, begins=True), mode="r+")
 
     def array(self, name: str, *, to_write: bool = False) -> zarr.Array[Any]:
         """Return the zarr array ``name``, for its shape, chunks and attributes.
@@ -356,16 +364,6 @@ class RunStore:
                 yield
         except _DAMAGE as error:
             raise StoreError(f"{where} is damaged ({error}); {self.cure(name)}") from error
-
-
-def _opened(path: Path, *, writable: bool, begins: bool = False) -> zarr.Group:
-    """Return the root of a store; ``begins`` to write chunks."""
-    import zarr
-
-    from pchem_pipeline.store.zarr_store import zarr_store
-
-    store = zarr_store(path, writable=writable, begins=begins)
-    return zarr.open_group(store, mode="r+" if writable else "r")
 
 
 def stored_config(path: Path) -> str | None:
