@@ -10,12 +10,7 @@ from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pchem_pipeline.base.errors import (
-    ConfigError,
-    IncompleteRunError,
-    MissingDependencyError,
-    install_hint,
-)
+from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, MissingDependencyError, install_hint
 from pchem_pipeline.compute.environment import prepare_environment, versions_of
 from pchem_pipeline.compute.executor import OnResult, Outcome, guarded, out_of_memory
 from pchem_pipeline.compute.settings import ComputeSettings
@@ -35,11 +30,7 @@ class DistributedExecutor:
     shares_memory = False
 
     def __init__(
-        self,
-        settings: ComputeSettings,
-        workers: int,
-        say: Callable[[str], None],
-        check: Callable[[], None],
+        self, settings: ComputeSettings, say: Callable[[str], None], check: Callable[[], None]
     ) -> None:
         """Connect to the cluster, or make it, and wait for its first worker.
 
@@ -67,7 +58,10 @@ class DistributedExecutor:
                 self._client = distributed.Client(**_address(settings.scheduler), timeout="20s")
             else:
                 self._cluster = distributed.LocalCluster(
-                    n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", host="127.0.0.1"
+                    n_workers=settings.count(),
+                    threads_per_worker=1,
+                    dashboard_address="127.0.0.1:0",
+                    host="127.0.0.1",
                 )
                 self._client = distributed.Client(self._cluster)
         except OSError as error:
@@ -95,11 +89,7 @@ class DistributedExecutor:
         return list(self._client.scheduler_info(n_workers=-1)["workers"].values())
 
     def _can_work(self) -> bool:
-        """Return whether a worker can work now; say once that none can.
-
-        Raises:
-            IncompleteRunError: none could for too long.
-        """
+        """Return whether a worker can work now; say once that none can, and raise if that is so for long."""
         workers = self._workers()
         if any(each["status"] == "running" for each in workers):
             self._since, self._said = None, False
@@ -224,22 +214,19 @@ def _differences(expected: tuple[tuple[str, str], ...]) -> str:
 
 
 def _outcome(future: Any) -> Outcome:
-    """Return what became of an item, also where its workers died.
-
-    Raises:
-        TimeoutError: it is not known, or no longer.
-    """
+    """Return what became of an item, also where its workers died; raise TimeoutError if it is not known."""
     if future.cancelled():
         raise CancelledError
     error = future.exception(timeout=_LOOK)
     if error is None:
         outcome: Outcome = future.result(timeout=_LOOK)
         return outcome
+    trace = str(error)
     if type(error).__name__ == "KilledWorker":
-        return Outcome(error=IncompleteRunError(_killed(error)), trace=str(error))
-    if isinstance(error, MemoryError):
-        return Outcome(error=IncompleteRunError(out_of_memory(error)), trace=str(error))
-    return Outcome(error=error, trace=str(error))
+        error = IncompleteRunError(_killed(error))
+    elif isinstance(error, MemoryError):
+        error = IncompleteRunError(out_of_memory(error))
+    return Outcome(error=error, trace=trace)
 
 
 def _killed(error: Any) -> str:

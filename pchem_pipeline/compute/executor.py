@@ -199,12 +199,9 @@ def make_executor(
     say: Callable[[str], None] = lambda text: None,
     check: Callable[[], None] = lambda: None,
 ) -> Executor:
-    """Return the executor that the settings ask for.
+    """Return the executor that the section ``compute`` asks for.
 
-    Args:
-        settings: the section ``compute``.
-        say: takes one line for people while workers are waited for.
-        check: called meanwhile; raises where the wait shall end.
+    While workers are waited for, ``say`` gets lines for people, and ``check`` raises to end the wait.
 
     Raises:
         PchEmError: it cannot be had; the message says why.
@@ -214,12 +211,10 @@ def make_executor(
     match settings.backend:
         case "serial":
             return SerialExecutor()
-        case "threads":
-            return PoolExecutor(settings.count(), processes=False)
-        case "processes":
-            return PoolExecutor(settings.count(), processes=True)
+        case "threads" | "processes":
+            return PoolExecutor(settings.count(), processes=settings.backend == "processes")
         case "distributed":
             from pchem_pipeline.compute.cluster import DistributedExecutor
 
-            return DistributedExecutor(settings, settings.count(), say, check)
+            return DistributedExecutor(settings, say, check)
     raise PchEmError(f"unknown backend {settings.backend}")

@@ -43,10 +43,7 @@ def keep_to_limit(limit: int | None) -> None:
 
     Freed memory then goes back to the system at once. Otherwise each thread keeps a heap of its own, and
     arrays that were freed stay in it: half as much again as is in use. It costs a twentieth of the CPU time.
-    Only the C library of Linux can do it.
-
-    Args:
-        limit: ``compute.max_memory``, MiB.
+    Only the C library of Linux can do it. The limit is ``compute.max_memory``, MiB.
 
     Raises:
         ConfigError: it is less than the program takes before it does anything; with what it takes.
@@ -72,13 +69,9 @@ def keep_to_limit(limit: int | None) -> None:
 
 
 def affordable(executor: Executor, limit: int, unit_bytes: int, what: str) -> Executor:
-    """Return the executor with no more workers than the memory allowed is enough for.
+    """Return the executor with no more workers than ``limit`` bytes are enough for; not that of a cluster.
 
-    Args:
-        executor: of the run; a cluster has memory of its own.
-        limit: bytes that this machine may give.
-        unit_bytes: that a worker takes for a unit of its work.
-        what: is done, for the message.
+    ``unit_bytes`` are what a worker takes for a unit of its work, ``what`` is done, for the message.
 
     Raises:
         ConfigError: it is not enough for one.

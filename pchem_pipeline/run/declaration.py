@@ -1,24 +1,17 @@
 """What a stage declares about itself: a row of the table in :mod:`pchem_pipeline.stages.table`.
 
-Rows import nothing that computes: functions are named as ``"module:function"`` and imported when called.
+Rows import nothing that computes: functions are named as ``"module:function"`` and imported when called, by
+:func:`pkgutil.resolve_name`.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pchem_pipeline.config.tree import RunConfig
-
-
-def imported(place: str) -> Callable[..., Any]:
-    """Import and return the function that ``"package.module:function"`` names."""
-    module, _, name = place.partition(":")
-    function: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    return function
 
 
 @dataclass(frozen=True)

@@ -5,20 +5,19 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pkgutil import resolve_name
+from typing import Any
 
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.config.load import setting_of, states
-from pchem_pipeline.run.declaration import Stage, imported
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.run.declaration import Stage
 from pchem_pipeline.run.model_versions import model_of_content, model_versions
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.files import DESCRIPTION, digest_of, fingerprint_of
 from pchem_pipeline.store.records import StageRecord
 from pchem_pipeline.store.remote_path import RemotePath
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.run.stage import StageContext
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 _NEWS = {f"input.{name}": f"new result of pchem {name}" for name in ("discrepancy", "methods")}
 
@@ -51,16 +50,12 @@ class StageState:
 
 def fingerprint_content(stage: Stage, context: StageContext) -> dict[str, Any]:
     """Return all that decides the result of a stage, as JSON data."""
-    upstream: dict[str, str | None] = {}
-    for name in stage.upstream:
-        record = context.store.records.known(name)
-        upstream[name] = None if record is None else _state_of_record(context.store, record)
     return {
         "stage": stage.name,
         "version": stage.version,
         "settings": setting_values(stage, context),
-        "upstream": upstream,
-        "input": None if stage.identity is None else imported(stage.identity)(context),
+        "upstream": {name: _state_of_result(context.store, name) for name in stage.upstream},
+        "input": None if stage.identity is None else resolve_name(stage.identity)(context),
     }
 
 
@@ -73,9 +68,11 @@ def setting_values(stage: Stage, context: StageContext) -> dict[str, Any]:
     return found
 
 
-def _state_of_record(store: RunStore, record: StageRecord) -> str:
-    """Return the fingerprint of a stage; for one that lacks units, also which it has."""
-    done = store.records.done(record.stage, record.fingerprint)
+def _state_of_result(store: RunStore, stage: str) -> str | None:
+    """Return the fingerprint of a stage; for one that lacks units, also which it has; None: no record."""
+    if (record := store.records.known(stage)) is None:
+        return None
+    done = store.records.done(stage, record.fingerprint)
     if len(done) >= record.keys > 0:
         return record.fingerprint
     return f"{record.fingerprint}+{hashlib.sha256(' '.join(sorted(done)).encode()).hexdigest()[:16]}"
@@ -108,8 +105,8 @@ def _state(stage: Stage, context: StageContext, record: StageRecord, done: int) 
         numbers = {each.digest: each.number for each in (context.model, *model_versions(context.store))}
         return "stale", "; ".join(differences(record.content, content, numbers, context.config))
     if done < record.keys or record.keys == 0:
-        reason = f"{len(record.failed)} failed: {next(iter(record.failed.values()))}" if record.failed else ""
-        return "partial", reason
+        failed = record.failed
+        return "partial", f"{len(failed)} failed: {next(iter(failed.values()))}" if failed else ""
     return ("complete", "") if record.finished else ("partial", "interrupted")
 
 
@@ -138,15 +135,14 @@ def rests_on(record: StageRecord, store: RunStore) -> int | None:
     """
     if record.model is not None:
         return record.model
-    version = model_of_content(store, record.content)
-    if version is not None:
+    if (version := model_of_content(store, record.content)) is not None:
         return version.number
     for name, fingerprint in record.content.get("upstream", {}).items():
         upstream = store.records.known(name)
-        if upstream is not None and _base(fingerprint) == upstream.fingerprint:
-            number = rests_on(upstream, store)
-            if number is not None:
-                return number
+        if upstream is None or _base(fingerprint) != upstream.fingerprint:
+            continue
+        if (number := rests_on(upstream, store)) is not None:
+            return number
     return None
 
 
@@ -173,17 +169,13 @@ def differences(
 ) -> list[str]:
     """Say in words why two fingerprint contents differ, and what keeps a result whose default has changed.
 
-    Args:
-        old: content before.
-        new: content now.
-        models: numbers of models, by digest.
-        config: of which the new content is; None: nothing is said of defaults.
+    ``models`` are the numbers of models by digest; without ``config``, of which the new content is, nothing
+    is said of defaults.
     """
     words: list[str] = []
     if old.get("version") != new["version"]:
         words.append(f"algorithm version {old.get('version')} -> {new['version']}")
-    before: dict[str, Any] = old.get("settings", {})
-    for key, was, now in changes(before, new["settings"]):
+    for key, was, now in changes(old.get("settings", {}), new["settings"]):
         default = config is not None and was is not None and not states(config, key)
         keep = f" (the default; {key}: {was} in the YAML keeps the result)" if default else ""
         words.append(f"{key} {was} -> {now}{keep}")

@@ -36,12 +36,10 @@ def known_identity(context: StageContext) -> dict[str, Any]:
         InputError: files are missing or bad, and nothing is known of them from before.
     """
     settings = context.config.input
-    known: dict[str, Any] = {}
-    held: dict[str, Any] = {}
+    known, held = dict[str, Any](), dict[str, Any]()
     with suppress(StoreError):  # one that is damaged is as good as none: the files are hashed again
         known = read_record(context.store.path / _KNOWN) or {}
         held = ingested_identity(context) or {}
-    same_files = known.get("files") == list(settings.files)
     try:
         paths = input_paths(settings, context.base_dir)
         quick = quick_identity(paths)
@@ -52,17 +50,17 @@ def known_identity(context: StageContext) -> dict[str, Any]:
         raise
     if known.get("quick") == quick:
         return dict(known["identity"])
-    if not same_files:
-        inspect_input(context)
+    if known.get("files") != list(settings.files):
+        _inspect_input(context)
     size = sum(int(file["size"]) for file in quick["files"])
     with context.reporter.progress("ingest: hash", size >> 20, "MiB") as advance:
-        told = whole_mebibytes(advance)
+        show = whole_mebibytes(advance)
 
-        def hear(count: int) -> None:
+        def on_bytes(count: int) -> None:
             context.stop.check()
-            told(count)
+            show(count)
 
-        identity = content_identity(paths, hear)
+        identity = content_identity(paths, on_bytes)
     with suppress(StoreError):  # a store that cannot be written is a matter for those who write to it
         keep_identity(context, quick, identity)
     return identity
@@ -95,16 +93,12 @@ def keep_identity(context: StageContext, quick: dict[str, Any], identity: dict[s
     Raises:
         StoreError: the store cannot be written.
     """
-    files = list(context.config.input.files)
-    write_record(context.store.path / _KNOWN, {"files": files, "quick": quick, "identity": identity})
+    content = {"files": list(context.config.input.files), "quick": quick, "identity": identity}
+    write_record(context.store.path / _KNOWN, content)
 
 
-def inspect_input(context: StageContext) -> None:
-    """Check the input for mistakes, without reading the frames.
-
-    Raises:
-        InputError: files are missing or bad.
-    """
+def _inspect_input(context: StageContext) -> None:
+    """Check the input for mistakes, without reading the frames."""
     from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
     from pchem_pipeline.frames.open import open_frames
 
@@ -124,19 +118,12 @@ def listed_identity(context: StageContext) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class StoredFrames:
-    """The frames that ``ingest`` copied into the store.
-
-    Attributes:
-        path: the store.
-        shape: frames, rows, columns.
-        dtype: type of the samples.
-        rows_per_read: rows that are decoded together.
-    """
+    """The frames that ``ingest`` copied into a store, a `FrameSource`."""
 
     path: Path
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]
-    rows_per_read: int = 1
+    rows_per_read: int
 
     def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
         """See `FrameSource.read_into`.
@@ -161,19 +148,19 @@ def open_source(context: StageContext) -> FrameSource:
     record = store.records.read("ingest")
     if record is None or not store.records.has_all(record):
         raise StoreError(f"{store.path}: the input is not complete; run: pchem ingest {quoted(store.path)}")
-    expected = (sensor.n_frames, *sensor.shape)
+    expected, dtype = (sensor.n_frames, *sensor.shape), np.dtype(sensor.dtype)
     if sensor.mode == "copy":
         array = store.array("frames/dn")
-        if array.shape != expected or array.dtype != np.dtype(sensor.dtype):
+        if array.shape != expected or array.dtype != dtype:
             raise StoreError(
                 f"{store.path}: frames/dn differs from the ingested frames; {store.cure('frames/dn')}"
             )
-        return StoredFrames(store.path, expected, np.dtype(sensor.dtype), array.chunks[1])
+        return StoredFrames(store.path, expected, dtype, array.chunks[1])
     reader = open_frames(context.config.input, context.base_dir, check_duplicates=False)
     files = known_identity(context)["files"]  # hashed again where names, sizes or times changed
     content = digest_of([file["xxh3_128"] for file in files])
     other = content != (record.content.get("input") or {}).get("content", content)
-    if other or reader.shape != expected or reader.dtype != np.dtype(sensor.dtype):
+    if other or reader.shape != expected or reader.dtype != dtype:
         raise InputError(
             f"{reader.paths[0]}: the camera files changed since they were ingested (now {reader.shape} "
             f"{reader.dtype}, then {expected} {sensor.dtype}); run: pchem ingest {quoted(store.path)}"

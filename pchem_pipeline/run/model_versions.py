@@ -13,7 +13,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -24,9 +24,7 @@ from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
 from pchem_pipeline.store.files import fingerprint_of, read_record, write_record
-
-if TYPE_CHECKING:
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 _GROUP = "model"
 _EXPOSURE, _WEIGHT = "added_exposure", "added_weight"
@@ -121,9 +119,12 @@ class ModelVersion:
             return False
 
 
-def _version(number: int, settings: ModelSettings, added: AddedArrays | None, **facts: Any) -> ModelVersion:
+def _next_version(
+    versions: Sequence[ModelVersion], settings: ModelSettings, added: AddedArrays | None, **facts: Any
+) -> ModelVersion:
     model = settings.model_dump(mode="json")
     digest = fingerprint_of({"model": model, "added_exposure": None if added is None else added.digest})
+    number = versions[-1].number + 1 if versions else 1
     return ModelVersion(number, model, digest, added=added, **facts)
 
 
@@ -134,15 +135,12 @@ def model_versions(store: RunStore) -> tuple[ModelVersion, ...]:
         StoreError: a version is damaged.
     """
     folder = store.path / _GROUP
-    places = sorted(folder.glob("[0-9]*.json")) if folder.is_dir() else []
     found = []
-    for place in places:
+    for place in sorted(folder.glob("[0-9]*.json")) if folder.is_dir() else ():
         content: Any = read_record(place, _CURE)
         try:
-            added = content["added"]
-            found.append(
-                ModelVersion(**{**content, "added": None if added is None else AddedArrays(**added)})
-            )
+            added = None if content["added"] is None else AddedArrays(**content["added"])
+            found.append(ModelVersion(**{**content, "added": added}))
         except (KeyError, TypeError) as error:
             raise StoreError(f"{place} is damaged ({error}); {_CURE}") from error
     return tuple(found)
@@ -154,12 +152,11 @@ def version_with(store: RunStore, number: int) -> ModelVersion:
     Raises:
         ConfigError: there is no such version.
     """
-    versions = model_versions(store)
-    for version in versions:
-        if version.number == number:
-            return version
-    have = ", ".join(str(version.number) for version in versions) or "none"
-    raise ConfigError(f"{store.path} has no model {number}; it has: {have}")
+    versions = {version.number: version for version in model_versions(store)}
+    if number not in versions:
+        have = ", ".join(map(str, versions)) or "none"
+        raise ConfigError(f"{store.path} has no model {number}; it has: {have}")
+    return versions[number]
 
 
 def with_digest(versions: Sequence[ModelVersion], digest: str | None) -> ModelVersion | None:
@@ -172,26 +169,15 @@ def model_in_force(store: RunStore, settings: ModelSettings) -> ModelVersion:
 
     It is the current one where that is what the section says, else the latest that is; else a new one, which
     takes over what the latest version knows of the exposure that the same effects add.
-
-    Args:
-        store: the run.
-        settings: the section.
     """
     versions = model_versions(store)
     number = (read_record(store.path / _GROUP / "current.json") or {}).get("number")
     fitting = [version for version in versions if version.holds(settings)]
-    for version in fitting:
-        if version.number == number:
-            return version
     if fitting:
-        return fitting[-1]
+        return next((version for version in fitting if version.number == number), fitting[-1])
     effects = [effect.model_dump(mode="json") for effect in settings.effects]
     known = [v.added for v in versions if v.added is not None and all(e in effects for e in v.added.effects)]
-    return _version(_next(versions), settings, known[-1] if known else None, parent=number)
-
-
-def _next(versions: Sequence[ModelVersion]) -> int:
-    return versions[-1].number + 1 if versions else 1
+    return _next_version(versions, settings, known[-1] if known else None, parent=number)
 
 
 def verdict_version(
@@ -202,19 +188,15 @@ def verdict_version(
     group: str = "",
     closed_fraction: float | None = None,
 ) -> ModelVersion:
-    """Return the version that a verdict makes: one that is there, or a new one; reads only.
+    """Return the version that a verdict with these settings makes: one that is there, or new; reads only.
 
-    Args:
-        store: the run.
-        settings: the model of the verdict.
-        start: the version that the search started from.
-        group: of the store, where the search left what the effects add to pixels.
-        closed_fraction: of the gap.
+    The search began with ``start``, closed a fraction of the gap, and left in ``group`` of the store what the
+    effects add to pixels (empty: nothing).
     """
     versions = model_versions(store)
     added = AddedArrays.of_group(store, group) if group else None
     facts = {"source": "verdict", "parent": start.number, "closed_fraction": closed_fraction}
-    new = _version(_next(versions), settings, added, **facts)
+    new = _next_version(versions, settings, added, **facts)
     return with_digest(versions, new.digest) or new
 
 
@@ -285,58 +267,46 @@ def write_added_exposure(
     rows: tuple[int, int],
     columns: tuple[int, int],
 ) -> None:
-    """Keep what effects add in a window of the sensor, or that they add nothing.
-
-    Args:
-        store: the run.
-        group: where to keep it.
-        added: (j, y, x) of the window; None: nothing.
-        effects: of the model.
-        rows: of the window, first and end.
-        columns: likewise.
-    """
+    """Keep in a group what effects add, (j, y, x), in a window of the sensor, or that they add nothing."""
     for name in (_EXPOSURE, _WEIGHT):
         store.delete(f"{group}/{name}")
     if added is None:
         return
-    arrays = [np.ascontiguousarray(values, np.float64) for values in added]
-    digest = hashlib.sha256(b"".join(values.tobytes() for values in arrays)).hexdigest()
+    exposure, weight = (np.ascontiguousarray(values, np.float64) for values in added)
+    digest = hashlib.sha256(exposure.tobytes() + weight.tobytes()).hexdigest()
     adding = [e for e in effects if type(e).added_exposure is not Effect.added_exposure]
     kept = tuple(e.model_dump(mode="json") for e in adding)
-    store.write_array(f"{group}/{_WEIGHT}", arrays[1])
+    store.write_array(f"{group}/{_WEIGHT}", weight)
     facts = AddedArrays(group, rows, columns, kept, digest)
-    store.write_array(f"{group}/{_EXPOSURE}", arrays[0], facts.attributes())
+    store.write_array(f"{group}/{_EXPOSURE}", exposure, facts.attributes())
 
 
 def read_added_exposure(
     store: RunStore, version: ModelVersion | None, region: Region | None = None
 ) -> AddedExposure | None:
-    """Return what the effects of a model add to the pixels of a region, or None where that is nothing.
+    """Return what the effects of a model add to the pixels of a region, or of all of the sensor.
 
-    Args:
-        store: the run.
-        version: of the model; None: a plain one.
-        region: of the sensor; None: all of it.
+    None where that is nothing, or where the model is a plain one (None).
     """
     if version is None or version.added is None:
         return None
     shape = store.array("histogram/origin").shape
-    window = [slice(*version.added.rows), slice(*version.added.columns)]
-    wanted = [
-        slice(*part.indices(n)[:2])
-        for part, n in zip(region or (slice(None), slice(None)), shape, strict=True)
-    ]
-    common = [slice(max(w.start, p.start), min(w.stop, p.stop)) for w, p in zip(window, wanted, strict=True)]
-    if any(c.start >= c.stop for c in common):
-        return None
-    inside = tuple(slice(c.start - w.start, c.stop - w.start) for c, w in zip(common, window, strict=True))
-    place = tuple(slice(c.start - p.start, c.stop - p.start) for c, p in zip(common, wanted, strict=True))
+    windows = (version.added.rows, version.added.columns)
+    wanted, inside, place = [], [], []
+    for (first, end), given, n in zip(windows, region or (slice(None), slice(None)), shape, strict=True):
+        start, stop, _ = given.indices(n)
+        low, high = max(first, start), min(end, stop)
+        if low >= high:
+            return None
+        wanted.append(stop - start)
+        inside.append(slice(low - first, high - first))
+        place.append(slice(low - start, high - start))
     found: list[FloatArray] = []
     for name in (_EXPOSURE, _WEIGHT):
         part = store.read(f"{version.added.group}/{name}", (slice(None), *inside))
-        whole = np.zeros((part.shape[0], *(p.stop - p.start for p in wanted)))
+        whole = np.zeros((part.shape[0], *wanted))
         if name == _WEIGHT:
             whole[0] = 1.0
         whole[(slice(None), *place)] = part
         found.append(whole)
-    return AddedExposure(found[0], found[1])
+    return AddedExposure(*found)

@@ -149,9 +149,7 @@ class Reporter:
     def compilation(self, stage: str, limit: int | None = None) -> Iterator[None]:
         """Say when a stage compiles kernels, or waits for another process that does: how many, and how long.
 
-        Args:
-            stage: its name.
-            limit: memory that the run may take, MiB: where compiling takes more, that is a warning.
+        Warn where compiling takes more memory than the run may take, ``limit`` in MiB.
         """
         seconds: list[float] = []
         most = 490  # MiB of this process while it compiles
@@ -233,9 +231,9 @@ class Reporter:
         from tqdm import tqdm
 
         with tqdm(
+            desc=label,
             total=total,
             initial=done,
-            desc=label,
             unit=f" {unit}",
             smoothing=0.0,
             disable=self._disable,
@@ -336,12 +334,14 @@ def read_progress(store: Path) -> dict[str, Any] | None:
     words_of = ("stage", "unit", "time", "host")
     numbers_of = ("done", "total", "elapsed", "rate", "remaining", "pid")
     words = {name: one_line(text) for name in words_of if isinstance(text := content.get(name), str)}
-    numbers = {name: value for name in numbers_of if _is_number(value := content.get(name))}
+    numbers = {
+        name: value
+        for name in numbers_of
+        if isinstance(value := content.get(name), int | float)
+        and not isinstance(value, bool)
+        and 0 <= value < 1e15
+    }
     return {**words, **numbers}
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 <= value < 1e15
 
 
 def _place(store: Path) -> Path:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.frames.camera import CameraFacts
+from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.frames.settings import InputSettings
 
 
 @dataclass(frozen=True)
@@ -22,7 +20,6 @@ class Sample:
     Attributes:
         name: name of its store.
         bias: it holds no electrons.
-        n_frames: frames.
         integration_time: s, as its run says; None where it does not.
         kind: dark, light or unknown, as its run says.
     """
@@ -43,7 +40,6 @@ class SensorInfo:
             same pixels that are fitted together.
         n_frames: number of frames (for histograms: the largest number of samples of a channel; for samples:
             of all together).
-        ny: rows.
         nx: columns (for histograms: channels).
         dtype: numpy name of the DN type.
         bit_depth: bits of the ADC, if known; codes at its limits count as clipped.
@@ -100,8 +96,7 @@ class SensorInfo:
 
     def write(self, store: RunStore) -> None:
         """Keep this in the store."""
-        content = {**asdict(self), "names": list(self.names), "samples": [asdict(s) for s in self.samples]}
-        store.set_attributes("frames", {"sensor": content})
+        store.set_attributes("frames", {"sensor": asdict(self)})
 
     @classmethod
     def read(cls, store: RunStore) -> SensorInfo:

@@ -58,11 +58,7 @@ class StopRequest:
             self._at_once = before and self.signal is None
 
     def check(self) -> None:
-        """Raise if a stop was asked for.
-
-        Raises:
-            InterruptedRunError: a signal arrived.
-        """
+        """Raise InterruptedRunError if a signal asked for a stop."""
         if self.signal is not None:
             raise InterruptedRunError(self.signal)
 
@@ -85,8 +81,8 @@ def stop_on_signals() -> Iterator[StopRequest]:
             signal.raise_signal(number)
         request.ask(number)
 
-    heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
-    old = {number: signal.signal(number, handle) for number in heard}
+    handled = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
+    old = {number: signal.signal(number, handle) for number in handled}
     try:
         yield request
     finally:

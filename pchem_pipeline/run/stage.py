@@ -79,19 +79,16 @@ Task = Callable[[AnyUnit, RunStore], Mapping[str, Any] | None]
 
 @dataclass(frozen=True)
 class Command:
-    """What the command line asked for, beside the configuration.
+    """What the command line asked for, beside the configuration, whose section ``compute`` it overrides.
 
     Attributes:
         force: do it again.
         dry_run: say what would be done.
         roi: only the tiles of this region.
         settings: of a stage on demand, in place of those of its section; None: those of its last result.
-        workers: overrides ``compute.workers``.
-        backend: overrides ``compute.backend``.
-        progress: auto | on | off.
         quiet: say warnings only.
         log_json: file for JSON lines.
-        max_memory: overrides ``compute.max_memory``, MiB.
+        max_memory: MiB.
     """
 
     force: bool = False
@@ -112,30 +109,26 @@ def open_store(path: Path) -> RunStore:
     return RunStore.open(path, writable=True)
 
 
-@dataclass(frozen=True)
-class MarkedTask:
-    """A task that sets the markers of its unit once it is done, in the worker.
+def _do_unit(
+    path: Path,
+    stage: str,
+    fingerprint: str,
+    task: Task[AnyUnit] | None,
+    tell: Callable[[str, float], None] | None,
+    unit: AnyUnit,
+) -> None:
+    """Do a unit of a run, in the worker, and set its markers once it is done.
 
     ``tell`` hears by key what share of a unit is done, where the worker shares the memory. Where it does not
     (None), the worker may be overtaken by a later command, and writes no more then.
     """
-
-    store: Path
-    stage: str
-    fingerprint: str
-    task: Task[Any] | None
-    tell: Callable[[str, float], None] | None = None
-
-    def __call__(self, unit: Unit) -> Mapping[str, Any]:
-        """Do the unit, then mark it."""
-        store = open_store(self.store)
-        with working(store.records, self.stage, self.fingerprint if self.tell is None else None):
-            with telling_parts(None if self.tell is None else functools.partial(self.tell, unit.key)):
-                summary = {} if self.task is None else dict(self.task(unit, store) or {})
-            check_work(self.store)
-            for key in markers(unit):
-                store.records.mark(self.stage, self.fingerprint, key, summary)
-        return summary
+    store = open_store(path)
+    with working(store.records, stage, fingerprint if tell is None else None):
+        with telling_parts(None if tell is None else functools.partial(tell, unit.key)):
+            summary = {} if task is None else dict(task(unit, store) or {})
+        check_work(path)
+        for key in markers(unit):
+            store.records.mark(stage, fingerprint, key, summary)
 
 
 @dataclass(frozen=True)
@@ -162,17 +155,14 @@ def allowed_bytes(config: RunConfig, workers: int) -> int:
 def band_bytes(config: RunConfig, workers: int, limit: int | None = None) -> int:
     """Return the memory of a worker that counts a band of rows.
 
-    Args:
-        config: of the run.
-        workers: number of workers.
-        limit: bytes that the process of a worker may take, above which it is killed; None: no limit.
+    ``limit``: bytes that the process of a worker may take, above which it is killed; None: no limit.
     """
-    bytes_each = config.histogram.band_memory << 20
+    bytes_each = [config.histogram.band_memory << 20]
     if limit is not None:
-        bytes_each = min(bytes_each, max(16 << 20, limit - BASE_BYTES))
-    if config.compute.max_memory is None:
-        return bytes_each
-    return min(bytes_each, max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))
+        bytes_each.append(max(16 << 20, limit - BASE_BYTES))
+    if config.compute.max_memory is not None:
+        bytes_each.append(max(16 << 20, ((config.compute.max_memory << 20) - BASE_BYTES) // workers))
+    return min(bytes_each)
 
 
 @dataclass
@@ -180,13 +170,9 @@ class StageContext:
     """All that a stage is given.
 
     Attributes:
-        config: the whole configuration.
         base_dir: folder to which relative paths of the configuration refer.
         store: the run's store, writable.
-        executor: who does the work.
-        reporter: where to say what happens.
         stop: raised signals; checked between units.
-        command: of the command line.
         stage: name of the running stage.
         fingerprint: of the running stage.
         fresh: True where the stage starts anew and must create its arrays.
@@ -257,7 +243,7 @@ class StageContext:
     @property
     def tile_pixels(self) -> int:
         """Pixels of the largest tile."""
-        return math.prod(min(size, length) for size, length in zip(self.tile, self.sensor.shape, strict=True))
+        return math.prod(self.tiles()[0].shape)
 
     @property
     def band_bytes(self) -> int:
@@ -301,7 +287,7 @@ class StageContext:
         sizes, parts = {**LENGTHS, **(lengths or {})}, dict(chunks or {})
         if "y" not in sizes:
             sizes |= zip(("y", "x"), self.sensor.shape, strict=True)
-            parts = {**dict(zip(("y", "x"), self.tile, strict=True)), **parts}
+            parts = dict(zip(("y", "x"), self.tile, strict=True)) | parts
         for name in names:
             self.created[name] = self.stage
             if self.fresh or not self.store.has(name):
@@ -366,11 +352,13 @@ class StageContext:
             StoreError: the store cannot be written.
         """
         self.begin()
-        self._know_total(sum(len(markers(unit)) for unit in units) if total is None else total)
+        self.n_keys = sum(len(markers(unit)) for unit in units) if total is None else total
+        record = self.store.records.read(self.stage)
+        if record is not None and record.keys != self.n_keys:  # a kill must not lose it
+            self.store.records.write(replace(record, keys=self.n_keys))
         todo = self._ready(self.pending(units, resumes=total is not None), needs)
-        self.store.records.unmark(
-            self.stage, self.fingerprint, (key for unit in todo for key in markers(unit))
-        )
+        again = (key for unit in todo for key in markers(unit))
+        self.store.records.unmark(self.stage, self.fingerprint, again)
         fatal: list[BaseException] = []
         shown = len(self.selected(units))
         undivided = list(units) == [WHOLE]
@@ -381,26 +369,26 @@ class StageContext:
         with self.reporter.progress(
             self.stage, shown, unit_name, shown - len(todo), hidden=undivided
         ) as advance:
-            told: dict[str, float] = {}
+            shares: dict[str, float] = {}  # of the running units, that are done
 
             def tell(key: str, share: float) -> None:
-                share = min(share, 1.0 - told.get(key, 0.0))
-                told[key] = told.get(key, 0.0) + share
+                share = min(share, 1.0 - shares.get(key, 0.0))
+                shares[key] = shares.get(key, 0.0) + share
                 advance(share)
 
             def on_result(unit: AnyUnit, outcome: Outcome) -> None:
-                advance(1.0 - told.pop(unit.key, 0.0))
+                advance(1.0 - shares.pop(unit.key, 0.0))
                 if outcome.error is not None:
                     self._failed(unit, outcome, fatal)
                 if fatal or self.stop.signal is not None:
                     raise Stop
 
             self.stop.check()
-            heard = tell if executor.shares_memory else None
-            marked = MarkedTask(self.store.path, self.stage, self.fingerprint, task, heard)
+            listener = tell if executor.shares_memory else None
+            place = self.store.path, self.stage, self.fingerprint
             try:
                 with self.stop.at_once() if undivided else contextlib.nullcontext():
-                    executor.map(marked, todo, on_result)
+                    executor.map(functools.partial(_do_unit, *place, task, listener), todo, on_result)
             except Stop:
                 if fatal:
                     raise fatal[0] from fatal[0].__cause__
@@ -417,28 +405,22 @@ class StageContext:
             if stage == self.stage and "frame" not in VARIABLES[name].dims:
                 self.store.fill(name)
 
-    def _know_total(self, n_keys: int) -> None:
-        """Record how many markers the stage will have, before the first is set: a kill must not lose it."""
-        self.n_keys = n_keys
-        record = self.store.records.read(self.stage)
-        if record is not None and record.keys != n_keys:
-            self.store.records.write(replace(record, keys=n_keys))
-
     def _ready(self, units: list[AnyUnit], needs: str | None) -> list[AnyUnit]:
         """Split off the units that an upstream stage has not finished."""
         if needs is None:
             return units
-        there = self.tiles_done(needs)
+        ready, finished = [], self.tiles_done(needs)
         for unit in units:
-            if not set(markers(unit)) <= there:
+            if set(markers(unit)) <= finished:
+                ready.append(unit)
+            else:
                 self.failed[unit.key] = f"stage {needs} of {self.store.path} is not finished"
-        return [unit for unit in units if set(markers(unit)) <= there]
+        return ready
 
     def _failed(self, unit: Unit, outcome: Outcome, fatal: list[BaseException]) -> None:
         error = outcome.error
         assert error is not None
-        reason = error_words(error)
-        self.failed[unit.key] = reason
+        self.failed[unit.key] = reason = error_words(error)
         self.reporter.event("failed", stage=self.stage, unit=unit.key, reason=reason, trace=outcome.trace)
         full = (isinstance(error, StoreError) and is_fatal(error.__cause__ or error)) or is_fatal(error)
         # camera files that vanished or changed are gone for all units, too

@@ -7,10 +7,11 @@ import time
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from pkgutil import resolve_name
 
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds, peak_rss_bytes, versions_of
-from pchem_pipeline.run.declaration import Stage, imported
+from pchem_pipeline.run.declaration import Stage
 from pchem_pipeline.run.fingerprint import StageState, changed_file, fingerprint_content, rests_on, status
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.table import STAGES
@@ -29,22 +30,22 @@ def execute(name: str, context: StageContext) -> StageState:
     Raises:
         PchEmError: the stage cannot be done.
     """
-    clock = time.perf_counter(), cpu_seconds()
+    clock = time.perf_counter(), cpu_seconds()  # hashing the input is part of the work
     stage = STAGES[name]
     before = status(stage, context)
     if before.state == "complete" and not context.command.force:
         context.selected(())  # refuses regions that the sensor does not have
         context.reporter.info(f"{name}: up to date")
         return before
-    for upstream in stage.upstream:
-        if context.store.records.known(upstream) is None:
+    records = {upstream: context.store.records.known(upstream) for upstream in stage.upstream}
+    for upstream, record in records.items():
+        if record is None:
             place = quoted(context.config_path or context.store.path)
             raise StoreError(f"{name} needs {upstream} first; run: pchem {upstream} {place}")
-    if stage.upstream:
+    if records:
         context.selected(())
-    for upstream in stage.upstream:
-        record = context.store.records.known(upstream)
-        if record is not None and (file := changed_file(record, context.store)):
+    for record in filter(None, records.values()):
+        if file := changed_file(record, context.store):
             raise StoreError(
                 f"{context.store.path}: {file} is missing or has changed; {context.store.cure(file)}"
             )
@@ -59,10 +60,7 @@ def execute(name: str, context: StageContext) -> StageState:
 def _perform(
     stage: Stage, context: StageContext, before: StageState, clock: tuple[float, float]
 ) -> StageState:
-    """Run a stage that is not up to date, and keep its record whatever happens.
-
-    The clock (wall, CPU) started before the state was looked at: hashing the input is part of the work.
-    """
+    """Run a stage that is not up to date, and keep its record whatever happens; the clock is wall, CPU."""
     records, restart = context.store.records, context.command.roi is None
     content = fingerprint_content(stage, context)
     old = records.known(stage.name)
@@ -72,17 +70,16 @@ def _perform(
         # chosen tiles mend chunks, and keep the rest
         same = fingerprint_of(content) == old.fingerprint
         resumes = same and not changed_file(old, context.store).endswith(DESCRIPTION)
-    if resumes and context.command.force and restart:
-        resumes = False
+    resumed = old if resumes and not (context.command.force and restart) else None
     context.stage, context.failed, context.notes, context.n_keys = stage.name, {}, [], 0
-    context.fingerprint = old.fingerprint if resumes and old is not None else fingerprint_of(content)
-    context.fresh = not resumes and not context.is_prepared
+    context.fingerprint = fingerprint_of(content) if resumed is None else resumed.fingerprint
+    context.fresh = resumed is None and not context.is_prepared
     record = StageRecord(
         stage.name,
         stage.version,
         context.fingerprint,
         content,
-        keys=old.keys if resumes and old is not None else 0,
+        keys=0 if resumed is None else resumed.keys,
         started=datetime.now(UTC).isoformat(timespec="seconds"),
         versions={"python": platform.python_version(), **versions_of("pchem-pipeline", *_LIBRARIES)},
     )
@@ -103,15 +100,15 @@ def _perform(
     context.reporter.event("start", stage=stage.name, why=before.words())
     wall, cpu = clock
     try:
-        imported(stage.run)(context)
+        resolve_name(stage.run)(context)
         begin()
         record = replace(record, finished=True, files=written_files(stage, context.store.path))
     finally:
         record = replace(
             record,
             keys=context.n_keys or record.keys,
-            seconds=time.perf_counter() - wall + (old.seconds if resumes and old is not None else 0.0),
-            cpu_seconds=cpu_seconds() - cpu + (old.cpu_seconds if resumes and old is not None else 0.0),
+            seconds=time.perf_counter() - wall + (0.0 if resumed is None else resumed.seconds),
+            cpu_seconds=cpu_seconds() - cpu + (0.0 if resumed is None else resumed.cpu_seconds),
             peak_rss_bytes=peak_rss_bytes(),
             failed=context.failed,
             notes=tuple(context.notes),

@@ -7,12 +7,12 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from pkgutil import resolve_name
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, InputError, StoreError
 from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.config.load import dump_config, effects_file, found_model
-from pchem_pipeline.run.declaration import imported
 from pchem_pipeline.run.fingerprint import StageState, status
 from pchem_pipeline.run.model_versions import keep_in_force, model_in_force
 from pchem_pipeline.run.progress import ProgressFile, Reporter
@@ -20,7 +20,7 @@ from pchem_pipeline.run.signals import stop_on_signals
 from pchem_pipeline.run.stage import Command, StageContext
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.execute import execute
-from pchem_pipeline.stages.samples import SAMPLES_UNTIL, check_samples, sample_targets
+from pchem_pipeline.stages.samples import check_samples, sample_targets
 from pchem_pipeline.stages.table import STAGES, pipeline_of
 from pchem_pipeline.store.files import write_record
 from pchem_pipeline.store.remote_path import RemotePath
@@ -36,10 +36,9 @@ def with_overrides(target: Target, command: Command) -> Target:
 
 def cropped(target: Target, command: Command) -> tuple[Target, Command]:
     """Turn the region of the command line into a crop of the input, where there is one."""
-    roi = command.roi
-    if roi is None:
+    if command.roi is None:
         return target, command
-    return target.changed("input", roi=roi), replace(command, roi=None)
+    return target.changed("input", roi=command.roi), replace(command, roi=None)
 
 
 def up_to(last: str, stages: Sequence[str]) -> Sequence[str]:
@@ -100,18 +99,14 @@ def _is_empty(place: Path) -> bool:
 
 
 def _bring_samples(target: Target, stages: Sequence[str], command: Command) -> None:
-    """Bring the runs of the samples up to their histograms, where a run has several and looks at its input.
-
-    Raises:
-        ConfigError: the samples do not belong together.
-    """
+    """Bring the runs of samples up to their histograms, where a run has several and looks at its input."""
     if not target.config.input.samples or not any(STAGES[name].reads_input for name in stages):
         return
-    own = replace(command, force=False, roi=None)
+    of_sample = replace(command, force=False, roi=None)
     reporter = Reporter("off", quiet=command.quiet)
     for sample in sample_targets(target.config, target.base_dir):
         reporter.info(f"sample {sample.store.name}")
-        run_stages(sample, up_to(SAMPLES_UNTIL, pipeline_of(sample.config)), own)
+        run_stages(sample, up_to("histogram", pipeline_of(sample.config)), of_sample)
     if not command.dry_run:
         check_samples(target.config, target.base_dir)
 
@@ -122,7 +117,7 @@ def _execute(name: str, context: StageContext, stages: Sequence[str]) -> StageSt
     passes = [STAGES[later].single_pass for later in stages if name in STAGES[later].upstream]
     with context.reporter.compilation(name, context.config.compute.max_memory):
         for single_pass in filter(None, passes if of_files else ()):
-            imported(single_pass)(context)
+            resolve_name(single_pass)(context)
         return execute(name, context)
 
 
@@ -136,16 +131,10 @@ def at_work(target: Target, store: RunStore, reporter: Reporter, command: Comman
     """
     with store.locked(), stop_on_signals() as stop:
         executor = make_executor(target.config.compute, reporter.warning, stop.check)
+        place = target.config_path
         with contextlib.closing(executor):
             yield StageContext(
-                target.config,
-                target.base_dir,
-                store,
-                executor,
-                reporter,
-                stop,
-                command,
-                config_path=target.config_path,
+                target.config, target.base_dir, store, executor, reporter, stop, command, config_path=place
             )
 
 
@@ -157,24 +146,21 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
         LockedError: another process works on the run.
         PchEmError: the store or the workers cannot be had.
     """
-    own, target = target.config, with_overrides(target, command)
+    config, target = target.config, with_overrides(target, command)
     keep_to_limit(target.config.compute.max_memory)
     with contextlib.ExitStack() as stack:
         stack.enter_context(nothing_left_of_a_refusal(target.store))
         store = RunStore.create(target.store)
-        progress_file = ProgressFile(store.path)
-        reporter = Reporter(
-            command.progress, quiet=command.quiet, log=command.log_json, progress_file=progress_file
-        )
+        progress_file, quiet = ProgressFile(store.path), command.quiet
+        reporter = Reporter(command.progress, quiet=quiet, log=command.log_json, progress_file=progress_file)
         stack.callback(reporter.close)
         context = stack.enter_context(at_work(target, store, reporter, command))
         if (path := target.config_path) is not None:
             found = found_model(path)
             if found is not None and found.model == target.config.model:
-                file = effects_file(path).name
-                reporter.info(f"the model is from {file}, not from {path.name}")
+                reporter.info(f"the model is from {effects_file(path).name}, not from {path.name}")
         progress_file.show({"stage": ""})
-        store.write_config(dump_config(own))  # what a single command was given is no setting of the run
+        store.write_config(dump_config(config))  # what a single command was given is no setting of the run
         keep_in_force(store, model_in_force(store, target.config.model))
         yaml = {} if target.config_path is None else {"config": str(target.config_path)}
         location = {"base_dir": str(target.base_dir), **yaml}  # to which its paths refer
@@ -185,9 +171,7 @@ def working_run(target: Target, command: Command) -> Iterator[StageContext]:
 def run_status(target: Target, command: Command | None = None) -> list[StageState]:
     """Return the state of every stage, of those on demand where they were run, without changing anything.
 
-    Args:
-        target: the run.
-        command: that is about to work on it; None: nothing is asked for.
+    ``command`` is about to work on the run; None: nothing is asked for.
     """
     stages = pipeline_of(target.config)
     if not any((target.store / each).exists() for each in ("zarr.json", ".pchem/stages")):
@@ -222,7 +206,7 @@ def _dry_run(target: Target, stages: Sequence[str], command: Command) -> list[St
         reporter.info(f"{state.stage}: {words} ({state.words()})")
     target = with_overrides(target, command)
     for plan in filter(None, (STAGES[name].plan for name in todo)):
-        for line in imported(plan)(target.config, target.base_dir, todo):
+        for line in resolve_name(plan)(target.config, target.base_dir, todo):
             reporter.info(line)
     return states
 

@@ -45,19 +45,18 @@ def plan_bands(
 ) -> list[Band]:
     """Cut the sensor into bands: as high as allowed where there is work, and one for each worker at least.
 
+    No tile and no group of rows is cut.
+
     Args:
         tiles: all tiles.
         pending: keys of the tiles that are to be done.
         most_rows: rows that fit into the memory of a worker; less than one step is taken as one.
         workers: number of workers.
         rows_per_read: rows that come at no more cost than one; bands keep to multiples where they can.
-
-    Returns:
-        Bands that cover the sensor; no tile and no group of rows is cut.
     """
     ny = tiles[-1].y1
     step = max(tiles[0].y1, ROW_GROUP)
-    aligned = rows_together(step, rows_per_read, ny, workers)
+    aligned = _rows_together(step, rows_per_read, ny, workers)
     if min(aligned, ny) <= most_rows:
         step = aligned
     keys: dict[int, list[str]] = {}
@@ -77,17 +76,10 @@ def plan_bands(
     return bands
 
 
-def rows_together(step: int, rows_per_read: int, ny: int, workers: int) -> int:
+def _rows_together(step: int, rows_per_read: int, ny: int, workers: int) -> int:
     """Return the multiple of ``step`` by which bands should grow so that little is decoded twice.
 
-    Args:
-        step: rows that must not be cut.
-        rows_per_read: rows that come at no more cost than one.
-        ny: rows of the sensor.
-        workers: number of workers, which should all get a band.
-
-    Returns:
-        Rows; no read is shared by two bands where each worker still gets one, else few are.
+    No read is shared by two bands where each worker still gets one, else few are.
     """
     rows = min(rows_per_read, ny)
     exact = math.lcm(step, rows)
@@ -95,39 +87,25 @@ def rows_together(step: int, rows_per_read: int, ny: int, workers: int) -> int:
 
 
 def cut_rows(ny: int, step: int, workers: int) -> list[tuple[int, int]]:
-    """Cut ``ny`` rows into bands of multiples of ``step`` rows, a few for each worker.
-
-    Args:
-        ny: rows of the sensor.
-        step: rows that must stay together, from the top.
-        workers: number of workers.
-
-    Returns:
-        First row and end of each band, from top to bottom.
-    """
+    """Return first row and end of bands of multiples of ``step`` rows, a few for each worker."""
     # four for each: enough to keep all busy to the end
     return equal_rows(ny, step * max(1, -(-ny // step) // (4 * workers)))
 
 
-def tile_bands(context: StageContext, most_rows: int, rows_per_read: int = 1) -> list[Band | Tile]:
+def tile_bands(context: StageContext, most_rows: int, rows_per_read: int) -> list[Band | Tile]:
     """Return the units of a stage that reads the frames of fitted pixels again by bands.
 
-    A tile that is done, or that is not fitted, is in no band and stays a unit of its own.
+    They are bands of the tiles to be done, and each tile that is done, or that is not fitted.
 
     Args:
         context: of the stage.
         most_rows: rows that a worker can hold; one row of tiles is the least.
         rows_per_read: rows that come at no more cost than one.
-
-    Returns:
-        Bands of the tiles to be done, and all the other tiles.
     """
     tiles = context.tiles()
-    ready = context.tiles_done("fit")
-    todo = {tile.key for tile in context.pending(tiles)} & ready
-    step = tiles[0].y1
-    ny, workers = tiles[-1].y1, context.executor.workers
-    together = rows_together(step, rows_per_read, ny, workers)
+    todo = {tile.key for tile in context.pending(tiles)} & context.tiles_done("fit")
+    step, ny, workers = tiles[0].y1, tiles[-1].y1, context.executor.workers
+    together = _rows_together(step, rows_per_read, ny, workers)
     # one worker that decodes once is faster than all of them that decode the same many times
     if min(together, ny) <= most_rows and (together * workers <= ny or together > step * workers):
         step = together

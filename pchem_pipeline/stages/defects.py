@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, IntArray
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.maps.defects import MAPS, Defects, Moments, find_defects, needs_moments
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.overscan import read_overscan
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 
 def stored_defects(store: RunStore, config: RunConfig, maps: Arrays | None = None) -> Defects:
-    """Return the defects of a run that has maps.
-
-    Args:
-        store: the run.
-        config: its configuration.
-        maps: the maps by name, where they are read already.
+    """Return the defects of a run that has maps; give these, by name, where they are read already.
 
     Raises:
         StoreError: an array is missing or corrupt.

@@ -8,25 +8,22 @@ large as the stack.
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 from pchem_pipeline.base.errors import InputError
-from pchem_pipeline.frames.stream import FrameStream
+from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.electrons.electrons import (
     LARGEST_NUMBER,
     NO_NUMBER,
+    KnownPixels,
     NumberTables,
     number_tables,
 )
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.stage import StageContext
-from pchem_pipeline.stages.bands import BAND_BYTES, tile_bands
-from pchem_pipeline.stages.fit.fitted_model import fitted_pixels
-
-if TYPE_CHECKING:
-    from pchem_pipeline.frames.stream import FrameSource
-    from pchem_pipeline.stages.bands import Band
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.stages.bands import BAND_BYTES, Band, tile_bands
+from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_satellites
+from pchem_pipeline.store.run_store import RunStore
 
 #: Frames and columns of a chunk; its rows are those of a tile.
 _CHUNK_FRAMES, _CHUNK_COLUMNS = 256, 128
@@ -36,7 +33,9 @@ def read_tables(store: RunStore, rows: slice) -> NumberTables:
     """Return the electron numbers of the codes that some rows have shown, the fitted H being the prior."""
     region = rows, slice(None)
     low, high = (store.read(f"histogram/{name}", region) for name in ("minimum", "maximum"))
-    pixels = fitted_pixels(store, region)
+    maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]
+    law = FittedModel.read(store, region).law(maps)
+    pixels = KnownPixels(maps, law, fitted_satellites(store, region))
     return number_tables(low, high, pixels.exposure, pixels)
 
 
@@ -65,8 +64,7 @@ def run(context: StageContext) -> None:
         largest_number=LARGEST_NUMBER,
     )
     depth = context.store.array("electrons/electron_number").chunks[0]
-    rows = BAND_BYTES // (depth * nx * 2)
-    bands = tile_bands(context, rows, source.rows_per_read)
+    bands = tile_bands(context, BAND_BYTES // (depth * nx * 2), source.rows_per_read)
     task = functools.partial(_do_band, source=source, depth=depth)
     context.run_units(bands, task, unit_name="band", needs="fit")
 
@@ -76,5 +74,5 @@ def _do_band(band: Band, store: RunStore, *, source: FrameSource, depth: int) ->
     tables = read_tables(store, rows)
     with FrameStream(source, [(band.y0, band.y1)], depth) as stream:
         for start, (frames,) in stream:
-            region = (slice(start, start + frames.shape[0]), rows, slice(None))
+            region = (slice(start, start + len(frames)), rows, slice(None))
             store.write("electrons/electron_number", region, tables.convert(frames).number)

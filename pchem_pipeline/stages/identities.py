@@ -3,45 +3,33 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic_core import to_jsonable_python
 
+from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.frames.identity import digest_of
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.run.input import known_identity
 from pchem_pipeline.run.model_versions import model_versions, with_digest
-
-if TYPE_CHECKING:
-    from pchem_pipeline.methods.settings import MethodsSettings
-    from pchem_pipeline.run.stage import StageContext
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.run.stage import StageContext
+from pchem_pipeline.stages.samples import exposure_axis, sample_facts
+from pchem_pipeline.store.run_store import RunStore
 
 
 def input_content(context: StageContext) -> dict[str, Any]:
-    """Return what the content of the input is.
+    """Return what the content of the input is, see `known_identity`, or what the samples' histograms are.
 
-    The files are hashed once; afterwards names, sizes and times of change are compared first, and they are
-    hashed again only where these differ. Where the files are gone, the last known content counts: what was
-    made of them stays valid.
+    Where the files are gone, the last known content counts: what was made of them stays valid.
 
     Raises:
         InputError: files are missing or bad, and nothing is known of them from before.
     """
-    if context.config.input.samples:
-        return _sample_content(context)
-    from pchem_pipeline.frames.identity import digest_of
-
-    identity = known_identity(context)
-    return {"content": digest_of([file["xxh3_128"] for file in identity["files"]])}
-
-
-def _sample_content(context: StageContext) -> dict[str, Any]:
-    """Return what the histograms of the samples are; as last known where their runs are gone."""
-    from pchem_pipeline.base.errors import ConfigError, StoreError
-    from pchem_pipeline.stages.samples import sample_facts
-
+    if not context.config.input.samples:
+        return {"content": digest_of([file["xxh3_128"] for file in known_identity(context)["files"]])}
     try:
         return sample_facts(context.config, context.base_dir)
-    except (ConfigError, StoreError):
+    except (ConfigError, StoreError):  # the runs of the samples are gone
         record = context.store.records.known("ingest")
         if record is None or not record.content.get("input"):
             raise
@@ -64,8 +52,6 @@ def integration_time(context: StageContext) -> dict[str, Any]:
     """Return what the files may say and the settings of the maps do not: time, or the samples' exposures."""
     if not context.config.input.samples:
         return {"integration_time": context.sensor.integration_time, "rate": context.charge_rate}
-    from pchem_pipeline.stages.samples import exposure_axis
-
     settings = context.config.input
     x = exposure_axis(settings, context.sensor.samples)
     known = None if x is None else [None if math.isnan(each) else each for each in x.tolist()]
@@ -83,11 +69,7 @@ def verdict(context: StageContext) -> dict[str, str] | None:
 
 
 def discrepancy_state(store: RunStore) -> str | None:
-    """Return in words which verdict a run has, None without one that can be read.
-
-    It changes whenever the verdict was redone.
-    """
-    from pchem_pipeline.base.errors import StoreError
+    """Return which verdict a run has, in words that change when it is redone; None without a readable one."""
     from pchem_pipeline.discrepancy.verdict import read_verdict
 
     try:
@@ -114,8 +96,7 @@ def _chosen(context: StageContext) -> dict[str, Any]:
     the YAML says.
     """
     if context.command.settings is not None:
-        chosen: dict[str, Any] = to_jsonable_python(dict(context.command.settings))
-        return chosen
+        return dict(to_jsonable_python(dict(context.command.settings)))
     record = context.store.records.known("methods")
     kept = {} if record is None else record.content.get("input") or {}
     return dict(kept.get("chosen", {}))
@@ -123,9 +104,6 @@ def _chosen(context: StageContext) -> dict[str, Any]:
 
 def other_samples(context: StageContext) -> dict[str, Any]:
     """Return which histograms of other runs join a comparison of methods, and what the command line chose."""
-    from pchem_pipeline.base.errors import StoreError
-    from pchem_pipeline.store.run_store import RunStore
-
     found: dict[str, Any] = {}
     for name in methods_settings(context).with_runs:
         try:
@@ -146,7 +124,8 @@ def search_start(context: StageContext) -> dict[str, Any]:
     record, model = context.store.records.known("discrepancy"), context.model
     kept = {} if record is None else record.content["input"]
     before = with_digest(model_versions(context.store), kept.get("model"))
-    own = model.source == "verdict" and before is not None and before.number == model.parent
-    start = before if own and before is not None else model
+    start = model
+    if before is not None and (model.source, model.parent) == ("verdict", before.number):
+        start = before
     roi = context.command.roi or (() if context.command.force else kept.get("roi", ()))
     return {"model": start.digest, "roi": list(roi)}

@@ -9,26 +9,25 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.first_look import limits_in
 from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histograms
 from pchem_pipeline.frames.identity import file_size
 from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.reader import FrameReader
+from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.input import keep_ingested, listed_identity
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import WHOLE, Named, StageContext, Task
 from pchem_pipeline.stages.overscan import write_overscan
 from pchem_pipeline.stages.samples import check_samples, sample_sensor
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.frames.reader import FrameReader
-    from pchem_pipeline.frames.sequence import FrameSequence
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import equal_rows
 
 #: frames, rows, columns: streams in the order of time and by tile alike
 _CHUNK = (256, 128, 128)
@@ -118,22 +117,24 @@ def create_frames(context: StageContext, reader: FrameSequence) -> None:
     shard = shard_shape(reader.shape, chunk)
     lengths, chunks = (dict(zip(("frame", "y", "x"), each, strict=True)) for each in (reader.shape, chunk))
     context.create("frames/dn", lengths=lengths, chunks=chunks, shards=shard, dtype=reader.dtype)
-    _warn_of_a_small_disk(context, reader)
-
-
-def _stored_bytes(config: RunConfig, shape: tuple[int, int, int], itemsize: int) -> float:
-    """Return about how many bytes the store takes."""
-    n, ny, nx = shape
-    blocks = n / config.histogram.block_length(n)
-    series = 16 * (n * ny + blocks * ny * nx) + 4 * n * math.ceil(ny / ROW_GROUP) * nx
-    total = _STORED_PIXEL * ny * nx + (_STORED_SERIES * series if config.histogram.summaries else 0)
-    return total + (math.prod(shape) * itemsize / _COPY_RATIO if config.input.mode == "copy" else 0)
+    free = context.store.free_bytes()
+    if context.fresh and math.prod(reader.shape) * reader.dtype.itemsize > free:  # if they compress badly
+        words = disk_words(context.config, reader)
+        context.note(f"{words}, {free / 1e9:.1f} GB free; if this does not fit, set input.mode: reference")
 
 
 def disk_words(config: RunConfig, frames: FrameSequence) -> str:
-    """Return where the frames are to be, and how much disk the store takes."""
-    how = "are copied from" if config.input.mode == "copy" else "stay in"
-    held = _stored_bytes(config, frames.shape, frames.dtype.itemsize)
+    """Return where the frames are to be, and about how much disk the store takes."""
+    n, ny, nx = frames.shape
+    held: float = _STORED_PIXEL * ny * nx
+    if config.histogram.summaries:
+        blocks = n / config.histogram.block_length(n)
+        series = 16 * (n * ny + blocks * ny * nx) + 4 * n * math.ceil(ny / ROW_GROUP) * nx
+        held += _STORED_SERIES * series
+    how = "stay in"
+    if config.input.mode == "copy":
+        how = "are copied from"
+        held += n * ny * nx * frames.dtype.itemsize / _COPY_RATIO
     return (
         f"frames {how} their files ({sum(map(file_size, frames.paths)) / 1e9:.2g} GB); "
         f"the store will hold about {held / 1e9:.2g} GB"
@@ -168,9 +169,8 @@ def copy_units(
     n_frames, ny, nx = shape
     band = chunk[0] * chunk[1] * nx * itemsize
     rows = chunk[1] * max(1, _UNIT_BYTES // band)
-    for t0 in range(0, n_frames, chunk[0]):
-        for y0 in range(0, ny, rows):
-            t1, y1 = min(t0 + chunk[0], n_frames), min(y0 + rows, ny)
+    for t0, t1 in equal_rows(n_frames, chunk[0]):
+        for y0, y1 in equal_rows(ny, rows):
             yield Named(f"frames-{t0}-{t1 - 1}-rows-{y0}-{y1 - 1}", (t0, t1, y0, y1))
 
 
@@ -180,14 +180,6 @@ def _copy(unit: Named[_Copied], store: RunStore, *, reader: FrameReader) -> None
     for y in range(y0, y1, rows):
         end = min(y + rows, y1)
         store.write("frames/dn", (slice(t0, t1), slice(y, end), slice(None)), reader.read(t0, t1, y, end))
-
-
-def _warn_of_a_small_disk(context: StageContext, reader: FrameSequence) -> None:
-    """Say beforehand that the frames may not fit; how well they compress is not known."""
-    free = context.store.free_bytes()
-    if context.fresh and math.prod(reader.shape) * reader.dtype.itemsize > free:
-        words = disk_words(context.config, reader)
-        context.note(f"{words}, {free / 1e9:.1f} GB free; if this does not fit, set input.mode: reference")
 
 
 def _run_whole(context: StageContext) -> None:
@@ -204,14 +196,13 @@ def _record_histograms(context: StageContext) -> None:
     context.begin()
     for note in given.notes:
         context.note(note)
-    lowest, highest = int(given.origin.min()), int(given.origin.max()) + given.counts.shape[2] - 1
-    dtype = "int32" if lowest < 0 else np.min_scalar_type(highest).name
+    highest = int(given.origin.max()) + given.counts.shape[2] - 1
     SensorInfo(
         kind="histograms",
         n_frames=int(given.counts.sum(axis=2).max()),
         ny=given.shape[0],
         nx=given.shape[1],
-        dtype=dtype,
+        dtype="int32" if given.origin.min() < 0 else np.min_scalar_type(highest).name,
         bit_depth=context.config.input.bit_depth,
         seen_limits=limits_in(given.counts, given.origin),
         integration_time=None,

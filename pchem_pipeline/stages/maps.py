@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,8 @@ from pchem_pipeline.model.maps.sample_maps import line_map_names, line_maps
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.samples import exposure_axis
-
-if TYPE_CHECKING:
-    from pchem_pipeline.store.run_store import RunStore
-    from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import Tile
 
 #: Why there is no charge rate.
 NO_TIME = "unknown integration time: no charge rate. Set input.integration_time (--integration-time), s"
@@ -53,7 +51,7 @@ def maps_tile(
     rate: str = "charge_rate",
     n_frames: int | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Return all maps of a tile.
+    """Return all maps of a tile by name.
 
     Args:
         fit: the arrays of the group ``fit`` of the tile, by name.
@@ -61,9 +59,6 @@ def maps_tile(
         rate: name of H over the integration time.
         n_frames: of the one sample, whose errors of H and mu hold the chance of being electrons off; None:
             of several samples, which settle the bias.
-
-    Returns:
-        The arrays of the group ``maps`` of the tile, by name.
     """
     parameters = {name: fit[name] for name in PARAMETERS}
     maps: dict[str, NDArray[Any]] = dict(parameters)
@@ -76,9 +71,7 @@ def maps_tile(
         stderr[..., 2] = np.hypot(stderr[..., 2], off / maps["conversion_gain"])
     maps |= {f"{name}_stderr": stderr[..., i] for i, name in enumerate(PARAMETERS)}
     maps |= derived_maps(parameters, covariance_from(stderr, fit["correlation"]), integration_time, rate)
-    for name in (path for each in INTERVALS for path in interval_names(each)):
-        if name in fit:
-            maps[name] = fit[name]
+    maps |= {name: fit[name] for each in INTERVALS for name in interval_names(each) if name in fit}
     if integration_time is not None and "quanta_exposure_low" in fit:
         ends = zip(interval_names(rate), interval_names("quanta_exposure"), strict=True)
         maps |= {name: fit[source] / integration_time for name, source in ends}
@@ -121,11 +114,10 @@ class Line:
 
 
 def _line(context: StageContext) -> Line | None:
-    settings = context.config.input
-    x = exposure_axis(settings, context.sensor.samples) if context.sensor.samples else None
-    return (
-        None if x is None else Line(line_map_names(settings.against, context.charge_rate), tuple(x.tolist()))
-    )
+    settings, samples = context.config.input, context.sensor.samples
+    if not samples or (x := exposure_axis(settings, samples)) is None:
+        return None
+    return Line(line_map_names(settings.against, context.charge_rate), tuple(x.tolist()))
 
 
 def _arrays(
@@ -150,9 +142,7 @@ def _do_tile(tile: Tile, store: RunStore, *, arrays: Callable[..., dict[str, NDA
 def line_tile(samples: Arrays, line: Line) -> dict[str, NDArray[Any]]:
     """Return the results of a line through the exposures of each pixel, by path.
 
-    Args:
-        samples: ``quanta_exposure`` (sample, y, x) and ``covariance`` (y, x, parameter, parameter) of a tile.
-        line: that is drawn.
+    ``samples`` has ``quanta_exposure`` (sample, y, x) and ``covariance`` (y, x, parameter, parameter).
     """
     exposure, covariance = samples["quanta_exposure"], samples["covariance"]
     n, *shape = exposure.shape
@@ -172,12 +162,9 @@ def _summarise(context: StageContext, names: list[str]) -> None:
     status = context.store.read("fit/fit_status")
     found: dict[str, Any] = {}
     for name in names:
+        left_out = (status & int(flags_of(name))) != 0
         values = context.store.read(f"maps/{name}")
-        summary = summarise(
-            values,
-            left_out=(status & int(flags_of(name))) != 0,
-            outlier_sigmas=settings.outlier_sigmas,
-        )
+        summary = summarise(values, left_out=left_out, outlier_sigmas=settings.outlier_sigmas)
         percentiles = {f"{p:g}": value for p, value in summary.percentiles.items()}
         found[name] = plain(asdict(summary) | {"percentiles": percentiles})
     facts = {"summary": found, "fit_status": status_counts(status), "goodness": _misfits(context)}
@@ -194,15 +181,9 @@ def _misfits(context: StageContext) -> dict[str, Any]:
         values[failed] = np.nan
     q = false_discovery(p)
     store.write("maps/goodness_q", None, q)
+    tests = {"chi2": chi2, "dof": dof, "p": p, "q": q}
     worst = [
-        {
-            "y": y,
-            "x": x,
-            "chi2": float(chi2[y, x]),
-            "dof": float(dof[y, x]),
-            "p": float(p[y, x]),
-            "q": float(q[y, x]),
-        }
+        {"y": y, "x": x, **{name: float(values[y, x]) for name, values in tests.items()}}
         for y, x in poorest(chi2, dof, settings.worst_pixels)
     ]
     outliers = store.read("fit/outlier_share")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quot
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.methods.base import PixelSamples, Sample, methods
 from pchem_pipeline.methods.compare import compare
+from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
 from pchem_pipeline.run.sensor import SensorInfo
@@ -25,9 +26,6 @@ from pchem_pipeline.run.stage import Named, StageContext
 from pchem_pipeline.stages.identities import methods_settings
 from pchem_pipeline.store.files import read_json, write_json
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.methods.settings import MethodsSettings
 
 #: File of the result in the folder of a run.
 METHODS_FILE = "methods.json"
@@ -48,12 +46,7 @@ def read_methods(store: RunStore) -> dict[str, Any] | None:
 
 
 def open_other_runs(store: RunStore, base_dir: Path, names: tuple[str, ...]) -> list[RunStore]:
-    """Return the stores of other runs.
-
-    Args:
-        store: the run that they are compared with.
-        base_dir: folder to which relative names refer.
-        names: as in ``methods.with_runs``.
+    """Return the stores of other runs, as named in ``methods.with_runs`` below a folder.
 
     Raises:
         ConfigError: a run is listed twice, or is the run itself.
@@ -65,11 +58,11 @@ def open_other_runs(store: RunStore, base_dir: Path, names: tuple[str, ...]) -> 
     paths = {store.path.resolve()}
     found = []
     for name in names:
-        path = base_dir / name
-        if path.resolve() in paths:
-            what = "is the run itself" if path.resolve() == store.path.resolve() else "is listed twice"
+        path, resolved = base_dir / name, (base_dir / name).resolve()
+        if resolved in paths:
+            what = "is the run itself" if resolved == store.path.resolve() else "is listed twice"
             raise ConfigError(f"methods.with_runs: {name} {what}; give each sample once")
-        paths.add(path.resolve())
+        paths.add(resolved)
         other = RunStore.open(path)
         if not other.has("histogram/counts"):
             raise StoreError(f"{path} has no histograms yet; run: pchem histogram {quoted(path)}")
@@ -100,15 +93,9 @@ def _same_pixels(here: SensorInfo, there: SensorInfo, name: str) -> None:
 
 
 def choose(shape: tuple[int, int], n_pixels: int, seed: int) -> IntArray:
-    """Choose pixels at random places, so that no pattern of rows or columns is favoured.
+    """Return flat indices, increasing, of ``n_pixels`` pixels at random places, all if there are fewer.
 
-    Args:
-        shape: rows and columns of the sensor.
-        n_pixels: how many; all if there are fewer.
-        seed: of the choice.
-
-    Returns:
-        Flat indices, increasing.
+    Random, so that no pattern of rows or columns is favoured.
     """
     total = shape[0] * shape[1]
     chosen = np.random.default_rng(seed).permutation(total)[: min(n_pixels, total)]
@@ -131,32 +118,23 @@ def run(context: StageContext) -> None:
     settings = methods_settings(context)
     others = open_other_runs(context.store, context.base_dir, settings.with_runs)
     units = [_Unit("run", None), *_study_units(context, settings)]
-    task = functools.partial(
-        _do,
-        stores=[context.store.path, *(other.path for other in others)],
-        settings=settings,
-        adc_limits=context.sensor.adc_limits,
-    )
+    stores = [context.store.path, *(other.path for other in others)]
+    task = functools.partial(_do, stores=stores, settings=settings, adc_limits=context.sensor.adc_limits)
     found = context.run_units(units, task, unit_name="part")
     if not {unit.key for unit in units} <= found.keys():
         return
+    points = [unit.content for unit in units if unit.content is not None]
+    names = ("quanta_exposure", "conversion_gain", "n_frames", "n_pixels")
     result = {
         "schema": 1,
         "run": context.store.path.name,
         **found["run"],
         "study": [found[unit.key] for unit in units[1:]],
-        "study_at": _conditions(units[1:]),
+        "study_at": {name: getattr(points[0], name) for name in names} if points else None,
     }
     for remark in result["remarks"]:
         context.note(remark)
     write_json(context.store.path / METHODS_FILE, result)
-
-
-def _conditions(units: Sequence[_Unit]) -> dict[str, Any] | None:
-    if not units or (point := units[0].content) is None:
-        return None
-    names = ("quanta_exposure", "conversion_gain", "n_frames", "n_pixels")
-    return {name: getattr(point, name) for name in names}
 
 
 def _study_units(context: StageContext, settings: MethodsSettings) -> list[_Unit]:
@@ -166,17 +144,11 @@ def _study_units(context: StageContext, settings: MethodsSettings) -> list[_Unit
     if settings.study_pixels == 0 or not np.isfinite(gain).any():
         return []
     exposure = float(np.nanmedian(store.read("fit/quanta_exposure")))
-    place = choose(context.sensor.shape, 64, settings.seed)
-    frames = int(np.median(_sample(store, context.sensor.shape, place).counts.sum(axis=1)))
-    return [
-        _Unit(
-            f"study-{noise:g}",
-            StudyPoint(
-                noise, exposure, float(np.nanmedian(gain)), frames, settings.study_pixels, settings.seed
-            ),
-        )
-        for noise in dict.fromkeys(settings.study_read_noise)
-    ]
+    y, x = np.divmod(choose(context.sensor.shape, 64, settings.seed), context.sensor.nx)
+    frames = int(np.median(_sample(store, y, x).counts.sum(axis=1)))
+    conditions = exposure, float(np.nanmedian(gain)), frames, settings.study_pixels, settings.seed
+    noises = dict.fromkeys(settings.study_read_noise)
+    return [_Unit(f"study-{noise:g}", StudyPoint(noise, *conditions)) for noise in noises]
 
 
 def _do(
@@ -190,23 +162,22 @@ def _do(
     """Compare the methods on simulated pixels, or on those of the run, whose estimates are stored."""
     if unit.content is not None:
         return study_point(unit.content, settings)
-    shape = store.array("fit/bias").shape
-    place = choose((shape[0], shape[1]), settings.pixels, settings.seed)
-    samples = tuple(_sample(RunStore.open(path), (shape[0], shape[1]), place) for path in stores)
-    reference, source = _reference(store, place)
+    ny, nx = store.array("fit/bias").shape
+    y, x = np.divmod(choose((ny, nx), settings.pixels, settings.seed), nx)
+    samples = tuple(_sample(RunStore.open(path), y, x) for path in stores)
+    reference, source = _reference(store, y, x)
     # against its own fit PCH-EM cannot err
     skipped = ("pchem_em",) if source == "fit" else ()
     results = compare(PixelSamples(samples, adc_limits), reference, settings, skip_errors=skipped)
-    y, x = np.divmod(place, shape[1])
     store.write_array("methods/pixel_y", y)
     store.write_array("methods/pixel_x", x)
-    blank = np.full((place.size, 4), np.nan)
+    blank = np.full((y.size, 4), np.nan)
     estimates = np.stack([blank if r.estimates is None else r.estimates for r in results])
     for column, name in enumerate(PARAMETERS):
         store.write_array(f"methods/{name}", estimates[:, :, column], {"methods": list(methods())})
     words = _sample_words([path.name for path in stores], samples, reference)
     return {
-        "pixels": int(place.size),
+        "pixels": int(y.size),
         "reference": source,
         "samples": words,
         "remarks": _remarks(words),
@@ -214,25 +185,21 @@ def _do(
     }
 
 
-def _sample(store: RunStore, shape: tuple[int, int], place: IntArray) -> Sample:
+def _sample(store: RunStore, y: IntArray, x: IntArray) -> Sample:
     """Read the histograms of some pixels."""
-    y, x = np.divmod(place, shape[1])
     counts, origin = (store.read_pixels(f"histogram/{name}", y, x) for name in ("counts", "origin"))
     return Sample(counts, origin.astype(np.int64))
 
 
-def _reference(store: RunStore, place: IntArray) -> tuple[FloatArray, str]:
+def _reference(store: RunStore, y: IntArray, x: IntArray) -> tuple[FloatArray, str]:
     """Return what is held for true, and whether it is the truth or the fit of the run."""
     if store.has("truth/read_noise_e"):
-        truth = {
-            name: store.read(f"truth/{name}").ravel()[place] for name in (*PARAMETERS[:3], "read_noise_e")
-        }
-        noise = truth["read_noise_e"] / truth["conversion_gain"]
-        columns = [truth["quanta_exposure"], truth["conversion_gain"], truth["bias"], noise]
-        return np.stack(columns, axis=1).astype(np.float64), "truth"
-    fit = np.stack([store.read(f"fit/{name}").ravel()[place] for name in PARAMETERS], axis=1)
+        names = (*PARAMETERS[:3], "read_noise_e")
+        exposure, gain, bias, noise = (store.read(f"truth/{name}")[y, x] for name in names)
+        return np.stack([exposure, gain, bias, noise / gain], axis=1).astype(np.float64), "truth"
+    fit = np.stack([store.read(f"fit/{name}")[y, x] for name in PARAMETERS], axis=1)
     # no value, or a bias that may be one electron off
-    fit[(store.read("fit/fit_status").ravel()[place] & int(FAILED | AMBIGUOUS)) != 0] = np.nan
+    fit[(store.read("fit/fit_status")[y, x] & int(FAILED | AMBIGUOUS)) != 0] = np.nan
     return fit, "fit"
 
 

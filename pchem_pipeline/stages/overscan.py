@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
+from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.overscan import Overscan
-
-if TYPE_CHECKING:
-    from pchem_pipeline.frames.sequence import FrameSequence
-    from pchem_pipeline.store.run_store import RunStore
 
 #: Frames that are read, evenly spread: their mean adds a thousandth to the variance of a row's offset.
 _MOST_FRAMES = 1024

@@ -10,17 +10,17 @@ import numpy as np
 from pchem_pipeline.base.arrays import Arrays, FloatArray, IntArray
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.discrepancy.observe.observe import UNTRUSTWORTHY
+from pchem_pipeline.discrepancy.quick.checks import QuickLook
 from pchem_pipeline.discrepancy.quick.codes import CodeSample
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
+from pchem_pipeline.store.run_store import RunStore
 
 if TYPE_CHECKING:
-    from pchem_pipeline.discrepancy.quick.checks import QuickLook
-    from pchem_pipeline.run.sensor import SensorInfo
     from pchem_pipeline.stages.report.stored import StoredRun
-    from pchem_pipeline.store.run_store import RunStore
 
 #: Sums of pixels over blocks, of rows over frames, of columns over frames, that are read at most.
 _MOST_BLOCK_SUMS, _MOST_LINE_SUMS = 1 << 22, 1 << 22
@@ -29,11 +29,7 @@ _PIXELS, _PIECES, _FEWEST = 1024, 8, 16
 
 
 def run_quick_look(run: StoredRun, sums: StackSums | None) -> QuickLook | None:
-    """Return the quick look at a run; None where no pixel has parameters.
-
-    Args:
-        run: that is looked at.
-        sums: of :func:`read_sums`.
+    """Return the quick look at a run and its sums (`read_sums`); None where no pixel has parameters.
 
     Raises:
         StoreError: an array is missing or corrupt.
@@ -71,9 +67,8 @@ def _maps(fit: Arrays, maps: Mapping[str, FloatArray]) -> PixelMaps | None:
 def read_sums(store: RunStore) -> StackSums | None:
     """Read the summaries of a run: all covariances, and sums of blocks of frames spread over it.
 
-    Returns:
-        None where the stage histogram has not made them, or frames are fewer than two in each block. Odd
-        frames are in none of the sums.
+    Odd frames are in none of the sums. None where the stage histogram has not made them, or frames are fewer
+    than two in each block.
 
     Raises:
         StoreError: an array is corrupt.
@@ -95,22 +90,21 @@ def read_sums(store: RunStore) -> StackSums | None:
     chosen = usable[_spread(usable.size, most)]
     groups = store.array("summary/column_sum").shape[1]
     some = _spread(chosen.size, _MOST_LINE_SUMS // (groups * nx * int(lengths[0])))
-    blocks = (np.s_[:], np.s_[:])
 
-    def lines(name: str, of: IntArray, rest: slice | tuple[slice, ...]) -> IntArray:
+    def lines(name: str, of: IntArray) -> IntArray:
         first, end = starts[of], (starts + lengths)[of]
-        there = np.concatenate([np.arange(*each) for each in zip(first, end, strict=True)])
-        return _read(store, name, first, end, rest)[~np.isin(there, out)]
+        frames_read = np.concatenate([np.arange(*each) for each in zip(first, end, strict=True)])
+        return _read(store, name, first, end)[~np.isin(frames_read, out)]
 
     return StackSums(
         numbers,
         usable.size,
         known[chosen],
-        _read(store, "block_sum", chosen, chosen + 1, blocks),
-        _read(store, "block_sum_square", chosen, chosen + 1, blocks),
-        lines("row_sum", chosen, np.s_[:]),
+        _read(store, "block_sum", chosen, chosen + 1),
+        _read(store, "block_sum_square", chosen, chosen + 1),
+        lines("row_sum", chosen),
         some,
-        lines("column_sum", chosen[some], blocks),
+        lines("column_sum", chosen[some]),
         mean,
         variance,
         store.read("summary/lag1_covariance"),
@@ -126,16 +120,10 @@ def _spread(n: int, most: int) -> IntArray:
     return np.unique(np.linspace(0, n - 1, min(n, max(most, 1))).astype(np.int64))
 
 
-def _read(
-    store: RunStore,
-    name: str,
-    first: IntArray,
-    end: IntArray,
-    rest: slice | tuple[slice, ...],
-) -> IntArray:
+def _read(store: RunStore, name: str, first: IntArray, end: IntArray) -> IntArray:
     """Read ranges along the first axis, those that follow each other at once."""
     cuts = np.flatnonzero(first[1:] != end[:-1]) + 1
-    others = rest if isinstance(rest, tuple) else (rest,)
+    others = (slice(None),) * (store.array(f"summary/{name}").ndim - 1)
     parts = [
         store.read(f"summary/{name}", (slice(int(a[0]), int(b[-1])), *others))
         for a, b in zip(np.split(first, cuts), np.split(end, cuts), strict=True)
@@ -160,8 +148,7 @@ def _codes(store: RunStore, maps: PixelMaps, sensor: SensorInfo) -> CodeSample |
         rows, columns = np.divmod(inside, maps.usable[part].shape[1])
         counts.append(store.read_pixels("histogram/counts", y + rows, x + columns))
         origins.append(origin[part].ravel()[inside].astype(np.int64))
-        values = maps.maps
-        parameters.append(np.stack([each[part].ravel()[inside] for each in values], axis=1))
+        parameters.append(np.stack([each[part].ravel()[inside] for each in maps.maps], axis=1))
     if sum(part.size for part in origins) < _FEWEST:
         return None
     joined = np.concatenate(counts), np.concatenate(origins), np.concatenate(parameters)

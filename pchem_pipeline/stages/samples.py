@@ -7,37 +7,24 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError, StoreError, quoted
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.camera import shared_facts
+from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.run.input import LISTED_FILES
 from pchem_pipeline.run.sensor import Sample, SensorInfo
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.store.run_store import RunStore
 
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.frames.settings import InputSettings
-
-#: The stage up to which the run of each sample must be brought, before they are fitted together.
-SAMPLES_UNTIL = "histogram"
-
 
 @dataclass(frozen=True)
 class OpenSample:
-    """The run of a sample, with its histograms.
-
-    Attributes:
-        where: what messages call it.
-        target: its configuration.
-        store: opened for reading.
-        sensor: its input, with the bit depth and integration time of its configuration.
-        histogram: fingerprint of its histograms.
-    """
+    """The run of a sample, with the fingerprint of its histograms; messages call it ``where``."""
 
     where: str
     target: Target
@@ -86,10 +73,10 @@ def open_samples(config: RunConfig, base_dir: Path) -> list[OpenSample]:
         StoreError: a run has no histograms.
     """
     found = []
-    for i, target in enumerate(sample_targets(config, base_dir)):
+    for given, target in zip(config.input.samples, sample_targets(config, base_dir), strict=True):
         store = RunStore.open(target.store)
         record = store.records.read("histogram")
-        where = f"sample {config.input.samples[i].run}"
+        where = f"sample {given.run}"
         if record is None or not store.has("histogram/counts"):
             raise StoreError(
                 f"{where}: {store.path} has no histograms; run: pchem histogram {quoted(store.path)}"
@@ -121,15 +108,15 @@ def _same_sensor(others: Sequence[OpenSample], mine: OpenSample) -> None:
     regions = [str(each.target.config.input.roi) for each in (mine, first)]
     same_region = "all samples must show the same region of one sensor"
     same_sensor = "all samples must come from one sensor"
-    for facts, words, others_words, rule in (
-        (sizes, "has {} pixels", "{}", same_region),
-        ((here.bit_depth, there.bit_depth), "has {} bits", "{}", f"{same_sensor} with the same settings"),
-        ((here.camera.serial, there.camera.serial), "has camera serial number {}", "{}", same_sensor),
-        (regions, "is cropped to {} (input.roi)", "to {}", same_region),
+    for facts, words, rule in (
+        (sizes, "has {} pixels, {} {}", same_region),
+        ((here.bit_depth, there.bit_depth), "has {} bits, {} {}", f"{same_sensor} with the same settings"),
+        ((here.camera.serial, there.camera.serial), "has camera serial number {}, {} {}", same_sensor),
+        (regions, "is cropped to {} (input.roi), {} to {}", same_region),
     ):
         if None not in facts and facts[0] != facts[1]:
-            found = f"{mine.where} {words.format(facts[0])}, {first.where} {others_words.format(facts[1])}"
-            raise ConfigError(f"{found}; {rule}")
+            found = words.format(facts[0], first.where, facts[1])
+            raise ConfigError(f"{mine.where} {found}; {rule}")
     for other in others:
         if mine.shares_frames(other):
             raise ConfigError(f"{mine.where} has the same frames as {other.where}; list each sample once")
@@ -145,30 +132,27 @@ def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> FloatAr
         return None
     found = np.full(len(samples), np.nan)
     for i, (given, sample) in enumerate(zip(settings.samples, samples, strict=True)):
-        where = f"sample {given.run}"
         if given.bias:
             continue
         if settings.against == "light_level":
-            if given.light_level is None:
-                raise ConfigError(
-                    f"{where} has no light_level; give one to each sample, or set input.against: none"
-                )
-            found[i] = given.light_level
-            continue
-        time = sample.integration_time if given.integration_time is None else given.integration_time
-        if time is None:
-            raise ConfigError(
-                f"{where} has no integration time, needed for the charge rate; set input.integration_time of "
-                "this run, s, or fit without: pchem joint RUNS --against none (in the YAML of a joint run: "
-                "input.against: none)"
+            exposure = given.light_level
+            missing = "light_level; give one to each sample, or set input.against: none"
+        else:
+            exposure = sample.integration_time if given.integration_time is None else given.integration_time
+            missing = (
+                "integration time, needed for the charge rate; set input.integration_time of this run, s, or "
+                "fit without: pchem joint RUNS --against none (in the YAML of a joint run: input.against: "
+                "none)"
             )
-        found[i] = time
+        if exposure is None:
+            raise ConfigError(f"sample {given.run} has no {missing}")
+        found[i] = exposure
     return found
 
 
 def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) -> None:
     """Refuse exposures that do not increase, or too few of them for a line."""
-    x = exposure_axis(settings, [_sample(settings, i, each) for i, each in enumerate(samples)])
+    x = exposure_axis(settings, _exposures(settings, samples))
     if x is None:
         return
     what = settings.against.replace("_", " ")
@@ -186,23 +170,17 @@ def _check_increasing(settings: InputSettings, samples: Sequence[OpenSample]) ->
         )
 
 
-def _sample(settings: InputSettings, i: int, found: OpenSample) -> Sample:
-    bias = settings.samples[i].bias
-    return Sample(
-        found.store.path.name,
-        bias,
-        found.sensor.n_frames,
-        found.sensor.integration_time,
-        found.target.config.input.kind,
-    )
-
-
-def _shared_limits(samples: Sequence[OpenSample]) -> tuple[int | None, int | None]:
-    """Return the outermost codes at which any of the samples pile up."""
-    low, high = zip(*(each.sensor.seen_limits for each in samples), strict=True)
-    return (
-        min((code for code in low if code is not None), default=None),
-        max((code for code in high if code is not None), default=None),
+def _exposures(settings: InputSettings, samples: Sequence[OpenSample]) -> tuple[Sample, ...]:
+    """Return what is known of the exposure of each sample."""
+    return tuple(
+        Sample(
+            found.store.path.name,
+            given.bias,
+            found.sensor.n_frames,
+            found.sensor.integration_time,
+            found.target.config.input.kind,
+        )
+        for given, found in zip(settings.samples, samples, strict=True)
     )
 
 
@@ -218,6 +196,7 @@ def sample_sensor(config: RunConfig, samples: Sequence[OpenSample]) -> SensorInf
     first = samples[0].sensor
     files = [file for each in samples for file in each.sensor.identity.get("files", [])]
     digests = " ".join(str(each.sensor.identity.get("digest", each.store.path)) for each in samples)
+    low, high = zip(*(each.sensor.seen_limits for each in samples), strict=True)
     return SensorInfo(
         kind="samples",
         n_frames=sum(each.sensor.n_frames for each in samples),
@@ -225,7 +204,11 @@ def sample_sensor(config: RunConfig, samples: Sequence[OpenSample]) -> SensorInf
         nx=first.nx,
         dtype=first.dtype,
         bit_depth=next((depth for each in samples if (depth := each.sensor.bit_depth) is not None), None),
-        seen_limits=_shared_limits(samples),
+        # the outermost codes at which any of them pile up
+        seen_limits=(
+            min((code for code in low if code is not None), default=None),
+            max((code for code in high if code is not None), default=None),
+        ),
         integration_time=None,
         mode="reference",
         identity={
@@ -234,7 +217,7 @@ def sample_sensor(config: RunConfig, samples: Sequence[OpenSample]) -> SensorInf
             "digest": hashlib.sha256(digests.encode()).hexdigest(),
         },
         names=first.names,
-        samples=tuple(_sample(config.input, i, each) for i, each in enumerate(samples)),
+        samples=_exposures(config.input, samples),
         shown=shown_sample(config.input),
         camera=shared_facts([each.sensor.camera for each in samples])[0],
         whole=first.whole,
@@ -248,8 +231,6 @@ def sample_facts(config: RunConfig, base_dir: Path) -> dict[str, Any]:
         ConfigError: a run cannot be found.
         StoreError: a run has no histograms.
     """
-    samples = open_samples(config, base_dir)
-    histograms = [
-        [each.histogram, given.bias] for each, given in zip(samples, config.input.samples, strict=True)
-    ]
+    samples = zip(open_samples(config, base_dir), config.input.samples, strict=True)
+    histograms = [[found.histogram, given.bias] for found, given in samples]
     return {"samples": histograms, "shown_sample": shown_sample(config.input)}

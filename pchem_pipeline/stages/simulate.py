@@ -14,10 +14,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.frames.formats.map_files import read_image, write_npz
@@ -32,11 +33,8 @@ from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
 from pchem_pipeline.store.files import in_storage
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import equal_rows
 
 TRUTH_FILE = "truth.npz"
 # memory for the frames in the making, over all workers
@@ -44,7 +42,6 @@ _BUDGET = 256 << 20
 # true electron numbers are stored in chunks of about this size
 _CHUNK = 16 << 20
 _MOST_UNITS = 256
-
 
 #: Frames, first and end, of the file of this name; None: whose electrons go into the store.
 _Frames = tuple[str | None, int, int]
@@ -70,7 +67,9 @@ def run(context: StageContext) -> None:
         context.begin()
         for name, values in truth.arrays().items():
             context.store.write_array(f"truth/{name}", values)
-    _write_truth(folder / TRUTH_FILE, truth, settings, [name for name, _, _ in files])
+    names = np.array([name for name, _, _ in files])
+    facts = {"files": names, "integration_time": settings.integration_time, "seed": settings.seed}
+    write_npz(folder / TRUTH_FILE, truth.arrays() | facts)
     electron_units = _electron_units(settings)
     if electron_units:
         step, (rows, columns) = electron_units[0].content[-1][2], settings.shape
@@ -82,32 +81,17 @@ def run(context: StageContext) -> None:
             chunks={"frame": step, "y": band},
             shards=(step, band * math.ceil(rows / band), columns),
         )
-    units = [*_frame_units(files), *electron_units]
-    task = functools.partial(
-        _do,
-        settings=settings,
-        folder=folder,
-        workers=context.executor.workers,
-        alone=len(_frame_units(files)) == 1,
-    )
+    frame_units, workers = _frame_units(files), context.executor.workers
+    alone = len(frame_units) == 1
+    task = functools.partial(_do, settings=settings, folder=folder, workers=workers, alone=alone)
     # frames are made whole: tiles and regions mean the sensor that is read
-    context.run_units(units, task, unit_name="part")
-
-
-def frames_tile(truth: TruthMaps, settings: SimulateSettings, frames: tuple[int, int]) -> NDArray[Any]:
-    """Return frames ``frames[0] .. frames[1] - 1`` of the whole sensor (frame, y, x), DN."""
-    return simulate_block(truth, settings, frames, electron_frames=0)[0]
+    context.run_units([*frame_units, *electron_units], task, unit_name="part")
 
 
 def _do(
-    unit: _Unit,
-    store: RunStore,
-    *,
-    settings: SimulateSettings,
-    folder: Path,
-    workers: int,
-    alone: bool,
+    unit: _Unit, store: RunStore, *, settings: SimulateSettings, folder: Path, workers: int, alone: bool
 ) -> None:
+    """Write the files of frames of a unit, or its true electron numbers into the store."""
     truth, settings = _sensor(settings.model_dump_json())
     step = frames_per_block(settings, settings.shape[0], _BUDGET // workers)
     for name, start, stop in unit.content:
@@ -120,7 +104,11 @@ def _do(
             settings.format,
             folder / name,
             # several files are shared out among the workers; a single one has them all to itself
-            _in_order(functools.partial(frames_tile, truth, settings), blocks, workers if alone else 1),
+            _in_order(
+                lambda block: simulate_block(truth, settings, block, electron_frames=0)[0],
+                blocks,
+                workers if alone else 1,
+            ),
             (stop - start, *settings.shape),
             dn_dtype(settings.bit_depth),
             integration_time=settings.integration_time,
@@ -159,11 +147,7 @@ def _is_number(text: str) -> bool:
 
 @functools.lru_cache(maxsize=2)
 def _sensor(content: str) -> tuple[TruthMaps, SimulateSettings]:
-    """Return maps and settings, made once per process; that is cheaper than sending them.
-
-    Raises:
-        ConfigError: a file is not that of a sensor, or of an image that fits it.
-    """
+    """Return maps and settings, made once per process; that is cheaper than sending them."""
     settings = SimulateSettings.model_validate_json(content)
     truth = draw_truth(settings) if settings.sensor is None else _stored_sensor(settings)
     if settings.scene is None:
@@ -206,11 +190,9 @@ def _files(settings: SimulateSettings) -> list[tuple[str, int, int]]:
     suffix = reader_class(settings.format).suffixes[0]
     if per_file >= n:
         return [(f"frames{suffix}", 0, n)]
-    width = max(5, len(str(math.ceil(n / per_file))))
-    return [
-        (f"frames_{i:0{width}d}{suffix}", start, min(start + per_file, n))
-        for i, start in enumerate(range(0, n, per_file), 1)
-    ]
+    parts = equal_rows(n, per_file)
+    width = max(5, len(str(len(parts))))
+    return [(f"frames_{i:0{width}d}{suffix}", *part) for i, part in enumerate(parts, 1)]
 
 
 def _frame_units(files: list[tuple[str, int, int]]) -> list[_Unit]:
@@ -223,17 +205,11 @@ def _frame_units(files: list[tuple[str, int, int]]) -> list[_Unit]:
 def _electron_units(settings: SimulateSettings) -> list[_Unit]:
     n = min(settings.truth_frames, settings.n_frames)
     step = max(1, min(n, _CHUNK // (4 * math.prod(settings.shape))))
-    parts = [(None, start, min(start + step, n)) for start in range(0, n, step)]
-    return [Named(f"electrons-{start}-{end}", [(None, start, end)]) for _, start, end in parts]
+    return [Named(f"electrons-{start}-{end}", [(None, start, end)]) for start, end in equal_rows(n, step)]
 
 
 def _prepare(folder: Path, settings: SimulateSettings) -> None:
-    """Remove the files of an earlier simulation, and nothing else.
-
-    Raises:
-        ConfigError: the folder holds files that no simulation made.
-        StoreError: the disk is too small or refuses.
-    """
+    """Remove the files of an earlier simulation, and nothing else; refuse a disk that is too small."""
     needed = settings.n_frames * math.prod(settings.shape) * dn_dtype(settings.bit_depth).itemsize
     with in_storage(folder):
         if folder.exists() and any(folder.iterdir()):
@@ -265,12 +241,3 @@ def _remove_simulated(folder: Path) -> None:
             else:
                 path.unlink(missing_ok=True)
     (folder / TRUTH_FILE).unlink()
-
-
-def _write_truth(path: Path, truth: TruthMaps, settings: SimulateSettings, files: list[str]) -> None:
-    facts = {
-        "files": np.array(files),
-        "integration_time": settings.integration_time,
-        "seed": settings.seed,
-    }
-    write_npz(path, truth.arrays() | facts)

@@ -53,7 +53,7 @@ def storage_error(error: OSError, path: object) -> StoreError:
     """Translate an error of the file system into one line with its cure; one that is such a line stays."""
     if isinstance(error, StoreError):
         return error
-    cures = {**_CURES, **_CURES_OF_A_PLACE}
+    cures = _CURES | _CURES_OF_A_PLACE
     cure = cures.get(error.errno or 0, "check the disk: its free space, quota and permissions")
     return StoreError(f"cannot use {path}: {error.strerror or error}; {cure}")
 
@@ -75,9 +75,7 @@ def is_fatal(error: BaseException) -> bool:
 def write_atomic(path: Path, data: disk.Data, *, sync: bool = True) -> None:
     """Write a small file, so that whoever reads it finds the old or the new one, whole.
 
-    A file that is there keeps its mode.
-
-    An object of an object storage is put at once: it appears whole or not at all.
+    A file that is there keeps its mode. An object of an object storage is put at once.
 
     Args:
         path: the file; folders above it are made.
@@ -91,10 +89,9 @@ def write_atomic(path: Path, data: disk.Data, *, sync: bool = True) -> None:
     if isinstance(path, RemotePath):
         path.write_bytes(data)
         return
-    before, after = (disk.sync_file, disk.sync_folder) if sync else (None, None)
     # a name that no other process uses; what a kill leaves there is removed later
     aside = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    with _put_in_place(path, aside, before, after) as part:
+    with _put_in_place(path, aside, disk.sync_file if sync else None) as part:
         disk.write(part, data)
 
 
@@ -110,31 +107,26 @@ def whole_file(path: Path) -> Iterator[Path]:
         StoreError: the file system refused.
     """
     aside = path.with_name(f".partial-{path.name}")
-    with _put_in_place(path, aside, disk.sync_all, disk.sync_folder) as part:
+    with _put_in_place(path, aside, disk.sync_all) as part:
         yield part
 
 
 @contextlib.contextmanager
-def _put_in_place(
-    path: Path,
-    aside: Path,
-    before: Callable[[Path], None] | None = None,
-    after: Callable[[Path], None] | None = None,
-) -> Iterator[Path]:
+def _put_in_place(path: Path, aside: Path, sync: Callable[[Path], None] | None) -> Iterator[Path]:
     """Yield ``aside`` to write to, then rename it to ``path``: the one place where files appear."""
     try:
         disk.make_folder(path.parent)
         _remove(aside)
         yield aside
-        if before is not None:
-            before(aside)
+        if sync is not None:
+            sync(aside)
         if path.is_dir():
             disk.remove_tree(path)
         elif path.is_file() and aside.is_file():
             shutil.copymode(path, aside)
         disk.replace(aside, path)
-        if after is not None:
-            after(path.parent)
+        if sync is not None:
+            disk.sync_folder(path.parent)
     except OSError as error:
         raise storage_error(error, path) from error
     except RuntimeError as error:  # of HDF5, which hides the number in its words
@@ -159,11 +151,11 @@ def remove_files(*paths: Path) -> None:
     Raises:
         StoreError: the file system, or the object storage, refused.
     """
-    there = [path for path in paths if isinstance(path, RemotePath) or os.path.lexists(path)]
-    for path in there:
+    found = [path for path in paths if isinstance(path, RemotePath) or os.path.lexists(path)]
+    for path in found:
         with in_storage(path):
             disk.remove(path)
-    for folder in {path.parent for path in there if not isinstance(path, RemotePath)}:
+    for folder in {path.parent for path in found if not isinstance(path, RemotePath)}:
         with in_storage(folder):
             disk.sync_folder(folder)
 
@@ -244,23 +236,23 @@ def _mark_of(chunk: str, array: str) -> bytes:
 # -- records of a run: JSON with a digest of itself ------------------------------------------------
 
 _DIGEST = "digest_of_content"
-#: groups of arrays that are not called like the stage which writes them
+_SAME_NAME = ("histogram", "fit", "maps", "ensemble", "electrons", "discrepancy", "methods")
+#: the stage which writes a group of arrays
 _STAGE_OF = {
+    **{name: name for name in _SAME_NAME},
     "frames": "ingest",
     "summary": "histogram",
     "truth": "simulate",
     "samples": "fit",
     "ensemble_tiles": "ensemble",
 }
-_COMMANDS = frozenset({"histogram", "fit", "maps", "ensemble", "electrons", "discrepancy", "methods"})
 
 
 def cure_of(run: Path, name: str) -> str:
     """Return what to do where an array or a group of a run is damaged."""
     group = name.partition("/")[0]
-    stage = _STAGE_OF.get(group, group)
-    if stage in _COMMANDS or group in _STAGE_OF:
-        return f"run it again: pchem {stage} {quoted(run)} --force"
+    if group in _STAGE_OF:
+        return f"run it again: pchem {_STAGE_OF[group]} {quoted(run)} --force"
     if group == "model":
         return f"delete {run / group} and run again; the model is then taken from the configuration"
     return "run it again with --force" if group else "delete it and run again"

@@ -31,11 +31,7 @@ _FILE, _OBJECT = "lock", "lock.json"
 
 @contextlib.contextmanager
 def locked(run: Path, private: Path) -> Iterator[None]:
-    """Hold the lock of a run.
-
-    Args:
-        run: its store, for messages.
-        private: its folder for the lock.
+    """Hold the lock of a run, which lies in its folder ``private``.
 
     Raises:
         LockedError: another process holds it.
@@ -117,11 +113,7 @@ def _acquired(run: Path, lock: RemotePath) -> bytes:
 
 
 def _owner(run: Path, lock: RemotePath) -> dict[str, Any]:
-    """Return what the object says of its owner.
-
-    Raises:
-        LockedError: it is damaged.
-    """
+    """Return what the object says of its owner; raise LockedError where it is damaged."""
     with contextlib.suppress(ValueError):
         held = json.loads(lock.read_bytes())
         if isinstance(held, dict):

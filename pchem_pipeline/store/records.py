@@ -11,12 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.errors import LockedError, StoreError, quoted
-from pchem_pipeline.store.files import (
-    read_record,
-    remove_files,
-    remove_folder,
-    write_record,
-)
+from pchem_pipeline.store.files import read_record, remove_files, remove_folder, write_record
 
 #: seconds for which a look at the record holds: a worker that hung for less was not overtaken
 _LOOK = 1.0
@@ -48,11 +43,7 @@ def working(records: Records, stage: str, fingerprint: str | None) -> Iterator[N
 
 
 def check_work(path: Path) -> None:
-    """Refuse to write into a run where the work of this thread was overtaken.
-
-    Raises:
-        LockedError: it was.
-    """
+    """Raise LockedError where the work of this thread on a run was overtaken, so that it writes no more."""
     work = _WORK.get()
     if work is None or time.monotonic() - work.looked < _LOOK:
         return
@@ -67,8 +58,7 @@ class StageRecord:
     """How a stage was last run.
 
     Attributes:
-        stage: its name.
-        version: version of its algorithm.
+        version: of its algorithm.
         fingerprint: digest of all that decides the result.
         content: what the digest was taken of: settings read, upstream fingerprints, input identity.
         keys: how many unit markers the complete stage has.
@@ -79,7 +69,7 @@ class StageRecord:
         peak_rss_bytes: largest resident set of a process.
         failed: key and reason of each unit that failed.
         notes: one-line remarks that the report repeats.
-        versions: versions of Python and of the libraries.
+        versions: of Python and of the libraries.
         model: number of the version of the run's model that the result rests on; None: of none.
         files: names of the files of the run that it wrote, beside arrays, with their digests.
     """

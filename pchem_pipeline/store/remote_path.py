@@ -103,11 +103,7 @@ class RemotePath(_Pure):
         return _URL.sub(r"\1://\2", super().__str__())
 
     def __fspath__(self) -> NoReturn:
-        """Refuse to be a path of this machine.
-
-        Raises:
-            TypeError: always.
-        """
+        """Refuse, with a TypeError, to be a path of this machine."""
         raise TypeError(f"{self} is not a local path")
 
     @property
@@ -189,11 +185,7 @@ class RemotePath(_Pure):
             self.write_bytes(data)
 
     def __getattr__(self, name: str) -> NoReturn:
-        """Refuse what a disk can do and an object storage cannot.
-
-        Raises:
-            UndefinedError: always.
-        """
+        """Refuse, with an UndefinedError, what a disk can do and an object storage cannot."""
         if not name.startswith("_") and hasattr(Path, name):
             raise UndefinedError(f"{self}: not possible in an object storage ({name}); use a store on a disk")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")

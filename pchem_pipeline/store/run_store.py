@@ -177,9 +177,8 @@ class RunStore:
         """
         variable = variable_at(name)
         kind = np.dtype(variable.dtype if dtype is None else dtype)
-        attrs = {"units": variable.unit, "long_name": variable.long_name}
-        if variable.symbol:
-            attrs["symbol"] = variable.symbol
+        symbol = {"symbol": variable.symbol} if variable.symbol else {}
+        attrs = {"units": variable.unit, "long_name": variable.long_name, **symbol, **(attributes or {})}
         with self._translated(name):
             self._root.create_array(
                 name,
@@ -190,7 +189,7 @@ class RunStore:
                 fill_value=np.nan if kind.kind == "f" else variable.fill,
                 compressors=_compressors(name, kind),
                 dimension_names=variable.dims,
-                attributes={**attrs, **(attributes or {})},
+                attributes=attrs,
                 config={"write_empty_chunks": True},
                 overwrite=True,
             )
@@ -257,15 +256,7 @@ class RunStore:
         return array.shards or array.chunks
 
     def read_pixels(self, name: str, y: IntArray, x: IntArray) -> NDArray[Any]:
-        """Return the elements of an array (y, x, ...) at some pixels, file by file.
-
-        Args:
-            name: of the array.
-            y: row of each, shape (n,).
-            x: column of each, shape (n,).
-
-        Returns:
-            Shape (n, ...).
+        """Return the elements of an array (y, x, ...) at rows y and columns x of n pixels, shape (n, ...).
 
         Raises:
             StoreError: it is missing or a chunk is corrupt.
@@ -354,15 +345,10 @@ class RunStore:
             StoreError: the lock file cannot be written.
         """
         with locked(self.path, self.path / _PRIVATE):
-            self._remove_unfinished()
+            if not isinstance(self.path, RemotePath):  # where no killed process leaves half files
+                found = (Path(folder) / name for folder, _, names in os.walk(self.path) for name in names)
+                remove_files(*(path for path in found if path.name.endswith(".partial")))
             yield
-
-    def _remove_unfinished(self) -> None:
-        """Remove the half files that a killed process left."""
-        if isinstance(self.path, RemotePath):  # which has none
-            return
-        found = (Path(folder) / name for folder, _, names in os.walk(self.path) for name in names)
-        remove_files(*(path for path in found if path.name.endswith(".partial")))
 
     def free_bytes(self) -> int:
         """Return the free space of the disk that holds the store; an object storage is never full."""
@@ -415,14 +401,15 @@ class Part(MutableMapping[str, NDArray[Any]]):
     def __init__(self, store: RunStore, region: tuple[slice, slice] | None, prefix: str) -> None:
         self._store, self._region, self._prefix = store, region, prefix
 
-    def _index(self, path: str) -> _Region | None:
-        return None if self._region is None else variable_at(path).index(self._region)
+    def _place(self, name: str) -> tuple[str, _Region | None]:
+        path = self._prefix + name
+        return path, None if self._region is None else variable_at(path).index(self._region)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        return self._store.read(self._prefix + name, self._index(self._prefix + name))
+        return self._store.read(*self._place(name))
 
     def __setitem__(self, name: str, values: NDArray[Any]) -> None:
-        self._store.write(self._prefix + name, self._index(self._prefix + name), values)
+        self._store.write(*self._place(name), values)
 
     def __delitem__(self, name: str) -> None:
         self._store.delete(self._prefix + name)
@@ -466,14 +453,12 @@ def _one_line(path: Path, where: object) -> Iterator[None]:
     except PchEmError:
         raise
     except OSError as error:
-        raise (
-            refused(where, error) if isinstance(path, RemotePath) else storage_error(error, where)
-        ) from error
+        remote = isinstance(path, RemotePath)
+        raise (refused(where, error) if remote else storage_error(error, where)) from error
+    except (ValueError, RuntimeError, KeyError, TypeError):  # a matter of the content
+        raise
     except Exception as error:
-        # each kind of storage has errors of its own; wrong values are a matter of the content
-        if isinstance(path, RemotePath) and not isinstance(
-            error, (ValueError, RuntimeError, KeyError, TypeError)
-        ):
+        if isinstance(path, RemotePath):  # each kind of storage has errors of its own
             raise refused(where, error) from error
         raise
 

@@ -53,16 +53,11 @@ class Tile:
         return slice(self.y0 + y.start, self.y0 + y.stop), slice(self.x0 + x.start, self.x0 + x.stop)
 
     def parts(self, bins: int = 1) -> Iterator[tuple[slice, slice]]:
-        """Yield pieces of at most 64 x 64 pixels and `MAX_BINS` bins, as indices into an array of the tile.
-
-        Args:
-            bins: of the histogram of a pixel.
-        """
+        """Yield indices of pieces of at most 64 x 64 pixels and `MAX_BINS` bins, ``bins`` for each pixel."""
         ny, nx = self.shape
-        rows = min(_SIDE, max(1, MAX_BINS // (_SIDE * bins)))
-        for y in range(0, ny, rows):
-            for x in range(0, nx, _SIDE):
-                yield slice(y, min(y + rows, ny)), slice(x, min(x + _SIDE, nx))
+        for y in equal_rows(ny, min(_SIDE, max(1, MAX_BINS // (_SIDE * bins)))):
+            for x in equal_rows(nx, _SIDE):
+                yield slice(*y), slice(*x)
 
 
 def tile_shape(size: TileSize, sensor: tuple[int, int]) -> tuple[int, int]:
@@ -87,17 +82,12 @@ def tile_shape(size: TileSize, sensor: tuple[int, int]) -> tuple[int, int]:
 
 def tile_grid(shape: tuple[int, int], size: TileSize) -> list[Tile]:
     """Return the tiles of a sensor of ``shape`` (y, x), row by row; edge tiles may be smaller."""
-    ny, nx = shape
-    rows, columns = tile_shape(size, shape)
-    return [
-        Tile(y0 // rows, x0 // columns, y0, min(y0 + rows, ny), x0, min(x0 + columns, nx))
-        for y0 in range(0, ny, rows)
-        for x0 in range(0, nx, columns)
-    ]
+    rows, columns = (equal_rows(*each) for each in zip(shape, tile_shape(size, shape), strict=True))
+    return [Tile(iy, ix, *y, *x) for iy, y in enumerate(rows) for ix, x in enumerate(columns)]
 
 
 def equal_rows(ny: int, height: int) -> list[tuple[int, int]]:
-    """Return first row and end of bands of ``ny`` rows, from top to bottom; the last may be lower."""
+    """Return first row (or column, or frame) and end of bands of ``ny`` of them; the last may be lower."""
     return [(y, min(y + height, ny)) for y in range(0, ny, height)]
 
 

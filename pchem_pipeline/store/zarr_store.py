@@ -119,9 +119,7 @@ class CheckedStore(WrapperStore[Store]):
 
 def foreign_codecs(array: Any) -> list[str]:
     """Return the names of an array's codecs that may do more than turn bytes into numbers."""
-    return sorted(
-        {name for name in codec_names(array) if name not in _PLAIN and not name.startswith("imagecodecs_")}
-    )
+    return sorted({n for n in codec_names(array) if n not in _PLAIN and not n.startswith("imagecodecs_")})
 
 
 def codec_names(array: Any) -> list[str]:

@@ -43,7 +43,7 @@ class PixelErrors:
     place: IntArray
     share: float = 1.0
 
-    def of(self, pixels: BoolArray) -> PixelErrors:
+    def of(self, pixels: BoolArray | IntArray) -> PixelErrors:
         """Return those of some pixels."""
         return PixelErrors(self.stderr[pixels], self.correlation[pixels], self.place[pixels], self.share)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,10 @@ from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.framework.compose import model_words
-from pchem_pipeline.frames.stream import FrameStream
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.electrons.electrons import ErrorTally, compare_electron_numbers
 from pchem_pipeline.model.electrons.error_rates import error_rates
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES, bias_weight
@@ -28,28 +30,22 @@ from pchem_pipeline.model.ensemble.curves import electron_numbers as electron_nu
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_axis
 from pchem_pipeline.model.ensemble.error_sample import WANTED, PixelErrors
 from pchem_pipeline.model.ensemble.moments import moment_rows
+from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
 from pchem_pipeline.model.fit.status import flags_of
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.progress import parts_told
+from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import StageContext, markers
-from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, tile_bands
+from pchem_pipeline.stages.bands import BAND_BYTES, FRAMES_AT_ONCE, Band, tile_bands
 from pchem_pipeline.stages.electrons import read_tables
 from pchem_pipeline.stages.ensemble.tile import PixelHistograms, ensemble_tile, occupied
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_effects, fitted_satellites
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of, uncounted_frames
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.frames.stream import FrameSource
-    from pchem_pipeline.model.ensemble.settings import EnsembleSettings
-    from pchem_pipeline.run.sensor import SensorInfo
-    from pchem_pipeline.stages.bands import Band
-    from pchem_pipeline.store.run_store import RunStore
-    from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import Tile
 
 _SUMS = ("integers", "floats")
 _HISTOGRAM = ("origin", "minimum", "maximum")
@@ -60,9 +56,6 @@ class _Job:
     """What the ensemble is of.
 
     Attributes:
-        config: of the run.
-        sensor: the input.
-        axes: axes of the ensemble.
         tiles: number and place of each tile by its key.
         frames: the chosen frames (first, end), or None where there are none to choose from.
         codes: by tile the samples of all frames, where the fit has counted them; see `code_sums`.
@@ -83,24 +76,10 @@ class _Job:
     effects: tuple[Effect, ...]
     limits: tuple[int, int] | None
 
-    @property
-    def counts_anew(self) -> bool:
-        """Whether the chosen frames are some of those in the histograms."""
-        return self.frames not in (None, (0, self.sensor.n_frames))
-
 
 @dataclass(frozen=True)
 class _Fitted:
-    """What the fit and the histograms of some tiles hold, of the pixels with a value.
-
-    Attributes:
-        pixels: their parameters.
-        place: which pixels of the sensor they are, (y, x).
-        origin: DN of bin 0.
-        low: smallest DN.
-        high: largest DN.
-        bins: bins of a histogram.
-    """
+    """Parameters and histogram ranges (DN) of the pixels with a value, at ``place`` (y, x) of the sensor."""
 
     pixels: UsablePixels
     place: BoolArray
@@ -113,19 +92,14 @@ class _Fitted:
     def read(cls, store: RunStore, tiles: list[Tile]) -> _Fitted:
         """Read them from the run."""
         fit, histogram = store.at(group="fit"), store.at(group="histogram")
-        maps, place = [fit[name] for name in PARAMETERS], np.zeros(store.array("fit/bias").shape, np.bool_)
+        maps = [fit[name] for name in PARAMETERS]
+        place = np.zeros(maps[0].shape, np.bool_)
         for tile in tiles:
             place[tile.region] = True
         pixels, known = UsablePixels.from_maps([values[place] for values in maps])
         place[place] = known
         origin, low, high = (histogram[name][place] for name in _HISTOGRAM)
         return cls(pixels, place, origin, low, high, store.array("histogram/counts").shape[2])
-
-    def limits(self, known: tuple[int, int] | None) -> tuple[int, int] | None:
-        """Return the known limits of the codes where samples lie at one of them; else None."""
-        if known is None or not np.any((self.low <= known[0]) | (self.high >= known[1])):
-            return None
-        return known
 
     def axes(self, settings: EnsembleSettings) -> EnsembleAxes | None:
         """Choose the axes of the ensemble; None where no pixel has a value."""
@@ -157,7 +131,9 @@ def run(context: StageContext) -> None:
     source = open_source(context) if frames is not None and (truth or not everything) else None
     fitted_tiles = [tile for tile in tiles if tile.key in ready]
     fitted = _Fitted.read(store, fitted_tiles)
-    limits = fitted.limits(context.sensor.adc_limits)
+    limits = sensor.adc_limits
+    if limits is not None and not np.any((fitted.low <= limits[0]) | (fitted.high >= limits[1])):
+        limits = None  # no samples lie there
     axes = fitted.axes(settings)
     if sensor.kind == "histograms":
         context.note("input is histograms: the ensemble has all samples, with equal weight per channel")
@@ -226,8 +202,7 @@ def _place_in_truth(
 def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
     """Make the rows of sums; start anew where more pixels have moved the axes."""
     context.begin()
-    store = context.store
-    content = asdict(axes)
+    store, content = context.store, asdict(axes)
     if store.attributes("ensemble_tiles").get("axes") != content:
         done = store.records.done(context.stage, context.fingerprint)
         store.records.unmark(context.stage, context.fingerprint, done)
@@ -241,14 +216,13 @@ def _create(context: StageContext, axes: EnsembleAxes, n_tiles: int) -> None:
 
 def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
     """Sum over each tile of a band; frames, where they are needed, are read once for all of them."""
-    chosen = _count(store, job, band) if job.counts_anew else None
+    some_frames = job.frames not in (None, (0, job.sensor.n_frames))
+    chosen = _count(store, job, band) if some_frames else None
     errors = {} if job.truth is None else _compare(store, job, band)
     for key in markers(band):
         number, tile = job.tiles[key]
-        own = None
-        if chosen is not None:
-            own = chosen.of((slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1)))
-        integers, floats = _sum_tile(store, tile, job, own)
+        of_tile = None if chosen is None else chosen.of(_in_band(tile, band))
+        integers, floats = _sum_tile(store, tile, job, of_tile)
         if key in errors:
             integers[job.axes.integers["error_sizes"]] = errors[key].by_size
             integers[job.axes.integers["compared"]] = errors[key].n_samples
@@ -257,17 +231,15 @@ def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
             store.write(f"ensemble_tiles/{name}", (slice(number, number + 1), slice(None)), row[None])
 
 
+def _in_band(tile: Tile, band: Band | Tile) -> tuple[slice, slice]:
+    """Return the index of a tile's pixels in its band."""
+    return slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1)
+
+
 def _sum_tile(
     store: RunStore, tile: Tile, job: _Job, chosen: PixelHistograms | None
 ) -> tuple[IntArray, FloatArray]:
-    """Return what a tile adds to the ensemble.
-
-    Args:
-        store: the run.
-        tile: the tile.
-        job: what is summed.
-        chosen: histograms of the chosen frames; None: all frames.
-    """
+    """Return what a tile adds to the ensemble; ``chosen``: histograms of some frames, None: of all."""
     fit, histogram = (store.at(tile.region, group) for group in ("fit", "histogram"))
     maps = [fit[name] for name in PARAMETERS]
     origin, low, high = (histogram[name].astype(np.int64) for name in _HISTOGRAM)
@@ -277,7 +249,7 @@ def _sum_tile(
     else:  # only the number of the samples matters
         outside = np.full(origin.shape, job.sensor.n_frames, np.uint32)
         counted = PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
-    errors = _errors(fit, tile, job.sensor.shape)
+    errors, numbers = _errors(fit, tile, job.sensor.shape), np.arange(origin.size).reshape(origin.shape)
     rows = []
     for part in parts_told(tile.parts(store.array("histogram/counts").shape[2])):
         everything = counted.of(part).cut(low[part], high[part])
@@ -290,7 +262,7 @@ def _sum_tile(
             job.axes,
             FittedModel.read(store, place).law(of_pixels).between(*(job.limits or (None, None))),
             fitted_satellites(store, place) if job.effects else None,
-            None if errors is None else errors.of(_inside(tile, part)),
+            None if errors is None else errors.of(numbers[part].ravel()),
         )
         rows.append(row)
     integers, floats = (np.sum(each, axis=0) for each in zip(*rows, strict=True))
@@ -316,20 +288,11 @@ def _errors(fit: Arrays, tile: Tile, shape: tuple[int, int]) -> PixelErrors | No
     """Return the errors of the pixels of a tile in C order; None where they are not known."""
     if "correlation" not in fit:
         return None
-    ny, nx = shape
     stderr = [fit[f"{name}_stderr"].ravel() for name in PARAMETERS]
     correlation = fit["correlation"]
-    place = np.arange(tile.y0, tile.y1)[:, None] * nx + np.arange(tile.x0, tile.x1)
-    share = min(1.0, WANTED / (ny * nx))
-    flat = correlation.reshape(-1, correlation.shape[2])
-    return PixelErrors(np.stack(stderr, axis=1), flat, place.ravel(), share)
-
-
-def _inside(tile: Tile, part: tuple[slice, slice]) -> BoolArray:
-    """Return which pixels of a tile, in C order, are in a part of it."""
-    mask = np.zeros((tile.y1 - tile.y0, tile.x1 - tile.x0), np.bool_)
-    mask[part] = True
-    return mask.ravel()
+    place = (np.arange(tile.y0, tile.y1)[:, None] * shape[1] + np.arange(tile.x0, tile.x1)).ravel()
+    share = min(1.0, WANTED / math.prod(shape))
+    return PixelErrors(np.stack(stderr, axis=1), correlation.reshape(place.size, -1), place, share)
 
 
 def _stream(job: _Job, band: Band | Tile, frames: tuple[int, int]) -> FrameStream:
@@ -361,8 +324,9 @@ def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, ErrorTa
     """Compare estimated with true electron numbers of the chosen frames, tile by tile."""
     assert job.truth is not None
     assert job.source is not None
+    assert job.frames is not None
     y0, x0, t0 = job.truth
-    first, end = job.frames or (0, job.source.shape[0])
+    first, end = job.frames
     known = min(end, store.array("truth/electron_number").shape[0] - t0)
     found: dict[str, ErrorTally] = {}
     if known <= first:
@@ -376,25 +340,19 @@ def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, ErrorTa
             numbers = tables.convert(block).number
             for key in markers(band):
                 tile = job.tiles[key][1]
-                part = (slice(None), slice(tile.y0 - band.y0, tile.y1 - band.y0), slice(tile.x0, tile.x1))
+                part = (slice(None), *_in_band(tile, band))
                 tally = compare_electron_numbers(numbers[part], true[part], ERROR_SIZES)
                 found[key] = found[key] + tally if key in found else tally
     return found
 
 
 def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
-    """Add the rows of the finished tiles; without frames every pixel counts the same.
-
-    Args:
-        store: the run.
-        job: what is summed.
-        rows: of the finished tiles in the sums.
-    """
+    """Add the rows of the finished tiles; without frames every pixel counts the same."""
     samples = (1, 1)
     if job.frames is not None:
-        gone = uncounted_frames(odd_frames_of(store)[0])
-        chosen, first = gone[gone < job.frames[1]], job.frames[0]
-        samples = job.frames[1] - first - int((chosen >= first).sum()), job.sensor.n_frames - gone.size
+        gone, (first, end) = uncounted_frames(odd_frames_of(store)[0]), job.frames
+        left_out = int(((gone >= first) & (gone < end)).sum())
+        samples = end - first - left_out, job.sensor.n_frames - gone.size
     integers, floats = (
         sum(store.read(f"ensemble_tiles/{name}", (number, slice(None))) for number in rows) for name in _SUMS
     )
@@ -402,27 +360,15 @@ def _totals(store: RunStore, job: _Job, rows: list[int]) -> EnsembleTotals:
 
 
 def _write_result(
-    store: RunStore,
-    totals: EnsembleTotals,
-    fitted: _Fitted,
-    job: _Job,
-    facts: dict[str, Any],
+    store: RunStore, totals: EnsembleTotals, fitted: _Fitted, job: _Job, facts: dict[str, Any]
 ) -> None:
     """Write the arrays of the group ``ensemble`` and its numbers (attributes of the group).
 
     The attributes are the facts (``rmse``, counts, error rates), ``moments`` (rows of Appendix A),
     ``component_cases`` (parameters held constant, a list for each row of ``component_variance``) and
     ``missing`` (part to reason).
-
-    Args:
-        store: the run.
-        totals: sums over the tiles.
-        fitted: pixels of the finished tiles.
-        job: what the ensemble is of.
-        facts: further attributes.
     """
-    missing, settings, frames = _missing(job, totals), job.config.ensemble, job.frames
-    pixels = fitted.pixels
+    settings, frames, pixels = job.config.ensemble, job.frames, fitted.pixels
     per_pixel: int | NDArray[Any] = totals.samples[0]
     if frames is None:
         per_pixel = store.read("histogram/counts")[fitted.place].sum(axis=1, dtype=np.int64)
@@ -449,7 +395,7 @@ def _write_result(
             totals, pixels, per_pixel, weight, extended=bool(job.effects) or job.limits is not None
         ),
         "component_cases": COMPONENT_CASES,
-        "missing": missing,
+        "missing": _missing(job, totals),
     }
     if job.effects:
         found["model"] = model_words(job.effects)
@@ -465,9 +411,8 @@ def _true_pixels(store: RunStore, job: _Job, place: BoolArray) -> UsablePixels |
         return None
     y0, x0, _ = job.truth
     ny, nx = job.sensor.shape
-    region = (slice(y0, y0 + ny), slice(x0, x0 + nx))
-    maps = [store.read(f"truth/{name}", region)[place] for name in PARAMETERS]
-    true, known = UsablePixels.from_maps(maps)
+    truth = store.at((slice(y0, y0 + ny), slice(x0, x0 + nx)), "truth")
+    true, known = UsablePixels.from_maps([truth[name][place] for name in PARAMETERS])
     return true if known.all() else None
 
 

@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
-from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, Outcomes, number_tables
+from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
 from pchem_pipeline.model.ensemble.ensemble import curve_errors, mass_sums, tally
 from pchem_pipeline.model.ensemble.error_sample import PixelErrors
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
@@ -49,13 +49,9 @@ class PixelHistograms:
         return np.asarray(self.counts.sum(axis=-1, dtype=np.int64) + self.outside)
 
     def cut(self, low: NDArray[Any], high: NDArray[Any]) -> PixelHistograms:
-        """Return them along one axis, with as many bins as the widest range needs.
+        """Return them along one axis, with as many bins as the widest range ``low`` to ``high`` (y, x) needs.
 
         A hot pixel widens the histograms of the whole sensor.
-
-        Args:
-            low: smallest DN of each pixel, shape (y, x).
-            high: largest.
         """
         bins = self.counts.shape[2]
         first, size = occupied(self.origin, low, high, bins)
@@ -82,19 +78,16 @@ def ensemble_tile(
     satellites: tuple[FloatArray, FloatArray] | None = None,
     errors: PixelErrors | None = None,
 ) -> tuple[IntArray, FloatArray]:
-    """Return what some pixels add to the ensemble.
+    """Return what some pixels add to the ensemble: rows of integers and floats, in the places of ``axes``.
 
     Args:
         maps: (H, g, mu, sigma) of the pixels, each of shape (n,); NaN where the fit failed.
         chosen: histograms of the chosen frames.
         everything: histograms of all frames.
-        axes: axes of the ensemble.
+        axes: of the ensemble.
         law: of the samples; None: that of the PCD.
         satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n,); None: none.
         errors: of the maps; None: not known.
-
-    Returns:
-        A row of integers and a row of floats, in the places that ``axes`` gives.
     """
     integers = np.zeros(list(axes.integers.values())[-1].stop, dtype=np.int64)
     floats = np.zeros(list(axes.floats.values())[-1].stop)
@@ -113,52 +106,20 @@ def ensemble_tile(
         found = curve_errors(law.of(some), pixels.of(some), covariance, axes.dn, axes.nuced)
         for name, variance in zip(MODEL_ERRORS, found, strict=True):
             floats[axes.floats[name]] = variance
-    for n, n_all in _numbers_of_samples(samples, samples_all):
+    for n, n_all in sorted({*zip(samples.tolist(), samples_all.tolist(), strict=True)}):
         if n == 0:
             continue
         group = (samples == n) & (samples_all == n_all)
         part = pixels.of(group)
-        own = None if satellites is None else (satellites[0][group], satellites[1][group])
+        levels = None if satellites is None else (satellites[0][group], satellites[1][group])
         of_group = chosen.of(group)
         sets = (of_group, n), (of_group if same else everything.of(group), n_all)
-        tallies, parts = _group_sums(KnownPixels(part, law.of(group), own), part, *sets, axes)
+        tallies, parts = _group_sums(KnownPixels(part, law.of(group), levels), part, *sets, axes)
         for name, tallied in tallies.items():
             integers[axes.integers[name]] += np.asarray(tallied, np.int64)  # floats are whole numbers
         for name, summed in parts.items():
             floats[axes.floats[name]] += summed
     return integers, floats
-
-
-def _numbers_of_samples(chosen: IntArray, everything: IntArray) -> list[tuple[int, int]]:
-    """Return the pairs of numbers of samples that occur; of frames all pixels have the same."""
-    if np.all(chosen == chosen[:1]) and np.all(everything == everything[:1]):
-        return [(int(chosen[0]), int(everything[0]))] if chosen.size else []
-    return sorted({*zip(chosen.tolist(), everything.tolist(), strict=True)})
-
-
-def _numbers(
-    known: KnownPixels, histograms: PixelHistograms, axes: EnsembleAxes
-) -> tuple[IntArray, int, Outcomes, NumberTables]:
-    """Return the samples of each electron number, those beyond, what is expected, and the tables."""
-    origin = histograms.origin
-    low, high = known.codes(histograms.counts, origin)
-    if np.any(known.law.outlier_share):  # may be anything, on the whole axis
-        low, high = np.minimum(low, axes.dn.start), np.maximum(high, axes.dn.start + axes.dn.size - 1)
-    tables = number_tables(low, high, known.exposure, known, detailed=True)
-    return (*tables.tally(histograms.counts, origin, axes.n_k), tables.outcomes(axes.n_k), tables)
-
-
-def _predicted(tables: NumberTables, pixels: UsablePixels, n: int, axes: EnsembleAxes) -> dict[str, Any]:
-    """Return what the law predicts of pixels that have n samples each."""
-    sums = mass_sums(tables.mass, tables.first, tables.start, pixels, axes.dn, axes.nuced)
-    return {
-        "pcd": sums.raw,
-        "pcd_variance": (sums.raw - sums.raw_square) / n,
-        "nuced": sums.nuced,
-        "nuced_variance": (sums.nuced - sums.nuced_square) / n,
-        "nuced_predicted_sum": sums.nuced_sum,
-        "nuced_predicted_sum_square": sums.nuced_sum_square,
-    }
 
 
 def _group_sums(
@@ -170,10 +131,17 @@ def _group_sums(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the tallies and sums of pixels that have the same number of samples."""
     (histograms, n), (histograms_all, n_all) = chosen, everything
-    data = data_all = tally(histograms.counts, histograms.origin, pixels, axes.dn, axes.nuced)
+    counts, origin = histograms.counts, histograms.origin
+    data = data_all = tally(counts, origin, pixels, axes.dn, axes.nuced)
     if histograms_all is not histograms:
         data_all = tally(histograms_all.counts, histograms_all.origin, pixels, axes.dn)
-    numbers, beyond, expected, tables = _numbers(known, histograms, axes)
+    low, high = known.codes(counts, origin)
+    if np.any(known.law.outlier_share):  # may be anything, on the whole axis
+        low, high = np.minimum(low, axes.dn.start), np.maximum(high, axes.dn.start + axes.dn.size - 1)
+    tables = number_tables(low, high, known.exposure, known, detailed=True)
+    numbers, beyond = tables.tally(counts, origin, axes.n_k)
+    expected = tables.outcomes(axes.n_k)
+    predicted = mass_sums(tables.mass, tables.first, tables.start, pixels, axes.dn, axes.nuced)
     tallies: dict[str, Any] = {
         "counts": data.raw,
         "counts_all": data_all.raw,
@@ -194,5 +162,11 @@ def _group_sums(
         "nuced_sum_square": data.nuced_sum_square / n,
         "error": expected.error.sum(),
         "error_variance": np.sum(expected.error * (1.0 - expected.error)),
+        "pcd": predicted.raw,
+        "pcd_variance": (predicted.raw - predicted.raw_square) / n,
+        "nuced": predicted.nuced,
+        "nuced_variance": (predicted.nuced - predicted.nuced_square) / n,
+        "nuced_predicted_sum": predicted.nuced_sum,
+        "nuced_predicted_sum_square": predicted.nuced_sum_square,
     }
-    return tallies, parts | _predicted(tables, pixels, n, axes)
+    return tallies, parts

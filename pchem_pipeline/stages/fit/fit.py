@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +29,7 @@ from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.tiles import Tile
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
 
@@ -106,20 +104,14 @@ def _do_tile(
 ) -> dict[str, Any]:
     """Fit one tile of the store; the summary counts its pixels, and the samples of each code.
 
-    Args:
-        tile: of the sensor.
-        store: the run.
-        samples: paths of the runs of its samples; none of a run of one.
-        how: the pixels are fitted.
-        model: of the run.
+    ``samples`` are the paths of the runs of several samples; empty for a run of one.
     """
     runs = [RunStore.open(path) for path in samples] or [store]
     read = [each.at(tile.region, "histogram") for each in runs]
     histograms = [{name: each[name] for name in _HISTOGRAM} for each in read]
-    start = added = None
     bins = sum(each["counts"].shape[2] for each in histograms)
-    if not samples:
-        start, added = kept_fit(store.path, tile.region), read_added_exposure(store, model, tile.region)
+    start = None if samples else kept_fit(store.path, tile.region)
+    added = None if samples else read_added_exposure(store, model, tile.region)
     arrays: dict[str, NDArray[Any]] = {}
     for part in parts_told(tile.parts(bins)):
         some = [{name: values[part] for name, values in each.items()} for each in histograms]
@@ -161,22 +153,19 @@ def _leave_out(arrays: Arrays, excluded: BoolArray) -> None:
     """Take the values of excluded pixels (y, x) out of the arrays of a tile, and give them their word."""
     for path, values in arrays.items():
         if values.dtype.kind == "f":
-            before = VARIABLES[path].dims.index("y")
-            values[(slice(None),) * before + (excluded,)] = np.nan
+            values[(slice(None),) * VARIABLES[path].dims.index("y") + (excluded,)] = np.nan
     arrays["fit/fit_status"][excluded] = int(FitStatus.EXCLUDED)
 
 
 def code_sums(histogram: Arrays, maps: Sequence[NDArray[Any]]) -> dict[str, Any]:
     """Return the samples of each code over the pixels that have a value, as JSON data for their marker.
 
+    These are the codes that occur (``dn``), the ``samples`` of each, and those ``outside`` of the histograms.
     The ensemble compares all frames with the model, and would decode every histogram again for it.
 
     Args:
         histogram: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x).
         maps: (H, g, mu, sigma), (y, x) each; NaN without a value.
-
-    Returns:
-        The codes that occur (``dn``), the ``samples`` of each, and those ``outside`` of the histograms.
     """
     usable, counts, origin = usable_pixels(*maps), histogram["counts"], histogram["origin"]
     start = int(origin.min())
@@ -209,11 +198,11 @@ def keep_fit(context: StageContext) -> None:
     The file holds (H, g, mu, sigma, likelihood gap), float64, (y, x, 5); NaN for pixels without a start.
     """
     store, record = context.store, context.store.records.read("fit")
-    known = None if record is None or not record.finished else record.content
     if (
-        known is None
-        or known["settings"] != setting_values(STAGES["fit"], context)
-        or known["input"]["model"] != context.model.digest
+        record is None
+        or not record.finished
+        or record.content["settings"] != setting_values(STAGES["fit"], context)
+        or record.content["input"]["model"] != context.model.digest
     ):
         _start_file(store.path).unlink(missing_ok=True)
         return
@@ -230,7 +219,5 @@ def kept_fit(store: Path, region: tuple[slice, slice]) -> FloatArray | None:
     if not place.exists():
         return None
     if isinstance(place, RemotePath):
-        whole = np.load(io.BytesIO(place.read_bytes()), allow_pickle=False)
-    else:
-        whole = np.load(place, mmap_mode="r", allow_pickle=False)
-    return np.array(whole[region])
+        return np.array(np.load(io.BytesIO(place.read_bytes()), allow_pickle=False)[region])
+    return np.array(np.load(place, mmap_mode="r", allow_pickle=False)[region])

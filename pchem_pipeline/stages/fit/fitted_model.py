@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
-from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS
-from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
+from pchem_pipeline.base.variables import FREE_SATELLITES
+from pchem_pipeline.effects.framework.compose import AddedExposure, PixelPlaces, pixel_maps, sample_law
+from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.run.model_versions import ModelVersion, Region, model_of, read_added_exposure
 from pchem_pipeline.run.sensor import SensorInfo
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pchem_pipeline.effects.framework.compose import AddedExposure
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.model.electrons.electrons import KnownPixels
-    from pchem_pipeline.model.law.sample_law import SampleLaw
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 
 def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
@@ -39,7 +33,7 @@ class FittedModel:
 
     Attributes:
         effects: in their order.
-        added: exposure that they add to the pixels, (j, n), the pixels in one axis; None: nothing.
+        added: exposure that they add to the n pixels, (j, n); None: nothing.
         version: of the run's model; None without a fit.
         places: of the pixels; None: not known.
     """
@@ -78,25 +72,16 @@ class FittedModel:
         return sample_law(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)), self.added, self.places)
 
 
-def pixel_places(store: RunStore, region: Region | None = None) -> PixelPlaces:
+def pixel_places(store: RunStore, region: Region | None) -> PixelPlaces:
     """Return where the pixels of a region lie, and the numbers of the frames, if these have an order."""
     sensor = SensorInfo.read(store)
     frames = sensor.n_frames if sensor.kind == "frames" else 0
     return PixelPlaces.of_block(region, sensor.shape, np.arange(frames))
 
 
-def fitted_satellites(store: RunStore, region: Region | None = None) -> tuple[FloatArray, FloatArray] | None:
+def fitted_satellites(store: RunStore, region: Region | None) -> tuple[FloatArray, FloatArray] | None:
     """Return amplitude (e-) and weight of the free satellites of a region, shape (n,); None: none."""
     if not all(store.has(f"fit/{name}") for name in FREE_SATELLITES):
         return None
     amplitude, weight = (store.read(f"fit/{name}", region).ravel() for name in FREE_SATELLITES)
     return amplitude, weight
-
-
-def fitted_pixels(store: RunStore, region: Region | None = None) -> KnownPixels:
-    """Return what the stored fit says of the pixels of a region."""
-    from pchem_pipeline.model.electrons.electrons import KnownPixels  # loads compiled loops
-
-    maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]
-    law = FittedModel.read(store, region).law(maps)
-    return KnownPixels(maps, law, fitted_satellites(store, region))

@@ -82,22 +82,26 @@ def fit_tile(
         added,
         places,
     )
-    fitted = _fit_arrays(found, how.shown, effects=bool(how.effects))
+    fitted = _fit_arrays(found, how)
     arrays = {"fit": {name: values.reshape(shape + values.shape[1:]) for name, values in fitted.items()}}
     if how.bias:
-        with np.errstate(invalid="ignore"):
-            errors = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
-        own = {
+        of_samples = {
             "quanta_exposure": found.quanta_exposure,
-            "quanta_exposure_stderr": errors[:, : len(histograms)],
+            "quanta_exposure_stderr": _errors(found.covariance)[:, : len(histograms)],
             "mean": found.mean,
             "variance": found.variance,
         }
         arrays["samples"] = {
-            **{name: np.ascontiguousarray(values.T).reshape(-1, *shape) for name, values in own.items()},
+            **{name: np.ascontiguousarray(each.T).reshape(-1, *shape) for name, each in of_samples.items()},
             "covariance": found.covariance.reshape(shape + found.covariance.shape[1:]),
         }
     return arrays
+
+
+def _errors(covariance: FloatArray) -> FloatArray:
+    """Return the standard errors (pixel, parameter) of a covariance; NaN where a variance is negative."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
 
 
 def _fit_model(
@@ -125,51 +129,36 @@ def _fit_model(
 
 
 def _laws(
-    plain: FitResult,
-    effects: Sequence[Effect],
-    added: AddedExposure | None,
-    places: PixelPlaces | None,
+    plain: FitResult, effects: Sequence[Effect], added: AddedExposure | None, places: PixelPlaces | None
 ) -> SampleLaw | list[SampleLaw]:
     """Return the law that the effects compose after the plain fit, or a list of one for each sample."""
     # not those without a value, or one electron off
     usable = (plain.fit_status & int(FAILED | AMBIGUOUS)) == 0
     shared = [getattr(plain, name) for name in PARAMETERS[1:]]
-    if plain.quanta_exposure.ndim == 1:
-        return sample_law(effects, pixel_maps([plain.quanta_exposure, *shared], usable), added, places)
-    return [
+    laws = [
         sample_law(effects, pixel_maps([np.ascontiguousarray(exposure), *shared], usable), added, places)
-        for exposure in plain.quanta_exposure.T
+        for exposure in np.atleast_2d(plain.quanta_exposure.T)
     ]
+    return laws[0] if plain.quanta_exposure.ndim == 1 else laws
 
 
-def _fit_arrays(result: FitResult, shown: int = 0, *, effects: bool = False) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the group ``fit`` of some pixels, by name, pixels along the first axis.
-
-    Args:
-        result: of the pixels.
-        shown: the sample whose H it is, where there are several.
-        effects: whether the model has effects, with which pixels may have free satellites.
-    """
+def _fit_arrays(result: FitResult, how: TileFit) -> dict[str, NDArray[Any]]:
+    """Return the arrays of the group ``fit`` of some pixels, by name, pixels along the first axis."""
     n_samples = result.covariance.shape[1] - 3
-    places = [shown, *range(n_samples, n_samples + 3)]
+    places = [how.shown, *range(n_samples, n_samples + 3)]
     covariance = result.covariance[:, places][:, :, places]
-    with np.errstate(invalid="ignore"):
-        errors = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     arrays: dict[str, NDArray[Any]] = {
-        f"{name}_stderr": errors[:, index] for index, name in enumerate(PARAMETERS)
+        f"{name}_stderr": errors for name, errors in zip(PARAMETERS, _errors(covariance).T, strict=True)
     }
     arrays["correlation"] = correlations(covariance)
-    arrays["quanta_exposure"] = result.quanta_exposure.reshape(-1, n_samples)[:, shown]
+    arrays["quanta_exposure"] = result.quanta_exposure.reshape(-1, n_samples)[:, how.shown]
     if result.intervals is not None:
         arrays |= {
             path: result.intervals[:, place, side]
             for place, name in zip([*places, n_samples + 3], INTERVALS, strict=True)
             for side, path in enumerate(interval_names(name))
         }
-    known = {*arrays, *(() if effects else FREE_SATELLITES)}
-    arrays |= {
-        v.name: getattr(result, v.name)
-        for v in variables_of("fit")
-        if v.name not in known and hasattr(result, v.name)
-    }
-    return arrays
+    # only under a model with effects may pixels have free satellites
+    known = {*arrays, *(() if how.effects else FREE_SATELLITES)}
+    rest = [v.name for v in variables_of("fit") if v.name not in known and hasattr(result, v.name)]
+    return arrays | {name: getattr(result, name) for name in rest}

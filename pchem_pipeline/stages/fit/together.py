@@ -19,9 +19,8 @@ _LARGEST_KEPT = 2**22  # pixels, 24 bytes each
 def judge_sensor(context: StageContext) -> int:
     """Set ``WEAKLY_IDENTIFIED`` or ``BIAS_UNSURE`` where a pixel is clear by chance; return the number.
 
-    The latter where a bias that is an electron off leaves the gain as it is.
-
-    The words depend on the sensor as a whole, not on its tiles, and may be given again and again.
+    The latter where a bias that is an electron off leaves the gain as it is. The words depend on the sensor
+    as a whole, not on its tiles, and may be given again and again.
 
     Raises:
         StoreError: the store refuses.

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pchem_pipeline.model.histogram.count import counts_dtype
+from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, block_starts
 from pchem_pipeline.run.stage import StageContext, open_store
-
-if TYPE_CHECKING:
-    from pchem_pipeline.model.histogram.settings import HistogramSettings
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 MAPS = ("origin", "under", "over", "minimum", "maximum")
 COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")

@@ -10,14 +10,16 @@ import functools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import call_all
+from pchem_pipeline.frames.stream import Block, Rows
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
 from pchem_pipeline.model.histogram.moved_frames import MovedFrames
+from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
@@ -29,10 +31,6 @@ from pchem_pipeline.model.histogram.summaries import (
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.stages.histogram.arrays import with_block_length
 
-if TYPE_CHECKING:
-    from pchem_pipeline.frames.stream import Block, Rows
-    from pchem_pipeline.model.histogram.settings import HistogramSettings
-
 _ALONG_TIME = ("block_sum", "block_sum_square", "row_sum", "row_sum_square", "column_sum")
 _OPEN = ("open_sums", "open_covariances")
 
@@ -40,15 +38,8 @@ _OPEN = ("open_sums", "open_covariances")
 class _AlongTime:
     """Gathers the pieces of one array along its first axis, and writes them by whole chunks."""
 
-    def __init__(self, store: Path, name: str, rows: slice, done: int = 0) -> None:
-        """Begin at the first frame or block that is not counted yet.
-
-        Args:
-            store: path of the run.
-            name: the array.
-            rows: its rows that are written, whole chunks.
-            done: frames or blocks that are in the store; those of the last chunk are written again.
-        """
+    def __init__(self, store: Path, name: str, rows: slice, done: int) -> None:
+        """Begin after ``done`` frames or blocks; those of the last chunk are written again."""
         self._store, self._name, self._rows = open_store(store), name, rows
         array = self._store.array(name)
         self._length = array.chunks[0]
@@ -86,8 +77,7 @@ class CountJob:
     Attributes:
         store: path of the run, which has the arrays.
         shape: frames, rows and columns of the whole stack.
-        bins: bins of a pixel.
-        settings: the section ``histogram``.
+        bins: of a pixel.
         copies: the frames go into ``frames/dn``, too.
     """
 
@@ -102,21 +92,12 @@ class StackCounter:
     """Counts the blocks of a stack, each band of rows apart, and copies the frames where that is asked."""
 
     def __init__(self, job: CountJob, bands: Sequence[Rows], workers: int = 1) -> None:
-        """Begin with no frames.
-
-        Args:
-            job: what is counted.
-            bands: bands of rows as the blocks have them, whole tiles and whole groups of rows.
-            workers: threads that share the bands.
-        """
-        self._job, self._bands, self._workers = job, bands, workers
+        """Begin with no frames; ``workers`` threads share the bands, whole tiles and whole groups of rows."""
+        self._job, self._workers = job, workers
         self._counters = [_BandCounter(job, rows) for rows in bands]
 
     def resume(self, n_frames: int) -> None:
-        """Continue after the frames that the run has counted.
-
-        Args:
-            n_frames: their number.
+        """Continue after the ``n_frames`` frames that the run has counted.
 
         Raises:
             StoreError: an array is missing or damaged.
@@ -124,12 +105,10 @@ class StackCounter:
         call_all([functools.partial(each.resume, n_frames) for each in self._counters], self._workers)
 
     def count(self, blocks: Iterable[Block], check: Callable[[], None] = lambda: None) -> None:
-        """Count all blocks, and write what they give into the run.
+        """Count all blocks, in the order of time, and write what they give into the run.
 
-        Args:
-            blocks: in the order of time; the first of a stack decides the windows, so let it always have
-                the same number of frames.
-            check: called before each block; raises where the work shall end.
+        The first of a stack decides the windows, so let it always have the same number of frames. ``check``
+        is called before each block; it raises where the work shall end.
 
         Raises:
             InputError: DN of more than 24 bits, or the frames cannot be read.
@@ -137,23 +116,13 @@ class StackCounter:
         """
         for start, parts in blocks:
             check()
-            tasks = [
-                functools.partial(counter.add, part)
-                for counter, part in zip(self._counters, parts, strict=True)
-            ]
+            pairs = list(zip(self._counters, parts, strict=True))
+            tasks = [functools.partial(counter.add, part) for counter, part in pairs]
             if self._job.copies:
-                tasks += [
-                    functools.partial(self._copy, start, rows, part)
-                    for rows, part in zip(self._bands, parts, strict=True)
-                ]
+                tasks += [functools.partial(counter.copy, start, part) for counter, part in pairs]
             call_all(tasks, self._workers)
-            del parts, tasks  # the frames are not held any more while results are written
+            del parts, pairs, tasks  # the frames are not held any more while results are written
         call_all([counter.finish for counter in self._counters], self._workers)
-
-    def _copy(self, start: int, rows: Rows, part: NDArray[Any]) -> None:
-        """Write a band of a block of frames, whole chunks, into the store."""
-        region = (slice(start, start + part.shape[0]), slice(*rows), slice(None))
-        open_store(self._job.store).write("frames/dn", region, part)
 
 
 class _BandCounter:
@@ -216,6 +185,11 @@ class _BandCounter:
             self._spectrum.add(frames[:, :ROW_GROUP])
         if self._moved is not None:
             self._moved.add(frames[:, :ROW_GROUP])
+
+    def copy(self, start: int, frames: NDArray[Any]) -> None:
+        """Write frames from ``start`` on, whole chunks, into the store."""
+        region = (slice(start, start + len(frames)), self._rows, slice(None))
+        open_store(self._store).write("frames/dn", region, frames)
 
     def finish(self) -> None:
         """Write all that was not written on the way."""

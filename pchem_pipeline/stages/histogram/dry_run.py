@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from pchem_pipeline.compute.memory import BASE_BYTES
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.model.histogram.count import most_bins
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
@@ -15,12 +17,6 @@ from pchem_pipeline.stages.histogram.histogram import bins_of
 from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.ingest import disk_words
 from pchem_pipeline.store.tiles import tile_grid, tile_shape
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from pchem_pipeline.config.tree import RunConfig
 
 #: the program with what the later stages hold, and that for each pixel
 _REPORT_BYTES, _REPORT_PIXEL_BYTES = 400 << 20, 400
@@ -32,10 +28,9 @@ class Plan:
 
     Attributes:
         shape: frames, rows, columns.
-        bins: bins of a pixel.
-        tiles: number of tiles.
+        bins: of a pixel.
+        tiles: their number.
         tile: rows and columns of one.
-        workers: number of workers.
         single_pass: the camera files are read once; else twice, by bands of rows.
         disk: where the frames are to be, and how much disk the store takes.
         held_bytes: largest resident memory of the process.
@@ -67,13 +62,7 @@ class Plan:
 
 
 def plan_lines(config: RunConfig, base_dir: Path, todo: Sequence[str]) -> list[str]:
-    """Return what it takes to go through the camera files, where they are there; else nothing.
-
-    Args:
-        config: of the run.
-        base_dir: folder to which its paths refer.
-        todo: the stages that are to be done.
-    """
+    """Return what it takes to go through the camera files, where they are there; else nothing."""
     if "simulate" in todo or config.input.samples or is_histogram_input(config.input, base_dir):
         return []
     return make_plan(config, base_dir).words()
@@ -88,8 +77,7 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     from pchem_pipeline.frames.open import open_frames
 
     frames = open_frames(config.input, base_dir)
-    ny, nx = frames.shape[1:]
-    workers = config.compute.count()
+    (ny, nx), workers = frames.shape[1:], config.compute.count()
     limit = most_bins(config.histogram.max_bins, frames.dtype)
     rows = min(ny, math.lcm(ROW_GROUP, min(frames.rows_per_read, ny)))
     bins = bins_of(frames, config.histogram.window_frames, limit, rows)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from pchem_pipeline.frames.histogram_files import HistogramInput, read_histograms
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.count import choose_bins, most_bins, pixels_by_range
 from pchem_pipeline.model.histogram.odd_frames import FAR_CHANCE, chance_of_copies, frame_scores, odd_frames
@@ -28,19 +29,13 @@ from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.store.tiles import equal_rows
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pchem_pipeline.frames.histogram_files import HistogramInput
-    from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.tiles import Tile, equal_rows
 
 # -- the stage ----------------------------------------------------------------------------------
 
 
-def _bands(context: StageContext, source: FrameSource, bins: int) -> list[Band]:
-    """Return the bands; say so where even the lowest possible ones need more memory than allowed."""
+def _bands(context: StageContext, source: FrameSource, bins: int) -> tuple[list[Band], int]:
+    """Return the bands and the bytes of the highest; say so where that is more memory than allowed."""
     settings, tiles = context.config.histogram, context.tiles()
     n_frames, _, columns = source.shape
     row = bytes_per_row(columns, n_frames, source.dtype.itemsize, bins, settings)
@@ -54,7 +49,7 @@ def _bands(context: StageContext, source: FrameSource, bins: int) -> list[Band]:
             f"{math.ceil(highest * row / 2**20)} MiB, more than histogram.band_memory or compute.max_memory "
             "allow; lower histogram.window_frames, or --workers"
         )
-    return bands
+    return bands, highest * row
 
 
 def run(context: StageContext) -> None:
@@ -64,15 +59,12 @@ def run(context: StageContext) -> None:
         InputError: the camera files vanished or changed.
         StoreError: the input is not complete, or the store refuses.
     """
-    if context.sensor.samples:
-        _copy_shown_sample(context)
-        return
-    if context.sensor.kind == "histograms":
+    if context.sensor.kind != "frames":
         _copy_histograms(context)
         return
     if context.is_prepared:
         context.run_units(context.tiles())
-        _end(context, context.tiles())
+        _end(context)
         return
     source = open_source(context)
     if context.fresh or not context.store.has("histogram/counts"):
@@ -80,26 +72,23 @@ def run(context: StageContext) -> None:
     else:
         bins = context.store.array("histogram/counts").shape[2]
     create_arrays(context, source.shape, bins)
-    bands = _bands(context, source, bins)
+    bands, held = _bands(context, source, bins)
     job = CountJob(context.store.path, source.shape, bins, context.config.histogram)
     threads = max(1, context.executor.workers // max(1, len(context.pending(bands))))
     task = functools.partial(_do_band, job=job, source=source, threads=threads)
-    row = bytes_per_row(source.shape[2], source.shape[0], source.dtype.itemsize, bins, job.settings)
-    held = row * max(band.y1 - band.y0 for band in bands)
     done = context.run_units(bands, task, unit_name="band", unit_bytes=held)
     if len(done) == context.n_keys:
-        _end(context, bands)
+        _end(context)
 
 
-def _end(context: StageContext, areas: Sequence[Band | Tile]) -> None:
+def _end(context: StageContext) -> None:
     """Do what needs the whole sensor."""
     if context.config.histogram.summaries:
-        _write_frame_statistics(context, (context.sensor.n_frames, *context.sensor.shape))
+        _write_frame_statistics(context)
     number = 0
-    for area in areas:
-        region = (slice(area.y0, area.y1), slice(None)) if isinstance(area, Band) else area.region
-        under, over = (context.store.read(f"histogram/{name}", region) for name in ("under", "over"))
-        number += int(np.count_nonzero(under | over))
+    for tile in context.tiles():
+        histogram = context.store.at(tile.region, "histogram")
+        number += int(np.count_nonzero(histogram["under"] | histogram["over"]))
     if number:
         bins = context.store.array("histogram/counts").shape[2]
         words = "pixels have samples outside their" if number > 1 else "pixel has samples outside its"
@@ -117,14 +106,7 @@ def _decide_bins(context: StageContext, source: FrameSource) -> int:
 
 
 def bins_of(source: FrameSource, frames: int, most: int, rows: int) -> int:
-    """Return the number of bins that the histograms of a sensor need.
-
-    Args:
-        source: its frames.
-        frames: the first ones, which are looked at.
-        most: number of bins at most.
-        rows: that are read at once.
-    """
+    """Return the number of bins, at most ``most``, that the first frames need; ``rows`` are read at once."""
     n_frames, ny, columns = source.shape
     ranges = np.zeros(most + 2, np.int64)
     for y0, y1 in equal_rows(ny, rows):
@@ -141,19 +123,17 @@ def _do_band(band: Band, store: RunStore, *, job: CountJob, source: FrameSource,
         StackCounter(job, rows).count(stream)
 
 
-def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) -> None:
+def _write_frame_statistics(context: StageContext) -> None:
     """Derive the statistics of whole frames from the row sums of all bands; leave out odd frames."""
-    n_frames, ny, nx = shape
+    n_frames, (ny, nx) = context.sensor.n_frames, context.sensor.shape
     mean, variance, level = np.empty((3, n_frames))
     weights = np.random.default_rng(1).integers(1 << 62, size=(2, ny))
     digest, usual, scores, chance = np.empty(n_frames, np.int64), None, [], 1.0
     # parts of about the same length: a frame is ranked among those of its part
     ends = np.linspace(0, n_frames, -(-n_frames // row_frames(ny)) + 1).astype(int).tolist()
     for part in (slice(*each) for each in pairwise(ends)):
-        sums, squares = (
-            context.store.read(f"summary/{name}", (part, slice(None)))
-            for name in ("row_sum", "row_sum_square")
-        )
+        rows = part, slice(None)
+        sums, squares = (context.store.read(f"summary/row_sum{of}", rows) for of in ("", "_square"))
         mean[part], variance[part] = frame_statistics(sums, squares, nx)
         if usual is None:
             usual, chance = np.median(sums, axis=0), chance_of_copies(sums.var(axis=0), n_frames)
@@ -179,29 +159,20 @@ def _write_frame_statistics(context: StageContext, shape: tuple[int, int, int]) 
 
 
 def _copy_histograms(context: StageContext) -> None:
-    """Take ready-made histograms as they are; order in time and neighbours are not known."""
-    from pchem_pipeline.frames.histogram_files import read_histograms
+    """Copy ready-made histograms, without order in time and neighbours, or those of the shown sample.
 
-    given = read_histograms(context.config.input, context.base_dir)
-    task = functools.partial(_copy_tile, given=given)
-    _copied(context, given.counts, "input is histograms, without order in time", task)
-
-
-def _copy_shown_sample(context: StageContext) -> None:
-    """Copy the histograms of the shown sample of several, so that report and ensemble need no run of it.
-
-    The fit reads the histograms of all samples in their own runs.
-
-    Raises:
-        StoreError: the run of the sample is gone, or the store refuses.
+    So report and ensemble need no run of a sample; the fit reads the histograms of all in their own runs.
     """
-    place = sample_targets(context.config, context.base_dir)[context.sensor.shown].store
-    task = functools.partial(_copy_sample_tile, sample=place)
-    _copied(context, RunStore.open(place).array("histogram/counts"), "in the runs of the samples", task)
-
-
-def _copied(context: StageContext, counts: Any, missing: str, task: Task[Tile]) -> None:
-    """Make the arrays, as wide as ``counts``, and do all tiles; summaries are ``missing`` for that reason."""
+    counts: Any
+    task: Task[Tile]
+    if context.sensor.samples:
+        place = sample_targets(context.config, context.base_dir)[context.sensor.shown].store
+        counts, missing = RunStore.open(place).array("histogram/counts"), "in the runs of the samples"
+        task = functools.partial(_copy_sample_tile, sample=place)
+    else:
+        given = read_histograms(context.config.input, context.base_dir)
+        counts, missing = given.counts, "input is histograms, without order in time"
+        task = functools.partial(_copy_tile, given=given)
     create_counts(context, counts.shape[2], counts.dtype)
     context.store.set_attributes("summary", {"missing": missing})
     context.run_units(context.tiles(), task)

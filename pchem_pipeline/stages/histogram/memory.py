@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pchem_pipeline.compute.memory import BASE_BYTES
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.histogram.count import counts_dtype
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.stages.histogram.arrays import CHUNK_BLOCKS, COLUMN_FRAMES, ROW_FRAMES
-from pchem_pipeline.stages.ingest import chunk_shape
-from pchem_pipeline.store.tiles import tile_shape
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
 
 
 def bytes_per_row(columns: int, n_frames: int, itemsize: int, bins: int, settings: HistogramSettings) -> int:
@@ -32,22 +28,7 @@ def bytes_per_row(columns: int, n_frames: int, itemsize: int, bins: int, setting
     return columns * pixel + row
 
 
-def single_pass_rows(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> int:
-    """Return the rows that must stay together in a single pass: of tiles, groups, chunks of the copy."""
-    step = max(tile_shape(config.run.tile, shape[1:])[0], ROW_GROUP)
-    if config.input.mode == "copy":
-        step = math.lcm(step, chunk_shape(shape, dtype.itemsize)[1])
-    return step
-
-
 def single_pass_bytes(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any], bins: int) -> int:
-    """Return the memory of a single pass over the input, the program included.
-
-    Args:
-        config: of the run.
-        shape: frames, rows, columns.
-        dtype: type of the samples.
-        bins: bins of a pixel.
-    """
+    """Return the memory of a single pass over frames (frame, y, x), the program included."""
     n_frames, ny, nx = shape
     return BASE_BYTES + ny * bytes_per_row(nx, n_frames, dtype.itemsize, bins, config.histogram)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,14 +16,11 @@ from pchem_pipeline.model.histogram.odd_frames import KINDS, left_out, odd_words
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
 from pchem_pipeline.run.input import open_source
+from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
 from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
-from pchem_pipeline.store.tiles import equal_rows
-
-if TYPE_CHECKING:
-    from pchem_pipeline.run.stage import StageContext
-    from pchem_pipeline.store.run_store import RunStore
-    from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.tiles import Tile, equal_rows
 
 
 def odd_frames_of(store: RunStore) -> tuple[dict[str, IntArray], IntArray]:
@@ -43,13 +39,9 @@ def uncounted_frames(odd: Mapping[str, IntArray]) -> IntArray:
 def leave_out_odd_frames(
     context: StageContext, odd: dict[str, IntArray], mean: FloatArray, variance: FloatArray
 ) -> None:
-    """Leave odd frames out; the result is the same where that was done in part before.
+    """Leave odd frames (by kind) out once all bands are done; again where that was done in part before.
 
-    Args:
-        context: of the stage, whose bands are all done.
-        odd: frames by kind.
-        mean: of each frame over its pixels, DN, (frame,).
-        variance: likewise, DN^2.
+    ``mean`` (DN) and ``variance`` (DN^2) are those of each frame over its pixels.
 
     Raises:
         InputError: frames cannot be read again.
@@ -78,9 +70,9 @@ def _leave_out_of_histograms(context: StageContext, frames: IntArray) -> None:
         before = {name: held[name] for name in ("counts", *MAPS)}
         counts, origin, under, over, low, high = (values.astype(np.int64) for values in before.values())
         last = origin + counts.shape[2] - 1
-        there = counts.sum(axis=2) + under + over - (context.sensor.n_frames - frames.size)
+        surplus = counts.sum(axis=2) + under + over - (context.sensor.n_frames - frames.size)
         for t, dn in _samples(source, tile, newer):
-            some = there > newer[t]
+            some = surplus > newer[t]
             inside = some & (dn >= origin) & (dn <= last)
             counts[inside, (dn - origin)[inside]] -= 1
             under -= some & (dn < origin)
@@ -114,13 +106,7 @@ def _leave_out_of_spectrum(context: StageContext, out: IntArray) -> None:
 
 
 def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) -> None:
-    """Write block sums and covariances without odd frames, from what all gave and the frames of their blocks.
-
-    Args:
-        context: of the stage.
-        changed: frames whose blocks are done again.
-        out: frames that are left out.
-    """
+    """Write block sums and covariances without frames ``out``; blocks of ``changed`` ones are read again."""
     store, source = context.store, open_source(context)
     n_frames, ny, _ = source.shape
     length = with_block_length(context.config.histogram, store).block_length(n_frames)

@@ -1,23 +1,23 @@
 """A single pass of ``pchem run`` over the camera files: hash, window, histogram, summaries, and the copy.
 
 What the stages ``ingest`` and ``histogram`` do one after the other, with two or three readings of all bytes,
-is done here in one. The results are the same to the bit; both stages afterwards find their
-arrays made and have but to mark them. It needs memory for the histograms of the whole sensor; where that is
-not there, or where something is known of the input already, nothing is done here and the stages run by
-themselves. Also a command whose tiles go to other machines counts here: it reads all bytes for the hash.
+is done here in one, to the same bit; both stages then find their arrays made and have but to mark them. It
+needs memory for the histograms of the whole sensor; where that is not there, or where something is known of
+the input already, nothing is done here and the stages run by themselves. Also a command whose tiles go to
+other machines counts here: it reads all bytes for the hash.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.compute.environment import cpu_seconds
@@ -26,8 +26,10 @@ from pchem_pipeline.frames.histogram_files import is_histogram_input
 from pchem_pipeline.frames.identity import file_size, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
+from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.stream import HashedFrameStream
 from pchem_pipeline.model.histogram.count import choose_bins, most_bins, pixels_by_range
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.input import identity_is_new, keep_identity
 from pchem_pipeline.run.progress import whole_mebibytes
 from pchem_pipeline.run.stage import Prepared, StageContext, allowed_bytes
@@ -35,13 +37,9 @@ from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.bands import cut_rows
 from pchem_pipeline.stages.histogram.arrays import create_arrays
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import single_pass_bytes, single_pass_rows
+from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.table import STAGES
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pchem_pipeline.frames.sequence import FrameSequence
+from pchem_pipeline.store.tiles import tile_shape
 
 #: the stages whose arrays one pass makes
 PREPARED = ("ingest", "histogram")
@@ -85,17 +83,15 @@ def prepared(frames: FrameSequence, clock: tuple[float, float]) -> dict[str, Pre
 def hashed_frames(
     context: StageContext, frames: FrameSequence, step: int, files: Sequence[Path], first: int = 0
 ) -> Iterator[HashedFrameStream]:
-    """Open the stream of frames whose files are hashed as they are read, by bands that the workers share.
+    """Open the stream of frames, ``step`` in a block, whose files are hashed as they are read.
 
-    Args:
-        context: of the run.
-        frames: all of them.
-        step: frames of a block.
-        files: that are read.
-        first: frame that they begin with.
+    Workers share its bands. Of all frames, those from ``first`` on are read, and lie in ``files``.
     """
     workers = context.config.compute.count()
-    rows = single_pass_rows(context.config, frames.shape, frames.dtype)
+    # rows that stay together: of a tile, of a group, of a chunk of the copy
+    rows = max(tile_shape(context.config.run.tile, frames.shape[1:])[0], ROW_GROUP)
+    if context.config.input.mode == "copy":
+        rows = math.lcm(rows, ingest.chunk_shape(frames.shape, frames.dtype.itemsize)[1])
     total = sum(file_size(path) for path in files) >> 20
     with (
         context.reporter.progress("ingest and histogram", total, "MiB") as advance,
@@ -142,25 +138,18 @@ def _count(context: StageContext, frames: FrameSequence, stream: HashedFrameStre
     blocks = iter(stream)
     first = next(blocks)
     context.stop.check()
-    bins = _choose_bins(context, first[1])
+    limit = most_bins(config.histogram.max_bins, frames.dtype)
+    found = call_all([functools.partial(pixels_by_range, part, limit) for part in first[1]], workers)
+    bins = choose_bins(np.sum(found, axis=0), limit)
     if not _fits(context, frames, bins):
         return False
     _create(context, frames, bins)
-    job = CountJob(
-        context.store.path, frames.shape, bins, config.histogram, copies=config.input.mode == "copy"
-    )
+    copies = config.input.mode == "copy"
+    job = CountJob(context.store.path, frames.shape, bins, config.histogram, copies)
     everything = itertools.chain([first], blocks)
     del first  # so that nothing holds the frames when they are counted
     StackCounter(job, stream.bands, workers).count(everything, context.stop.check)
     return True
-
-
-def _choose_bins(context: StageContext, parts: Sequence[NDArray[Any]]) -> int:
-    """Return the number of bins of the sensor, from its first frames."""
-    limit = most_bins(context.config.histogram.max_bins, parts[0].dtype)
-    tasks = [functools.partial(pixels_by_range, part, limit) for part in parts]
-    found = call_all(tasks, context.config.compute.count())
-    return choose_bins(np.sum(found, axis=0), limit)
 
 
 def _create(context: StageContext, frames: FrameSequence, bins: int) -> None:
