@@ -15,7 +15,6 @@ from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.simulate import chain
 
 KINDS = effect_classes()
-BOW = (-0.5, 0.5, -0.5)
 JUMPS = (((0, 1.0), (5, -2.0), (9, 0.0)), ((3, 1.0),), (), ((2, 0.5), (11, 4.0)))
 UNTESTABLE = {"charge_lag", "charge_diffusion", "spurious_charge"}
 SHAPE, N_FRAMES = (8, 7), 40
@@ -26,7 +25,7 @@ STRONG: list[Effect] = [
     make("flicker_noise", share=0.9, correlation_frames=0.4),
     make("flicker_noise", share=0.9, correlation_frames=90.0, spectrum="one_over_f"),
     make("gain_drift", drift=0.4),
-    make("gain_drift", drift=0.4, shape="path", path=BOW),
+    make("gain_drift", drift=0.4, shape="path", path=(-0.5, 0.5, -0.5)),
     make("gain_drift", drift=0.4, shape="settling"),
     make("heavy_tailed_noise", share=0.3, factor=4.0),
     make("interpixel_capacitance", coupling=0.1, anisotropy=0.3),

@@ -19,24 +19,19 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-
-N_FRAMES, SMALL = 14, (6, 5)
-
-
-def frames_of(*effects):
-    sensor = SimulateSettings(shape=SMALL, n_frames=N_FRAMES, seed=8, effects=effects)
-    return simulate_block(drawn_truth(SMALL), sensor, (0, N_FRAMES))[0]
 
 
 def test_repeats_are_exact_copies_of_what_was_delivered():
-    plain, listed = frames_of(), (1, 2, 5, 9, 10, 11)
+    plain, listed = (
+        np.random.default_rng(8).integers(90, 140, (14, 6, 5)).astype(np.uint16),
+        (1, 2, 5, 9, 10, 11),
+    )
     delivered = plain.copy()
     for t in listed:
         delivered[t] = delivered[t - 1]
-    np.testing.assert_array_equal(frames_of(RepeatedFrames(frames=listed)), delivered)
-    some = frames_of(RepeatedFrames(frames=listed, rows=(2, 4)))
+    context = context_of((6, 5), 14)
+    np.testing.assert_array_equal(RepeatedFrames(frames=listed).apply(plain, context), delivered)
+    some = RepeatedFrames(frames=listed, rows=(2, 4)).apply(plain, context)
     np.testing.assert_array_equal(some[:, 2:4], delivered[:, 2:4])
     np.testing.assert_array_equal(np.delete(some, [2, 3], axis=1), np.delete(plain, [2, 3], axis=1))
 
@@ -52,10 +47,7 @@ def test_random_repeats_come_as_often_as_they_should():
     assert out[0] == 0
 
 
-BITS_SHAPE = (50, 50)
-
-
-BITS_FRAMES = np.random.default_rng(1).integers(90, 140, (40, *BITS_SHAPE)).astype(np.uint16)
+BITS_FRAMES = np.random.default_rng(1).integers(90, 140, (40, 50, 50)).astype(np.uint16)
 
 
 def by_hand(code, bit, fault):
@@ -70,7 +62,7 @@ def by_hand(code, bit, fault):
 @pytest.mark.parametrize("bit", [0, 3, 5])
 def test_a_stuck_bit_is_wrong_in_every_sample(bit, fault):
     effect = BitErrors(share=1.0, bit=bit, fault=fault)
-    found = effect.apply(BITS_FRAMES, context_of(BITS_SHAPE, 40))
+    found = effect.apply(BITS_FRAMES, context_of((50, 50), 40))
     table = np.array([by_hand(code, bit, fault) for code in range(256)])
     np.testing.assert_array_equal(found, table[BITS_FRAMES])
     assert found.dtype == BITS_FRAMES.dtype
@@ -84,9 +76,17 @@ def test_a_stuck_bit_is_wrong_in_every_sample(bit, fault):
     ],
 )
 def test_a_share_of_the_samples_is_wrong(effect, share):
-    found = effect.apply(BITS_FRAMES, context_of(BITS_SHAPE, 40))
+    found = effect.apply(BITS_FRAMES, context_of((50, 50), 40))
     n, wrong = BITS_FRAMES.size, int((found != BITS_FRAMES).sum())
     assert abs(wrong - share * n) <= 5 * np.sqrt(share * (1 - share) * n)
+
+
+def with_errors(plain, codes, effect):
+    """Return masses (pixel, code) of which a share has a wrong bit; errors do not leave the codes."""
+    exact = (1 - effect.share) * plain
+    for place, code in enumerate(codes[:300]):
+        exact[:, by_hand(int(code), effect.bit, effect.fault) - codes[0]] += effect.share * plain[:, place]
+    return exact
 
 
 @pytest.mark.parametrize("fault", ["zero", "one", "flip"])
@@ -94,28 +94,18 @@ def test_the_law_has_as_many_moved_samples_and_their_mean(fault):
     effect = BitErrors(share=0.01, bit=3, fault=fault)
     maps = PixelMaps(*np.array([[0.8, 2.5], [0.1, 0.07], [100.3, 97.0], [3.0, 3.4]]), np.ones(2, bool))
     codes = np.arange(40, 400)
-    plain = sample_mass(SampleLaw(), maps, codes)
     law = sample_mass(effect.sample_law(SampleLaw(), maps), maps, codes)
-    exact = 0.99 * plain
-    for place, code in enumerate(codes):
-        exact[:, by_hand(code, 3, fault) - 40] += 0.01 * plain[:, place]
     np.testing.assert_allclose(law.sum(axis=1), 1.0, atol=1e-9)
+    exact = with_errors(sample_mass(SampleLaw(), maps, codes), codes, effect)
     np.testing.assert_allclose(law @ codes, exact @ codes, atol=2e-4)
 
 
 def test_the_law_takes_some_of_the_errors_out_of_the_read_noise():
-    rng = np.random.default_rng(7)
-    n = 24
-    maps = PixelMaps(
-        rng.uniform(0.5, 3, n), 1 / rng.uniform(8, 16, n), rng.uniform(96, 112, n), rng.uniform(2.4, 4.2, n),
-        np.ones(n, bool),
-    )  # fmt: skip
-    effect = BitErrors(share=0.004, bit=3)
-    codes = np.arange(30, 500)
-    plain = sample_mass(SampleLaw(), maps, codes)
-    mass = 0.996 * plain
-    for place, code in enumerate(codes[:300]):
-        mass[:, by_hand(int(code), 3, "zero") - 30] += 0.004 * plain[:, place]
+    rng, n = np.random.default_rng(7), 24
+    ranges = ((0.5, 3), (1 / 16, 1 / 8), (96, 112), (2.4, 4.2))
+    maps = PixelMaps(*(rng.uniform(*each, n) for each in ranges), np.ones(n, bool))
+    effect, codes = BitErrors(share=0.004, bit=3), np.arange(30, 500)
+    mass = with_errors(sample_mass(SampleLaw(), maps, codes), codes, effect)
     counts, origin = np.rint(1e6 * mass).astype(np.uint32), np.full(n, 30)
     errors = []
     for law in (None, effect.sample_law(SampleLaw(), maps)):
@@ -151,21 +141,15 @@ def test_a_bit_that_never_changes_is_stuck(bit, fault):
     assert BitErrors.estimate(seen(taken(truth, effect, n_frames=800))) == (effect,)
 
 
-def predicted_by_hand(frame, y, x, predictor):
-    """Return what the neighbours of one sample predict, written down once more."""
-    around = [int(frame[y + b, x + a]) for b in (-1, 0, 1) for a in (-1, 0, 1) if a or b]
-    if predictor == "row":
-        around = [int(frame[y, x - 1]), int(frame[y, x + 1])]
-    return int(np.floor(np.median(around) if predictor == "median" else np.mean(around)))
-
-
 def corrected_by_hand(frame, threshold, predictor):
+    """Replace samples above what their neighbours predict, written down once more."""
     found = frame.copy()
-    for y in range(1, frame.shape[0] - 1):
-        for x in range(1, frame.shape[1] - 1):
-            prediction = predicted_by_hand(frame, y, x, predictor)
-            if int(frame[y, x]) - prediction > threshold:
-                found[y, x] = prediction
+    for y, x in np.ndindex(frame.shape[0] - 2, frame.shape[1] - 2):
+        around = frame[y : y + 3, x : x + 3].astype(int).ravel()
+        others = around[[3, 5]] if predictor == "row" else np.delete(around, 4)
+        prediction = int(np.floor(np.median(others) if predictor == "median" else np.mean(others)))
+        if around[4] - prediction > threshold:
+            found[y + 1, x + 1] = prediction
     return found
 
 
@@ -226,19 +210,6 @@ def test_a_rule_without_a_threshold_is_none_that_an_effect_can_have():
     some = np.random.default_rng(6).random(inner.shape) < 0.3
     inner[some] = np.minimum(inner, prediction)[some]
     assert all(found.threshold_dn > 0 for found in PixelCorrection.estimate(seen(frames)))
-
-
-def test_the_rule_says_what_comes_out_in_the_stead_of_a_sample():
-    frames = np.random.default_rng(4).integers(90, 140, (5, 7, 6)).astype(np.uint16)
-    effect = PixelCorrection(threshold_dn=12)
-    rule = effect.replacement(frames)
-    changed = effect.apply(frames, context_of((7, 6), 5)) != frames
-    assert changed.any()
-    assert not changed[:, ~rule.inside].any()
-    np.testing.assert_array_equal(
-        changed, (frames.astype(int) - rule.value > rule.excess) & rule.inside & (frames != rule.value)
-    )
-    assert not PixelCorrection(threshold_dn=1).replacement(frames[:, :2]).inside.any()
 
 
 LINES_SHAPE, N_LINE_FRAMES = (9, 11), 300
