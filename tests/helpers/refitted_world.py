@@ -26,14 +26,7 @@ Mean = Callable[[Sequence[Effect]], np.ndarray[Any, Any]]
 
 
 class World:
-    """Data of some effects, and of something beside them, and what refits under other effects would give.
-
-    Args:
-        truth: effects of the data.
-        statistics: mean of the statistics under effects.
-        seed: of what is by chance.
-        beside: what else the data show.
-    """
+    """Data of some effects and of something beside them, and what refits under other effects would give."""
 
     def __init__(
         self,

@@ -177,7 +177,6 @@ def test_a_skew_is_told_from_tails_and_tails_from_a_skew() -> None:
     for noise, right, wrong in ((exgaussian(rng, 0.4), skew, heavy), (mixture(rng, 0.2, 1.8), heavy, skew)):
         likelihood = PixelLikelihood(frames_of(noise, 9), maps_of(0.3), (), Effort(None))
         answer, back = likelihood.behind([wrong], [right]), likelihood.behind([right], [wrong])
-        assert back is not None
         assert answer[0] < -4.0 * answer[1] < 0.0
         assert back == pytest.approx((-answer[0], answer[1]))
 
