@@ -93,17 +93,6 @@ def test_parts_of_a_dn_give_the_same_as_whole_ones():
     np.testing.assert_allclose(parts.probability, whole.probability, rtol=1e-6)
 
 
-def test_exposure_does_not_depend_on_the_unit_of_codes():
-    _, camera, _, frames = KnownCamera.taken(34, (4, 4), 2.0, 300)
-    whole = histogram_frames(frames)
-    fine = histogram_frames(frames.astype(np.uint32) * 4, bins=1024)
-    found = [
-        estimate_exposure(h.counts, h.origin, camera.calibration(), parts).exposure
-        for h, parts in ((whole, 1), (fine, 4))
-    ]
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("n_frames", "exposure"), [(1, (1.0, 1.0)), (1, (0.3, 4.0)), (2, (0.0, 0.02)), (4, (0.3, 6.0))]
 )
