@@ -24,7 +24,6 @@ Fate = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 
 def nothing(k: np.ndarray, _: np.random.Generator) -> np.ndarray:
-    """Return electrons as they come."""
     return k
 
 
@@ -58,7 +57,6 @@ def emptied(k: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def chances(frames: np.ndarray) -> Any:
-    """Return what is measured of frames."""
     numbers = np.arange(FRAMES)
     evidence = observe(frames, numbers, n_run=FRAMES, block_frames=100)
     return electron_chances(PartSamples(frames, numbers, evidence.maps, evidence, np.ones(SHAPE, bool)))
@@ -74,7 +72,6 @@ def drawn(fate: Fate, seed: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def plain() -> Any:
-    """What is measured where electrons come by themselves."""
     return chances(drawn(nothing, 1))
 
 

@@ -38,7 +38,6 @@ def frames(
 
 
 def scores(frames: np.ndarray, maps: PixelMaps) -> dict[Any, Sums]:
-    """Return the sums of scores of frames."""
     evidence: Any = None
     return common_scores(PartSamples(frames, np.arange(len(frames)), maps, evidence, EVERYWHERE))
 
@@ -62,7 +61,6 @@ def sums_of(changes: str, sums: np.ndarray, numbers: np.ndarray | None = None) -
 
 
 def drawn(*shape: int) -> np.ndarray:
-    """Return random numbers of mean 0 and variance 1."""
     return np.random.default_rng(9).standard_normal(shape)
 
 

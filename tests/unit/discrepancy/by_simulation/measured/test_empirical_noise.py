@@ -24,6 +24,7 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 ROWS, COLUMNS, FRAMES, STEP = 14, 16, 900, 12.0
 SHAPE = (ROWS, COLUMNS)
+EVERYWHERE = np.ones(SHAPE, bool)
 AMPLITUDE, NEXT = 0.9, 0.7  # DN, and the weight of the neighbour
 POWER = AMPLITUDE**2 * (1 + NEXT**2)
 COVARIANCE = AMPLITUDE**2 * NEXT
@@ -49,7 +50,6 @@ def of_earlier_frames(rng: np.random.Generator) -> np.ndarray:
 
 
 def nothing(rng: np.random.Generator) -> float:
-    """No noise."""
     return 0.0
 
 
@@ -63,10 +63,9 @@ def stack(seed: int, noise: Any, read_noise: float = 0.25, exposure: float = 1.2
     return np.floor(dn + 0.5).clip(0).astype(np.uint16)
 
 
-def measured(frames: np.ndarray, inside: np.ndarray | None = None) -> EmpiricalNoise | None:
+def measured(frames: np.ndarray, inside: np.ndarray = EVERYWHERE) -> EmpiricalNoise | None:
     """Return what is measured beside a model that makes no covariances."""
     numbers = np.arange(FRAMES)
-    inside = np.ones(SHAPE, bool) if inside is None else inside
     evidence = observe(frames, numbers, n_run=FRAMES, block_frames=30)
     found = residual_covariances(PartSamples(frames, numbers, evidence.maps, evidence, inside))
     noise = measured_noise(found, NOTHING, evidence, inside)
@@ -106,12 +105,8 @@ def test_nothing_is_measured_where_there_is_nothing():
 def test_the_shape_of_what_lines_share_is_measured(axis):
     slope = np.linspace(-1.5, 1.5, SHAPE[axis - 1])
 
-    def tilted(rng):
-        if axis == 2:
-            return rng.standard_normal((FRAMES, ROWS, 1)) * slope
-        return rng.standard_normal((FRAMES, 1, COLUMNS)) * slope[:, None]
-
-    found = measured(stack(7, tilted))
+    along, size = {1: (np.s_[:, None], (FRAMES, 1, COLUMNS)), 2: (np.s_[:], (FRAMES, ROWS, 1))}[axis]
+    found = measured(stack(7, lambda rng: rng.standard_normal(size) * slope[along]))
     (mode,) = found.modes  # near samples share it, and nothing else
     assert mode.of == ("row" if axis == 2 else "column")
     shape = mode.along(np.linspace(0.0, 1.0, slope.size))
@@ -119,36 +114,28 @@ def test_the_shape_of_what_lines_share_is_measured(axis):
     power = np.mean(slope**2)
     assert found.share_of(mode) ** 2 == pytest.approx(power, rel=0.25)
     noise = simulated(EmpiricalNoise(noise_dn=1.0, modes=(mode,)))
-    size = noise.std(axis=0)
-    wanted = abs(shape) if axis == 2 else abs(shape)[:, None]
+    wanted = np.broadcast_to(abs(shape)[along], SHAPE)
     # a standard deviation of 600 values has an error of 2.9 %
-    np.testing.assert_allclose(size, np.broadcast_to(wanted, SHAPE), rtol=0.15, atol=0.02)
+    np.testing.assert_allclose(noise.std(axis=0), wanted, rtol=0.15, atol=0.02)
 
 
 def test_only_a_part_is_looked_at():
-    def in_left_half(rng):
-        noise = of_whole_rows(rng) * np.ones(SHAPE)
-        noise[:, :, COLUMNS // 2 :] = 0.0
-        return noise
-
-    frames = stack(5, in_left_half)
-    left = np.zeros(SHAPE, bool)
-    left[:, : COLUMNS // 2] = True
+    left = np.broadcast_to(np.arange(COLUMNS) < COLUMNS // 2, SHAPE)
+    frames = stack(5, lambda rng: of_whole_rows(rng) * left)
     found = measured(frames, left)
     assert found.noise_dn**2 == pytest.approx(POWER, rel=0.25)
     assert measured(frames, ~left) is None
 
 
 def test_what_a_model_makes_is_taken_off():
-    frames = stack(6, of_whole_rows)
-    evidence = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=30)
-    inside = np.ones(SHAPE, bool)
-    data = residual_covariances(PartSamples(frames, np.arange(FRAMES), evidence.maps, evidence, inside))
-    assert measured_noise(data, data, evidence, inside) is None
-    by_chance = {key: Covariance(2.0 * one.error, one.error) for key, one in data.pairs.items()}
-    assert measured_noise(data, Covariances(by_chance, {}), evidence, inside) == measured_noise(
-        data, NOTHING, evidence, inside
-    )
+    frames, numbers = stack(6, of_whole_rows), np.arange(FRAMES)
+    evidence = observe(frames, numbers, n_run=FRAMES, block_frames=30)
+    data = residual_covariances(PartSamples(frames, numbers, evidence.maps, evidence, EVERYWHERE))
+    pairs = {key: Covariance(2.0 * one.error, one.error) for key, one in data.pairs.items()}
+    models = data, Covariances(pairs, {}), NOTHING
+    own, by_chance, nothing = (measured_noise(data, model, evidence, EVERYWHERE) for model in models)
+    assert own is None
+    assert by_chance == nothing
 
 
 def simulated(effect: EmpiricalNoise, n_frames: int = 600) -> np.ndarray:

@@ -22,7 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison
 from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, Trial, _grown, compare
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
@@ -265,8 +265,8 @@ def likelihood_of(behind: Callable[[str, str], tuple[float, float] | None]) -> H
 def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    world = world_of(row_noise=0.5)
-    twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
+    world, guess = world_of(row_noise=0.5), hypothesis("row_noise", 0.5)
+    twin = Hypothesis(effect("frame_noise", 0.5), guess.fingerprint)
     row, asked = TRUTH["row_noise"], []
 
     def decided(one: str, other: str) -> tuple[float, float]:
@@ -274,10 +274,9 @@ def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
         return (12.0, 4.0) if one == "frame_noise" else (-12.0, 4.0)
 
     monkeypatch.setitem(TRUTH, "frame_noise", (row[0] + 0.5 * np.eye(M)[1], row[1]))
-    plain: Any = world.compare(hypothesis("row_noise", 0.5), twin)
-    found: Any = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(decided))
-    open_: Any = world.compare(
-        hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(lambda *_: (-3.0, 4.0))
+    plain, found, open_ = (
+        world.compare(guess, twin, likelihood=likelihood_of(behind) if behind else None)
+        for behind in (None, decided, lambda *_: (-3.0, 4.0))
     )
     assert plain.chosen.tags == open_.chosen.tags == {"row_noise"}
     assert found.chosen.tags == {"frame_noise"}
@@ -295,9 +294,8 @@ def test_statistics_that_are_all_off_a_little_are_no_good_fit() -> None:
     fitted = world.refitter().refined(guess)
     assert world.refitter().passes_goodness_of_fit(fitted)
     scatter = world.refitter().scatter(fitted.covariance, len(fitted.vectors))
-    off = replace(
-        world.refitter(), target=fitted.mean + 2.6 * scatter * np.where(np.arange(M) % 2, 1.0, -1.0)
-    )
+    to_and_fro = np.where(np.arange(M) % 2, 1.0, -1.0)
+    off = replace(world.refitter(), target=fitted.mean + 2.6 * scatter * to_and_fro)
     left = off.refined(guess)
     assert np.abs(left.rest).max() < 2.0
     assert not off.passes_goodness_of_fit(left)
@@ -310,7 +308,7 @@ def test_predictions_that_lie_near_each_other_are_not_told_apart_by_chance(
     row, world = TRUTH["row_noise"], world_of(row_noise=0.5, seed=20)
     twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
     monkeypatch.setitem(TRUTH, "frame_noise", (row[0] + 0.35 * np.eye(M)[1], row[1]))
-    found: Any = world.compare(hypothesis("row_noise", 0.5), twin)
+    found = world.compare(hypothesis("row_noise", 0.5), twin)
     _, second = found.rivals_of(found.chosen.hypotheses[0])
     assert second.score < -4.0
     assert second.stderr == pytest.approx(2.4, abs=0.1)
@@ -326,22 +324,17 @@ def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
     assert grown.chosen.tags == {"row_noise", "frame_noise"}
 
 
-def seeds(refitter: Refitter, *tried: Refitted) -> list[frozenset[str]]:
-    """Return the sets, of those that were tried, beside which others are asked for."""
-    asked: list[frozenset[str]] = []
-    search = Search(refitter, HistogramLikelihood(), [Trial.of(one) for one in tried])
-    _grown(search, lambda one: asked.append(one.tags) or [])  # type: ignore[func-returns-value]
-    return asked
-
-
 def test_a_part_of_a_better_set_is_not_grown_again() -> None:
     refitter = world_of(row_noise=0.3, frame_noise=0.3, exposure_drift=0.3).refitter()
     row, frame, drift = (hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift"))
     # of all that there is to explain each explains nearly as much
     far = replace(refitter, null=replace(refitter.null, mean=refitter.null.mean - 1e4 * np.eye(M)[0]))
-    alone, both, other = (refitter.refined(one) for one in ([row], [row, frame], [row, drift]))
-    assert seeds(far, alone, both) == [{"row_noise", "frame_noise"}]
-    assert len(seeds(far, other, both)) == 2
+    alone, both, other = map(refitter.refined, ([row], [row, frame], [row, drift]))
+    for tried, seeds in (((alone, both), [both.tags]), ((other, both), [other.tags, both.tags])):
+        asked: list[frozenset[str]] = []
+        search = Search(far, HistogramLikelihood(), [Trial.of(one) for one in tried])
+        _grown(search, lambda one, asked=asked: asked.append(one.tags) or [])  # type: ignore[misc]
+        assert sorted(asked, key=sorted) == sorted(seeds, key=sorted)
 
 
 def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -> None:
@@ -392,14 +385,16 @@ def test_a_description_that_leaves_nothing_keeps_no_named_effect_from_its_refit(
         assert sum(one.tags == {"exposure_drift"} for one in search.tried) == refits
 
 
+def placed(one: Hypothesis, place: str) -> Hypothesis:
+    return replace(one, effect=one.effect.at_place(Region.model_validate(place)))
+
+
 @pytest.mark.parametrize("second", ["columns=0:8", "columns=16:24"])
 def test_effects_that_meet_in_one_part_are_one_cause_without_a_name(second: str) -> None:
     world = world_of(row_noise=0.1, frame_noise=0.06)
-    guesses = [
-        Hypothesis(h.effect.at_place(Region.model_validate(place)), h.fingerprint)
-        for h, place in ((hypothesis("row_noise"), "columns=0:8"), (hypothesis("frame_noise"), second))
-    ]
-    found = world.compare(*guesses)
+    found = world.compare(
+        placed(hypothesis("row_noise"), "columns=0:8"), placed(hypothesis("frame_noise"), second)
+    )
     assert len(found.chosen.tags) == (1 if second == "columns=0:8" else 2)
 
 
@@ -488,8 +483,7 @@ def test_a_set_is_fitted_again_with_the_kind_of_an_effect_that_does_better() -> 
     for members in ((row,), (frame,), (row, frame), (row, frame)):
         search.add(members)
     assert len(search.trials) == 3
-    elsewhere = Hypothesis(frame.effect.at_place(Region(rows=((1, 2),))), frame.fingerprint)
-    search.add((row, elsewhere))
+    search.add((row, placed(frame, "rows=1:2")))
     assert len(search.trials) == 4
 
 
@@ -660,17 +654,11 @@ def test_a_few_events_are_an_effect_though_they_hardly_tell_its_strength(
     rng, first, size = np.random.default_rng(3), np.eye(9)[0], 1.3
     null = NullModel.from_replicates((name, *NAMES[:8]), rng.standard_normal((40, 9)))
     scatter = size * rng.standard_normal((16, 9))
+    mean, shown = null.mean + made * first, null.mean + seen * first
     found = established(
-        null,
-        made * first[None],
-        0.36,
-        null.mean + seen * first,
-        final=null.mean + final * first,
-        scatter=size,
-        mean=null.mean + made * first,
-        vectors=null.mean + made * first + scatter - scatter.mean(axis=0),
-        rest=(seen - made) * first / (size * np.sqrt(1 / 2 + 1 / 16)),
-    )
+        null, made * first[None], 0.36, shown, final=null.mean + final * first, scatter=size, mean=mean,
+        vectors=mean + scatter - scatter.mean(axis=0), rest=(shown - mean) / (size * np.sqrt(1 / 2 + 1 / 16)),
+    )  # fmt: skip
     assert bool(found) is there
 
 
@@ -682,21 +670,16 @@ def test_strong_effects_need_not_add_up_to_be_there() -> None:
     assert found == {"row_noise", "frame_noise"}
 
 
-def test_what_the_final_frames_do_not_show_gets_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = world_of(row_noise=0.1)
-    search, extended = add(world, monkeypatch, hypothesis("row_noise"), final=np.zeros(M))
-    added = search.close(search.gap(world.null), extended, False).additions
-    assert not any(each.named for each in added)
-
-
 def test_what_widens_the_gap_of_the_final_frames_is_not_certain(monkeypatch: pytest.MonkeyPatch) -> None:
     """They have some of it, by what it does to one statistic, and the opposite of what it does to another."""
     monkeypatch.setitem(TRUTH, "row_noise", ((np.eye(M)[0] + np.eye(M)[5]) * 40.0, 1.0))
     world = world_of(row_noise=0.1)
-    for of_other, outside in ((-0.5, True), (0.3, False)):
-        final = 40.0 * (np.eye(M)[0] + of_other * np.eye(M)[5])
-        search, _ = add(world, monkeypatch, hypothesis("row_noise"), final=final)
-        assert (search.extension is not None and search.extension.certain) != outside
+    for of_one, of_other, certain in ((1.0, -0.5, False), (1.0, 0.3, True), (0.0, 0.0, False)):
+        final = 40.0 * (of_one * np.eye(M)[0] + of_other * np.eye(M)[5])
+        search, extended = add(world, monkeypatch, hypothesis("row_noise"), final=final)
+        assert (search.extension is not None and search.extension.certain) is certain
+    added = search.close(search.gap(world.null), extended, False).additions
+    assert not any(each.named for each in added)  # what the final frames do not show at all
 
 
 @pytest.mark.parametrize(
