@@ -51,19 +51,6 @@ def test_a_right_estimator_passes_and_a_wrong_one_does_not():
     assert wrong.probability < 1e-4
 
 
-def test_frames_of_another_simulator_are_taken():
-    seeds = []
-
-    def dull(seed):
-        seeds.append(seed)
-        rng = np.random.default_rng(seed)
-        electrons = rng.poisson(2.0, (400, 8, 8)) + 0.25 * rng.standard_normal((400, 8, 8))
-        return np.rint(100 + 10 * electrons).astype(np.uint16)
-
-    assert recovered_strength(ColumnNoise(column_noise_dn=1.0), camera=dull, stacks=2, seed=4).n_guesses == 0
-    assert seeds == [4, 5]
-
-
 class RowBefore(ColumnNoise):
     """Adds a share of the row before, without saying so."""
 
@@ -118,10 +105,8 @@ def state_of(before: float, after: float, pull: float, monkeypatch: pytest.Monke
     addition = Addition(effect, True, "", (), {}, gaps[0], gaps[1], (), ())
     monkeypatch.setattr(skeleton, "locate", lambda *_: [])
     monkeypatch.setattr(skeleton, "build_verdict", lambda found, *_, **__: found)
-    unused: Any = None
-    data = skeleton.Prepared(
-        DiscrepancySettings(), "frames", unused, unused, NULL, Measured(z, z, z), Effort(None), {}
-    )
+    unused, measured = [None, None], Measured(z, z, z)
+    data = skeleton.Prepared(DiscrepancySettings(), "frames", *unused, NULL, measured, Effort(None), {})
     by: Any = SimpleNamespace(
         prepared=data, model=(), gap=lambda _: gaps[0], suspects=lambda _: True, explain=lambda *_: True,
         add=lambda *_: NULL, limit="", tolerance=lambda: 0.0,

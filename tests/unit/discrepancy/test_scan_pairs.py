@@ -27,11 +27,8 @@ def test_sums_of_cells_are_those_of_all_pairs(shape: tuple[int, int]) -> None:
     y, x = (each.ravel() for each in np.mgrid[: shape[0], : shape[1]])
     products, counts = flat.T @ flat, 5.0 * np.outer(usable.ravel(), usable.ravel())
     same_row, same_column = y[:, None] == y, x[:, None] == x
-    shared = {
-        "row": same_row & ~same_column,
-        "column": same_column & ~same_row,
-        "frame": ~same_row & ~same_column,
-    }
+    of_row, of_column, of_frame = same_row & ~same_column, same_column & ~same_row, ~same_row & ~same_column
+    shared = {"row": of_row, "column": of_column, "frame": of_frame}
     for mode, pairs in pairs_of(samples)[0].items():
         rows, columns = pairs.edges
         box = np.array([[1], [rows.size - 2]]), np.array([[2], [columns.size - 1]])

@@ -45,9 +45,8 @@ def test_a_measured_noise_has_the_size_that_was_measured(changes: str) -> None:
     mode = {"of": "row", "share": 1.0, "changes": changes, "signal_dn": EXPOSURE / GAIN}
     fields = {"tag": "empirical_noise", "noise_dn": 1.0, "modes": [mode]}
     size = size_of(effect_class("empirical_noise").model_validate(fields), MAPS, 4000)
-    assert size.model_dump() == pytest.approx(
-        {"electrons": GAIN, "dn": 1.0, "of_read_noise": 1.0 / NOISE, "samples": 1.0}
-    )
+    wanted = Size(electrons=GAIN, dn=1.0, of_read_noise=1.0 / NOISE, samples=1.0)
+    assert size.model_dump() == pytest.approx(wanted.model_dump())
 
 
 def test_the_size_in_a_part_is_that_where_it_acts_and_there_is_none_without_usable_pixels() -> None:

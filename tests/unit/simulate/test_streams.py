@@ -81,21 +81,13 @@ def test_dims_say_along_what_the_numbers_differ(dims, shape):
     np.testing.assert_array_equal(part, numbers[cut])
 
 
-def test_other_purposes_seeds_draws_and_dims_give_other_numbers():
-    sets = [
-        streams().uniform(("frame", "y", "x")),
-        streams(purpose="other").uniform(("frame", "y", "x")),
-        streams(seed=4).uniform(("frame", "y", "x")),
-        streams().uniform(("frame", "y", "x"), draw=1),
-        streams().uniform(("frame", "y")),
-        streams().uniform(("y", "x")),
-        special.ndtr(streams().normal(("frame", "y", "x"))),
-    ]
+def test_other_purposes_seeds_draws_and_dims_give_other_numbers_and_their_order_does_not():
+    every = ("frame", "y", "x")
+    sets = [each.uniform(every) for each in (streams(), streams(purpose="other"), streams(seed=4))]
+    sets += [streams().uniform(every, draw=1), special.ndtr(streams().normal(every))]
+    sets += [streams().uniform(dims) for dims in (("frame", "y"), ("y", "x"))]
     numbers = np.concatenate([s.ravel() for s in sets])
     assert np.unique(numbers).size == numbers.size
-
-
-def test_order_of_dims_does_not_matter_and_unknown_ones_are_refused():
     np.testing.assert_array_equal(streams().normal(("y", "frame")), streams().normal(("frame", "y")))
     with pytest.raises(ValueError, match="column"):
         streams().uniform(("column",))

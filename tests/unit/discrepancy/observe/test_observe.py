@@ -70,9 +70,8 @@ def test_law_holds_the_polynomials_integrated_over_cells(width: float) -> None:
         for column, (a, b) in enumerate(cell_scores_numba.COLUMNS):
             expected = np.sum(weight * charlier[b] * density * special.eval_hermitenorm(a, z))
             assert law[code, column] == pytest.approx(expected, rel=1e-6, abs=1e-6 * law[code, 0])
-    np.testing.assert_allclose(
-        law[20:120, 0], pcd_mass(np.arange(20, 120), H, 1 / STEP, BIAS, width / STEP), atol=1e-11
-    )
+    mass = pcd_mass(np.arange(20, 120), H, 1 / STEP, BIAS, width / STEP)
+    np.testing.assert_allclose(law[20:120, 0], mass, atol=1e-11)
     assert law[:, 0].sum() == pytest.approx(1.0, abs=1e-10)
 
 
@@ -191,9 +190,8 @@ def test_sums_are_those_of_plain_numpy() -> None:
     np.testing.assert_allclose(time.frame_readout, r.sum(axis=(1, 2)) / usable.sum(), **tight)
     np.testing.assert_allclose(time.row_charge, k.sum(axis=2) / usable.sum(axis=1), **tight)
     np.testing.assert_allclose(time.column_readout, r.sum(axis=1) / usable.sum(axis=0), **tight)
-    np.testing.assert_allclose(
-        time.quadrant_readout[:, 1], r[:, :2, 3:].sum(axis=(1, 2)) / usable[:2, 3:].sum(), **tight
-    )
+    top_right = r[:, :2, 3:].sum(axis=(1, 2)) / usable[:2, 3:].sum()
+    np.testing.assert_allclose(time.quadrant_readout[:, 1], top_right, **tight)
     edges = blocks_of(numbers, 12)
     assert edges.tolist() == [0, 12, 24, 36, 48, 60]
     assert time.block_start.tolist() == [0, 24, 48, 72, 96]
@@ -202,28 +200,25 @@ def test_sums_are_those_of_plain_numpy() -> None:
     # products are of what the common mode leaves
     k1 = k - time.frame_charge[:, None, None] * h
     r1 = r - time.frame_readout[:, None, None] * usable
-    t = np.concatenate([np.arange(a + 1, b) for a, b in pairwise(edges)])
-    assert time.n_pairs == t.size
-    n_pairs = t.size
     vk, vr = k.var(axis=0), r.var(axis=0)
     share_k, share_r = h / h.sum(), usable / usable.sum()
-    vk1 = vk * (1 - 2 * share_k) + share_k**2 * vk.sum()
-    vr1 = vr * (1 - 2 * share_r) + share_r**2 * vr.sum()
-    lag = (k1[t] * k1[t - 1]).sum(axis=0) / n_pairs
-    np.testing.assert_allclose(time.lag_charge[0][usable], (lag[usable] / vk1[usable]) + 1 / 59, **tight)
-    both = np.sqrt(vk1 * vr1)
-    cross = (r1[t] * k1[t - 1]).sum(axis=0) / n_pairs + (k * r).mean(axis=0) / 59
-    np.testing.assert_allclose(time.lag_readout_charge[usable], cross[usable] / both[usable], **tight)
-    t3 = np.concatenate([np.arange(a + 3, b) for a, b in pairwise(edges)])
-    lag3 = (r1[t3] * r1[t3 - 3]).sum(axis=0) / t3.size
-    np.testing.assert_allclose(time.lag_readout[2][usable], (lag3[usable] / vr1[usable]) + 1 / 59, **tight)
+    vk1, vr1 = (v * (1 - 2 * s) + s**2 * v.sum() for v, s in ((vk, share_k), (vr, share_r)))
+
+    def lagged(one: np.ndarray, other: np.ndarray, lag: int) -> np.ndarray:
+        t = np.concatenate([np.arange(a + lag, b) for a, b in pairwise(edges)])
+        return (one[t] * other[t - lag]).mean(axis=0)[usable]
+
+    assert time.n_pairs == sum(b - a - 1 for a, b in pairwise(edges))
+    of_k, of_r = vk1[usable], vr1[usable]
+    cross = lagged(r1, k1, 1) + (k * r).mean(axis=0)[usable] / 59
+    np.testing.assert_allclose(time.lag_charge[0][usable], lagged(k1, k1, 1) / of_k + 1 / 59, **tight)
+    np.testing.assert_allclose(time.lag_readout_charge[usable], cross / np.sqrt(of_k * of_r), **tight)
+    np.testing.assert_allclose(time.lag_readout[2][usable], lagged(r1, r1, 3) / of_r + 1 / 59, **tight)
     # neighbours along y: what the removal of the mean does to pairs is taken out
     pairs = usable[:-1] & usable[1:]
     product = (r1[:, :-1] * r1[:, 1:]).mean(axis=0)
     removed = share_r[0, 0] ** 2 * vr.sum() - share_r[0, 0] * (vr[:-1] + vr[1:])
-    expected = ((product - removed) / np.sqrt(vr1[:-1] * vr1[1:], where=pairs, out=np.ones(pairs.shape)))[
-        pairs
-    ]
+    expected = (product - removed)[pairs] / np.sqrt((vr1[:-1] * vr1[1:])[pairs])
     assert time.neighbours["y.rr"] == pytest.approx(expected.mean(), abs=2e-5)
     assert evidence.z["space.y.rr"] == pytest.approx(expected.sum() * np.sqrt(60 / pairs.sum()), abs=1e-2)
     mixed = (r1[:, :, :-1] * k1[:, :, 1:] + k1[:, :, :-1] * r1[:, :, 1:]).mean(axis=0)
@@ -277,13 +272,19 @@ def test_a_pixel_whose_residuals_hardly_vary_does_not_speak_for_all() -> None:
     assert max(abs(value) for name, value in z.items() if ".noise." in name) < 5
 
 
-def test_names_come_in_the_order_of_the_catalogue_and_all_are_there() -> None:
+def test_all_names_come_in_the_order_of_the_catalogue_and_histograms_alone_give_those_of_samples() -> None:
     frames = small_stack((12, 12), 300, 1)
-    evidence = seen(frames)
+    evidence, histograms = seen(frames), histogram_frames(frames)
     assert list(evidence.z) == list(STATISTICS)
     assert np.isfinite(list(evidence.z.values())).all()
     assert tuple(evidence.scores) == SCORES
     assert dict(seen(frames).z) == dict(evidence.z)
+    alone = observe_histograms(histograms.counts.reshape(144, -1), histograms.origin.ravel())
+    assert alone.time is None
+    assert alone.maps.bias.shape == (1, 144)
+    assert alone.z == {name: evidence.z[name] for name in alone.z}
+    assert {name.split(".")[0] for name in alone.z} == {"shape", "code", "tail"}
+    assert set(evidence.z) - set(alone.z) >= {"tail.high.clusters", "time.lag1.charge.mean"}
 
 
 @pytest.mark.parametrize("shape", [(1, 40), (40, 1)], ids=["one row", "one column"])
@@ -309,19 +310,6 @@ def test_a_third_of_the_pixels_unfit_breaks_nothing() -> None:
     assert np.isnan(evidence.maps.bias[unfit]).all()
     assert np.isnan(evidence.scores["He4"][unfit]).all()
     assert np.isfinite(evidence.scores["He4"][~unfit]).all()
-
-
-def test_histograms_alone_give_the_same_sample_statistics() -> None:
-    frames = small_stack((10, 10), 300, 1)
-    histograms = histogram_frames(frames)
-    full = seen(frames)
-    alone = observe_histograms(histograms.counts.reshape(100, -1), histograms.origin.ravel())
-    assert alone.time is None
-    assert alone.maps.bias.shape == (1, 100)
-    for name, value in alone.z.items():
-        assert full.z[name] == value
-    assert {name.split(".")[0] for name in alone.z} == {"shape", "code", "tail"}
-    assert set(full.z) - set(alone.z) >= {"tail.high.clusters", "time.lag1.charge.mean"}
 
 
 def test_what_cannot_be_observed_says_why() -> None:
@@ -432,10 +420,7 @@ def test_samples_far_above_or_below_are_listed_and_are_the_rarer_ones():
     assert rarer.expected.sum() <= 1.0
     assert rarer.seen[[2, 4], [2, 4]].all()
     assert rarer.seen.sum() <= beyond.seen.sum()
-
-
-def test_a_tail_of_which_not_all_samples_are_listed_says_nothing_of_places():
-    evidence = seen(small_stack((10, 10), 400, 3))
+    # a tail of which not all samples are listed says nothing of places
     assert len(list(rare_samples(evidence))) == 4
     many = np.zeros((MOST_HITS, 4), np.int64)
     assert len(list(rare_samples(replace(evidence, time=replace(evidence.time, low_hits=many))))) == 2

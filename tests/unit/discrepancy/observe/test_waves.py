@@ -71,9 +71,8 @@ def test_a_wave_is_found_between_frames_that_are_missing() -> None:
 
 def test_a_wave_of_any_phase_in_each_frame_is_pickup_of_random_phase() -> None:
     turns = np.random.default_rng(4).random(FRAMES)
-    (pickup,) = (
-        p for p in PeriodicPickup.estimate(evidence(frames(4, sine(0.5, turns)))) if p.cycles_per_column
-    )
+    guesses = PeriodicPickup.estimate(evidence(frames(4, sine(0.5, turns))))
+    (pickup,) = (guess for guess in guesses if guess.cycles_per_column)
     assert pickup.random_phase
     assert pickup.cycles_per_row == pytest.approx(CYCLES[1], abs=2e-3)
     assert pickup.cycles_per_column == pytest.approx(CYCLES[2], abs=2e-3)

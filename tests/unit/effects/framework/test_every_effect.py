@@ -148,22 +148,6 @@ def test_every_division_gives_the_same_frames(effect, monkeypatch):
             np.testing.assert_array_equal(a, b[slice(*t), slice(*y)])
 
 
-@pytest.mark.parametrize("effect", [e for e in EVERY if e.plane.value == "analog"], ids=repr)
-def test_nothing_is_overwritten(effect, monkeypatch):
-    apply, calls = type(effect).apply, []
-
-    def watched(self, values, context):
-        before = values.copy()
-        after = apply(self, values, context)
-        np.testing.assert_array_equal(values, before)
-        calls.append((after.dtype, after.shape == before.shape, np.shares_memory(after, values)))
-        return after
-
-    monkeypatch.setattr(type(effect), "apply", watched)
-    frames(effect)
-    assert set(calls) == {(np.dtype(np.float64), True, False)}
-
-
 @pytest.mark.parametrize("effect", SCALED, ids=repr)
 def test_the_largest_strengths_work(effect):
     truth = a_sensor((4, 4), exposure=(20.0, 50.0))

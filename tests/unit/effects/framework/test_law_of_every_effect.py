@@ -50,6 +50,10 @@ EFFECTS = [
     make("exposure_drift", drift=0.6, settling_fraction=0.3),
     make("exposure_flicker", rms=0.3, period_frames=5.3),
     make("exposure_flicker", rms=0.3, levels=(1.0, 2.0)),
+    make("empirical", share=0.2, moves=[{"shift_dn": -9, "weight": 3.0}, {"shift_dn": 5}]),
+    make("empirical_electrons", chance=0.1, modes=[{"fate": "lost"}]),
+    make("empirical_electrons", chance=0.1, modes=[{"fate": "emptied"}]),
+    make("empirical_noise", noise_dn=1.0, modes=[{"of": "sample", "share": 1.0}]),
 ]
 
 

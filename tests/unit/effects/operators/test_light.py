@@ -117,9 +117,8 @@ def test_a_window_sees_its_part_of_the_glow(effect):
         own = part.peak_e * part.pattern(np.arange(size[0]), size)
         np.testing.assert_allclose(own, image[slice(*rows), slice(*columns)], rtol=1e-9)
     part = effect.to_window((0, 20), (20, 50), (40, 60)).to_sensor((0, 20), (20, 50), (40, 60))
-    np.testing.assert_allclose(
-        [getattr(part, n) for n in ("peak_e", "centre_y", "centre_x", "radius")], [2.0, 0.1, 0.6, 0.3]
-    )
+    found = part.peak_e, part.centre_y, part.centre_x, part.radius
+    np.testing.assert_allclose(found, [2.0, 0.1, 0.6, 0.3])
 
 
 def test_what_it_adds_has_the_moments_of_the_frames():

@@ -51,9 +51,8 @@ def test_the_levels_of_a_jump_are_those_of_its_place(samples):
 
 @pytest.mark.parametrize("tau", [0.7, 6.0])
 def test_a_slow_trap_is_a_markov_chain_of_two_levels(tau):
-    effect = RtsNoise(
-        fraction=1.0, amplitude_e=2.0, probability=0.3, sampling="single", correlation_frames=tau
-    )
+    slow = {"sampling": "single", "correlation_frames": tau}
+    effect = RtsNoise(fraction=1.0, amplitude_e=2.0, probability=0.3, **slow)
     after, before, _, _ = analog(effect, (60, 60, 60))
     full = (after - before) / 2.0 + 0.3
     np.testing.assert_allclose(full, np.rint(full), atol=1e-9)

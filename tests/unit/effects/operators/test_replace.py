@@ -22,10 +22,8 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
 def test_repeats_are_exact_copies_of_what_was_delivered():
-    plain, listed = (
-        np.random.default_rng(8).integers(90, 140, (14, 6, 5)).astype(np.uint16),
-        (1, 2, 5, 9, 10, 11),
-    )
+    plain = np.random.default_rng(8).integers(90, 140, (14, 6, 5)).astype(np.uint16)
+    listed = (1, 2, 5, 9, 10, 11)
     delivered = plain.copy()
     for t in listed:
         delivered[t] = delivered[t - 1]
@@ -47,9 +45,6 @@ def test_random_repeats_come_as_often_as_they_should():
     assert out[0] == 0
 
 
-BITS_FRAMES = np.random.default_rng(1).integers(90, 140, (40, 50, 50)).astype(np.uint16)
-
-
 def by_hand(code, bit, fault):
     """Return a code with a wrong bit, by its binary digits."""
     digits = list(f"{code:016b}")
@@ -60,25 +55,21 @@ def by_hand(code, bit, fault):
 
 @pytest.mark.parametrize("fault", ["zero", "one", "flip"])
 @pytest.mark.parametrize("bit", [0, 3, 5])
-def test_a_stuck_bit_is_wrong_in_every_sample(bit, fault):
-    effect = BitErrors(share=1.0, bit=bit, fault=fault)
-    found = effect.apply(BITS_FRAMES, context_of((50, 50), 40))
-    table = np.array([by_hand(code, bit, fault) for code in range(256)])
-    np.testing.assert_array_equal(found, table[BITS_FRAMES])
-    assert found.dtype == BITS_FRAMES.dtype
-
-
-@pytest.mark.parametrize(
-    ("effect", "share"),
-    [
-        (BitErrors(share=0.02, bit=3, fault="flip"), 0.02),
-        (BitErrors(share=1.0, bit=14, fault="one"), 0.0),  # a bit that the converter lacks
-    ],
-)
-def test_a_share_of_the_samples_is_wrong(effect, share):
-    found = effect.apply(BITS_FRAMES, context_of((50, 50), 40))
-    n, wrong = BITS_FRAMES.size, int((found != BITS_FRAMES).sum())
-    assert abs(wrong - share * n) <= 5 * np.sqrt(share * (1 - share) * n)
+def test_a_stuck_bit_is_wrong_in_every_sample_and_another_in_its_share(bit, fault):
+    frames = np.random.default_rng(1).integers(90, 140, (40, 50, 50)).astype(np.uint16)
+    wrong = np.array([by_hand(code, bit, fault) for code in range(256)])[frames]
+    every, some, lacking = (
+        effect.apply(frames, context_of((50, 50), 40))
+        for effect in (
+            BitErrors(share=share, bit=n, fault=fault) for share, n in ((1, bit), (0.02, bit), (1, 14))
+        )
+    )
+    np.testing.assert_array_equal(every, wrong)
+    assert every.dtype == frames.dtype
+    np.testing.assert_array_equal(lacking, frames)  # a bit that the converter lacks
+    there = wrong != frames
+    assert abs((some != frames).sum() - 0.02 * there.sum()) <= 5 * np.sqrt(0.02 * 0.98 * there.sum())
+    np.testing.assert_array_equal(np.where(some != frames, wrong, frames), some)
 
 
 def with_errors(plain, codes, effect):
@@ -213,8 +204,6 @@ def test_a_rule_without_a_threshold_is_none_that_an_effect_can_have():
 
 
 LINES_SHAPE, N_LINE_FRAMES = (9, 11), 300
-
-
 MOVES = ("swapped", "early", "late", "sample_lost", "sample_twice", "line_lost", "line_twice")
 
 
@@ -229,9 +218,8 @@ def test_every_sample_comes_from_where_the_move_says(move, lines):
     # values tell where in the frame they come from
     places = np.arange(LINES_SHAPE[0] * LINES_SHAPE[1], dtype=np.uint16).reshape(LINES_SHAPE)
     frames, share = np.tile(places, (N_LINE_FRAMES, 1, 1)), 0.1
-    found = MisplacedLines(share=share, move=move, lines=lines).apply(
-        frames, context_of(LINES_SHAPE, N_LINE_FRAMES)
-    )
+    effect = MisplacedLines(share=share, move=move, lines=lines)
+    found = effect.apply(frames, context_of(LINES_SHAPE, N_LINE_FRAMES))
     found, plain = turned(found, lines), turned(frames, lines)[0]
     n, m = plain.shape
     hits = 0

@@ -12,7 +12,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hyp
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, compare
-from pchem_pipeline.discrepancy.effort import EffortSpentError
+from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.effects.operators.light import DarkCurrentRts
@@ -91,14 +91,12 @@ def test_what_is_left_where_the_effect_moves_nothing_is_no_reason_to_tune() -> N
 
 def test_nothing_is_simulated_at_the_limit() -> None:
     world = world_of(TRUE)
-    begun = refined(world, BLINKING)
+    begun, effort = refined(world, BLINKING), Effort(1.0)
     drawn = world.drawn
-
-    def refuse(_: str) -> None:
-        raise EffortSpentError("it")
-
+    effort.begin()
+    effort.spent = effort.most
     with pytest.raises(EffortSpentError):
-        tuned(replace(world.refitter(), allow=refuse), begun)
+        tuned(replace(world.refitter(), allow=effort.check), begun)
     assert world.drawn == drawn
 
 

@@ -147,11 +147,8 @@ def test_statistics_of_a_part_are_those_of_a_sensor_of_its_own():
 
 def test_effects_are_told_on_the_sensor_and_act_in_the_window():
     window = SensorWindow((8, 24), (4, 20), (40, 32))
-    effects = [
-        RowNoise(row_noise_dn=4.0, region="columns=10:14"),
-        RowNoise(row_noise_dn=4.0, region="columns=24:30"),
-        RowNoise(row_noise_dn=4.0, region="rows=0:30"),
-    ]
+    places = "columns=10:14", "columns=24:30", "rows=0:30"
+    effects = [RowNoise(row_noise_dn=4.0, region=place) for place in places]
     inside = window.effects(effects)
     assert [e.region for e in inside] == [Region(columns=((6, 10),)), None]
     assert window.on_sensor(Region(columns=((6, 10),))) == Region(columns=((10, 14),))
@@ -220,14 +217,12 @@ def test_what_is_guessed_in_a_part_has_its_phase_on_the_sensor(window):
 
 def test_what_is_a_spot_by_itself_is_not_cut_off_by_the_part_that_showed_it():
     part = Part(Region(rows=((5, 18),)), When(range=((100, 300),)))
-    guess = effect_classes()["glow"].model_validate({"peak_e": 2.0, "centre_y": 0.5, "radius": 0.3})
+    guess = effect_classes()["glow"](peak_e=2.0, centre_y=0.5, radius=0.3)
     found = SensorWindow.whole((26, 24)).found(guess, part)
     assert found.region is None
     assert found.when == part.when
     assert found.centre_y == pytest.approx((5 + 0.5 * 13) / 26, abs=0.03)
-    image = effect_classes()["persistence"].model_validate(
-        {"peak_e": 2.0, "decay_frames": 90.0, "image": [[0.0, 1.0]]}
-    )
+    image = effect_classes()["persistence"](peak_e=2.0, decay_frames=90.0, image=((0.0, 1.0),))
     assert SensorWindow.whole((26, 24)).found(image, part).region == part.region
 
 

@@ -20,8 +20,6 @@ from pchem_pipeline.discrepancy.verdict import closed_share
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.effects.operators.replace import Empirical, MixtureShift, neighbour_words
-from pchem_pipeline.model.law.mass import sample_mass
-from pchem_pipeline.model.law.sample_law import SampleLaw
 
 SHAPE, FRAMES, STEP = (10, 12), 1500, 12.0
 SENSOR = a_uniform_sensor(SHAPE, 1.0, 1 / STEP, 100.0, 0.25)
@@ -173,11 +171,6 @@ def test_samples_are_moved_by_their_shares() -> None:
     for shift, share in ((-9, 0.15), (5, 0.05), (0, 0.8)):
         error = np.sqrt(share * (1 - share) / own.size)
         assert abs((found - own == shift).mean() - share) < 5 * error
-    maps = PixelMaps(*(np.array([v]) for v in (1.2, 1 / STEP, 100.0, 3.0)), np.ones(1, bool))
-    laws = effect.sample_law(SampleLaw(), maps), SampleLaw()
-    law, plain = (sample_mass(each, maps, np.arange(40, 260))[0] for each in laws)
-    wanted = 0.8 * plain + 0.15 * np.roll(plain, -9) + 0.05 * np.roll(plain, 5)
-    np.testing.assert_allclose(law[20:-20], wanted[20:-20], atol=1e-9)
 
 
 def test_samples_are_moved_towards_what_was_delivered_before() -> None:

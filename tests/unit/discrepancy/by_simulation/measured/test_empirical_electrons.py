@@ -139,21 +139,6 @@ def test_the_law_of_emptied_samples_is_a_mixture() -> None:
     np.testing.assert_allclose(law_of(ElectronMode(fate="emptied"), chance=0.1), mixed, atol=1e-6)
 
 
-@pytest.mark.parametrize("fate", ["lost", "emptied"])
-def test_the_law_is_that_of_the_simulated_samples(fate: Any) -> None:
-    k = np.round(simulated(ElectronMode(fate=fate), chance=0.1)).astype(int).ravel()
-    seen = np.bincount(k, minlength=16)[:16]
-
-    def misfit(mass: np.ndarray) -> float:
-        expected = k.size * mass
-        good = expected > 20
-        chi2 = float(((seen - expected)[good] ** 2 / expected[good]).sum())
-        return (chi2 - good.sum()) / np.sqrt(2.0 * good.sum())
-
-    assert abs(misfit(law_of(ElectronMode(fate=fate), chance=0.1))) < 5
-    assert misfit(law_of(ElectronMode(fate=fate), chance=0.08)) > 20  # another chance would be seen
-
-
 @pytest.mark.parametrize("place", [(1, 0, 0), (0, 0, 1), (0, 0, 0)])
 def test_the_law_has_the_mean_of_electrons_with_those_that_follow(place: tuple[int, int, int]) -> None:
     mode = ElectronMode(fate="followed", place=place)

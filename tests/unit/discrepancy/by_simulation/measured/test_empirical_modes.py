@@ -128,9 +128,7 @@ def test_noise_of_changing_size_has_the_law_that_is_simulated() -> None:
     weights, widths = mode.model_copy(update={"burst": None}).widths(0.2)
     # of 1 + 0.2 x, x normal: its mean square is 1 + 0.2^2
     assert weights @ widths**2 == pytest.approx(1.04, rel=1e-6)
-    quiet, loud = (
-        simulated(mode, size, read_noise=0.3, light=1e-9).std(axis=(1, 2)) for size in (0.0, 2.0 * 0.2)
-    )
+    quiet, loud = (simulated(mode, size, 0.3, light=1e-9).std(axis=(1, 2)) for size in (0.0, 2.0 * 0.2))
     ratio = np.sort(loud**2 / quiet.mean() ** 2)
     assert abs(np.mean(ratio > 1.25) - 0.1) < 5 * np.sqrt(0.09 / FRAMES)
 
@@ -247,15 +245,14 @@ def test_the_simulated_change_has_its_size(on: Any) -> None:
 
 
 def test_simulated_bursts_are_as_rare_and_where_they_are_told() -> None:
-    mode = NoiseMode(
-        of="frame", share=1.0, changes="light", signal_dn=4 * STEP, burst=0.04, shape=((1.0, 0.0), (0.0, 0.0))
-    )
+    corner = ((1.0, 0.0), (0.0, 0.0))
+    mode = NoiseMode(of="frame", share=1.0, changes="light", signal_dn=4 * STEP, burst=0.04, shape=corner)
     found = simulated(mode, 2.0 * np.sqrt(0.04) / 2.0 * 4 * STEP)
-    corner, rest = found[:, :8, :10].mean(axis=(1, 2)), found[:, 8:, 10:].mean(axis=(1, 2))
-    high = corner > 6 * STEP
+    there, rest = found[:, :8, :10].mean(axis=(1, 2)), found[:, 8:, 10:].mean(axis=(1, 2))
+    high = there > 6 * STEP
     assert abs(high.mean() - 0.04) < 5 * np.sqrt(0.04 / FRAMES)
     # twice the light more: a root mean square over the sensor of half of that
-    assert corner[high].mean() == pytest.approx(12 * STEP, rel=0.03)
+    assert there[high].mean() == pytest.approx(12 * STEP, rel=0.03)
     assert rest.max() < 6 * STEP
 
 
@@ -277,9 +274,7 @@ def test_a_hit_by_a_particle_needs_no_tables_of_its_codes_and_outweighs_no_other
 def test_a_shape_that_was_found_in_a_window_is_there_on_the_sensor_and_nowhere_else(of: Any) -> None:
     """And as it was in the window, or in another one that shows a part of it."""
     sensor, window = (40, 60), ((10, 26), (20, 40))
-    form: dict[str, Any] = (
-        {"shape": ((0.5, 1.0), (1.5, 0.2))} if of == "frame" else {"profile": (1.0, -0.5, 2.0)}
-    )
+    form: Any = {"shape": ((0.5, 1.0), (1.5, 0.2))} if of == "frame" else {"profile": (1.0, -0.5, 2.0)}
     found = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of=of, share=1.0, **form),))
     of_sensor = found.to_sensor(*window, sensor)
     size = (16, 20)

@@ -17,10 +17,7 @@ from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise, NoiseMode, spectrum
-from pchem_pipeline.model.law.mass import sample_mass
-from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise, NoiseMode
 
 ROWS, COLUMNS, FRAMES, STEP = 14, 16, 900, 12.0
 SHAPE = (ROWS, COLUMNS)
@@ -158,9 +155,8 @@ def simulated(effect: EmpiricalNoise, n_frames: int = 600) -> np.ndarray:
 )
 def test_the_simulated_noise_has_its_power_and_correlations(mode):
     noise = simulated(EmpiricalNoise(noise_dn=2.0, modes=(mode,)))
-    values = {
-        "sample": noise, "row": noise[:, :, :1], "column": noise[:, :1], "frame": noise[:, :1, :1]
-    }[mode.of]  # fmt: skip
+    parts = {"sample": np.s_[:], "row": np.s_[:, :, :1], "column": np.s_[:, :1], "frame": np.s_[:, :1, :1]}
+    values = noise[parts[mode.of]]
     np.testing.assert_array_equal(noise, np.broadcast_to(values, noise.shape))
     # neighbours count for less than one each
     error = 2.0 / np.sqrt(values.size)
@@ -170,22 +166,6 @@ def test_the_simulated_noise_has_its_power_and_correlations(mode):
         two = values[tuple(slice(max(n, 0), s + min(n, 0)) for n, s in zip(lag, values.shape, strict=True))]
         assert np.mean(one * two) / 4.0 == pytest.approx(wanted, abs=5 * error + 0.03)
         assert abs(wanted) > 10 * (error if mode.of != "frame" else error / 4)
-
-
-def test_the_law_of_a_pixel_has_its_variance():
-    effect = EmpiricalNoise.typical()[0].scaled(4.0)
-    maps = PixelMaps(*(np.array([v]) for v in (1.2, 1 / STEP, 100.0, 3.0)), np.ones(1, bool))
-    codes = np.arange(60, 220)
-    law = sample_mass(effect.sample_law(SampleLaw(), maps), (1.2, 1 / STEP, 100.0, 3.0), codes)[0]
-    wider = np.sqrt(9.0 + effect.noise_dn**2)
-    plain = sample_mass(SampleLaw(), (1.2, 1 / STEP, 100.0, wider), codes)[0]
-    np.testing.assert_allclose(law, plain, atol=1e-4)
-
-
-def test_the_spectrum_of_one_distance_is_a_cosine():
-    found = spectrum(((0, 1, 0),), (0.5,))
-    assert found.shape == (1, 8, 1)
-    np.testing.assert_allclose(found[0, :, 0], np.cos(2 * np.pi * np.arange(8) / 8), atol=1e-12)
 
 
 def test_it_is_found_beside_a_named_effect_and_closes_the_gap():

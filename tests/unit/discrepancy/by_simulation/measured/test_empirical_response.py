@@ -195,11 +195,9 @@ def test_simulated_samples_follow_what_is_told(term: ResponseTerm, power: float)
     # where a frame, row and column before it exist
     inner = np.s_[2:, 1:-1, 4:-1]
     followed = term.seen(charge, np.full(charge.shape[1:], 2.0))[inner]
-    rounding = 2.0 / STEP / np.sqrt(12.0)
     np.testing.assert_allclose(change[inner], 0.02 * term.weight * followed, atol=1.01 / STEP)
-    assert change[inner].std() == pytest.approx(
-        0.02 * np.sqrt(2.0 * power), abs=rounding + 0.1 * 0.02 * power**0.5
-    )
+    limit = 2.0 / STEP / np.sqrt(12.0) + 0.002 * np.sqrt(power)  # the former is rounding
+    assert change[inner].std() == pytest.approx(0.02 * np.sqrt(2.0 * power), abs=limit)
 
 
 def test_the_law_has_the_variance_of_the_pixels_that_follow() -> None:
@@ -255,13 +253,6 @@ def test_it_says_what_follows() -> None:
     ):
         said = EmpiricalResponse(response=response, terms=terms).describe()
         assert said == f"samples depend on the charge of other samples ({words})"
-
-
-def test_columns_of_a_window_are_told_on_the_sensor() -> None:
-    effect = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, 3), columns=(2, 5)),))
-    there = effect.to_sensor((0, 8), (10, 20), (32, 32))
-    assert there.terms[0].columns == (12, 15)
-    assert there.to_window((0, 8), (10, 20), (32, 32)) == effect
 
 
 @pytest.mark.parametrize("how", [{}, {"place": (1, 0, 0)}, {"of": "row", "place": (0, 0, 2)}])

@@ -177,16 +177,21 @@ def test_an_expensive_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatc
     assert not found.settled
 
 
-@pytest.mark.parametrize("paid", [1, 2, 3])
-def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> None:
-    world, asked = world_of(row_noise=1.2), []
+def limit(paid: int) -> Callable[[str], None]:
+    """Return what allows so many refits."""
+    left = iter(range(paid))
 
     def allow(words: str) -> None:
-        asked.append(words)
-        if len(asked) > paid:
+        if next(left, None) is None:
             raise EffortSpentError(words)
 
-    found = replace(world.refitter(), allow=allow).refined([hypothesis("row_noise")])
+    return allow
+
+
+@pytest.mark.parametrize("paid", [1, 2, 3])
+def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> None:
+    world = world_of(row_noise=1.2)
+    found = replace(world.refitter(), allow=limit(paid)).refined([hypothesis("row_noise")])
     assert world.drawn == 6 * paid
     whole = world.refitter().refined([hypothesis("row_noise")])
     assert (found.effects == (effect("row_noise", 0.1),)) == (paid == 1)
@@ -199,9 +204,8 @@ def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> No
     drift = hypothesis("exposure_drift")
 
     def begun(members: Sequence[Hypothesis], *tried: Refitted) -> tuple[Hypothesis, ...]:
-        return Search(world.refitter(), HistogramLikelihood(), [Trial.of(one) for one in tried])._started(
-            members
-        )
+        trials = [Trial.of(one) for one in tried]
+        return Search(world.refitter(), HistogramLikelihood(), trials)._started(members)
 
     first, second = begun([hypothesis("row_noise"), drift], known)
     assert (first.effect, second) == (hypothesis("row_noise").effect, drift)  # one in common is not enough
@@ -230,14 +234,8 @@ def test_a_set_that_cannot_come_to_another_is_not_simulated_further() -> None:
 def test_a_promising_set_does_not_wait_for_the_best_strengths_of_its_effects() -> None:
     world = world_of(row_noise=0.4, frame_noise=0.4)
     hypotheses = [hypothesis(tag) for tag in STRENGTHS]
-    asked: list[str] = []
-
-    def allow(words: str) -> None:
-        asked.append(words)
-        if len(asked) > 3:  # each of the two, and both
-            raise EffortSpentError(words)
-
-    search = Search(replace(world.refitter(), allow=allow), HistogramLikelihood())
+    three = limit(3)  # each of the two, and both
+    search = Search(replace(world.refitter(), allow=three), HistogramLikelihood())
     compare(search, hypotheses, world.likely(*hypotheses))
     assert search.limit is not None
     assert search.best.tags == {"row_noise", "frame_noise"}
@@ -392,9 +390,8 @@ def placed(one: Hypothesis, place: str) -> Hypothesis:
 @pytest.mark.parametrize("second", ["columns=0:8", "columns=16:24"])
 def test_effects_that_meet_in_one_part_are_one_cause_without_a_name(second: str) -> None:
     world = world_of(row_noise=0.1, frame_noise=0.06)
-    found = world.compare(
-        placed(hypothesis("row_noise"), "columns=0:8"), placed(hypothesis("frame_noise"), second)
-    )
+    row, frame = hypothesis("row_noise"), hypothesis("frame_noise")
+    found = world.compare(placed(row, "columns=0:8"), placed(frame, second))
     assert len(found.chosen.tags) == (1 if second == "columns=0:8" else 2)
 
 
@@ -584,21 +581,21 @@ def established(
 ) -> set[str]:
     """Return the tags of the effects of a set that are certain, which do ``parts`` and are known so well."""
     effects = effects or [effect(tag, 0.1) for tag in ("row_noise", "frame_noise")[: len(parts)]]
-    m, unused = len(null.names), cast("Any", None)
-    added: dict[str, Any] = {
-        "hypotheses": tuple(Hypothesis(e, part) for e, part in zip(effects, parts, strict=True)),
+    n, m, unused = len(parts), len(null.names), cast("Any", None)
+    hypotheses = tuple(Hypothesis(e, part) for e, part in zip(effects, parts, strict=True))
+    added = {
         "parts": parts,
         "slopes": parts,
         "mean": seen,
-        "change": np.zeros(len(parts)),
-        "stderr": np.full(len(parts), stderr),
-        "vectors": np.zeros((400, m)),
-        "covariance": Covariance(np.full(m, scatter**2), np.zeros((0, m))),
-        "rest": np.zeros(m),
+        "change": np.zeros(n),
+        "stderr": np.full(n, stderr),
     }
+    added |= {"vectors": np.zeros((400, m)), "rest": np.zeros(m), **more}
+    covariance = Covariance(np.full(m, scatter**2), np.zeros((0, m)))
+    one: Any = SimpleNamespace(hypotheses=hypotheses, covariance=covariance, **added)
     z = Measured(seen, seen, seen if final is None else final)
     accept = Acceptance(null, z, unused, DiscrepancySettings(model_error=0.0))
-    return {h.tag for h in accept.established(cast("Any", SimpleNamespace(**{**added, **more})))}
+    return {h.tag for h in accept.established(one)}
 
 
 @pytest.mark.parametrize(

@@ -184,10 +184,8 @@ def test_a_skew_is_told_from_tails_and_tails_from_a_skew() -> None:
         assert answer[0] < -4.0 * answer[1] < 0.0
         assert back == pytest.approx((-answer[0], answer[1]))
     # of noise without either nothing is said: chance makes a nat of each number, and of that half
-    likelihood = likelihood_of(
-        frames_of(np.random.default_rng(10).normal(0.0, 0.3, (FRAMES, SIDE, SIDE)), 11)
-    )
-    answer = likelihood.behind([SKEW(share=0.1)], [HEAVY(share=0.05, factor=1.5)])
+    plain = frames_of(np.random.default_rng(10).normal(0.0, 0.3, (FRAMES, SIDE, SIDE)), 11)
+    answer = likelihood_of(plain).behind([SKEW(share=0.1)], [HEAVY(share=0.05, factor=1.5)])
     assert abs(answer[0]) < 4.0
 
 
