@@ -24,14 +24,10 @@ class Shine(Effect):
         return values + self.extra
 
 
-class Impostor(Effect):
-    """An effect of somebody else with a tag of ours."""
+class Impostor(Shine):
+    """With a tag of ours."""
 
     tag: Literal["row_noise"] = "row_noise"
-    plane: ClassVar[Plane] = Plane.ANALOG
-
-    def apply(self, values, context):
-        return values
 
 
 class Tagless(Effect):

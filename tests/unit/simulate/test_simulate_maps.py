@@ -50,21 +50,18 @@ def test_bounds_that_leave_nothing_are_refused():
         truncated_quantile(Normal(mean=0, std=1, minimum=50), np.array([0.5]))
 
 
-def test_constant_maps_and_derived_noise():
+def test_constant_maps_and_derived_noise_and_other_ways_to_say_the_same():
     truth = draw_truth(settings())
     assert (truth.quanta_exposure == 2).all()
     np.testing.assert_allclose(truth.conversion_gain, 0.1)
     np.testing.assert_allclose(truth.read_noise_dn, np.sqrt(9 + 1 / 12))
     np.testing.assert_allclose(truth.read_noise_e, 0.1 * np.sqrt(9 + 1 / 12))
-
-
-def test_dark_current_and_gain_are_other_ways_to_say_the_same():
     other = {"dark_current": 0.5, "conversion_gain": 0.1}
     parameters = {name: {"kind": "constant", "value": value} for name, value in other.items()}
     parameters["hot_pixels"] = {"fraction": 0}
-    truth = draw_truth(SimulateSettings(shape=(3, 3), integration_time=4.0, parameters=parameters))
-    assert (truth.quanta_exposure == 2).all()
-    assert (truth.conversion_gain == 0.1).all()
+    same = draw_truth(SimulateSettings(shape=(3, 3), integration_time=4.0, parameters=parameters))
+    assert (same.quanta_exposure == 2).all()
+    assert (same.conversion_gain == 0.1).all()
 
 
 def test_a_smaller_sensor_is_part_of_a_larger_one():

@@ -45,6 +45,14 @@ def test_errors_are_as_rare_as_they_can_be_and_as_often_as_stated_and_the_expect
     assert ((found.number[:, noisy].astype(int) - electrons[:, noisy]) ** 2).mean() > 1.15 * square
 
 
+def test_large_numbers_need_two_bytes():
+    _, camera, electrons, frames = KnownCamera.taken(32, (3, 4), 300.0, 200, read_noise=(0.2, 0.3))
+    dtype = number_type(float((frames.max() - 80) * 0.12))
+    assert (dtype, number_type(254.0)) == (np.uint16, np.uint8)
+    found = converted(frames, np.full((3, 4), 300.0), camera.calibration(), dtype)
+    assert (found.number == electrons).mean() > 0.9
+
+
 def test_pixels_without_calibration_have_no_number():
     _, camera, _, frames = KnownCamera.taken(31, (3, 4), 1.0, 50)
     calibration = camera.calibration()
@@ -54,15 +62,6 @@ def test_pixels_without_calibration_have_no_number():
     assert np.isnan(found.probability[:, 2, 1]).all()
     assert np.isnan(found.expected[:, 2, 1]).all()
     assert (found.number[:, 0, 0] < 20).all()
-
-
-def test_large_numbers_need_two_bytes():
-    _, camera, electrons, frames = KnownCamera.taken(32, (3, 4), 300.0, 200, read_noise=(0.2, 0.3))
-    dtype = number_type(float((frames.max() - 80) * 0.12))
-    assert dtype == np.uint16
-    found = converted(frames, np.full((3, 4), 300.0), camera.calibration(), dtype)
-    assert (found.number == electrons).mean() > 0.9
-    assert number_type(254.0) == np.uint8
 
 
 def test_parts_of_a_dn_give_the_same_as_whole_ones():

@@ -96,7 +96,4 @@ def test_one_end_of_a_slope_along_rows_is_noise_of_rows_but_not_at_the_other(col
     words = said(tilted(1.0), columns, (right,))
     assert (words == "") is holds
     assert holds or "row means of the readout residuals scatter" in words
-
-
-def test_frames_without_anything_agree_with_the_plain_model():
-    assert said(tilted(0.0), (0, 16), ()) == ""
+    assert holds or said(tilted(0.0), columns, ()) == ""  # frames without anything agree with the plain model

@@ -612,9 +612,9 @@ def test_what_gets_no_name_needs_fewer_errors_and_more_of_them_in_the_final_fram
     error: float, in_final: float, with_name: bool, without: bool
 ) -> None:
     null, part = world_of().null, np.eye(M)[0] * 6.0
-    # missing codes where the pixels have no samples: no statistic moves, and no strength is off
-    assert not established(null, 0.0 * part[None], 0.0, null.mean, mean=null.mean)
     seen = null.mean + np.eye(M)[0] * in_final
+    # missing codes where the pixels have no samples: no statistic moves, and no strength is off
+    assert not established(null, 0.0 * part[None], 0.0, seen, mean=null.mean)
     noise = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
     for one, there in ((effect("row_noise", 0.1), with_name), (noise, without)):
         found = established(null, part[None], error, seen, effects=[one], mean=null.mean + part)
