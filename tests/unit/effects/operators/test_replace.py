@@ -207,43 +207,41 @@ LINES_SHAPE, N_LINE_FRAMES = (9, 11), 300
 MOVES = ("swapped", "early", "late", "sample_lost", "sample_twice", "line_lost", "line_twice")
 
 
-def turned(frames, lines):
-    """Return frames (frame, line, sample)."""
-    return frames if lines == "rows" else frames.swapaxes(1, 2)
+def steps_of(effect):
+    """Return from how many lines, and samples along them, further on each (frame, line, sample) comes."""
+    places = np.arange(np.prod(LINES_SHAPE), dtype=np.uint16).reshape(LINES_SHAPE)
+    frames = np.tile(places, (N_LINE_FRAMES, 1, 1))  # values tell where in the frame they come from
+    found = effect.apply(frames, context_of(LINES_SHAPE, N_LINE_FRAMES)).astype(int)
+    y, x = np.stack(np.divmod(found, LINES_SHAPE[1])) - np.indices(LINES_SHAPE)[:, None]
+    return (y, x) if effect.lines == "rows" else (x.swapaxes(1, 2), y.swapaxes(1, 2))
 
 
 @pytest.mark.parametrize("lines", ["rows", "columns"])
 @pytest.mark.parametrize("move", MOVES)
 def test_every_sample_comes_from_where_the_move_says(move, lines):
-    # values tell where in the frame they come from
-    places = np.arange(LINES_SHAPE[0] * LINES_SHAPE[1], dtype=np.uint16).reshape(LINES_SHAPE)
-    frames, share = np.tile(places, (N_LINE_FRAMES, 1, 1)), 0.1
-    effect = MisplacedLines(share=share, move=move, lines=lines)
-    found = effect.apply(frames, context_of(LINES_SHAPE, N_LINE_FRAMES))
-    found, plain = turned(found, lines), turned(frames, lines)[0]
-    n, m = plain.shape
-    hits = 0
-    for one in found:
-        if move.startswith("line"):
-            moved = np.flatnonzero((one != plain).any(axis=1))
-            if moved.size:
-                hits += 1
-                come = np.clip(np.arange(n) + (1 if move == "line_lost" else -1), 0, n - 1)
-                np.testing.assert_array_equal(one[moved[0] :], plain[come][moved[0] :])
-            continue
-        y = 0
-        while y < n:
-            at = np.flatnonzero(one[y] != plain[y])
-            if at.size and move == "swapped":
-                np.testing.assert_array_equal(one[[y, y + 1]], plain[[y + 1, y]])
-                y += 1
-            elif at.size:
-                step = 1 if move in ("early", "sample_lost") else -1
-                come = np.clip(np.arange(m) + step, 0, m - 1)
-                np.testing.assert_array_equal(one[y, at[0] :], plain[y, come][at[0] :])
-                assert move not in ("early", "late") or at[0] == (0 if step == 1 else 1)
-            hits += at.size > 0
-            y += 1
+    share = 0.1
+    across, along = steps_of(MisplacedLines(share=share, move=move, lines=lines))
+    n, m = across.shape[1:]
+    if move in ("swapped", "line_lost", "line_twice"):
+        assert not along.any()
+        assert not np.ptp(across, axis=2).any()
+        off = across[:, :, 0]
+    else:
+        assert not across.any()
+        off = along
+    if move == "swapped":
+        np.testing.assert_array_equal(off[:, :-1] == 1, off[:, 1:] == -1)
+        assert set(np.unique(off)) == {-1, 0, 1}
+        hits = (off == 1).sum()
+    else:
+        # from some place on; at the end of a line the last sample is repeated
+        step = 1 if move in ("early", "sample_lost", "line_lost") else -1
+        inner, end = (off[..., :-1], off[..., -1]) if step == 1 else (off[..., 1:], off[..., 0])
+        assert not end.any()
+        assert set(np.unique(inner)) == {0, step}
+        assert (np.diff(abs(inner), axis=-1) >= 0).all()
+        assert move not in ("early", "late") or not np.ptp(inner, axis=-1).any()
+        hits = inner.any(axis=-1).sum()
     # of a line lost at the end, or a sample twice at the end, nothing is seen
     trials = N_LINE_FRAMES * (1 if move.startswith("line") else n)
     shown = {"swapped": 1 - 1 / n - share, "line_lost": 1 - 1 / n, "sample_lost": 1 - 1 / m}.get(move, 1.0)
@@ -271,8 +269,9 @@ def test_pixels_are_fitted_without_the_lines_that_were_moved(move, lines):
     truth, effect = drawn_truth(shape), MisplacedLines(share=0.1, move=move, lines=lines)
     frames, plain = taken(truth, effect, n_frames=n_frames, seed=5), taken(truth, n_frames=n_frames, seed=5)
     found = own_lines(frames, np.ones(shape, np.bool_), [effect])
-    moved = turned(frames != plain, lines).any(axis=2)
-    replaced = turned(found != frames, lines).any(axis=2)
+    moved, replaced = (
+        each.any(axis=2 if lines == "rows" else 1) for each in (frames != plain, found != frames)
+    )
     # where a line is cut, few of its samples may have moved
     assert replaced[moved].mean() > (0.5 if "sample" in move else 0.8)
     assert replaced[~moved].mean() < 0.01
@@ -286,18 +285,13 @@ def test_a_line_in_two_places_is_misplaced_too_and_its_equality_tells():
 
 @pytest.mark.parametrize("lines", ["rows", "columns"])
 def test_a_line_is_its_own_or_the_one_before(lines):
-    frames = np.random.default_rng(1).integers(90, 140, (N_LINE_FRAMES, *LINES_SHAPE)).astype(np.uint16)
-    found = RepeatedLines(share=0.1, lines=lines).apply(frames, context_of(LINES_SHAPE, N_LINE_FRAMES))
-    repeats = 0
-    for one, plain in zip(found, frames, strict=True):
-        one, plain = (one, plain) if lines == "rows" else (one.T, plain.T)
-        np.testing.assert_array_equal(one[0], plain[0])
-        for y in range(1, len(one)):
-            if not np.array_equal(one[y], plain[y]):
-                np.testing.assert_array_equal(one[y], plain[y - 1])
-                repeats += 1
-    n = N_LINE_FRAMES * (LINES_SHAPE[0 if lines == "rows" else 1] - 1)
-    assert abs(repeats - 0.1 * n) < 5 * np.sqrt(0.09 * n)
+    across, along = steps_of(RepeatedLines(share=0.1, lines=lines))
+    assert not along.any()
+    assert not np.ptp(across, axis=2).any()
+    assert set(np.unique(across)) == {-1, 0}
+    repeats = across[:, 1:, 0]
+    assert abs((repeats == -1).sum() - 0.1 * repeats.size) < 5 * np.sqrt(0.09 * repeats.size)
+    assert not across[:, 0].any()
 
 
 @pytest.mark.parametrize("lines", ["rows", "columns"])
