@@ -21,7 +21,7 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.operators.offsets import RowNoise
 
-NOISY = PlainCamera(0.62, 1.2, 9.0, (12, 14), 600)
+NOISY = PlainCamera(0.62, 1.2, 9.0, (10, 12), 600)
 QUICK = DiscrepancySettings(replicates=20, extended_replicates=12, candidates=("row_noise",))
 
 
@@ -46,7 +46,7 @@ def test_perfect_frames_of_a_sensor_of_any_layout_are_not_called_wrong(layout):
 
 
 def test_row_noise_is_found_on_a_noisy_sensor():
-    """Four tenths of the read noise of 5.6 DN, 14 errors of the variance of row means."""
+    """Four tenths of the read noise of 5.6 DN, 12 errors of the variance of row means."""
     rng = np.random.default_rng(21)
     frames = NOISY.frames(21).astype(np.int64)
     frames += np.rint(2.2 * rng.standard_normal((*frames.shape[:2], 1))).astype(np.int64)
