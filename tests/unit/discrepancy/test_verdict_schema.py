@@ -44,8 +44,7 @@ def test_what_is_written_is_read_back(verdict: str) -> None:
 def test_numbers_that_are_not_known_are_null_in_the_file() -> None:
     gap = {**result("named")["gap"], "floor": math.nan, "after": math.inf}
     content = json.loads(verdict_of("named", gap=gap).to_json())
-    assert content["gap"]["floor"] is None
-    assert content["gap"]["after"] is None
+    assert content["gap"]["floor"] is content["gap"]["after"] is None
     assert math.isnan(Verdict.from_json(json.dumps(content)).gap.floor)
 
 

@@ -24,8 +24,8 @@ def test_another_take_is_the_same_sensor_with_other_electrons_even_beside_an_eff
 
     def common(other):
         """Sum of the correlations of all different pixels, in its standard deviations."""
-        first, second = (each.frames.reshape(FRAMES, -1).astype(float) for each in (one, other))
-        first, second = ((each - each.mean(axis=0)) / each.std(axis=0) for each in (first, second))
+        both = (each.frames.reshape(FRAMES, -1).astype(float) for each in (one, other))
+        first, second = ((each - each.mean(axis=0)) / each.std(axis=0) for each in both)
         product = first.T @ second / np.sqrt(FRAMES)
         np.fill_diagonal(product, 0.0)
         return product.sum() / np.sqrt(product.size)
@@ -63,18 +63,13 @@ def times(v, effect):
     return regress(v, v.h * course, effect.strength)
 
 
-def covariance(v, one, other, expected):
-    """Covariance of pairs of samples over the one expected of unit strength, and its standard error."""
-    spread = np.sqrt((v.var[one[1:]] * v.var[other[1:]]).sum() * v.c[one].shape[0])
-    return (v.c[one] * v.c[other]).sum() / expected, spread / expected
-
-
 def neighbours(v, weight):
     """Mean of both axes of the covariance of neighbours over ``weight`` (H_i + H_j)."""
     both = []
     for one, other in ((np.s_[:, :, :-1], np.s_[:, :, 1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         expected = weight * (v.h[one[1:]] + v.h[other[1:]]).sum() * FRAMES
-        both.append(covariance(v, one, other, expected))
+        spread = np.sqrt((v.var[one[1:]] * v.var[other[1:]]).sum() * FRAMES)
+        both.append(((v.c[one] * v.c[other]).sum() / expected, spread / expected))
     (x, sx), (y, sy) = both
     return (x + y) / 2, np.hypot(sx, sy) / 2
 
