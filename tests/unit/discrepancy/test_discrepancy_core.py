@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from pchem_pipeline.discrepancy.null import Covariance, Measured, NullModel, as_
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
+from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
@@ -39,21 +41,23 @@ def _null(rng: np.random.Generator, b: int = 60, m: int = 40) -> NullModel:
 
 
 def _hypothesis(tag: str, fingerprint: np.ndarray) -> Hypothesis:
-    parameters = {
-        "row_noise": {"row_noise_dn": 0.1},
-        "frame_noise": {"frame_noise_dn": 0.1},
-        "exposure_drift": {"drift": 0.1},
-    }[tag]
-    return Hypothesis(effect_class(tag).model_validate({"tag": tag, **parameters}), fingerprint)
+    kind = effect_class(tag)
+    return Hypothesis(kind.model_validate({"tag": tag, kind.strength: 0.1}), fingerprint)
 
 
-# -- names ------------------------------------------------------------------------------------------
+def _gap_of(value: float, floor: float = 3e-5) -> Gap:
+    return Gap(value, floor, (value, value), {})
+
+
+def _addition(effect: Effect, before: Gap, after: Gap, **more: Any) -> Addition:
+    """Return an effect that fits, added alone."""
+    plain = Addition(effect, True, "", (), {}, before, after, (), ())
+    return replace(plain, **more)
 
 
 def test_beside_an_effect_that_moves_more_and_does_not_fit_there_is_no_name() -> None:
     def one(tag: str, against: str) -> Addition:
-        effect, gap = _hypothesis(tag, np.zeros(1)).effect, Gap(1.0, 0.1, (1.0, 1.0), {})
-        return Addition(effect, True, against, (), {}, gap, gap, (), ())
+        return _addition(_hypothesis(tag, np.zeros(1)).effect, _gap_of(1.0), _gap_of(1.0), against=against)
 
     mimic, good = one("frame_noise", "it leaves too much of the discrepancy"), one("row_noise", "")
     assert [each.fits for each in without_company([mimic, good])] == [False, False]
@@ -67,23 +71,16 @@ def test_beside_an_effect_that_moves_more_and_does_not_fit_there_is_no_name() ->
 
 @pytest.mark.parametrize(("left", "fits"), [(0.9, True), (0.6, True), (0.4, False), (-0.1, False)])
 def test_what_something_unrelated_closes_nearly_as_well_gets_no_name(left: float, fits: bool) -> None:
-    effect, before, after = _hypothesis("row_noise", np.zeros(1)).effect, _gap_of(1.0), _gap_of(0.0)
     related, rival = (Rival(effect=tag, gap_after=left) for tag in ("periodic_pickup", "adc_dnl"))
-    one = Addition(effect, True, "", (), {}, before, after, (related, rival), ())
+    effect = _hypothesis("row_noise", np.zeros(1)).effect
+    one = _addition(effect, _gap_of(1.0), _gap_of(0.0), rivals=(related, rival))
     assert without_better_reason(one).fits is fits
     measured = Rival(effect="empirical_noise", gap_after=left)
     for other in (replace(one, rivals=(related, measured)), replace(one, described=True)):
         assert without_better_reason(other) == other
 
 
-def _gap_of(value: float) -> Gap:
-    return Gap(value, 0.1, (value, value), {})
-
-
-# -- splits -----------------------------------------------------------------------------------------
-
-
-def test_splits_share_no_frame_and_keep_blocks_whole() -> None:
+def test_splits_share_no_frame_and_keep_blocks_whole_also_at_a_gap_in_the_numbering() -> None:
     splits = split_frames(np.arange(1000), 20)
     parts = [splits.train, splits.test, splits.final]
     together = np.concatenate(parts)
@@ -95,29 +92,17 @@ def test_splits_share_no_frame_and_keep_blocks_whole() -> None:
         assert np.all(blocks[:, 0] % 20 == 0)
     # a slow drift must look alike in all three: their middles are a block apart at most
     assert np.ptp([part.mean() for part in parts]) <= 20
-
-
-def test_no_block_spans_a_gap_in_the_numbering() -> None:
     numbers = np.concatenate([np.arange(0, 330), np.arange(500, 830)])
     splits = split_frames(numbers, 20)
     for part in (splits.train, splits.test, splits.final):
         assert np.all(np.diff(numbers[part].reshape(-1, 20), axis=1) == 1)
 
 
-@pytest.mark.parametrize(
-    ("frames", "wanted", "expected"), [(4000, None, 66), (17750, None, 100), (700, None, 20)]
-)
-def test_length_of_blocks(frames: int, wanted: int | None, expected: int) -> None:
-    assert block_length(frames, wanted) == expected
-
-
-@pytest.mark.parametrize(("frames", "wanted"), [(299, None), (800, 100)])
-def test_too_few_frames_are_refused_with_how_many(frames: int, wanted: int | None) -> None:
-    with pytest.raises(InputError, match=r"need (300|900)"):
-        block_length(frames, wanted)
-
-
-# -- null -------------------------------------------------------------------------------------------
+def test_length_of_blocks_and_too_few_frames_are_refused_with_how_many() -> None:
+    assert [block_length(frames, None) for frames in (4000, 17750, 700)] == [66, 100, 20]
+    for frames, wanted, least in ((299, None, 300), (800, 100, 900)):
+        with pytest.raises(InputError, match=f"need {least}"):
+            block_length(frames, wanted)
 
 
 def test_global_p_is_uniform_under_the_null() -> None:
@@ -154,21 +139,15 @@ def test_an_effect_that_only_widens_a_statistic_makes_no_false_deviation() -> No
     assert unaware > 0.3 * tests
 
 
-# -- fingerprints and naming ------------------------------------------------------------------------
-
-
 def test_factors_and_their_errors_are_those_of_least_squares() -> None:
     rng = np.random.default_rng(14)
-    first, second = rng.normal(size=40), rng.normal(size=40)
-    noise = Noise(UNIT, 0.0)
-    pulls = []
-    for _ in range(400):
-        shift = 8.0 * first + 5.0 * second + rng.normal(size=40)
-        fit = fit_set([_hypothesis("row_noise", first), _hypothesis("frame_noise", second)], shift, noise)
-        pulls.append((fit.factors - [8.0, 5.0]) / fit.stderr)
-    pulls_ = np.array(pulls)
-    assert np.all(np.abs(pulls_.mean(axis=0)) < 5 / np.sqrt(400))
-    assert np.all(np.abs(pulls_.std(axis=0) - 1) < 5 / np.sqrt(800))
+    first, second = rng.normal(size=(2, 40))
+    both = [_hypothesis("row_noise", first), _hypothesis("frame_noise", second)]
+    shifts = 8.0 * first + 5.0 * second + rng.normal(size=(400, 40))
+    fits = [fit_set(both, shift, Noise(UNIT, 0.0)) for shift in shifts]
+    pulls = np.array([(fit.factors - [8.0, 5.0]) / fit.stderr for fit in fits])
+    assert np.all(np.abs(pulls.mean(axis=0)) < 5 / np.sqrt(400))
+    assert np.all(np.abs(pulls.std(axis=0) - 1) < 5 / np.sqrt(800))
 
 
 def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_sensor() -> None:
@@ -192,22 +171,14 @@ def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_senso
 
 def test_nothing_predicts_held_out_samples_where_nothing_is() -> None:
     rng = np.random.default_rng(18)
-    gains = {}
-    for size in (0.0, 2.0):
-        prints = rng.normal(size=(50, 40))
-        gains[size] = [
-            held_out_gain(
-                [_hypothesis("row_noise", each)],
-                (size * each + rng.normal(size=40), size * each + rng.normal(size=40)),
-                Noise(UNIT, 0.1),
-            )
-            for each in prints
-        ]
-    assert np.sum(np.array(gains[0.0]) > 0.0) <= 1
-    assert np.min(gains[2.0]) > 10.0
 
+    def gain(size: float) -> float:
+        print_ = rng.normal(size=40)
+        halves = size * print_ + rng.normal(size=(2, 40))
+        return held_out_gain([_hypothesis("row_noise", print_)], tuple(halves), Noise(UNIT, 0.1))
 
-# -- gap --------------------------------------------------------------------------------------------
+    assert sum(gain(0.0) > 0.0 for _ in range(50)) <= 1
+    assert min(gain(2.0) for _ in range(50)) > 10.0
 
 
 def test_gap_is_the_divergence_and_does_not_grow_with_the_samples() -> None:
@@ -215,26 +186,12 @@ def test_gap_is_the_divergence_and_does_not_grow_with_the_samples() -> None:
     values = []
     for n in (10_000, 40_000):
         null = _null(rng, b=200)
-        shift = np.zeros(40)
-        shift[:3] = 0.05 * np.sqrt(n)
-        metric = StatisticsGap(null, n)
-        gaps = [
-            metric.gap(0.3 + shift + rng.normal(size=40), null.mean, null.replicates).value for _ in range(60)
-        ]
+        z = 0.3 + 0.05 * np.sqrt(n) * (np.arange(40) < 3) + rng.normal(size=(60, 40))
+        gaps = [StatisticsGap(null, n).gap(each, null.mean, null.replicates).value for each in z]
         values.append(np.mean(gaps))
     # three statistics moved by 0.05 sigma per root sample: 3 * 0.05^2 / 2
     assert values[0] == pytest.approx(3 * 0.05**2 / 2, rel=0.15)
     assert values[1] == pytest.approx(values[0], rel=0.15)
-
-
-def test_a_right_model_is_below_the_floor_in_19_of_20() -> None:
-    rng = np.random.default_rng(21)
-    below = []
-    for _ in range(100):
-        null = _null(rng)
-        gap = StatisticsGap(null, 1000).gap(rng.normal(0.3, 1.0, 40), null.mean, null.replicates)
-        below.append(gap.at_floor)
-    assert abs(np.mean(below) - 0.95) < 5 * np.sqrt(0.95 * 0.05 / 100)
 
 
 @pytest.mark.parametrize("part", [[7], [6, 7]])  # of both parts of a stack, too
@@ -321,11 +278,9 @@ def test_expected_codes_are_those_of_the_mixture_of_every_usable_pixel() -> None
     maps = PixelMaps(h, g, mu, sigma, np.array([[True, True]]))
     codes = np.arange(70, 260)
     by_hand = np.zeros(codes.size)
-    for pixel in range(2):
-        theta = (each[0, pixel] for each in (h, g, mu, sigma))
+    for theta in zip(*(each[0] for each in (h, g, mu, sigma)), strict=True):
         by_hand += 300 * joint_mass(codes, *theta, 40).sum(axis=0)
     found = expected_codes(maps, [], codes, np.arange(300))
-    assert found is not None
     np.testing.assert_allclose(found, by_hand, rtol=1e-8, atol=1e-9)
     one = expected_codes(PixelMaps(h, g, mu, sigma, np.array([[True, False]])), [], codes, np.arange(300))
     assert one.sum() == pytest.approx(300, rel=1e-6)
@@ -344,7 +299,7 @@ def test_a_statistic_that_a_replicate_lacks_says_nothing() -> None:
 def test_what_nearly_disagrees_is_said_beside_consistent() -> None:
     null, calm, high = _null(np.random.default_rng(31)), np.full(40, 0.3), np.full(40, 0.3)
     high[5] += 4.2
-    near, far = Gap(1e-4, 2e-4, (0.0, 0.0), {}), Gap(3e-4, 2e-4, (0.0, 0.0), {})
+    near, far = _gap_of(1e-4, 2e-4), _gap_of(3e-4, 2e-4)
     nothing = Added((), near)
     words = {
         (quiet, gap.at_floor): _sentence(
@@ -381,8 +336,7 @@ def test_rivals_that_frames_cannot_tell_apart_come_with_the_measurement_that_can
 ) -> None:
     first, other = (effect_class(tag).typical()[0] for tag in (effect, rival))
     candidates = (Candidate.of(first, 0.0, 0.0, 0.6), Candidate.of(other, score, 4.0, 0.4))
-    gap = Gap(9e-5, 3e-5, (0.0, 0.0), {})
-    addition = Addition(first, False, "", candidates, {}, gap, gap, (), ())
+    addition = _addition(first, _gap_of(9e-5), _gap_of(9e-5), alone=False, candidates=candidates)
     assert list(addition.step(None).separate) == [rival]
     assert says in addition.step(None).separate[rival]
 
@@ -390,8 +344,8 @@ def test_rivals_that_frames_cannot_tell_apart_come_with_the_measurement_that_can
 def test_what_the_likeliest_effects_have_in_common_is_certain() -> None:
     row, pickup = (effect_class(tag).typical()[0] for tag in ("row_noise", "periodic_pickup"))
     candidates = (Candidate.of(row, 0.0, 0.0, 0.6), Candidate.of(pickup, -1.0, 4.0, 0.4))
-    gap = Gap(9e-5, 3e-5, (0.0, 0.0), {})
-    addition = Addition(row, False, "", candidates, {}, gap, gap, (), ())
+    gap = _gap_of(9e-5)
+    addition = _addition(row, gap, gap, alone=False, candidates=candidates)
     assert addition.step(None).factors == {
         "changes": ("offset",),
         "shared_by": ("pixels of a row", "a wave over the sensor"),
@@ -401,11 +355,8 @@ def test_what_the_likeliest_effects_have_in_common_is_certain() -> None:
     z = Measured(*(np.zeros(null.mean.size),) * 3)
     found = Findings("frames", z, null, null, gap, [], False, Added((addition,), gap))
     assert found.state == "ambiguous"
-    words = _sentence(found, {})
-    assert (
-        "do not decide which; certain: what changes (offset); open: what shares it (pixels of a row or"
-        in words
-    )
+    certain = "certain: what changes (offset); open: what shares it (pixels of a row or"
+    assert f"do not decide which; {certain}" in _sentence(found, {})
     named = replace(addition, alone=True, candidates=candidates[:1])
     assert named.step(None).factors["shared_by"] == ("pixels of a row",)
     assert replace(addition, against="it does not fit").step(None).factors == {}
@@ -424,11 +375,9 @@ def test_a_statistic_says_what_its_sign_says() -> None:
 )
 def test_what_the_final_frames_do_not_confirm_has_no_name(before: float, after: float, state: str) -> None:
     effect = effect_class("flicker_noise")(share=0.1)
-    first, last = (Gap(value, 3e-5, (0.0, 0.0), {}) for value in (before, after))
-    rival = [
-        Candidate.of(one, 0.0, 0.0, 0.5) for one in (effect, effect_class("row_noise")(row_noise_dn=1.0))
-    ]
-    addition = Addition(effect, True, "", tuple(rival), {}, first, last, (), ())
+    first, last = _gap_of(before), _gap_of(after)
+    both = effect, effect_class("row_noise")(row_noise_dn=1.0)
+    addition = _addition(effect, first, last, candidates=tuple(Candidate.of(e, 0.0, 0.0, 0.5) for e in both))
     found = Findings("frames", None, None, None, first, [], False, Added((addition,), last))  # type: ignore[arg-type]
     assert found.state == addition.verdict == state
     assert bool(found.named) == bool(found.model((), (effect,))) == (state == "named")
@@ -436,8 +385,8 @@ def test_what_the_final_frames_do_not_confirm_has_no_name(before: float, after: 
     assert ("not confirmed" in words) == (state == "ambiguous"), words
     step = addition.step(None)
     assert (step.effect, len(step.candidates)) == (("flicker_noise", 2) if state == "named" else (None, 1))
-    both = Added((addition, replace(addition, alone=False)), last)
-    words = _sentence(replace(found, added=both), {})
+    two = Added((addition, replace(addition, alone=False)), last)
+    words = _sentence(replace(found, added=two), {})
     assert "do not decide" in words
     assert ("not confirmed" in words) == (state == "ambiguous"), words
 
@@ -448,8 +397,8 @@ def test_what_one_statistic_shows_still_is_a_part_that_has_no_name() -> None:
     z = null.mean.copy()
     z[7] += 7.5 * null.std[7]
     effect = effect_class("row_noise")(row_noise_dn=1.0)
-    first, last = (Gap(value, 3e-5, (0.0, 0.0), {}) for value in (9e-5, 1e-5))
-    addition = Addition(effect, True, "", (), {}, first, last, (), ())
+    first, last = _gap_of(9e-5), _gap_of(1e-5)
+    addition = _addition(effect, first, last)
     found = Findings("frames", Measured(z, z, z), null, null, first, [], True, Added((addition,), last))
     assert (found.state, found.named) == ("named_in_part", (effect,))
     assert STATISTICS[NAMES[7]].sentence in _sentence(found, {})

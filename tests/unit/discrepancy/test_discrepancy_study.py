@@ -19,18 +19,11 @@ SHAPE = (64, 64, 4000)
 def record(hidden, verdict, *steps, kind="single", level=4.0, **more):
     """A record: each step is a name, or a set of names that could not be told apart."""
     gap = {"after": 1e-7, "before": 1e-4, "floor": 1e-6, "closed_fraction": 0.999}
-    told = [
-        {
-            "effect": step if isinstance(step, str) else None,
-            "candidates": [{"effect": tag} for tag in ([step, "other"] if isinstance(step, str) else step)],
-            "rivals": [],
-            "gap_before": 1e-4,
-            "gap_after": 1e-7,
-            "gap_floor": 1e-6,
-        }
-        for step in steps
-    ]
-    names = [step for step in steps if isinstance(step, str)]
+    of_step = {"rivals": [], "gap_before": 1e-4, "gap_after": 1e-7, "gap_floor": 1e-6}
+    told, names = [], [step for step in steps if isinstance(step, str)]
+    for step in steps:
+        effect, tags = (step, [step, "other"]) if step in names else (None, step)
+        told.append({"effect": effect, "candidates": [{"effect": tag} for tag in tags], **of_step})
     return {
         "case": {"kind": kind, "level": level, "hidden": list(hidden), "key": f"{kind}{hidden}{steps}"},
         "verdict": {"verdict": verdict, "effects": names, "steps": told, "gap": gap, "replicates": 90},

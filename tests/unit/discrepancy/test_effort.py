@@ -6,10 +6,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
+from helpers.small_sensors import seen as seen_in
 
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, refit_maps
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
-from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.operators.couple import InterpixelCapacitance
@@ -112,21 +112,16 @@ def test_a_law_that_differs_by_pixel_costs_no_more_for_that():
     assert 1 < placed.components <= 2 * everywhere.components
 
 
-def test_a_law_that_fits_hardly_a_pixel_is_given_up_after_some():
-    """So much coupling between neighbours would widen the peaks more than they are."""
+def test_a_law_that_fits_hardly_a_pixel_is_given_up_after_some_and_one_of_too_many_peaks_is_not_begun_with():
     frames = PlainCamera(0.3, 4.0, 12.0, (16, 16), 600).frames(1)
-    seen = observe(frames, np.arange(600), n_run=600, block_frames=50)
+    seen = seen_in(frames)
     little = refit_maps(frames, seen.maps, [InterpixelCapacitance(coupling=0.01)], seen.covariance)
     assert little.maps.usable.all()
     assert 1.0 < little.evaluations < 15.0
+    # so much coupling between neighbours would widen the peaks more than they are
     with pytest.raises(NotFittedError):
         refit_maps(frames, seen.maps, [InterpixelCapacitance(coupling=0.1)], seen.covariance)
-
-
-def test_a_law_of_too_many_peaks_is_not_begun_with():
-    """A stack with noise of three kinds, strong in all, took minutes over a set that left nearly all."""
-    frames = PlainCamera(0.3, 4.0, 12.0, (16, 16), 600).frames(1)
-    seen = observe(frames, np.arange(600), n_run=600, block_frames=50)
+    # a stack with noise of three kinds, strong in all, took minutes over a set that left nearly all
     wave = PeriodicPickup(amplitude_dn=1.0, cycles_per_row=0.36)
     with pytest.raises(NotFittedError, match="would have 80"):
         refit_maps(frames, seen.maps, [NoiseSkew(share=0.83), wave], seen.covariance)

@@ -28,7 +28,6 @@ class TwiceTooLarge(ColumnNoise):
 
     @classmethod
     def estimate(cls, evidence):
-        """Return twice the strength."""
         return [guess.scaled(2.0) for guess in ColumnNoise.estimate(evidence)]
 
 
@@ -52,29 +51,10 @@ def test_a_right_estimator_passes_and_a_wrong_one_does_not():
     assert wrong.probability < 1e-4
 
 
-def test_frames_of_another_simulator_are_taken():
-    seeds = []
-
-    def dull(seed):
-        seeds.append(seed)
-        rng = np.random.default_rng(seed)
-        electrons = rng.poisson(2.0, (400, 8, 8)) + 0.25 * rng.standard_normal((400, 8, 8))
-        return np.rint(100 + 10 * electrons).astype(np.uint16)
-
-    assert recovered_strength(ColumnNoise(column_noise_dn=1.0), camera=dull, stacks=2, seed=4).n_guesses == 0
-    assert seeds == [4, 5]
-
-
-def test_an_effect_without_a_strength_is_refused():
-    with pytest.raises(ConfigError, match="'clipping' has no strength"):
-        recovered_strength(Clipping(high=900.0))
-
-
 class RowBefore(ColumnNoise):
     """Adds a share of the row before, without saying so."""
 
     def apply(self, values, context):
-        """Return each row with what the one before it in the array has."""
         return values + 0.5 * np.roll(values, 1, axis=1)
 
 
@@ -82,7 +62,6 @@ class FrameBefore(ColumnNoise):
     """Adds a share of the frame before, without saying so."""
 
     def apply(self, values, context):
-        """Return each frame with what the one before it in the array has."""
         return values + 0.5 * np.roll(values, 1, axis=0)
 
 
@@ -90,7 +69,6 @@ class EveryOtherRowOfABand(ColumnNoise):
     """Counts rows from the first one of the band that it is given."""
 
     def apply(self, values, context):
-        """Return each second row one DN higher."""
         return values + np.arange(values.shape[1])[:, None] % 2
 
 
@@ -100,18 +78,19 @@ class Misspelled(ColumnNoise):
     signature = ("space.colum.readout.variance",)
 
 
-def test_a_signature_without_its_statistic_is_refused():
-    with pytest.raises(ConfigError, match=r"names no statistics: space\.colum\.readout\.variance"):
-        recovered_strength(Misspelled(column_noise_dn=1.0), **STACKS)
-
-
 @pytest.mark.parametrize(
-    ("effect", "declared"),
-    [(RowBefore, "reach_rows"), (FrameBefore, "reach_frames"), (EveryOtherRowOfABand, "reach_rows")],
+    ("effect", "words"),
+    [
+        (RowBefore(column_noise_dn=1.0), "set `reach_rows` to how many"),
+        (FrameBefore(column_noise_dn=1.0), "set `reach_frames` to how many"),
+        (EveryOtherRowOfABand(column_noise_dn=1.0), "set `reach_rows` to how many"),
+        (Misspelled(column_noise_dn=1.0), r"names no statistics: space\.colum\.readout\.variance"),
+        (Clipping(high=900.0), "'clipping' has no strength"),
+    ],
 )
-def test_an_effect_that_reads_more_than_it_declares_is_refused(effect, declared):
-    with pytest.raises(ConfigError, match=f"set `{declared}` to how many"):
-        recovered_strength(effect(column_noise_dn=1.0), **STACKS)
+def test_an_effect_that_is_declared_wrongly_is_refused(effect, words):
+    with pytest.raises(ConfigError, match=words):
+        recovered_strength(effect, **STACKS)
 
 
 NAMES = tuple(STATISTICS)[:40]
@@ -126,10 +105,8 @@ def state_of(before: float, after: float, pull: float, monkeypatch: pytest.Monke
     addition = Addition(effect, True, "", (), {}, gaps[0], gaps[1], (), ())
     monkeypatch.setattr(skeleton, "locate", lambda *_: [])
     monkeypatch.setattr(skeleton, "build_verdict", lambda found, *_, **__: found)
-    unused: Any = None
-    data = skeleton.Prepared(
-        DiscrepancySettings(), "frames", unused, unused, NULL, Measured(z, z, z), Effort(None), {}
-    )
+    unused, measured = [None, None], Measured(z, z, z)
+    data = skeleton.Prepared(DiscrepancySettings(), "frames", *unused, NULL, measured, Effort(None), {})
     by: Any = SimpleNamespace(
         prepared=data, model=(), gap=lambda _: gaps[0], suspects=lambda _: True, explain=lambda *_: True,
         add=lambda *_: NULL, limit="", tolerance=lambda: 0.0,

@@ -27,11 +27,6 @@ def mask_of(shape: tuple[int, int] = SHAPE, **region: Any) -> Mask:
     return Region.model_validate(region).mask(shape)
 
 
-def disc() -> Mask:
-    y, x = np.ogrid[: SHAPE[0], : SHAPE[1]]
-    return np.asarray((y - 20) ** 2 + (x - 44) ** 2 <= 49)
-
-
 @pytest.mark.parametrize(
     ("mask", "shift", "least"),
     [
@@ -40,7 +35,7 @@ def disc() -> Mask:
         (mask_of(rows=[0, 24], columns=[32, 64]), -0.8, 0.9),
         (mask_of(taps={"every": 8, "which": 5}), 1.0, 1.0),
         (mask_of(columns=[12, 64]), 0.7, 0.9),
-        (disc(), -1.5, 0.8),
+        (np.hypot(np.arange(48)[:, None] - 20, np.arange(64) - 44) <= 7, -1.5, 0.8),
     ],
 )
 def test_a_place_is_found_where_it_is(mask: Mask, shift: float, least: float) -> None:
@@ -96,11 +91,8 @@ def test_pairs_with_the_next_column_reach_one_further() -> None:
 
 def test_the_share_that_is_affected_is_a_lower_bound_for_any_place() -> None:
     rng = np.random.default_rng(6)
-    true = np.zeros(4000, bool)
-    true[:300] = True
-    z = rng.standard_normal(4000) + 6.0 * true
-    inside = np.zeros(4000, bool)
-    inside[:400] = True
+    z = rng.standard_normal(4000) + 6.0 * (np.arange(4000) < 300)
+    inside = np.arange(4000) < 400
     assert 0.6 < affected_share(z, inside) <= 0.75
     # chosen after looking, without any effect: more than none in 5 of 100 at most, 16 with five errors
     noise = rng.standard_normal((100, 2000))
@@ -194,12 +186,11 @@ def test_events_of_a_place_are_found_there(place: Mask) -> None:
     """Sixteen or so in a tenth of the pixels, and a dozen by chance anywhere."""
     rng = np.random.default_rng(int(place.sum()))
     seen = rng.random(SQUARE) < 0.01 + 0.2 * place
-    found = scan_event_map(seen, np.full(SQUARE, 0.01), EVERY)
-    assert len(found) == 1
-    assert found[0].region.overlap(Region.of_mask(place), SQUARE) > 0.6
-    assert found[0].only_there
+    [found] = scan_event_map(seen, np.full(SQUARE, 0.01), EVERY)
+    assert found.region.overlap(Region.of_mask(place), SQUARE) > 0.6
+    assert found.only_there
     # a rate between those of a binomial number five deviations off
-    assert abs(found[0].inside - 0.2) < 5.0 * np.sqrt(0.2 * 0.8 / place.sum()) + 0.04
+    assert abs(found.inside - 0.2) < 5.0 * np.sqrt(0.2 * 0.8 / place.sum()) + 0.04
 
 
 def test_events_have_no_place_by_chance_and_follow_the_share_of_each_pixel() -> None:
@@ -218,16 +209,12 @@ def test_a_binomial_tail_is_that_of_the_law() -> None:
 
 
 def test_a_range_of_frames_with_events_is_found() -> None:
-    rng = np.random.default_rng(2)
+    rng, numbers = np.random.default_rng(2), np.arange(100, 100 + FRAMES)
+    wanted = (numbers >= 700) & (numbers < 860)
     for _ in range(20):
-        happened = rng.random(FRAMES) < 0.004
-        happened[600:760] |= rng.random(160) < 0.15
-        numbers = np.arange(100, 100 + FRAMES)
+        happened = rng.random(FRAMES) < np.where(wanted, 0.154, 0.004)
         found = scan_event_frames(np.flatnonzero(happened), numbers, expected=6.0, shortest=64)
-        assert found is not None
         inside = found.when.frames(numbers)
-        wanted = np.zeros(FRAMES, np.bool_)
-        wanted[600:760] = True
         # of 24 events the outermost lie seven frames from the ends on average
         assert (inside & wanted).sum() > 0.6 * (inside | wanted).sum()
         assert found.only_there
@@ -237,7 +224,6 @@ def test_of_very_many_events_some_tell_the_range() -> None:
     rng = np.random.default_rng(4)
     happened = rng.random(50_000) < np.where((np.arange(50_000) // 5000) == 3, 0.4, 0.1)
     found = scan_event_frames(np.flatnonzero(happened), np.arange(50_000), shortest=64)
-    assert found is not None
     assert found.when.overlap(When(range=((15_000, 20_000),)), 50_000) > 0.8
 
 

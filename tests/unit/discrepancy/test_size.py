@@ -34,7 +34,6 @@ def test_the_size_is_what_the_law_of_the_effect_says(
 ) -> None:
     """Of a short run no less well than of a long one: the draws are as many."""
     size = size_of(effect_class(tag).model_validate({"tag": tag, **fields}), MAPS, n_frames)
-    assert size is not None
     assert size.electrons == pytest.approx(electrons, rel=4.0 / np.sqrt(2.0 * draws) + 0.005)
     assert size.dn == pytest.approx(size.electrons / GAIN)
     assert size.of_read_noise == pytest.approx(size.dn / NOISE)
@@ -46,40 +45,25 @@ def test_a_measured_noise_has_the_size_that_was_measured(changes: str) -> None:
     mode = {"of": "row", "share": 1.0, "changes": changes, "signal_dn": EXPOSURE / GAIN}
     fields = {"tag": "empirical_noise", "noise_dn": 1.0, "modes": [mode]}
     size = size_of(effect_class("empirical_noise").model_validate(fields), MAPS, 4000)
-    assert size is not None
-    assert size.model_dump() == pytest.approx(
-        {"electrons": GAIN, "dn": 1.0, "of_read_noise": 1.0 / NOISE, "samples": 1.0}
-    )
+    wanted = Size(electrons=GAIN, dn=1.0, of_read_noise=1.0 / NOISE, samples=1.0)
+    assert size.model_dump() == pytest.approx(wanted.model_dump())
 
 
-def test_the_size_in_a_part_is_that_where_it_acts() -> None:
+def test_the_size_in_a_part_is_that_where_it_acts_and_there_is_none_without_usable_pixels() -> None:
     effect = effect_class("row_noise").model_validate({"tag": "row_noise", "row_noise_dn": 0.5})
     part = effect.at_place(Region.model_validate({"columns": [[0, 4]]}))
     assert size_of(part, MAPS, 1000) == size_of(effect, MAPS, 1000)
+    assert size_of(effect, replace(MAPS, usable=np.zeros(SHAPE, bool)), 1000) is None
 
 
-def test_without_usable_pixels_there_is_no_size() -> None:
-    nothing = replace(MAPS, usable=np.zeros(SHAPE, bool))
-    effect = effect_class("row_noise").model_validate({"tag": "row_noise", "row_noise_dn": 0.5})
-    assert size_of(effect, nothing, 1000) is None
-
-
-@pytest.mark.parametrize(
-    ("size", "words"),
-    [
+def test_a_size_is_told_with_the_samples_that_change() -> None:
+    for (electrons, dn, of_read_noise, samples), words in (
+        ((0.039, 0.61, 0.11, 1.0), "samples change by 0.61 DN rms, 11 % of the read noise"),
         (
-            Size(electrons=0.039, dn=0.61, of_read_noise=0.11),
-            "samples change by 0.61 DN rms, 11 % of the read noise",
-        ),
-        (
-            Size(electrons=213.0, dn=2028.0, of_read_noise=831.06, samples=0.0081),
+            (213.0, 2028.0, 831.06, 0.0081),
             "0.81 % of samples change by 2028 DN rms, 831 times the read noise",
         ),
-        (
-            Size(electrons=1.1, dn=12.0, of_read_noise=3.41),
-            "samples change by 12 DN rms, 3.4 times the read noise",
-        ),
-    ],
-)
-def test_a_size_is_told_with_the_samples_that_change(size: Size, words: str) -> None:
-    assert size.words() == words
+        ((1.1, 12.0, 3.41, 1.0), "samples change by 12 DN rms, 3.4 times the read noise"),
+    ):
+        size = Size(electrons=electrons, dn=dn, of_read_noise=of_read_noise, samples=samples)
+        assert size.words() == words

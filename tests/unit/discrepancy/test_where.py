@@ -43,26 +43,19 @@ def blob() -> Array:
 
 
 @pytest.mark.parametrize(
-    ("moved", "name", "region"),
+    ("part", "values", "name"),
     [
-        (added(np.s_[:, :, 48:], 1.2 * NOISE((500, 40, 1))), "x.rr", Region(columns=((48, 64),))),
-        (
-            added(np.s_[:, :20, 32:], NOISE((500, 1, 32))),
-            "y.rr",
-            Region(rows=((0, 20),), columns=((32, 64),)),
-        ),
-        (added(np.s_[:, 17], 1.5 * NOISE((500, 1))), "x.rr", Region(rows=((17, 18),))),
-        (
-            added(np.s_[:, blob()], 1.5 * np.linspace(-0.5, 0.5, 500)[:, None]),
-            "trend.readout",
-            Region.of_mask(blob()),
-        ),
+        (np.s_[:, :, 48:], 1.2 * NOISE((500, 40, 1)), "x.rr"),
+        (np.s_[:, :20, 32:], NOISE((500, 1, 32)), "y.rr"),
+        (np.s_[:, 17], 1.5 * NOISE((500, 1)), "x.rr"),
+        (np.s_[:, blob()], 1.5 * np.linspace(-0.5, 0.5, 500)[:, None], "trend.readout"),
     ],
 )
-def test_the_place_overlaps_the_truth_by_80_per_cent(
-    moved: Callable[..., Array], name: str, region: Region
-) -> None:
-    found = suspected_regions(seen(moved))
+def test_the_place_overlaps_the_truth_by_80_per_cent(part: Any, values: Array, name: str) -> None:
+    inside = np.zeros(SHAPE, np.bool_)
+    inside[part] = True
+    region = Region.of_mask(inside[0])
+    found = suspected_regions(seen(added(part, values)))
     best = min(found, key=lambda each: found[each][0].log_p)
     assert best == name
     first = found[name][0]
@@ -82,19 +75,20 @@ def test_frames_that_are_noisier_in_every_sample_by_itself_are_told() -> None:
     assert abs(first - 200) + abs(last - 280) <= 8
 
 
-def test_clean_frames_have_no_place_and_no_time() -> None:
-    assert suspected_regions(seen()) == {}
-    assert suspected_frames(seen()) == {}
-
-
-def test_maps_and_series_are_standard_normal_by_chance() -> None:
+def test_clean_frames_have_no_place_and_no_time_and_their_maps_and_series_are_standard_normal() -> None:
     evidence = seen()
+    assert suspected_regions(evidence) == suspected_frames(evidence) == {}
     maps, series = pixel_maps(evidence), frame_series(evidence)
     assert len(maps) == 8 + 2 + 3 + 4 + 6
     for name, values in (maps | series).items():
         z = values[np.isfinite(values)]
         assert abs(z.mean()) < 5.0 / np.sqrt(z.size) + 0.05, name
         assert 0.8 < z.std() < 1.2, name
+    # every statistic is asked of one of them, or of none
+    assert {map_of(name) for name in STATISTICS} - {""} <= set(maps)
+    assert {known.series for known in STATISTICS.values()} - {""} <= set(series)
+    assert (map_of("space.x.rk@rows=0:4"), map_of("code.rough")) == ("x.rk", "")
+    assert STATISTICS["space.row.readout.lag1"].series == "row.readout"
 
 
 def test_pixels_whose_levels_wander_are_listed_and_no_others() -> None:
@@ -108,15 +102,6 @@ def test_pixels_whose_levels_wander_are_listed_and_no_others() -> None:
     assert {p for name in names for p in _pixels(name, evidence, pixel_maps(evidence))} == {(30, 60), (36, 7)}
 
 
-def test_every_statistic_is_asked_of_a_map_or_series_that_exists() -> None:
-    evidence = seen()
-    maps, series = pixel_maps(evidence), frame_series(evidence)
-    assert {map_of(name) for name in STATISTICS} - {""} <= set(maps)
-    assert {known.series for known in STATISTICS.values()} - {""} <= set(series)
-    assert (map_of("space.x.rk@rows=0:4"), map_of("code.rough")) == ("x.rk", "")
-    assert STATISTICS["space.row.readout.lag1"].series == "row.readout"
-
-
 def test_a_place_counts_from_the_corner_of_the_sensor() -> None:
     inside = Place.of("space.x.rr", 9.0, region={"columns": [[2, 6]]}, when={"range": [[3, 9]]})
     moved = inside.shifted((100, 200), (10, 30), (40, 60))
@@ -126,13 +111,11 @@ def test_a_place_counts_from_the_corner_of_the_sensor() -> None:
 
 
 def test_pixels_without_a_fit_have_a_place_where_they_come_together_and_else_none() -> None:
-    rng, alarms = np.random.default_rng(5), 0
-    for _ in range(100):
-        alarms += unfitted_place(rng.random((32, 32)) > 0.02) is not None
-    assert alarms <= 2  # 0.1 are meant
+    rng = np.random.default_rng(5)
+    alarms = [unfitted_place(rng.random((32, 32)) > 0.02) for _ in range(100)]
+    assert sum(each is not None for each in alarms) <= 2  # 0.1 are meant
     usable = rng.random((32, 32)) > 0.005
     usable[:, 6:9] &= rng.random((32, 3)) > 0.25
     place = unfitted_place(usable)
-    assert place is not None
     assert place.region.overlap(Region(columns=((6, 9),)), usable.shape) > 0.6
     assert unfitted_place(np.ones((32, 32), np.bool_)) is None

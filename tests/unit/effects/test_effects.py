@@ -24,14 +24,10 @@ class Shine(Effect):
         return values + self.extra
 
 
-class Impostor(Effect):
-    """An effect of somebody else with a tag of ours."""
+class Impostor(Shine):
+    """With a tag of ours."""
 
     tag: Literal["row_noise"] = "row_noise"
-    plane: ClassVar[Plane] = Plane.ANALOG
-
-    def apply(self, values, context):
-        return values
 
 
 class Tagless(Effect):
@@ -104,16 +100,13 @@ def test_a_broken_plugin_is_named_and_left_out(installed, caplog, point, reason)
     assert registry.effect_class("row_noise") is not Impostor
 
 
-def test_asking_for_a_broken_plugin_says_why_it_is_missing(installed):
-    installed(entry("gone", "package_that_is_not_there:Effect"))
-    with pytest.raises(ConfigError, match="left out: package_that_is_not_there"):
-        registry.effect_class("gone")
-
-
-def test_two_plugins_with_one_tag(installed):
-    installed(entry("Shine"), entry("other", f"{__name__}:Shine"))
+def test_of_two_plugins_with_one_tag_the_first_counts_and_a_broken_one_that_is_asked_for_is_told(installed):
+    gone = entry("gone", "package_that_is_not_there:Effect")
+    installed(entry("Shine"), entry("other", f"{__name__}:Shine"), gone)
     assert registry.effect_class("shine") is Shine
     assert "taken" in registry.broken_plugins()["other"]
+    with pytest.raises(ConfigError, match="left out: package_that_is_not_there"):
+        registry.effect_class("gone")
 
 
 def test_our_own_tags_cannot_be_taken_twice():
@@ -140,12 +133,9 @@ def test_parameters_at_a_limit_are_told_and_defaults_are_not():
     assert stuck.at_limits() == {"anisotropy": -1.0}
     assert stuck.model_copy(update={"anisotropy": -0.99}).at_limits() == {}
     assert kind.model_validate({"coupling": 0.0}).at_limits() == {"coupling": 0.0}  # its strength, gone
-
-
-def test_limits_that_are_values_like_others_are_not_told():
-    """Half a cycle per row is a frequency; a missing code is one of no width."""
-    kind = registry.effect_class("periodic_pickup")
-    assert kind(amplitude_dn=0.3, cycles_per_row=0.5).at_limits() == {}
+    # half a cycle per row is a frequency like others
+    pickup = registry.effect_class("periodic_pickup")
+    assert pickup(amplitude_dn=0.3, cycles_per_row=0.5).at_limits() == {}
     every = [kind for kind in registry.effect_classes().values() if kind.may_be_at_bound]
     assert every
     assert all(set(kind.may_be_at_bound) <= set(kind.model_fields) for kind in every)

@@ -24,8 +24,8 @@ def test_another_take_is_the_same_sensor_with_other_electrons_even_beside_an_eff
 
     def common(other):
         """Sum of the correlations of all different pixels, in its standard deviations."""
-        first, second = (each.frames.reshape(FRAMES, -1).astype(float) for each in (one, other))
-        first, second = ((each - each.mean(axis=0)) / each.std(axis=0) for each in (first, second))
+        both = (each.frames.reshape(FRAMES, -1).astype(float) for each in (one, other))
+        first, second = ((each - each.mean(axis=0)) / each.std(axis=0) for each in both)
         product = first.T @ second / np.sqrt(FRAMES)
         np.fill_diagonal(product, 0.0)
         return product.sum() / np.sqrt(product.size)
@@ -57,24 +57,19 @@ def regress(v, regressor, scale=1.0):
     return scale * (weight * v.d).sum() / norm, scale / np.sqrt(norm)
 
 
-def times(effect):
-    return effect.strength * np.array([effect.course(t) for t in range(FRAMES)])[:, None, None]
-
-
-def covariance(v, one, other, expected):
-    """Covariance of pairs of samples over the one expected of unit strength, and its standard error."""
-    spread = np.sqrt((v.var[one[1:]] * v.var[other[1:]]).sum() * v.c[one].shape[0])
-    return (v.c[one] * v.c[other]).sum() / expected, spread / expected
+def times(v, effect):
+    """Multiple of a course that the signal follows."""
+    course = effect.strength * np.array([effect.course(t) for t in range(FRAMES)])[:, None, None]
+    return regress(v, v.h * course, effect.strength)
 
 
 def neighbours(v, weight):
     """Mean of both axes of the covariance of neighbours over ``weight`` (H_i + H_j)."""
-    a, f = slice(None), slice(None, -1)
-    t = slice(1, None)
     both = []
-    for one, other in (((a, a, f), (a, a, t)), ((a, f, a), (a, t, a))):
+    for one, other in ((np.s_[:, :, :-1], np.s_[:, :, 1:]), (np.s_[:, :-1], np.s_[:, 1:])):
         expected = weight * (v.h[one[1:]] + v.h[other[1:]]).sum() * FRAMES
-        both.append(covariance(v, one, other, expected))
+        spread = np.sqrt((v.var[one[1:]] * v.var[other[1:]]).sum() * FRAMES)
+        both.append(((v.c[one] * v.c[other]).sum() / expected, spread / expected))
     (x, sx), (y, sy) = both
     return (x + y) / 2, np.hypot(sx, sy) / 2
 
@@ -88,9 +83,8 @@ def lagged(v, expected):
 def excess(v, axes, unit):
     """Variance of means along axes beyond that of their samples, per unit^2, and its standard error."""
     w = unit / v.var
-    mean = (w * v.d).sum(axis=axes) / (w * unit * np.ones_like(v.var)).sum(axis=tuple(a - 1 for a in axes))
-    w2 = (w**2 * v.var * np.ones_like(v.var)).sum(axis=tuple(a - 1 for a in axes))
-    plain = w2 / (w * unit * np.ones_like(v.var)).sum(axis=tuple(a - 1 for a in axes)) ** 2
+    norm = (w * unit).sum(axis=tuple(a - 1 for a in axes))  # the variance of the sum of w d, too
+    mean, plain = (w * v.d).sum(axis=axes) / norm, 1 / norm
     got = (mean**2 - plain).mean()
     return got, np.sqrt(2 * (plain**2).mean() / mean.size)
 
@@ -111,17 +105,24 @@ def light(v, e):
     return regress(v, np.array([e.exposure(t, 0.0) for t in range(FRAMES)]), e.strength)
 
 
+def blinking(v, e):
+    regressor = np.zeros((FRAMES, *SHAPE))
+    regressor[:, *e.where] = e.extra
+    return regress(v, regressor, e.strength)
+
+
 def amplifier(v, e):
-    half = SHAPE[1] // 2
-    left, right = v.c[:, :, :half], v.c[:, :, half:][:, :, ::-1]
-    expected = v.h[:, :half].sum() * FRAMES
-    spread = np.sqrt((v.var[:, :half] * v.var[:, half:][:, ::-1]).sum() * FRAMES)
-    return (left * right).sum() / expected, spread / expected
+    half = np.s_[..., : SHAPE[1] // 2]
+    mirrored = np.s_[..., : SHAPE[1] // 2 - 1 : -1]
+    expected = v.h[half].sum() * FRAMES
+    spread = np.sqrt((v.var[half] * v.var[mirrored]).sum() * FRAMES)
+    return (v.c[half] * v.c[mirrored]).sum() / expected, spread / expected
 
 
 #: by tag: (estimate of the strength, standard error) from a view of a stack and the effect
 ESTIMATES = {
-    "exposure_drift": lambda v, e: regress(v, v.h * times(e), e.strength),
+    "dark_current_rts": blinking,
+    "exposure_drift": times,
     "persistence": light,
     "exposure_flicker": lambda v, e: excess(v, (1, 2), v.h),
     "overdispersed_counts": overdispersion,
@@ -130,7 +131,7 @@ ESTIMATES = {
     "nonlinearity": lambda v, e: regress(v, (v.h + v.h**2) / 5 * e.parameters["sign"]),
     "interpixel_capacitance": lambda v, e: neighbours(v, 1),
     "analog_memory": lambda v, e: lagged(v, v.h.sum()),
-    "gain_drift": lambda v, e: regress(v, v.h * times(e), e.strength),
+    "gain_drift": times,
     "bias_drift": offset,
     "bias_jumps": offset,
     "frame_noise": lambda v, e: excess(v, (1, 2), 1 / v.step),
@@ -184,45 +185,21 @@ def noise_of(tag, k=None, n=400):
     """The hook of a noise effect on normal numbers, in units of the plain noise."""
     (effect,) = made(tag).effects
     rng = np.random.default_rng(1)
-    s = effect.sensor.noise
-    k = np.zeros(SHAPE, int) if k is None else k
-    plain = [s * rng.standard_normal(SHAPE) for _ in range(n)]
-    return effect, np.array([effect.noise(t, p, k) / s for t, p in enumerate(plain)])
+    s, k = effect.sensor.noise, np.zeros(SHAPE, int) if k is None else k
+    return effect, np.array([effect.noise(t, s * rng.standard_normal(SHAPE), k) / s for t in range(n)])
 
 
 def test_rts_widens_the_chosen_pixels_only():
     hiding = made("rts_noise")
     (effect,) = hiding.effects
-    pulls = lambda v: (v.c.var(axis=0, ddof=1) - v.var) / np.sqrt((v.fourth - v.var**2) / FRAMES)  # noqa: E731
-    inside, outside = pulls(View(hiding))[effect.affected], pulls(View(hiding))[~effect.affected]
+    found, plain = (
+        (v.c.var(axis=0, ddof=1) - v.var) / np.sqrt((v.fourth - v.var**2) / FRAMES)
+        for v in (View(hiding), View(made()))
+    )
+    inside, outside = found[effect.affected], found[~effect.affected]
     assert inside.sum() > 5 * np.sqrt(inside.size)
     assert abs(outside.mean()) < 5 / np.sqrt(outside.size)
-    assert abs(pulls(View(made()))[effect.affected].sum()) < 5 * np.sqrt(inside.size)
-
-
-def test_the_trap_of_averaged_reads_moves_in_steps():
-    for seed in range(30):
-        (effect,) = hide(("rts_noise",), 4.0, seed, (8, 8), 40).effects
-        jumps = np.array([effect.noise(t, np.zeros((8, 8)), None)[effect.where] for t in range(40)])
-        levels = jumps / effect.amplitude * max(effect.reads, 1)
-        if effect.reads:
-            np.testing.assert_allclose(levels, np.round(levels), atol=1e-9)
-            assert abs(levels).max() <= effect.reads
-            assert levels.min() < 0 < levels.max()
-        else:
-            assert len(np.unique(levels[:, 0].round(9))) <= 2
-
-
-def test_blinking_pixels_follow_their_defects():
-    hiding = made("dark_current_rts")
-    (effect,) = hiding.effects
-    regressor = np.zeros((FRAMES, *SHAPE))
-    regressor[:, *effect.where] = effect.extra
-    value, error = regress(View(hiding), regressor)
-    assert abs(value - 1) < 5 * max(error, 0.02)
-    assert 5 * error < 1
-    value, error = regress(View(made()), regressor)
-    assert abs(value) < 5 * error
+    assert abs(plain[effect.affected].sum()) < 5 * np.sqrt(inside.size)
 
 
 def test_heavy_tails_and_skew():
@@ -277,50 +254,47 @@ def test_a_bent_converter_stays_within_its_amplitude():
     assert 0.9 * effect.strength < abs(bend).max() <= effect.strength * (1 + 1e-9)
 
 
-def test_clipping_catches_the_part_that_is_asked():
-    for seed in (1, 2, 3, 4):
-        hiding = hide(("clipping",), 4.0, seed, SHAPE, FRAMES)
-        (effect,) = hiding.effects
-        plain = made(seed=seed).frames
-        limit = effect.parameters["limit_dn"]
-        cut = np.maximum(plain, limit) if effect.side == "low" else np.minimum(plain, limit)
-        np.testing.assert_array_equal(hiding.frames, cut)
-        assert 0.4 < effect.parameters["samples"] / (effect.strength * plain.size) < 2.5
+def hidden_in(tag, level=4.0, seed=SEED):
+    """Return an effect, the frames with it and those without."""
+    hiding = hide((tag,), level, seed, SHAPE, FRAMES)
+    return hiding.effects[0], hiding.frames.astype(int), made(seed=seed).frames.astype(int)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_clipping_catches_the_part_that_is_asked(seed):
+    effect, frames, plain = hidden_in("clipping", seed=seed)
+    cut = (np.maximum if effect.side == "low" else np.minimum)(plain, effect.parameters["limit_dn"])
+    np.testing.assert_array_equal(frames, cut)
+    assert 0.4 < effect.parameters["samples"] / (effect.strength * plain.size) < 2.5
 
 
 def test_repeats_are_exact_and_where_the_key_says():
-    hiding, plain = made("repeated_frames"), made().frames
-    (effect,) = hiding.effects
-    same = (hiding.frames[1:, effect.rows] == hiding.frames[:-1, effect.rows]).all(axis=(1, 2))
+    effect, *both = hidden_in("repeated_frames")
+    same, by_chance = ((f[1:, effect.rows] == f[:-1, effect.rows]).all(axis=(1, 2)) for f in both)
     assert (np.flatnonzero(same) + 1).tolist() == effect.parameters["frames"]
-    assert not (plain[1:] == plain[:-1]).all(axis=(1, 2)).any()
+    assert not by_chance.any()
 
 
 def test_corrected_pixels_equal_their_median():
-    hiding, plain = hide(("pixel_correction",), 20.0, SEED, SHAPE, FRAMES), made().frames.astype(int)
-    (effect,) = hiding.effects
-    changed = np.argwhere(hiding.frames != plain)
+    effect, frames, plain = hidden_in("pixel_correction", 20.0)
+    changed = np.argwhere(frames != plain)
     assert len(changed) > 50
     for t, y, x in changed[:50]:
         around = np.delete(plain[t, y - 1 : y + 2, x - 1 : x + 2].ravel(), 4)
-        assert hiding.frames[t, y, x] == int(np.median(around)) < plain[t, y, x] - effect.limit
+        assert frames[t, y, x] == int(np.median(around)) < plain[t, y, x] - effect.limit
 
 
 def test_wrong_bits_are_the_bit_and_the_share_of_the_key():
-    hiding, plain = made("bit_errors"), made().frames
-    (effect,) = hiding.effects
-    changed = hiding.frames != plain
-    assert set((hiding.frames ^ plain)[changed].tolist()) == {2**effect.bit}
-    possible = np.ones(plain.shape, bool) if effect.kind == "flip" else (plain >> effect.bit & 1) == 1
-    n = int(possible.sum())
-    assert abs(changed.sum() - n * effect.strength) < 5 * np.sqrt(n * effect.strength)
+    effect, frames, plain = hidden_in("bit_errors")
+    wrong = frames ^ plain
+    assert set(wrong[wrong > 0].tolist()) == {2**effect.bit}
+    n = plain.size if effect.kind == "flip" else int((plain >> effect.bit & 1).sum())
+    assert abs((wrong > 0).sum() - n * effect.strength) < 5 * np.sqrt(n * effect.strength)
 
 
 def test_offsets_follow_the_bit_before():
-    hiding, plain = hide(("binary_offset",), 20.0, SEED, SHAPE, FRAMES), made().frames.astype(int)
-    (effect,) = hiding.effects
-    moved = (hiding.frames.astype(int) - plain)[:, :, 1:]
-    one = (hiding.frames[:, :, :-1] >> effect.bit & 1) == 1
+    effect, frames, plain = hidden_in("binary_offset", 20.0)
+    moved, one = (frames - plain)[:, :, 1:], (frames[:, :, :-1] >> effect.bit & 1) == 1
     apart = moved[one].mean() - moved[~one].mean()
     assert abs(apart / (effect.side * effect.strength) - 1) < 0.05
 
@@ -328,20 +302,18 @@ def test_offsets_follow_the_bit_before():
 def test_misplaced_lines_hold_the_samples_of_others():
     moves = set()
     for seed in range(12):
-        hiding, plain = hide(("misplaced_lines",), 20.0, seed, SHAPE, FRAMES), made(seed=seed).frames
-        (effect,) = hiding.effects
-        found, before = (np.moveaxis(f, effect.axis + 1, 1) for f in (hiding.frames, plain))
+        effect, *both = hidden_in("misplaced_lines", 20.0, seed)
+        found, before = (np.moveaxis(f, effect.axis + 1, 1) for f in both)
         changed = (found != before).any(axis=2)
-        n = FRAMES if effect.move == "line_lost" else changed.size
-        hit = changed.any(axis=1).sum() if effect.move == "line_lost" else changed.sum()
+        # a line that is lost moves all after it
+        hits = changed.any(axis=1) if effect.move == "line_lost" else changed
+        expected = hits.size * effect.strength
         # a sample lost near the end of a short line is often not seen
-        assert 0.6 * n * effect.strength < hit < n * effect.strength + 5 * np.sqrt(n * effect.strength)
-        t, y = np.nonzero(changed)
+        assert 0.6 * expected < hits.sum() < expected + 5 * np.sqrt(expected)
         if effect.move in ("early", "late"):
-            come = np.clip(
-                np.arange(found.shape[2]) + (1 if effect.move == "early" else -1), 0, found.shape[2] - 1
-            )
-            np.testing.assert_array_equal(found[t, y], before[t, y][:, come])
+            last, step = found.shape[2] - 1, 1 if effect.move == "early" else -1
+            come = np.clip(np.arange(last + 1) + step, 0, last)
+            np.testing.assert_array_equal(found[changed], before[changed][:, come])
         moves.add(effect.move)
     assert len(moves) >= 4
 

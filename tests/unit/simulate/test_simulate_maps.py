@@ -50,23 +50,18 @@ def test_bounds_that_leave_nothing_are_refused():
         truncated_quantile(Normal(mean=0, std=1, minimum=50), np.array([0.5]))
 
 
-def test_constant_maps_and_derived_noise():
+def test_constant_maps_and_derived_noise_and_other_ways_to_say_the_same():
     truth = draw_truth(settings())
     assert (truth.quanta_exposure == 2).all()
     np.testing.assert_allclose(truth.conversion_gain, 0.1)
     np.testing.assert_allclose(truth.read_noise_dn, np.sqrt(9 + 1 / 12))
     np.testing.assert_allclose(truth.read_noise_e, 0.1 * np.sqrt(9 + 1 / 12))
-
-
-def test_dark_current_and_gain_are_other_ways_to_say_the_same():
-    constant = {
-        name: {"kind": "constant", "value": v}
-        for name, v in (("dark_current", 0.5), ("conversion_gain", 0.1))
-    }
-    parameters = {**constant, "hot_pixels": {"fraction": 0}}
-    truth = draw_truth(SimulateSettings(shape=(3, 3), integration_time=4.0, parameters=parameters))
-    assert (truth.quanta_exposure == 2).all()
-    assert (truth.conversion_gain == 0.1).all()
+    other = {"dark_current": 0.5, "conversion_gain": 0.1}
+    parameters = {name: {"kind": "constant", "value": value} for name, value in other.items()}
+    parameters["hot_pixels"] = {"fraction": 0}
+    same = draw_truth(SimulateSettings(shape=(3, 3), integration_time=4.0, parameters=parameters))
+    assert (same.quanta_exposure == 2).all()
+    assert (same.conversion_gain == 0.1).all()
 
 
 def test_a_smaller_sensor_is_part_of_a_larger_one():
@@ -85,20 +80,16 @@ def test_column_and_row_patterns_repeat_along_their_lines(kind, n):
 
 
 @pytest.mark.parametrize(
-    ("bias", "along_y", "along_x"),
+    ("pattern", "bounds", "along_y", "along_x"),
     [
-        (with_pattern(kind="gradient", amplitude=4.0), (100, 100), (98, 102)),
-        (with_pattern(kind="gradient", amplitude=4.0, angle=90), (98, 102), (100, 100)),
-        (
-            with_pattern(kind="gradient", amplitude=40.0) | {"minimum": 90, "maximum": 105},
-            (100, 100),
-            (80, 120),
-        ),
+        ({"amplitude": 4.0}, (0, 200), (100, 100), (98, 102)),
+        ({"amplitude": 4.0, "angle": 90}, (0, 200), (98, 102), (100, 100)),
+        ({"amplitude": 40.0}, (90, 105), (100, 100), (80, 120)),
     ],
 )
-def test_gradient_runs_from_edge_to_edge_in_its_direction_within_bounds(bias, along_y, along_x):
+def test_gradient_runs_from_edge_to_edge_in_its_direction_within_bounds(pattern, bounds, along_y, along_x):
     plane = np.linspace(*along_y, 12)[:, None] + np.linspace(*along_x, 10) - 100
-    bounds = bias.get("minimum"), bias.get("maximum")
+    bias = with_pattern(kind="gradient", **pattern) | dict(zip(("minimum", "maximum"), bounds, strict=True))
     np.testing.assert_allclose(draw_truth(settings(bias=bias)).bias, plane.clip(*bounds))
 
 

@@ -16,7 +16,6 @@ from pchem_pipeline.use.electrons import electrons
 
 SHAPE, N_FRAMES = (24, 40), 60
 EVERYWHERE = np.ones((1, *SHAPE), bool)
-SPREAD = {"frame": 1.0, "row": 1.5, "column": 1.2}
 
 
 def seen(frames, calibration):
@@ -24,23 +23,21 @@ def seen(frames, calibration):
     return Reference.of_pixels(calibration, scene_of(frames.mean(axis=0), calibration))
 
 
-def taken(seed, read_noise, spread, exposure=1.0):
+def taken(seed, read_noise, spread):
+    """Frames whose offsets of (frame, row, column) have these standard deviations, DN."""
     rng = np.random.default_rng(seed)
     camera = KnownCamera.drawn(rng, SHAPE, read_noise=read_noise)
-    frame = spread["frame"] * rng.standard_normal((N_FRAMES, 1))
-    rows = spread["row"] * rng.standard_normal((N_FRAMES, SHAPE[0]))
-    columns = spread["column"] * rng.standard_normal((N_FRAMES, SHAPE[1]))
-    offset = (frame + rows)[:, :, None] + columns[:, None, :]
-    true, frames = camera.frames(rng, exposure, N_FRAMES, offset)
-    variances = np.array([[spread[name] ** 2 for name in ("frame", "row", "column")]])
-    modes = CommonModes(("row_noise",), np.ones((1, *SHAPE), bool), variances)
+    sizes = (N_FRAMES, 1, 1), (N_FRAMES, SHAPE[0], 1), (N_FRAMES, 1, SHAPE[1])
+    offset = sum(each * rng.standard_normal(size) for each, size in zip(spread, sizes, strict=True))
+    true, frames = camera.frames(rng, 1.0, N_FRAMES, offset)
+    modes = CommonModes(("row_noise",), EVERYWHERE, np.square([spread]))
     calibration = camera.calibration()
     return camera, true, frames, offset, modes, estimate_offsets(frames, seen(frames, calibration), modes)
 
 
 @pytest.mark.parametrize(("read_noise", "share"), [((0.15, 0.25), 0.1), ((0.3, 0.45), 0.5)])
 def test_offsets_are_as_near_as_they_say(read_noise, share):
-    camera, true, frames, offset, modes, found = taken(50, read_noise, SPREAD)
+    camera, true, frames, offset, modes, found = taken(50, read_noise, (1.0, 1.5, 1.2))
     total = found.of_samples(modes)
     variance = ((total - offset) ** 2).mean()
     # where peaks overlap, a sample says less of an offset than its read noise allows
@@ -55,10 +52,8 @@ def test_offsets_are_as_near_as_they_say(read_noise, share):
 
 
 def test_frames_without_offsets_lose_nothing():
-    *_, found = taken(51, (0.15, 0.25), dict.fromkeys(SPREAD, 0.0))
-    assert (found.rows == 0).all()
-    assert (found.columns == 0).all()
-    assert (found.left == 0).all()
+    *_, found = taken(51, (0.15, 0.25), (0.0, 0.0, 0.0))
+    assert not any(each.any() for each in (found.rows, found.columns, found.left))
 
 
 def test_a_model_names_its_offsets():
@@ -74,6 +69,8 @@ def test_a_model_names_its_offsets():
     assert modes.removed == ("row_noise", "column_noise", "frame_noise", "bias_drift", "periodic_pickup")
     np.testing.assert_allclose(modes.variances[0], (0.09 + 0.04, 0.25, 0.16))
     np.testing.assert_allclose(modes.waves, [[0.1, 0.0, 0.5, 0.0]])
+    timed = CommonModes.of_model([RowNoise(row_noise_dn=1.0, when="frames=3:9")], SHAPE)
+    assert (timed.removed, timed.left) == ((), ("row_noise",))
     still = CommonModes.of_model([PeriodicPickup(amplitude_dn=1.0, cycles_per_frame=0.2)], SHAPE)
     assert (len(still.waves), still.variances[0, 0]) == (0, 0.5)
 
@@ -102,7 +99,8 @@ def test_offsets_of_a_tap_are_found_there_and_beside_those_of_all():
     offset = rows + rng.standard_normal((N_FRAMES, 1, 1))
     _, frames = camera.frames(rng, 1.0, N_FRAMES, offset)
     calibration = camera.calibration()
-    found = estimate_offsets(frames, seen(frames, calibration), modes)
+    reference = seen(frames, calibration)
+    found = estimate_offsets(frames, reference, modes)
     error = (found.of_samples(modes) - offset) ** 2
     # a frame's offset is known from 960 samples, a row's from 16
     inside, outside = error[..., 24:].mean(), error[..., :24].mean()
@@ -111,16 +109,11 @@ def test_offsets_of_a_tap_are_found_there_and_beside_those_of_all():
     assert 0.6 < inside / found.left.sum(axis=1).mean() < 1.6
     # taken for all of the row, the tap's noise would be smeared over the pixels beside it
     smeared = CommonModes.of_model([RowNoise(row_noise_dn=1.5), whole], SHAPE)
-    wrong = estimate_offsets(frames, seen(frames, calibration), smeared)
+    wrong = estimate_offsets(frames, reference, smeared)
     assert ((wrong.of_samples(smeared) - offset) ** 2)[..., :24].mean() > 10 * outside
 
 
-def test_what_has_a_time_stays():
-    modes = CommonModes.of_model([RowNoise(row_noise_dn=1.0, when="frames=3:9")], SHAPE)
-    assert (modes.removed, modes.left) == ((), ("row_noise",))
-
-
-WAVES = [(0.13, 0.21, "all"), (-0.31, 0.07, "all"), (0.17, 0.0, "all"), (0.0, 0.23, "columns=8:32")]
+WAVES = [(0.13, 0.21, None), (-0.31, 0.07, None), (0.17, 0.0, None), (0.0, 0.23, "columns=8:32")]
 
 
 @pytest.mark.parametrize("amplitude", [0.4, 6.0])
@@ -131,15 +124,11 @@ def test_pickup_of_any_orientation_is_taken_from_each_frame(per_row, per_column,
     camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.15, 0.3))
     y, x = np.arange(SHAPE[0])[:, None], np.arange(SHAPE[1])
     size, phase = rng.rayleigh(amplitude / np.sqrt(2), (N_FRAMES, 1, 1)), rng.uniform(0, 7, (N_FRAMES, 1, 1))
-    inside = (x >= 8) & (x < 32) if region != "all" else True
+    inside = (x >= 8) & (x < 32) if region else True
     offset = size * np.sin(2 * np.pi * (per_row * y + per_column * x) + phase) * inside
     true, frames = camera.frames(rng, 1.0, N_FRAMES, offset)
-    pickup = PeriodicPickup(
-        amplitude_dn=amplitude,
-        cycles_per_row=per_row,
-        cycles_per_column=per_column,
-        region=None if region == "all" else region,
-    )
+    cycles = {"cycles_per_row": per_row, "cycles_per_column": per_column}
+    pickup = PeriodicPickup(amplitude_dn=amplitude, region=region, **cycles)
     modes = CommonModes.of_model([pickup], SHAPE)
     assert modes.removed == ("periodic_pickup",)
     calibration = camera.calibration()

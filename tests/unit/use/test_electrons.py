@@ -30,26 +30,19 @@ def test_errors_of_samples_and_errors_common_to_all_frames():
     assert (difference.mean(axis=0) / (read_stderr(calibration) / np.sqrt(N_FRAMES))).std() > 1.5
 
 
-def test_it_is_the_two_point_correction_in_single_precision():
-    _, camera, _, frames = KnownCamera.taken(41, (6, 7), 5.0, 9)
+def test_it_is_the_two_point_correction_in_single_precision_less_offsets():
+    rng, camera, _, frames = KnownCamera.taken(41, (6, 7), 5.0, 9)
     calibration = camera.calibration()
     calibration.fit_status[2, 3] = 4
-    found = electrons(frames, calibration)
-    assert found.dtype == np.float32
-    assert np.isnan(found[:, 2, 3]).all()
-    expected = (frames - camera.bias) * camera.gain
-    expected[:, 2, 3] = np.nan
-    np.testing.assert_allclose(found, expected, atol=1e-4)
-
-
-def test_offsets_of_rows_and_columns_are_taken_away():
-    rng, camera, _, frames = KnownCamera.taken(42, (6, 7), 5.0, 9)
-    rows, columns = rng.normal(size=(9, 6)), rng.normal(size=(9, 7))
-    found = electrons(
-        frames, camera.calibration(), (rows[:, :, None] + columns[:, None, :]).astype(np.float32)
-    )
-    expected = (frames - camera.bias - rows[:, :, None] - columns[:, None, :]) * camera.gain
-    np.testing.assert_allclose(found, expected, atol=1e-4)
+    offset = rng.normal(size=(9, 6, 1)) + rng.normal(size=(9, 1, 7))
+    for found, moved in (
+        (electrons(frames, calibration), 0.0),
+        (electrons(frames, calibration, offset.astype(np.float32)), offset),
+    ):
+        expected = (frames - camera.bias - moved) * camera.gain
+        expected[:, 2, 3] = np.nan
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 def test_noise_of_effects_is_part_of_the_error():

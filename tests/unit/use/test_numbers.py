@@ -14,50 +14,43 @@ from pchem_pipeline.use.exposure import ExposurePool, estimate_exposure, mean_si
 BYTE = np.dtype(np.uint8)
 
 
-def converted(frames, prior, calibration, dtype=BYTE):
+def converted(frames, prior, calibration, dtype=BYTE, parts=1):
     ends = frames.min(axis=0), frames.max(axis=0)
-    return number_tables(*ends, prior, calibration.known, dtype=dtype, detailed=True).convert(
-        frames, expected=True
-    )
+    tables = number_tables(*ends, prior, calibration.known, dtype=dtype, parts=parts, detailed=True)
+    return tables.convert(frames, expected=True)
 
 
-@pytest.fixture(scope="module")
-def night():
+def test_errors_are_as_rare_as_they_can_be_and_as_often_as_stated_and_the_expectation_is_unbiased():
     rng = np.random.default_rng(30)
     camera = KnownCamera.drawn(rng, (12, 14), read_noise=(0.15, 0.6))
     exposure = rng.uniform(0.2, 4.0, camera.bias.shape)
     electrons, frames = camera.frames(rng, exposure, 1500)
-    return camera, exposure, electrons, frames, converted(frames, exposure, camera.calibration())
-
-
-def test_errors_are_as_rare_as_they_can_be(night):
-    camera, exposure, electrons, frames, found = night
-    limit = camera.least_error(exposure)
-    wrong = (found.number != electrons).mean(axis=0)
+    found = converted(frames, exposure, camera.calibration())
+    limit, right = camera.least_error(exposure), found.number == electrons
     error = np.sqrt((limit * (1 - limit)).sum() / len(electrons)) / limit.size
-    assert abs(wrong.mean() - limit.mean()) < 5 * error
+    assert abs((~right).mean() - limit.mean()) < 5 * error
     # rounding, which knows neither noise nor exposure, errs clearly more often
     rounded = np.rint((frames - camera.bias) * camera.gain).clip(0)
     assert (rounded != electrons).mean() > limit.mean() + 10 * error
-
-
-def test_the_probability_is_how_often_they_are_right(night):
-    _, _, electrons, _, found = night
-    right = found.number == electrons
     for low, high in ((0.0, 0.6), (0.6, 0.8), (0.8, 0.95), (0.95, 0.999), (0.999, 1.01)):
         chosen = (found.probability >= low) & (found.probability < high)
         p, n = found.probability[chosen].mean(dtype=np.float64), chosen.sum()
         assert n > 1000
         assert abs(right[chosen].mean() - p) < 5 * np.sqrt(p * (1 - p) / n) + 1e-5
-
-
-def test_the_expectation_is_unbiased_and_nearer_than_the_number(night):
-    camera, _, electrons, _, found = night
     difference = found.expected.astype(np.float64) - electrons
     assert abs(difference.mean()) < 5 * difference.std() / np.sqrt(difference.size)
+    # and where it is noisy, nearer than the number
     noisy = camera.read_noise_e > 0.4
     square = (difference[:, noisy] ** 2).mean()
     assert ((found.number[:, noisy].astype(int) - electrons[:, noisy]) ** 2).mean() > 1.15 * square
+
+
+def test_large_numbers_need_two_bytes():
+    _, camera, electrons, frames = KnownCamera.taken(32, (3, 4), 300.0, 200, read_noise=(0.2, 0.3))
+    dtype = number_type(float((frames.max() - 80) * 0.12))
+    assert (dtype, number_type(254.0)) == (np.uint16, np.uint8)
+    found = converted(frames, np.full((3, 4), 300.0), camera.calibration(), dtype)
+    assert (found.number == electrons).mean() > 0.9
 
 
 def test_pixels_without_calibration_have_no_number():
@@ -71,37 +64,13 @@ def test_pixels_without_calibration_have_no_number():
     assert (found.number[:, 0, 0] < 20).all()
 
 
-def test_large_numbers_need_two_bytes():
-    _, camera, electrons, frames = KnownCamera.taken(32, (3, 4), 300.0, 200, read_noise=(0.2, 0.3))
-    dtype = number_type(float((frames.max() - 80) * 0.12))
-    assert dtype == np.uint16
-    found = converted(frames, np.full((3, 4), 300.0), camera.calibration(), dtype)
-    assert (found.number == electrons).mean() > 0.9
-    assert number_type(254.0) == np.uint8
-
-
 def test_parts_of_a_dn_give_the_same_as_whole_ones():
     _, camera, _, frames = KnownCamera.taken(33, (5, 6), 2.0, 100)
     calibration, prior = camera.calibration(), np.full((5, 6), 2.0)
     whole = converted(frames, prior, calibration)
-    fine = frames.astype(np.uint32) * 4
-    tables = number_tables(
-        fine.min(axis=0), fine.max(axis=0), prior, calibration.known, dtype=BYTE, parts=4, detailed=True
-    )
-    parts = tables.convert(fine, expected=True)
+    parts = converted(frames.astype(np.uint32) * 4, prior, calibration, parts=4)
     np.testing.assert_array_equal(parts.number, whole.number)
     np.testing.assert_allclose(parts.probability, whole.probability, rtol=1e-6)
-
-
-def test_exposure_does_not_depend_on_the_unit_of_codes():
-    _, camera, _, frames = KnownCamera.taken(34, (4, 4), 2.0, 300)
-    whole = histogram_frames(frames)
-    fine = histogram_frames(frames.astype(np.uint32) * 4, bins=1024)
-    found = [
-        estimate_exposure(h.counts, h.origin, camera.calibration(), parts).exposure
-        for h, parts in ((whole, 1), (fine, 4))
-    ]
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -48,9 +48,8 @@ def test_bias_noise_and_variances_are_right_within_their_errors(row, frame, acro
     of_row, of_frame = shared_errors(row, frame, rows, pixels, N)
     assert abs(found.row_variance - row**2) < 5 * of_row
     assert abs(found.frame_variance - frame**2) < 5 * of_frame
-    assert abs(found.own_variance[where].mean() / OWN - 1) < 5 * np.sqrt(2 / (N * where.sum())) + 5 * (
-        (of_row + of_frame) / OWN
-    )
+    error = np.sqrt(2 / (N * where.sum())) + (of_row + of_frame) / OWN
+    assert abs(found.own_variance[where].mean() / OWN - 1) < 5 * error
 
 
 def test_pixels_that_never_change_tell_nothing():

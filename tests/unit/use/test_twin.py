@@ -105,9 +105,8 @@ def test_a_larger_sensor_has_the_same_distributions_and_correlations():
     shape = (64, 64)
     columns = rng.normal(0.0, 3.0, 64)
     smooth = rng.standard_normal((66, 66))
-    smooth = (smooth[1:-1, 1:-1] + smooth[2:, 1:-1] + smooth[1:-1, 2:]) / np.sqrt(
-        3
-    )  # neighbours belong together
+    # neighbours belong together
+    smooth = (smooth[1:-1, 1:-1] + smooth[2:, 1:-1] + smooth[1:-1, 2:]) / np.sqrt(3)
     noise = np.exp(0.2 * smooth - 1.3)
     gain = 0.1 * np.exp(0.05 * smooth + 0.03 * rng.standard_normal(shape))  # gain goes with read noise
     bias = 100 + columns + 2.0 * rng.standard_normal(shape)
@@ -122,16 +121,14 @@ def test_a_larger_sensor_has_the_same_distributions_and_correlations():
         # columns are drawn from 64: a median is known to about an eighth of their spread
         assert (abs(np.quantile(old, shares) - np.quantile(new, shares)) < 0.5 * spread).all()
         assert 0.7 < new.std() / spread < 1.4
-    pair = [
-        np.corrcoef(each.conversion_gain.ravel(), each.analog_read_noise_e.ravel())[0, 1]
-        for each in (truth, large)
-    ]
+    # of gain with read noise, of read noise with that of the next pixel; variance of the columns
+    pair, beside, of_columns = [], [], []
+    for each in (truth, large):
+        noise = each.analog_read_noise_e
+        pair.append(np.corrcoef(each.conversion_gain.ravel(), noise.ravel())[0, 1])
+        beside.append(np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1])
+        of_columns.append(np.var(each.bias.mean(axis=0)))
     assert abs(pair[0] - pair[1]) < 0.1
-    beside = [
-        np.corrcoef(each.analog_read_noise_e[:, 1:].ravel(), each.analog_read_noise_e[:, :-1].ravel())[0, 1]
-        for each in (truth, large)
-    ]
     assert beside[0] > 0.2
     assert abs(beside[0] - beside[1]) < 0.1
-    of_columns = [np.var(each.bias.mean(axis=0)) for each in (truth, large)]
     assert 0.5 < of_columns[1] / of_columns[0] < 2.0

@@ -21,17 +21,15 @@ from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.operators.offsets import RowNoise
 
-NOISY = PlainCamera(0.62, 1.2, 9.0, (12, 14), 600)
+NOISY = PlainCamera(0.62, 1.2, 9.0, (10, 12), 600)
 QUICK = DiscrepancySettings(replicates=20, extended_replicates=12, candidates=("row_noise",))
 
 
-@pytest.fixture(scope="module")
-def perfect():
-    return find_discrepancies(NOISY.frames(11), settings=QUICK)
-
-
-def test_perfect_frames_of_a_noisy_sensor_cannot_tell_and_what_would_help_is_said(perfect):
-    found = perfect.verdict
+def test_perfect_frames_of_a_noisy_sensor_cannot_tell_and_what_would_help_is_said():
+    perfect = find_discrepancies(NOISY.frames(11), settings=QUICK)
+    found, counted = perfect.verdict, perfect.statistics[0]
+    assert "space.row.readout.variance" in counted
+    assert not {"shape.C3.mean", "code.smooth"} & set(counted)
     assert found.verdict == "cannot_tell"
     assert found.effects == ()
     assert "pchem joint" in found.doubt
@@ -48,7 +46,7 @@ def test_perfect_frames_of_a_sensor_of_any_layout_are_not_called_wrong(layout):
 
 
 def test_row_noise_is_found_on_a_noisy_sensor():
-    """Four tenths of the read noise of 5.6 DN, 14 errors of the variance of row means."""
+    """Four tenths of the read noise of 5.6 DN, 12 errors of the variance of row means."""
     rng = np.random.default_rng(21)
     frames = NOISY.frames(21).astype(np.int64)
     frames += np.rint(2.2 * rng.standard_normal((*frames.shape[:2], 1))).astype(np.int64)
@@ -58,17 +56,13 @@ def test_row_noise_is_found_on_a_noisy_sensor():
     assert found.limit == ""
 
 
-def test_what_rests_on_the_parameters_does_not_count_where_they_are_not_identified(perfect):
+def test_what_rests_on_the_parameters_does_not_count_where_they_are_not_identified():
     names = ("shape.C3.mean", "space.row.readout.variance", "code.smooth", "code.rough", "code.period4")
     # of electrons that are four codes apart the parameters bend codes of that period, too
     for step, told in ((12.0, [True, True]), (4.6, [True, False]), (3.9, [False, False])):
-        maps = PixelMaps.known(
-            [np.full((2, 2), v) for v in (1.0, 1.0 / step, 100.0, 2.0)], np.full((2, 2), True)
-        )
+        values = [np.full((2, 2), v) for v in (1.0, 1.0 / step, 100.0, 2.0)]
+        maps = PixelMaps.known(values, np.full((2, 2), True))
         assert free_of_parameters(names, maps).tolist() == [False, True, False, *told]
-    counted = perfect.statistics[0]
-    assert "space.row.readout.variance" in counted
-    assert not {"shape.C3.mean", "code.smooth"} & set(counted)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])
@@ -102,7 +96,4 @@ def test_one_end_of_a_slope_along_rows_is_noise_of_rows_but_not_at_the_other(col
     words = said(tilted(1.0), columns, (right,))
     assert (words == "") is holds
     assert holds or "row means of the readout residuals scatter" in words
-
-
-def test_frames_without_anything_agree_with_the_plain_model():
-    assert said(tilted(0.0), (0, 16), ()) == ""
+    assert holds or said(tilted(0.0), columns, ()) == ""  # frames without anything agree with the plain model

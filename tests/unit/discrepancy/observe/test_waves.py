@@ -10,7 +10,6 @@ from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.sums import laws_of_frames
 from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise
 from pchem_pipeline.effects.operators.offsets import PeriodicPickup
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
@@ -38,9 +37,8 @@ def sine(amplitude: float, turns: Floats | None = None, cycles: tuple[float, ...
     return amplitude * np.sin(2.0 * np.pi * (phase + cycles[1] * y + cycles[2] * x) + 0.4)
 
 
-def found(values: Frames, numbers: Any = None) -> Waves:
-    numbers = np.arange(FRAMES) if numbers is None else numbers
-    return waves_across(values, numbers, laws_of_frames(values, MAPS), MAPS)
+def found(values: Frames, numbers: Any = range(FRAMES)) -> Waves:
+    return waves_across(values, np.array(numbers), laws_of_frames(values, MAPS), MAPS)
 
 
 def evidence(values: Frames) -> Evidence:
@@ -54,7 +52,6 @@ def test_frames_in_random_order_have_hardly_a_wave() -> None:
 def test_a_steady_wave_has_its_frequencies_size_and_phase() -> None:
     amplitude = 0.2
     (wave,) = found(frames(1, sine(amplitude))).found
-    assert wave.per_frame is not None
     # a residual holds that part of an offset which charge does not take for electrons
     response = 1.0 / evidence(frames(1)).readout_std.mean()
     # Cramer and Rao: sqrt(6) / (pi snr n sqrt(N)) in each frequency
@@ -67,17 +64,15 @@ def test_a_steady_wave_has_its_frequencies_size_and_phase() -> None:
 
 def test_a_wave_is_found_between_frames_that_are_missing() -> None:
     kept = np.flatnonzero(np.arange(FRAMES) % 200 >= 50)
-    values = frames(3, sine(0.3))[kept]
-    (wave,) = waves_across(values, kept, laws_of_frames(values, MAPS), MAPS).found
+    (wave,) = found(frames(3, sine(0.3))[kept], kept).found
     assert wave.per_frame == pytest.approx(CYCLES[0], abs=1e-4)
     assert np.cos(wave.phase - 0.4) > 0.97  # at frame 0, which is not among them
 
 
 def test_a_wave_of_any_phase_in_each_frame_is_pickup_of_random_phase() -> None:
     turns = np.random.default_rng(4).random(FRAMES)
-    (pickup,) = (
-        p for p in PeriodicPickup.estimate(evidence(frames(4, sine(0.5, turns)))) if p.cycles_per_column
-    )
+    guesses = PeriodicPickup.estimate(evidence(frames(4, sine(0.5, turns))))
+    (pickup,) = (guess for guess in guesses if guess.cycles_per_column)
     assert pickup.random_phase
     assert pickup.cycles_per_row == pytest.approx(CYCLES[1], abs=2e-3)
     assert pickup.cycles_per_column == pytest.approx(CYCLES[2], abs=2e-3)
@@ -111,12 +106,9 @@ def test_what_takes_turns_is_measured_and_no_pickup() -> None:
     seen = evidence(values)
     assert [p for p in PeriodicPickup.estimate(seen) if p.cycles_per_column and p.cycles_per_row] == []
     measured = measured_wave(found(values), found(frames(8)), seen, EVERYWHERE)
-    assert measured is not None
-    assert isinstance(measured.effect, EmpiricalNoise)
     assert measured.effect.noise_dn == pytest.approx(0.3, rel=0.09)
     assert measured_wave(found(values), found(values), seen, EVERYWHERE) is None
 
 
 def test_too_few_frames_or_lines_have_no_statistic() -> None:
-    few = waves_across(frames(9)[:40], np.arange(40), laws_of_frames(frames(9), MAPS), MAPS)
-    assert few == Waves((), {})
+    assert found(frames(9)[:40], range(40)) == Waves((), {})

@@ -2,19 +2,18 @@
 
 import re
 import zlib
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
-from helpers.quick_stacks import EXPOSURE, GAIN, READ_NOISE, added, codes_of, maps_of, stack, sums_of
+from helpers.quick_stacks import EXPOSURE, GAIN, READ_NOISE, Array, added, codes_of, maps_of, stack, sums_of
 
 from pchem_pipeline import fit_counts
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.quick import sums as module
 from pchem_pipeline.discrepancy.quick.checks import KINDS, Check, QuickLook
-from pchem_pipeline.discrepancy.quick.codes import CodeSample, code_checks
+from pchem_pipeline.discrepancy.quick.codes import code_checks
 from pchem_pipeline.discrepancy.quick.frames import levels_check
 from pchem_pipeline.discrepancy.quick.quick_look import quick_look
 from pchem_pipeline.effects.framework.context import EffectContext
@@ -38,23 +37,17 @@ class OfAnotherPackage(Effect):
     tag: Literal["other"] = "other"
     signature: ClassVar[tuple[str, ...]] = ("space.row.readout.variance",)
 
-    def apply(self, values: np.ndarray[Any, Any], context: EffectContext) -> np.ndarray[Any, Any]:
+    def apply(self, values: Array, context: EffectContext) -> Array:
         return values
 
 
-def looked(
-    frames: np.ndarray[Any, Any], model: tuple[Effect, ...] = (), limits: tuple[int, int] | None = None
-) -> QuickLook:
+def looked(frames: Array, model: tuple[Effect, ...] = (), limits: tuple[int, int] | None = None) -> QuickLook:
     codes = replace(codes_of(frames), limits=limits)
     return quick_look(sums_of(frames), maps_of(frames.shape[1:]), codes, model)
 
 
-def without_codes(frames: np.ndarray[Any, Any]) -> QuickLook:
+def without_codes(frames: Array) -> QuickLook:
     return quick_look(sums_of(frames), maps_of(frames.shape[1:]))
-
-
-def codes_alone(frames: np.ndarray[Any, Any], limits: tuple[int, int] | None) -> QuickLook:
-    return quick_look(None, maps_of(frames.shape[1:]), replace(codes_of(frames), limits=limits))
 
 
 def by_name(look: QuickLook) -> dict[str, Check]:
@@ -129,11 +122,6 @@ def test_hot_and_blinking_pixels_and_tracks_of_particles_are_no_noise_of_rows_or
     assert found <= {"wandering_pixels"}
 
 
-def shared(rng: np.random.Generator, size: float, *axes: int) -> Callable[..., Any]:
-    """Return what adds noise, DN, that samples share along some axes."""
-    return lambda dn: dn + size * rng.standard_normal([1 if i in axes else n for i, n in enumerate(dn.shape)])
-
-
 @pytest.mark.parametrize(
     ("name", "axes", "size"),
     [
@@ -145,35 +133,27 @@ def shared(rng: np.random.Generator, size: float, *axes: int) -> Callable[..., A
 def test_what_pixels_share_is_found_alone_and_its_size_is_right(
     name: str, axes: tuple[int, ...], size: float
 ) -> None:
-    rng = np.random.default_rng(11)
-    look = looked(stack(rng, SHAPE, shared(rng, size, *axes)))
+    rng, shape = np.random.default_rng(11), [1 if axis in axes else n for axis, n in enumerate(SHAPE)]
+    look = looked(stack(rng, SHAPE, lambda dn: dn + size * rng.standard_normal(shape)))
     check = by_name(look)[name]
     assert [each.name for each in look.found] == [name]
     assert check.level == ("note" if size < 0.1 * SIGMA * 1.01 else "caution")
     # standard error of the variance: that by chance, and that of a noise of so many independent values
-    n, ny, nx = SHAPE
-    values = n * {"row_noise": ny, "column_noise": nx, "frame_noise": 1}[name]
-    error = (check.limit**2 / 5.4) + size**2 * np.sqrt(2.0 / values)
+    error = (check.limit**2 / 5.4) + size**2 * np.sqrt(2.0 / np.prod(shape))
     assert abs(check.size**2 - size**2) < 5.0 * error
     assert size**2 > 5.0 * check.limit**2 / 5.4
     assert check.share == pytest.approx(check.size / np.hypot(SIGMA, 12**-0.5))
     assert check.size_e == pytest.approx(check.size * GAIN)
 
 
-def test_a_single_noisy_row_is_told() -> None:
-    rng = np.random.default_rng(3)
-
-    noise = SIGMA * np.random.default_rng(4).standard_normal((SHAPE[0], 1))
-    check = by_name(looked(stack(rng, SHAPE, added(np.s_[:, 21], noise))))["row_noise"]
+def test_a_single_noisy_row_is_told_and_row_noise_of_a_tap_is_found_there_with_its_size_there() -> None:
+    noise = SIGMA * np.random.default_rng(4).standard_normal((*SHAPE[:2], 1))
+    one = stack(np.random.default_rng(3), SHAPE, added(np.s_[:, 21], noise[:, 21]))
+    check = by_name(looked(one))["row_noise"]
     assert check.found
     assert check.where == "mainly in row 21"
-
-
-def test_row_noise_of_a_tap_is_found_there_with_its_size_there() -> None:
-    rng = np.random.default_rng(21)
-
-    noise = 0.8 * SIGMA * np.random.default_rng(4).standard_normal((*SHAPE[:2], 1))
-    checks = by_name(looked(stack(rng, SHAPE, added(np.s_[:, :, 18:], noise))))
+    tap = stack(np.random.default_rng(21), SHAPE, added(np.s_[:, :, 18:], 0.8 * noise))
+    checks = by_name(looked(tap))
     check = checks["row_noise"]
     assert check.found
     assert check.region == {"columns": [[18, 24]]}
@@ -183,28 +163,19 @@ def test_row_noise_of_a_tap_is_found_there_with_its_size_there() -> None:
     assert check.level == "serious"
 
 
-def test_a_corner_that_drifts_is_found_there_with_its_rms() -> None:
-    rng = np.random.default_rng(22)
+def test_a_drift_of_all_or_of_a_corner_is_found_there_with_its_rms() -> None:
     ramp = np.linspace(-0.5, 0.5, SHAPE[0])[:, None, None]
-
-    look = looked(stack(rng, SHAPE, added(np.s_[:, :8, 12:], 3.0 * ramp)))
+    look = looked(stack(np.random.default_rng(5), SHAPE, lambda dn: dn + 0.6 * SIGMA * ramp))
+    assert look.found[0].name == "drift"
+    limit = 20 * np.sqrt(VARIANCE / np.prod(SHAPE))
+    assert look.found[0].size == pytest.approx(0.6 * SIGMA / np.sqrt(12), abs=limit)
+    look = looked(stack(np.random.default_rng(22), SHAPE, added(np.s_[:, :8, 12:], 3.0 * ramp)))
     check = by_name(look)["local_drift"]
     assert check.found
-    assert check.region is not None
     true = Region(rows=((0, 8),), columns=((12, 24),))
     assert Region.model_validate(check.region).overlap(true, SHAPE[1:]) > 0.9
     # of the means over four blocks, the last one short, less the drift of all
     assert check.size == pytest.approx(3.0 / np.sqrt(12), rel=0.25)
-
-
-def test_a_drift_is_found_with_its_rms_and_is_nothing_else() -> None:
-    rng = np.random.default_rng(5)
-    ramp = np.linspace(-0.5, 0.5, SHAPE[0])[:, None, None]
-    look = looked(stack(rng, SHAPE, lambda dn: dn + 0.6 * SIGMA * ramp))
-    check = by_name(look)["drift"]
-    assert look.found[0].name == "drift"
-    rms = 0.6 * SIGMA / np.sqrt(12)
-    assert check.size == pytest.approx(rms, abs=5 * np.sqrt(VARIANCE / np.prod(SHAPE)) * 4)
 
 
 @pytest.mark.parametrize("order", ["one after the other", "mixed"])
@@ -256,37 +227,28 @@ def test_offsets_that_jump_or_alternate_and_lamps_that_drift_are_no_two_exposure
 def test_a_period_of_the_frames_and_even_and_odd_ones_are_told_apart() -> None:
     rng = np.random.default_rng(6)
     t = np.arange(SHAPE[0])[:, None, None]
-    wave = by_name(without_codes(stack(rng, SHAPE, lambda dn: dn + 0.35 * np.sin(2 * np.pi * t / 7.3))))[
-        "period"
-    ]
+    wave, even = (
+        by_name(without_codes(stack(rng, SHAPE, lambda dn, each=each: dn + each)))["period"]  # type: ignore[misc]
+        for each in (0.35 * np.sin(2 * np.pi * t / 7.3), 0.3 * (-1.0) ** t)
+    )
     assert wave.found
     period = float(wave.where.split()[1])
     assert abs(1.0 / period - 1.0 / 7.3) < 1.0 / SHAPE[0]
     assert wave.size == pytest.approx(0.35 / np.sqrt(2), rel=0.2)
-    even = by_name(without_codes(stack(rng, SHAPE, lambda dn: dn + 0.3 * (-1.0) ** t)))["period"]
     assert even.where == "even and odd frames differ"
     assert even.size == pytest.approx(0.3, rel=0.2)
 
 
 def test_charge_of_the_frame_before_and_of_neighbours_is_found() -> None:
-    rng = np.random.default_rng(8)
-
-    def memory(electrons: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        return electrons + 0.02 * np.roll(electrons, 1, axis=0)
-
-    look = looked(stack(rng, SHAPE, charge=memory))
-    assert [check.name for check in look.found] == ["lag"]
-    assert "gain (e⁻/DN) is too high by about this share" in look.found[0].advice
-    expected = 0.02 * EXPOSURE / GAIN**2 / VARIANCE
-    assert look.found[0].size == pytest.approx(expected, abs=5 / np.sqrt(np.prod(SHAPE)))
-
-    def coupled(electrons: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        return electrons + 0.01 * (np.roll(electrons, 1, axis=2) + np.roll(electrons, -1, axis=2))
-
-    look = looked(stack(rng, SHAPE, charge=coupled))
-    assert [check.name for check in look.found] == ["neighbours_x"]
-    expected = 0.02 * EXPOSURE / GAIN**2 / VARIANCE
-    assert look.found[0].size == pytest.approx(expected, abs=6 / np.sqrt(np.prod(SHAPE)))
+    rng, expected = np.random.default_rng(8), 0.02 * EXPOSURE / GAIN**2 / VARIANCE
+    (lag,) = looked(stack(rng, SHAPE, charge=lambda e: e + 0.02 * np.roll(e, 1, axis=0))).found
+    assert lag.name == "lag"
+    assert "gain (e⁻/DN) is too high by about this share" in lag.advice
+    assert lag.size == pytest.approx(expected, abs=5 / np.sqrt(np.prod(SHAPE)))
+    sides = lambda e: np.roll(e, 1, axis=2) + np.roll(e, -1, axis=2)  # noqa: E731
+    (coupled,) = looked(stack(rng, SHAPE, charge=lambda e: e + 0.01 * sides(e))).found
+    assert coupled.name == "neighbours_x"
+    assert coupled.size == pytest.approx(expected, abs=6 / np.sqrt(np.prod(SHAPE)))
 
 
 def test_the_gain_moves_as_the_advice_on_correlations_says() -> None:
@@ -318,6 +280,10 @@ def test_repeated_and_single_frames_are_told_by_their_numbers() -> None:
     assert re.fullmatch(r"frame 77 is (2|3|4)(\.\d)? DN above the others", found["odd_frames"].where)
     assert {check.name for check in found.values() if check.found} == {"repeated_frames", "odd_frames"}
     assert found["odd_frames"].level == "caution"
+    frames = stack(np.random.default_rng(1), (400, 16, 24))
+    frames[1::2] = frames[::2]
+    (check,) = looked(frames).found
+    assert (check.name, check.size) == ("repeated_frames", 0.5)
 
 
 @pytest.mark.parametrize(
@@ -341,7 +307,7 @@ def test_frames_that_differ_are_told_by_their_numbers_and_nothing_else(
     shape: tuple[int, int, int], gain: float, kind: str
 ) -> None:
     """Rows that a link has lost, samples of fourfold read noise, pixels that are one column or row away."""
-    rng = np.random.default_rng(hash_of(kind, *shape))
+    rng = np.random.default_rng(zlib.crc32(repr((kind, *shape)).encode()))
     noise = READ_NOISE * np.ones((shape[0], 1, 1))
     # four frames that are half dark may be of another exposure
     odd = np.sort(rng.choice(shape[0], 3 if kind == "half dark" else 6, replace=False))
@@ -369,22 +335,11 @@ def test_frames_that_differ_are_told_by_their_numbers_and_nothing_else(
     assert all(f" {t}" in check.where for t in odd[:2])
 
 
-def hash_of(*values: Any) -> int:
-    return zlib.crc32(repr(values).encode())
-
-
 def test_frames_look_moved_only_where_the_pattern_tells() -> None:
     rng = np.random.default_rng(23)
     frames = rng.normal(200.0, 10.0, (300, 32, 32)) + 0.3 * rng.standard_normal((32, 32))
     frames[::40] = np.roll(frames[::40], 1, axis=1)
     assert without_codes(np.rint(frames).astype(np.uint16)).found == ()
-
-
-def test_every_second_frame_a_copy_is_told_and_nothing_else() -> None:
-    frames = stack(np.random.default_rng(1), (400, 16, 24))
-    frames[1::2] = frames[::2]
-    (check,) = looked(frames).found
-    assert (check.name, check.size) == ("repeated_frames", 0.5)
 
 
 @pytest.mark.parametrize("axis", [1, 2])
@@ -422,13 +377,9 @@ def test_chance_alarms_as_often_as_stated() -> None:
 @pytest.mark.parametrize("size", [0.05, 0.15])
 def test_widths_of_codes_are_found_with_their_size(size: float) -> None:
     rng = np.random.default_rng(10)
-    edges = np.arange(400) - 0.5 + 0.5 * np.cumsum(size * rng.standard_normal(400)) * 0.0
-    edges += size / np.sqrt(2.0) * rng.standard_normal(400)  # differences of edges have the rms ``size``
-
-    def quantised(dn: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        return np.searchsorted(edges, dn) - 1.0
-
-    look = looked(stack(rng, SHAPE, quantised))
+    # differences of edges have the rms ``size``
+    edges = np.arange(400) - 0.5 + size / np.sqrt(2.0) * rng.standard_normal(400)
+    look = looked(stack(rng, SHAPE, lambda dn: np.searchsorted(edges, dn) - 1.0))
     assert [check.name for check in look.found] == ["codes"]
     # some 60 codes are occupied; widths that share an edge are anticorrelated, which the estimate
     # (against the mean of both neighbours) takes for (1 + 2/3) of the variance
@@ -438,14 +389,14 @@ def test_widths_of_codes_are_found_with_their_size(size: float) -> None:
 def test_clipping_is_found() -> None:
     rng = np.random.default_rng(12)
     frames = stack(rng, (800, 8, 12), lambda dn: np.minimum(dn, 222.0))
-    unknown, known = (by_name(codes_alone(frames, limits)) for limits in (None, (0, 222)))
+    unknown, known = (by_name(looked(frames, limits=limits)) for limits in (None, (0, 222)))
     assert (unknown["top_code"].level, known["top_limit"].level) == ("serious", "caution")
 
 
 def test_samples_cut_off_at_0_are_the_black_level_and_no_widths() -> None:
     shape = (800, 8, 12)
     frames = stack(np.random.default_rng(12), shape, lambda dn: dn - dn.mean(axis=(0, 1, 2)) + 11.0)
-    found = by_name(codes_alone(frames, (0, 65535)))
+    found = by_name(looked(frames, limits=(0, 65535)))
     assert found["bottom_limit"].found
     assert found["bottom_limit"].size == pytest.approx(np.mean(frames == 0), rel=0.02)
     assert found["bottom_limit"].where == "0 DN"
@@ -502,7 +453,7 @@ def test_a_pickup_along_the_reading_order_is_found_with_its_size() -> None:
 
 def test_what_the_model_has_is_a_remark() -> None:
     rng = np.random.default_rng(13)
-    frames = stack(rng, SHAPE, shared(rng, SIGMA, 2))
+    frames = stack(rng, SHAPE, lambda dn: dn + SIGMA * rng.standard_normal((*SHAPE[:2], 1)))
     for effect in (RowNoise(row_noise_dn=SIGMA), OfAnotherPackage()):
         found = looked(frames, (effect,)).found[0]
         assert (found.name, found.level, found.in_model) == ("row_noise", "note", True)
@@ -525,22 +476,17 @@ def test_the_codes_of_a_joint_fit_are_judged_by_its_parameters() -> None:
     """At 8 e- and 0.7 e- one exposure alone does not tell the gain; others did, with errors of their own."""
     frames = stack(np.random.default_rng(3), (800, 16, 16), exposure=8.0, read_noise=0.7)
     codes = codes_of(frames, 8.0, 0.7)
-    n, bias = len(codes.counts), frames.mean(axis=0).ravel() - 8.0 / GAIN
-    given = np.stack(
-        [np.full(n, 8.0), np.full(n, GAIN), bias, np.full(n, np.hypot(0.7 / GAIN, 12**-0.5))], axis=1
+    given = codes.parameters
+    odd = (frames & 1) * (np.random.default_rng(4).random(frames.shape) < 0.1).astype(frames.dtype)
+    uneven = replace(codes_of(frames - odd, 8.0, 0.7), parameters=given)
+    right, wrong = (
+        next(check.p for check in code_checks(replace(each, joint=True)) if check.name == "codes")
+        for each in (codes, uneven)
     )
-    known = CodeSample(codes.counts, codes.origin, given, joint=True)
-    (widths,) = (check for check in code_checks(known) if check.name == "codes")
-    assert widths.p > 1e-3
-    rng = np.random.default_rng(4)
-    uneven = codes_of(frames - (frames & 1) * (rng.random(frames.shape) < 0.1).astype(frames.dtype), 8.0, 0.7)
-    uneven = replace(uneven, parameters=given, joint=True)
-    (wrong,) = (check for check in code_checks(uneven) if check.name == "codes")
-    assert wrong.p < 1e-6
-    none = CodeSample(np.zeros_like(codes.counts), codes.origin, given)
-    assert code_checks(none) == []
-    bright = CodeSample(codes.counts, codes.origin, given * (1e5, 1.0, 1.0, 1.0))
-    assert code_checks(bright) == []
+    assert right > 1e-3
+    assert wrong < 1e-6
+    assert code_checks(replace(codes, counts=np.zeros_like(codes.counts))) == []
+    assert code_checks(replace(codes, parameters=given * (1e5, 1.0, 1.0, 1.0))) == []
 
 
 def test_a_pixel_of_wild_noise_makes_no_wave() -> None:

@@ -4,21 +4,17 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
-from helpers.drawn_pixels import draw
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.base.variables import INTERVALS, interval_names, variables_of
 from pchem_pipeline.effects.framework.compose import along_chain, model_words, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.draws import regrouped
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.operators.couple import BlackClamp
 from pchem_pipeline.effects.operators.curve import AdcInl, Clipping
-from pchem_pipeline.effects.operators.noise import RtsNoise
 from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.effects.operators.replace import RepeatedFrames
 from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
 
 
 class Broken(Effect):
@@ -76,36 +72,11 @@ def test_an_effect_that_raises_is_named():
         sample_law([RowNoise(row_noise_dn=0.5), Broken()], maps_of(1.0))
 
 
-def test_tile_without_effects_is_the_plain_fit_and_with_them_not():
-    pixels = draw(np.random.default_rng(6), [0.5, 2.0, 1.0, 4.0], 11.0, 0.3)
-    histogram = {name: np.zeros((2, 2), np.uint32) for name in ("under", "over")}
-    histogram |= {
-        "counts": pixels.counts.reshape(2, 2, -1),
-        "origin": pixels.origin.reshape(2, 2).astype("i4"),
-    }
-    plain = fit_tile([histogram], TileFit())["fit"]
-    trap = RtsNoise(fraction=0.1, amplitude_e=1.5, probability=0.2)
-    extended = fit_tile([histogram], TileFit(effects=[RowNoise(row_noise_dn=1.0), trap]))["fit"]
-    ends = {path for name in INTERVALS for path in interval_names(name)}  # only where they are asked for
-    stored = [variable for variable in variables_of("fit") if variable.name not in ends]
-    assert set(extended) == {variable.name for variable in stored}
-    for variable in stored:
-        assert extended[variable.name].dtype == np.dtype(variable.dtype), variable.name
-        assert extended[variable.name].shape[:2] == (2, 2), variable.name
-    # the pixel's own noise is what the rows leave of it
-    expected = plain["read_noise_dn"] ** 2 - 1.0
-    np.testing.assert_allclose(extended["read_noise_dn"] ** 2, expected, rtol=2e-3)
-    np.testing.assert_allclose(extended["bias"], plain["bias"], atol=0.01)
-    assert not extended["satellite_weight"].any()
-    assert np.isnan(extended["satellite_amplitude_e"]).all()
-
-
 def test_the_nearest_pcd_has_the_whole_width_of_the_peaks():
     columns = [np.array([value, np.nan]) for value in (2.0, 0.1, 100.0, 2.5)]
     model = SampleLaw().with_variance(dn2=1.0, e2=0.01, per_electron=0.005, per_electron2=0.001)
-    model = model.with_levels(scale=0.98, shift_e=0.1, curvature=0.02).with_noise(
-        [0.5, 0.5], shift_dn=[-1.0, 2.0]
-    )
+    model = model.with_levels(scale=0.98, shift_e=0.1, curvature=0.02)
+    model = model.with_noise([0.5, 0.5], shift_dn=[-1.0, 2.0])
     exposure, gain, bias, sigma = nearest_pcd(columns, model)
     # near k = H: levels 100 + 10 (0.98 k (1 + 0.01 (k - 1)) + 0.1) + 0.5
     levels = [100 + 10 * (0.98 * k * (1 + 0.01 * (k - 1)) + 0.1) + 0.5 for k in (1.9, 2.0, 2.1)]

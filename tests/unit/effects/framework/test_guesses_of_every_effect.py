@@ -53,8 +53,8 @@ def test_nothing_is_guessed_of_a_relative(tag, hidden):
 
 def test_nothing_is_guessed_where_nothing_is():
     # some are guessed by chance in 2 to 5 % of stacks
-    fired = [tag for seed in range(10, 20) for tag in EVERY if EVERY[tag].estimate(evidence_of("", seed))]
-    assert len(fired) <= 12, fired
+    fired = [tag for seed in range(10, 16) for tag in EVERY if EVERY[tag].estimate(evidence_of("", seed))]
+    assert len(fired) <= 7, fired
     assert not set(fired) & SILENT.keys()
 
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from helpers.small_sensors import a_uniform_sensor, make, taken
+from helpers.small_sensors import a_uniform_sensor, context_of, make, offsets, taken
+from scipy.special import ndtri
 
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.law.mass import sample_mass
@@ -49,7 +50,18 @@ EFFECTS = [
     make("exposure_drift", drift=0.6, settling_fraction=0.3),
     make("exposure_flicker", rms=0.3, period_frames=5.3),
     make("exposure_flicker", rms=0.3, levels=(1.0, 2.0)),
+    make("empirical", share=0.2, moves=[{"shift_dn": -9, "weight": 3.0}, {"shift_dn": 5}]),
+    make("empirical_electrons", chance=0.1, modes=[{"fate": "lost"}]),
+    make("empirical_electrons", chance=0.1, modes=[{"fate": "emptied"}]),
+    make("empirical_noise", noise_dn=1.0, modes=[{"of": "sample", "share": 1.0}]),
 ]
+
+
+def maps_of(bias):
+    sigma = np.sqrt((NOISE_E / GAIN) ** 2 + 1 / 12)
+    return PixelMaps.known(
+        np.broadcast_arrays(EXPOSURE, GAIN, np.ravel(bias), sigma), np.ones(np.size(bias), bool)
+    )
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=repr)
@@ -58,8 +70,7 @@ def test_the_law_is_that_of_the_samples(effect):
     inside = taken(truth, effect, n_frames=N_FRAMES, seed=8)[:, 1:-1, 1:-1]  # fewer neighbours at the edge
     seen = np.bincount(inside.ravel(), minlength=CODES[-1] + 1)[CODES]
     assert seen.sum() == inside.size
-    sigma = np.sqrt((NOISE_E / GAIN) ** 2 + 1 / 12)
-    maps = PixelMaps.known([np.array([v]) for v in (EXPOSURE, GAIN, BIAS, sigma)], np.ones(1, bool))
+    maps = maps_of(BIAS)
 
     def misfit(model):
         expected = sample_mass(model, maps, CODES)[0] * inside.size
@@ -70,3 +81,38 @@ def test_the_law_is_that_of_the_samples(effect):
     model = effect.sample_law(SampleLaw(), maps)
     assert abs(misfit(model)) < 5
     assert model.neutral or misfit(SampleLaw()) > 20
+
+
+def assert_smeared(effect, added):
+    """The law with an effect is the mean of the plain law over offsets, DN."""
+    plain, exact = (
+        sample_mass(SampleLaw(), maps_of(BIAS + each), CODES).mean(axis=0) for each in (0.0, added)
+    )
+    law = sample_mass(effect.sample_law(SampleLaw(), maps_of(BIAS)), maps_of(BIAS), CODES)[0]
+    assert np.abs(law - exact).max() < 0.06 * np.abs(exact - plain).max()
+
+
+@pytest.mark.parametrize("scale", [0.2, 3.0])
+@pytest.mark.parametrize(
+    "effect",
+    [
+        make("bias_drift", drift_dn=2.0),
+        make("bias_drift", drift_dn=-2.0, shape="path", path=(0.0, 0.2, 1.0, -0.1)),
+        make("bias_drift", drift_dn=2.0, shape="settling", settling_fraction=0.3),
+        make("periodic_pickup", amplitude_dn=1.0, cycles_per_frame=0.2137),
+        make("readout_alternation", alternation_dn=-0.8),
+        make("bias_jumps", amplitude_dn=1.0, rate=0.4, levels=5),
+        make("bias_jumps", amplitude_dn=1.0, path=(((0, 1.0), (700, -0.5), (1400, 0.8)),) * 4),
+    ],
+    ids=repr,
+)
+def test_offsets_smear_the_law_as_they_smear_the_samples(effect, scale):
+    effect = effect.scaled(scale)
+    assert_smeared(effect, offsets(effect, context_of((1, 1), 2100))[:, 0, 0])
+
+
+@pytest.mark.parametrize("size", [0.2, 2.0])
+@pytest.mark.parametrize("tag", ["frame_noise", "row_noise", "column_noise"])
+def test_gaussian_offsets_widen_the_law(tag, size):
+    quantiles = ndtri((np.arange(2000) + 0.5) / 2000)
+    assert_smeared(make(tag, **{f"{tag}_dn": size}), quantiles / quantiles.std() * size)

@@ -10,6 +10,7 @@ from pchem_pipeline.effects.framework.effect import registered_effects
 from pchem_pipeline.effects.framework.region import Region, When
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.effects.framework.settings import ModelSettings
+from pchem_pipeline.effects.operators.curve import Clipping
 from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.simulate.chain import simulate_block
 from pchem_pipeline.simulate.maps import draw_truth
@@ -26,9 +27,7 @@ def simulate(effects, frames=(0, FRAMES), rows=None):
 
 def strong(tag):
     """Return an effect so strong that it changes many of these few samples."""
-    effect = next(iter(effect_class(tag).typical()), None)
-    if effect is None:
-        effect = effect_class(tag).model_validate({"tag": tag, "low": 104})
+    effect = next(iter(effect_class(tag).typical()), None) or Clipping(low=104)
     if tag == "repeated_frames":
         return type(effect)(frames=(5, 25, 30))
     if tag in ("cosmic_rays", "rts_noise", "dark_current_rts", "heavy_tailed_noise"):
@@ -51,9 +50,8 @@ def test_an_effect_acts_in_its_place_as_everywhere_and_not_beside_it(tag):
     if effect.plane.value in ("adc", "readout"):
         # nothing that happens later mixes the samples
         np.testing.assert_array_equal(placed[inside], every[inside])
-    np.testing.assert_array_equal(
-        simulate((effect.at_place(REGION, WHEN),), (15, 33), (1, 7)), placed[15:33, 1:7]
-    )
+    part = simulate((effect.at_place(REGION, WHEN),), (15, 33), (1, 7))
+    np.testing.assert_array_equal(part, placed[15:33, 1:7])
 
 
 def test_taps_may_have_strengths_of_their_own():
@@ -77,9 +75,8 @@ def test_every_effect_may_have_a_place_and_none_needs_one():
 def test_words_of_a_model_tell_the_places():
     effects = [RowNoise(row_noise_dn=1.0, region="columns=120:160"), RowNoise(row_noise_dn=1.0)]
     assert model_words(effects) == "PCD + row_noise in columns 120 to 159 + row_noise"
-    assert effect_words(effects[1].at_place(REGION, WHEN)) == (
-        "row_noise in rows 2 to 8, columns 4 to 7, frames 20 to 39"
-    )
+    words = effect_words(effects[1].at_place(REGION, WHEN))
+    assert words == "row_noise in rows 2 to 8, columns 4 to 7, frames 20 to 39"
 
 
 YAML = """input: {files: [night.npy], integration_time: 1.0}

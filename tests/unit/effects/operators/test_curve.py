@@ -30,9 +30,6 @@ def test_listed_edges_move_and_no_others_and_in_the_wrong_order_coincide():
     np.testing.assert_allclose(moved, [0, 0, 0.3, -0.2, 0, 0], atol=2e-3)
     crossed = AdcDnl(dnl_lsb=1.0, pattern="edges", first_code=101, edges=(1.0, -1.0))
     assert set(coded(crossed, np.arange(99.5, 103.5, 1e-2))) == {100, 102, 103}
-
-
-def test_a_code_whose_edges_coincide_is_missing():
     effect = AdcDnl(dnl_lsb=1.0, pattern="edges", first_code=101, edges=(1.0, 0.0, 0.0, 0.5, -0.5, 0.0, -1.0))
     fine = np.arange(97.5, 112.5, 1e-2) + 5e-3
     codes = coded(effect, fine)

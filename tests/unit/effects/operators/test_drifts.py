@@ -47,14 +47,11 @@ def test_a_walk_has_the_variance_of_its_end():
     assert abs(np.mean(np.square(ends)) / (0.25 * 59 / 60) - 1) < 5 * np.sqrt(2 / 400)
 
 
-BOW = (-0.5, 0.5, -0.5)
-
-
 @pytest.mark.parametrize(
     ("effect", "profile"),
     [
         (GainDrift(drift=0.2), np.linspace(-0.5, 0.5, 101)),
-        (GainDrift(drift=0.2, shape="path", path=BOW), 0.5 - np.abs(np.linspace(-1, 1, 101))),
+        (GainDrift(drift=0.2, shape="path", path=(-0.5, 0.5, -0.5)), 0.5 - np.abs(np.linspace(-1, 1, 101))),
     ],
 )
 def test_the_gain_follows_its_profile(effect, profile):

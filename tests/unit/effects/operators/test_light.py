@@ -117,9 +117,8 @@ def test_a_window_sees_its_part_of_the_glow(effect):
         own = part.peak_e * part.pattern(np.arange(size[0]), size)
         np.testing.assert_allclose(own, image[slice(*rows), slice(*columns)], rtol=1e-9)
     part = effect.to_window((0, 20), (20, 50), (40, 60)).to_sensor((0, 20), (20, 50), (40, 60))
-    np.testing.assert_allclose(
-        [getattr(part, n) for n in ("peak_e", "centre_y", "centre_x", "radius")], [2.0, 0.1, 0.6, 0.3]
-    )
+    found = part.peak_e, part.centre_y, part.centre_x, part.radius
+    np.testing.assert_allclose(found, [2.0, 0.1, 0.6, 0.3])
 
 
 def test_what_it_adds_has_the_moments_of_the_frames():
@@ -164,11 +163,7 @@ def test_a_spot_that_no_cell_shows_is_no_guess():
     rng = np.random.default_rng(5)
     lost = np.full((4, 4), 0.01)
     lost[:2] = np.inf  # no usable pixel in the upper half
-    for _ in range(12):
-        spot = best_spot(rng.normal(0.0, 0.01, (4, 4)), lost, np.ones((4, 4)), (64, 64))
-        assert spot is None or spot.peak < 1.0
-    for _ in range(12):
-        # cells far wider than the narrowest spot, and noise only: its far tail would fit with any peak
-        noise = rng.normal(0.0, 0.01, (2, 2))
-        spot = best_spot(noise, np.full((2, 2), 0.01), np.ones((2, 2)), (64, 64))
+    # and cells far wider than the narrowest spot, and noise only: its far tail would fit with any peak
+    for error in 6 * [lost, np.full((2, 2), 0.01)]:
+        spot = best_spot(rng.normal(0.0, 0.01, error.shape), error, np.ones(error.shape), (64, 64))
         assert spot is None or spot.peak < 1.0

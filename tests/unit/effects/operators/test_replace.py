@@ -19,24 +19,17 @@ from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
-from pchem_pipeline.simulate.chain import simulate_block
-from pchem_pipeline.simulate.settings import SimulateSettings
-
-N_FRAMES, SMALL = 14, (6, 5)
-
-
-def frames_of(*effects):
-    sensor = SimulateSettings(shape=SMALL, n_frames=N_FRAMES, seed=8, effects=effects)
-    return simulate_block(drawn_truth(SMALL), sensor, (0, N_FRAMES))[0]
 
 
 def test_repeats_are_exact_copies_of_what_was_delivered():
-    plain, listed = frames_of(), (1, 2, 5, 9, 10, 11)
+    plain = np.random.default_rng(8).integers(90, 140, (14, 6, 5)).astype(np.uint16)
+    listed = (1, 2, 5, 9, 10, 11)
     delivered = plain.copy()
     for t in listed:
         delivered[t] = delivered[t - 1]
-    np.testing.assert_array_equal(frames_of(RepeatedFrames(frames=listed)), delivered)
-    some = frames_of(RepeatedFrames(frames=listed, rows=(2, 4)))
+    context = context_of((6, 5), 14)
+    np.testing.assert_array_equal(RepeatedFrames(frames=listed).apply(plain, context), delivered)
+    some = RepeatedFrames(frames=listed, rows=(2, 4)).apply(plain, context)
     np.testing.assert_array_equal(some[:, 2:4], delivered[:, 2:4])
     np.testing.assert_array_equal(np.delete(some, [2, 3], axis=1), np.delete(plain, [2, 3], axis=1))
 
@@ -52,12 +45,6 @@ def test_random_repeats_come_as_often_as_they_should():
     assert out[0] == 0
 
 
-BITS_SHAPE = (50, 50)
-
-
-BITS_FRAMES = np.random.default_rng(1).integers(90, 140, (40, *BITS_SHAPE)).astype(np.uint16)
-
-
 def by_hand(code, bit, fault):
     """Return a code with a wrong bit, by its binary digits."""
     digits = list(f"{code:016b}")
@@ -68,25 +55,29 @@ def by_hand(code, bit, fault):
 
 @pytest.mark.parametrize("fault", ["zero", "one", "flip"])
 @pytest.mark.parametrize("bit", [0, 3, 5])
-def test_a_stuck_bit_is_wrong_in_every_sample(bit, fault):
-    effect = BitErrors(share=1.0, bit=bit, fault=fault)
-    found = effect.apply(BITS_FRAMES, context_of(BITS_SHAPE, 40))
-    table = np.array([by_hand(code, bit, fault) for code in range(256)])
-    np.testing.assert_array_equal(found, table[BITS_FRAMES])
-    assert found.dtype == BITS_FRAMES.dtype
+def test_a_stuck_bit_is_wrong_in_every_sample_and_another_in_its_share(bit, fault):
+    frames = np.random.default_rng(1).integers(90, 140, (40, 50, 50)).astype(np.uint16)
+    wrong = np.array([by_hand(code, bit, fault) for code in range(256)])[frames]
+    every, some, lacking = (
+        effect.apply(frames, context_of((50, 50), 40))
+        for effect in (
+            BitErrors(share=share, bit=n, fault=fault) for share, n in ((1, bit), (0.02, bit), (1, 14))
+        )
+    )
+    np.testing.assert_array_equal(every, wrong)
+    assert every.dtype == frames.dtype
+    np.testing.assert_array_equal(lacking, frames)  # a bit that the converter lacks
+    there = wrong != frames
+    assert abs((some != frames).sum() - 0.02 * there.sum()) <= 5 * np.sqrt(0.02 * 0.98 * there.sum())
+    np.testing.assert_array_equal(np.where(some != frames, wrong, frames), some)
 
 
-@pytest.mark.parametrize(
-    ("effect", "share"),
-    [
-        (BitErrors(share=0.02, bit=3, fault="flip"), 0.02),
-        (BitErrors(share=1.0, bit=14, fault="one"), 0.0),  # a bit that the converter lacks
-    ],
-)
-def test_a_share_of_the_samples_is_wrong(effect, share):
-    found = effect.apply(BITS_FRAMES, context_of(BITS_SHAPE, 40))
-    n, wrong = BITS_FRAMES.size, int((found != BITS_FRAMES).sum())
-    assert abs(wrong - share * n) <= 5 * np.sqrt(share * (1 - share) * n)
+def with_errors(plain, codes, effect):
+    """Return masses (pixel, code) of which a share has a wrong bit; errors do not leave the codes."""
+    exact = (1 - effect.share) * plain
+    for place, code in enumerate(codes[:300]):
+        exact[:, by_hand(int(code), effect.bit, effect.fault) - codes[0]] += effect.share * plain[:, place]
+    return exact
 
 
 @pytest.mark.parametrize("fault", ["zero", "one", "flip"])
@@ -94,28 +85,18 @@ def test_the_law_has_as_many_moved_samples_and_their_mean(fault):
     effect = BitErrors(share=0.01, bit=3, fault=fault)
     maps = PixelMaps(*np.array([[0.8, 2.5], [0.1, 0.07], [100.3, 97.0], [3.0, 3.4]]), np.ones(2, bool))
     codes = np.arange(40, 400)
-    plain = sample_mass(SampleLaw(), maps, codes)
     law = sample_mass(effect.sample_law(SampleLaw(), maps), maps, codes)
-    exact = 0.99 * plain
-    for place, code in enumerate(codes):
-        exact[:, by_hand(code, 3, fault) - 40] += 0.01 * plain[:, place]
     np.testing.assert_allclose(law.sum(axis=1), 1.0, atol=1e-9)
+    exact = with_errors(sample_mass(SampleLaw(), maps, codes), codes, effect)
     np.testing.assert_allclose(law @ codes, exact @ codes, atol=2e-4)
 
 
 def test_the_law_takes_some_of_the_errors_out_of_the_read_noise():
-    rng = np.random.default_rng(7)
-    n = 24
-    maps = PixelMaps(
-        rng.uniform(0.5, 3, n), 1 / rng.uniform(8, 16, n), rng.uniform(96, 112, n), rng.uniform(2.4, 4.2, n),
-        np.ones(n, bool),
-    )  # fmt: skip
-    effect = BitErrors(share=0.004, bit=3)
-    codes = np.arange(30, 500)
-    plain = sample_mass(SampleLaw(), maps, codes)
-    mass = 0.996 * plain
-    for place, code in enumerate(codes[:300]):
-        mass[:, by_hand(int(code), 3, "zero") - 30] += 0.004 * plain[:, place]
+    rng, n = np.random.default_rng(7), 24
+    ranges = ((0.5, 3), (1 / 16, 1 / 8), (96, 112), (2.4, 4.2))
+    maps = PixelMaps(*(rng.uniform(*each, n) for each in ranges), np.ones(n, bool))
+    effect, codes = BitErrors(share=0.004, bit=3), np.arange(30, 500)
+    mass = with_errors(sample_mass(SampleLaw(), maps, codes), codes, effect)
     counts, origin = np.rint(1e6 * mass).astype(np.uint32), np.full(n, 30)
     errors = []
     for law in (None, effect.sample_law(SampleLaw(), maps)):
@@ -151,21 +132,15 @@ def test_a_bit_that_never_changes_is_stuck(bit, fault):
     assert BitErrors.estimate(seen(taken(truth, effect, n_frames=800))) == (effect,)
 
 
-def predicted_by_hand(frame, y, x, predictor):
-    """Return what the neighbours of one sample predict, written down once more."""
-    around = [int(frame[y + b, x + a]) for b in (-1, 0, 1) for a in (-1, 0, 1) if a or b]
-    if predictor == "row":
-        around = [int(frame[y, x - 1]), int(frame[y, x + 1])]
-    return int(np.floor(np.median(around) if predictor == "median" else np.mean(around)))
-
-
 def corrected_by_hand(frame, threshold, predictor):
+    """Replace samples above what their neighbours predict, written down once more."""
     found = frame.copy()
-    for y in range(1, frame.shape[0] - 1):
-        for x in range(1, frame.shape[1] - 1):
-            prediction = predicted_by_hand(frame, y, x, predictor)
-            if int(frame[y, x]) - prediction > threshold:
-                found[y, x] = prediction
+    for y, x in np.ndindex(frame.shape[0] - 2, frame.shape[1] - 2):
+        around = frame[y : y + 3, x : x + 3].astype(int).ravel()
+        others = around[[3, 5]] if predictor == "row" else np.delete(around, 4)
+        prediction = int(np.floor(np.median(others) if predictor == "median" else np.mean(others)))
+        if around[4] - prediction > threshold:
+            found[y + 1, x + 1] = prediction
     return found
 
 
@@ -228,63 +203,45 @@ def test_a_rule_without_a_threshold_is_none_that_an_effect_can_have():
     assert all(found.threshold_dn > 0 for found in PixelCorrection.estimate(seen(frames)))
 
 
-def test_the_rule_says_what_comes_out_in_the_stead_of_a_sample():
-    frames = np.random.default_rng(4).integers(90, 140, (5, 7, 6)).astype(np.uint16)
-    effect = PixelCorrection(threshold_dn=12)
-    rule = effect.replacement(frames)
-    changed = effect.apply(frames, context_of((7, 6), 5)) != frames
-    assert changed.any()
-    assert not changed[:, ~rule.inside].any()
-    np.testing.assert_array_equal(
-        changed, (frames.astype(int) - rule.value > rule.excess) & rule.inside & (frames != rule.value)
-    )
-    assert not PixelCorrection(threshold_dn=1).replacement(frames[:, :2]).inside.any()
-
-
 LINES_SHAPE, N_LINE_FRAMES = (9, 11), 300
-
-
 MOVES = ("swapped", "early", "late", "sample_lost", "sample_twice", "line_lost", "line_twice")
 
 
-def turned(frames, lines):
-    """Return frames (frame, line, sample)."""
-    return frames if lines == "rows" else frames.swapaxes(1, 2)
+def steps_of(effect):
+    """Return from how many lines, and samples along them, further on each (frame, line, sample) comes."""
+    places = np.arange(np.prod(LINES_SHAPE), dtype=np.uint16).reshape(LINES_SHAPE)
+    frames = np.tile(places, (N_LINE_FRAMES, 1, 1))  # values tell where in the frame they come from
+    found = effect.apply(frames, context_of(LINES_SHAPE, N_LINE_FRAMES)).astype(int)
+    y, x = np.stack(np.divmod(found, LINES_SHAPE[1])) - np.indices(LINES_SHAPE)[:, None]
+    return (y, x) if effect.lines == "rows" else (x.swapaxes(1, 2), y.swapaxes(1, 2))
 
 
 @pytest.mark.parametrize("lines", ["rows", "columns"])
 @pytest.mark.parametrize("move", MOVES)
 def test_every_sample_comes_from_where_the_move_says(move, lines):
-    # values tell where in the frame they come from
-    places = np.arange(LINES_SHAPE[0] * LINES_SHAPE[1], dtype=np.uint16).reshape(LINES_SHAPE)
-    frames, share = np.tile(places, (N_LINE_FRAMES, 1, 1)), 0.1
-    found = MisplacedLines(share=share, move=move, lines=lines).apply(
-        frames, context_of(LINES_SHAPE, N_LINE_FRAMES)
-    )
-    found, plain = turned(found, lines), turned(frames, lines)[0]
-    n, m = plain.shape
-    hits = 0
-    for one in found:
-        if move.startswith("line"):
-            moved = np.flatnonzero((one != plain).any(axis=1))
-            if moved.size:
-                hits += 1
-                come = np.clip(np.arange(n) + (1 if move == "line_lost" else -1), 0, n - 1)
-                np.testing.assert_array_equal(one[moved[0] :], plain[come][moved[0] :])
-            continue
-        y = 0
-        while y < n:
-            at = np.flatnonzero(one[y] != plain[y])
-            if at.size and move == "swapped":
-                np.testing.assert_array_equal(one[[y, y + 1]], plain[[y + 1, y]])
-                y += 1
-            elif at.size:
-                step = 1 if move in ("early", "sample_lost") else -1
-                come = np.clip(np.arange(m) + step, 0, m - 1)
-                np.testing.assert_array_equal(one[y, at[0] :], plain[y, come][at[0] :])
-                assert move not in ("early", "late") or at[0] == (0 if step == 1 else 1)
-            hits += at.size > 0
-            y += 1
+    share = 0.1
+    across, along = steps_of(MisplacedLines(share=share, move=move, lines=lines))
+    n, m = across.shape[1:]
+    if move in ("swapped", "line_lost", "line_twice"):
+        assert not along.any()
+        assert not np.ptp(across, axis=2).any()
+        off = across[:, :, 0]
+    else:
+        assert not across.any()
+        off = along
+    if move == "swapped":
+        np.testing.assert_array_equal(off[:, :-1] == 1, off[:, 1:] == -1)
+        assert set(np.unique(off)) == {-1, 0, 1}
+        hits = (off == 1).sum()
+    else:
+        # from some place on; at the end of a line the last sample is repeated
+        step = 1 if move in ("early", "sample_lost", "line_lost") else -1
+        inner, end = (off[..., :-1], off[..., -1]) if step == 1 else (off[..., 1:], off[..., 0])
+        assert not end.any()
+        assert set(np.unique(inner)) == {0, step}
+        assert (np.diff(abs(inner), axis=-1) >= 0).all()
+        assert move not in ("early", "late") or not np.ptp(inner, axis=-1).any()
+        hits = inner.any(axis=-1).sum()
     # of a line lost at the end, or a sample twice at the end, nothing is seen
     trials = N_LINE_FRAMES * (1 if move.startswith("line") else n)
     shown = {"swapped": 1 - 1 / n - share, "line_lost": 1 - 1 / n, "sample_lost": 1 - 1 / m}.get(move, 1.0)
@@ -312,8 +269,9 @@ def test_pixels_are_fitted_without_the_lines_that_were_moved(move, lines):
     truth, effect = drawn_truth(shape), MisplacedLines(share=0.1, move=move, lines=lines)
     frames, plain = taken(truth, effect, n_frames=n_frames, seed=5), taken(truth, n_frames=n_frames, seed=5)
     found = own_lines(frames, np.ones(shape, np.bool_), [effect])
-    moved = turned(frames != plain, lines).any(axis=2)
-    replaced = turned(found != frames, lines).any(axis=2)
+    moved, replaced = (
+        each.any(axis=2 if lines == "rows" else 1) for each in (frames != plain, found != frames)
+    )
     # where a line is cut, few of its samples may have moved
     assert replaced[moved].mean() > (0.5 if "sample" in move else 0.8)
     assert replaced[~moved].mean() < 0.01
@@ -327,18 +285,13 @@ def test_a_line_in_two_places_is_misplaced_too_and_its_equality_tells():
 
 @pytest.mark.parametrize("lines", ["rows", "columns"])
 def test_a_line_is_its_own_or_the_one_before(lines):
-    frames = np.random.default_rng(1).integers(90, 140, (N_LINE_FRAMES, *LINES_SHAPE)).astype(np.uint16)
-    found = RepeatedLines(share=0.1, lines=lines).apply(frames, context_of(LINES_SHAPE, N_LINE_FRAMES))
-    repeats = 0
-    for one, plain in zip(found, frames, strict=True):
-        one, plain = (one, plain) if lines == "rows" else (one.T, plain.T)
-        np.testing.assert_array_equal(one[0], plain[0])
-        for y in range(1, len(one)):
-            if not np.array_equal(one[y], plain[y]):
-                np.testing.assert_array_equal(one[y], plain[y - 1])
-                repeats += 1
-    n = N_LINE_FRAMES * (LINES_SHAPE[0 if lines == "rows" else 1] - 1)
-    assert abs(repeats - 0.1 * n) < 5 * np.sqrt(0.09 * n)
+    across, along = steps_of(RepeatedLines(share=0.1, lines=lines))
+    assert not along.any()
+    assert not np.ptp(across, axis=2).any()
+    assert set(np.unique(across)) == {-1, 0}
+    repeats = across[:, 1:, 0]
+    assert abs((repeats == -1).sum() - 0.1 * repeats.size) < 5 * np.sqrt(0.09 * repeats.size)
+    assert not across[:, 0].any()
 
 
 @pytest.mark.parametrize("lines", ["rows", "columns"])

@@ -5,27 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.refitted_world import M, World
 
 from pchem_pipeline.discrepancy.by_simulation.candidates.details import may_be_tuned, standard_errors, tuned
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
-    Hypothesis,
-    SetFit,
-    likeliest_sets,
-)
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.rivals import chosen
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, compare
-from pchem_pipeline.discrepancy.effort import EffortSpentError
-from pchem_pipeline.discrepancy.null import NullModel
-from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.effects.operators.light import DarkCurrentRts
 from pchem_pipeline.effects.operators.offsets import RowNoise
 
-NAMES = tuple(name for name in STATISTICS if not name.startswith("frame.repeated"))[:24]
-M = len(NAMES)
 UNIT = np.eye(M)
 BLINKING = DarkCurrentRts(fraction=0.1, step_e=1.0, dwell_low_frames=200.0, dwell_high_frames=200.0)
 TRUE = DarkCurrentRts(fraction=0.12, step_e=1.4, dwell_low_frames=120.0, dwell_high_frames=200.0)
@@ -46,40 +38,20 @@ def statistics(effects: Sequence[Effect]) -> np.ndarray:
     return mean
 
 
-class World:
-    """Refitted models that can be drawn from."""
+def world_of(*truth: Effect, beside: np.ndarray | float = 0.0) -> World:
+    return World(truth, statistics, beside=beside)
 
-    def __init__(self, truth: Sequence[Effect], beside: np.ndarray | float = 0.0) -> None:
-        rng = np.random.default_rng(1)
-        self.null = NullModel.from_replicates(NAMES, rng.standard_normal((40, M)))
-        mean = statistics(truth) + beside
-        self.parts = [mean + rng.standard_normal(M) for _ in range(2)]
-        self.drawn = 0
 
-    def draw(self, effects: tuple[Effect, ...], count: int) -> np.ndarray:
-        self.drawn += 1
-        vectors = statistics(effects) + np.random.default_rng(7).standard_normal((count, M))
-        return vectors
-
-    def refitter(self) -> Refitter:
-        return Refitter(self.draw, self.null, (self.parts[0] + self.parts[1]) / 2.0)
-
-    def likely(self, hypotheses: list[Hypothesis]) -> list[SetFit]:
-        refitter = self.refitter()
-        shift, noise = refitter.target - self.null.mean, refitter.noise(self.null.covariance, 40)
-        return likeliest_sets(hypotheses, shift, noise)
-
-    def refined(self, effect: Effect) -> Refitted:
-        return self.refitter().refined([Hypothesis(effect, statistics([effect]))])
+def refined(world: World, effect: Effect) -> Refitted:
+    return world.refitter().refined([Hypothesis(effect, statistics([effect]))])
 
 
 def test_numbers_are_brought_to_what_the_data_ask_for() -> None:
-    world = World([TRUE])
-    begun = world.refined(BLINKING)
+    world = world_of(TRUE)
+    begun = refined(world, BLINKING)
     assert may_be_tuned(world.refitter(), begun)
     found = tuned(world.refitter(), begun)
     [effect] = found.effects
-    assert isinstance(effect, DarkCurrentRts)
     assert found.tuned
     assert begun.chance - begun.score > 40.0
     assert found.chance - found.score < 15.0
@@ -90,8 +62,8 @@ def test_numbers_are_brought_to_what_the_data_ask_for() -> None:
 
 def test_standard_errors_are_those_of_a_fit_of_all_numbers_together() -> None:
     """The scatter of least squares with other derivatives; a number that nothing tells has none."""
-    world = World([TRUE])
-    one = world.refined(TRUE)
+    world = world_of(TRUE)
+    one = refined(world, TRUE)
     [found] = standard_errors(world.refitter(), one, np.zeros(1))
     [taken] = one.effects
     names = ["fraction", "step_e", "dwell_low_frames", "dwell_high_frames"]
@@ -110,37 +82,32 @@ def test_standard_errors_are_those_of_a_fit_of_all_numbers_together() -> None:
 
 
 def test_what_is_left_where_the_effect_moves_nothing_is_no_reason_to_tune() -> None:
-    world = World([TRUE], beside=60.0 * UNIT[9])
-    assert not may_be_tuned(world.refitter(), world.refined(BLINKING))
+    world = world_of(TRUE, beside=60.0 * UNIT[9])
+    assert not may_be_tuned(world.refitter(), refined(world, BLINKING))
     # nor is it where nothing is left
-    world = World([TRUE])
-    assert not may_be_tuned(world.refitter(), world.refined(TRUE))
+    world = world_of(TRUE)
+    assert not may_be_tuned(world.refitter(), refined(world, TRUE))
 
 
 def test_nothing_is_simulated_at_the_limit() -> None:
-    world = World([TRUE])
-    begun = world.refined(BLINKING)
+    world = world_of(TRUE)
+    begun, effort = refined(world, BLINKING), Effort(1.0)
     drawn = world.drawn
-
-    def refuse(_: str) -> None:
-        raise EffortSpentError("it")
-
+    effort.begin()
+    effort.spent = effort.most
     with pytest.raises(EffortSpentError):
-        tuned(replace(world.refitter(), allow=refuse), begun)
+        tuned(replace(world.refitter(), allow=effort.check), begun)
     assert world.drawn == drawn
 
 
 @pytest.mark.parametrize("truth", [TRUE, BLINKING.model_copy(update={"dwell_low_frames": 165.0})])
 def test_an_effect_that_wrong_numbers_of_another_brought_in_is_not_kept(truth: DarkCurrentRts) -> None:
     """Row noise explains what blinking leaves at the guessed numbers, at once or when tuned, too."""
-    world = World([truth])
+    world = world_of(truth)
     hypotheses = [Hypothesis(e, statistics([e])) for e in (BLINKING, RowNoise(row_noise_dn=0.6))]
-    sets = world.likely(hypotheses)
+    sets = world.likely(*hypotheses)
     assert {h.tag for h in sets[0].hypotheses} == {"dark_current_rts", "row_noise"}
-    search = Search(world.refitter(), HistogramLikelihood())
-    compare(search, hypotheses, sets)
-    found = chosen(search)
-    assert found is not None
+    found = world.compare(*hypotheses, sets=sets)
     assert found.chosen.tags == {"dark_current_rts"}
 
 
@@ -178,15 +145,14 @@ class Broken(DarkCurrentRts):
 
 @pytest.mark.parametrize("strange", [Limited, Wrong, Broken])
 def test_what_an_effect_of_another_package_raises_ends_no_search(strange: type[DarkCurrentRts]) -> None:
-    world = World([TRUE])
+    world = world_of(TRUE)
     guessed = strange.model_validate(BLINKING.model_dump())
     hypotheses = [Hypothesis(e, statistics([e])) for e in (guessed, RowNoise(row_noise_dn=0.6))]
-    sets = world.likely(hypotheses)
     refitter = world.refitter()
     search = Search(refitter, HistogramLikelihood())
-    compare(search, hypotheses, sets)
+    compare(search, hypotheses, world.likely(*hypotheses))
     assert "dark_current_rts" in search.best.tags
-    own = world.refined(guessed)
+    own = refined(world, guessed)
     assert standard_errors(refitter, own, own.stderr)[0].keys() == {"fraction"}
     assert refitter.defects
     assert all("dark_current_rts" in failed for failed in refitter.defects)

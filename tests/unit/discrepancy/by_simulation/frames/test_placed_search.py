@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.small_sensors import seen
 
 from pchem_pipeline.discrepancy.by_simulation.explainer import find_discrepancies
 from pchem_pipeline.discrepancy.by_simulation.frames.frame_stack import FrameStack
@@ -11,7 +12,6 @@ from pchem_pipeline.discrepancy.by_simulation.frames.observed import ObservedFra
 from pchem_pipeline.discrepancy.by_simulation.frames.suspects import suspected_parts
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Acquisition, simulate_frames
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
-from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow, part_evidence, part_statistics
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
@@ -59,21 +59,15 @@ def every_eighth(rng, shape):
     return offsets
 
 
-def tails(rng, shape, where):
-    """Return noise four times as wide in a few of some samples, DN."""
-    return np.where(where & (rng.random(shape) < 0.008), rng.normal(0.0, 12.0, shape), 0.0)
+def tails(part):
+    """Return what adds noise four times as wide, DN, to a few of the samples of a part."""
 
+    def add(rng, shape):
+        inside = np.zeros(shape, bool)
+        inside[part] = True
+        return np.where(inside & (rng.random(shape) < 0.008), rng.normal(0.0, 12.0, shape), 0.0)
 
-def tails_of_columns(rng, shape):
-    return tails(rng, shape, (np.arange(shape[2]) >= 14) & (np.arange(shape[2]) < 18))
-
-
-def tails_of_frames(rng, shape):
-    return tails(rng, shape, ((np.arange(shape[0]) // 160) == 4)[:, None, None])
-
-
-def tails_everywhere(rng, shape):
-    return tails(rng, shape, np.True_)
+    return add
 
 
 def everywhere(rng, shape):
@@ -85,7 +79,7 @@ def nothing(rng, shape):
 
 
 def parts_of(frames):
-    return suspected_parts(observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=50), frames)
+    return suspected_parts(seen(frames), frames)
 
 
 @pytest.mark.parametrize(
@@ -96,8 +90,8 @@ def parts_of(frames):
         (1, every_eighth, Region.model_validate("every=8/3"), 0.8),
         (3, rows_of_frames, When(range=((600, 760),)), 0.8),
         # what no map and no series of means shows
-        (1, tails_of_columns, Region(columns=((14, 18),)), 0.7),
-        (1, tails_of_frames, When(range=((640, 800),)), 0.6),
+        (1, tails(np.s_[:, :, 14:18]), Region(columns=((14, 18),)), 0.7),
+        (1, tails(np.s_[640:800]), When(range=((640, 800),)), 0.6),
     ],
 )
 def test_a_part_of_sensor_or_run_that_differs_is_suspected(seed, add, place, least):
@@ -107,7 +101,7 @@ def test_a_part_of_sensor_or_run_that_differs_is_suspected(seed, add, place, lea
     assert found.overlap(place, SHAPE if isinstance(place, Region) else FRAMES) >= least
 
 
-@pytest.mark.parametrize("add", [nothing, everywhere, tails_everywhere])
+@pytest.mark.parametrize("add", [nothing, everywhere, tails(np.s_[:])])
 def test_no_part_is_suspected_where_none_differs(add):
     assert parts_of(camera(4, add)) == ()
 
@@ -115,7 +109,7 @@ def test_no_part_is_suspected_where_none_differs(add):
 def test_a_part_is_suspected_by_what_several_shapes_show_together():
     """As of telegraph noise in three rows: no map has the place by itself, and chance has none."""
     frames = camera(7, nothing)
-    clean = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=50)
+    clean = seen(frames)
     rng, rows = np.random.default_rng(11), slice(5, 8)
 
     def parts(shift, names):
@@ -129,19 +123,17 @@ def test_a_part_is_suspected_by_what_several_shapes_show_together():
     assert all(parts(0.0, names) == () for _ in range(2))
     # in a map by itself, of thousands of places in two dozen maps, five standard errors are nothing
     assert sum(len(parts(shift, names[:1])) for _ in range(2)) <= 1
-    seen = [part.region.overlap(found, SHAPE) for _ in range(3) for part in parts(shift, names[:5])]
-    assert len(seen) >= 2
-    assert np.median(seen) >= 0.8
+    overlaps = [part.region.overlap(found, SHAPE) for _ in range(3) for part in parts(shift, names[:5])]
+    assert len(overlaps) >= 2
+    assert np.median(overlaps) >= 0.8
 
 
 def test_statistics_of_a_part_are_those_of_a_sensor_of_its_own():
     frames = camera(7, rows_of_columns)
-    maps = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=50).maps
+    maps = seen(frames).maps
     part = Part(Region(columns=((17, 22),)))
     found = part_statistics(frames, np.arange(FRAMES), maps, [part], block_frames=50)
-    alone = observe(
-        np.ascontiguousarray(frames[:, :, 17:22]), np.arange(FRAMES), n_run=FRAMES, block_frames=50
-    )
+    alone = seen(np.ascontiguousarray(frames[:, :, 17:22]))
     name = "space.x.rr@columns=17:22"
     assert found[name] == pytest.approx(alone.z["space.x.rr"], rel=0.01)
     assert found[name] > 15.0
@@ -155,11 +147,8 @@ def test_statistics_of_a_part_are_those_of_a_sensor_of_its_own():
 
 def test_effects_are_told_on_the_sensor_and_act_in_the_window():
     window = SensorWindow((8, 24), (4, 20), (40, 32))
-    effects = [
-        RowNoise(row_noise_dn=4.0, region="columns=10:14"),
-        RowNoise(row_noise_dn=4.0, region="columns=24:30"),
-        RowNoise(row_noise_dn=4.0, region="rows=0:30"),
-    ]
+    places = "columns=10:14", "columns=24:30", "rows=0:30"
+    effects = [RowNoise(row_noise_dn=4.0, region=place) for place in places]
     inside = window.effects(effects)
     assert [e.region for e in inside] == [Region(columns=((6, 10),)), None]
     assert window.on_sensor(Region(columns=((6, 10),))) == Region(columns=((10, 14),))
@@ -192,7 +181,6 @@ def test_an_effect_in_a_tap_of_a_window_is_named_with_its_place():
     assert found.verdict.verdict == "named"
     assert found.verdict.effects == ("row_noise",)
     [effect] = found.model
-    assert effect.region is not None
     assert effect.region.overlap(Region(columns=((57, 62),)), (512, 512)) >= 0.8
     [step] = found.verdict.steps
     assert abs(effect.row_noise_dn - 1.2) < 4.0 * step.parameters["row_noise_dn"].stderr + 0.06
@@ -216,7 +204,7 @@ def test_what_is_guessed_in_a_part_has_its_phase_on_the_sensor(window):
         return wave
 
     frames, numbers = camera(21, pickup, (24, 24), 1200), np.arange(1200)
-    maps = observe(frames, numbers, n_run=1200, block_frames=50).maps
+    maps = seen(frames).maps
     part = Part(Region(rows=((rows.start + top, rows.stop + top),)))
     own = part_evidence(frames, numbers, maps, part, n_run=1200, block_frames=50, window=window)
     guess = effect_classes()["periodic_pickup"].estimate(own)[0]
@@ -229,14 +217,12 @@ def test_what_is_guessed_in_a_part_has_its_phase_on_the_sensor(window):
 
 def test_what_is_a_spot_by_itself_is_not_cut_off_by_the_part_that_showed_it():
     part = Part(Region(rows=((5, 18),)), When(range=((100, 300),)))
-    guess = effect_classes()["glow"].model_validate({"peak_e": 2.0, "centre_y": 0.5, "radius": 0.3})
+    guess = effect_classes()["glow"](peak_e=2.0, centre_y=0.5, radius=0.3)
     found = SensorWindow.whole((26, 24)).found(guess, part)
     assert found.region is None
     assert found.when == part.when
     assert found.centre_y == pytest.approx((5 + 0.5 * 13) / 26, abs=0.03)
-    image = effect_classes()["persistence"].model_validate(
-        {"peak_e": 2.0, "decay_frames": 90.0, "image": [[0.0, 1.0]]}
-    )
+    image = effect_classes()["persistence"](peak_e=2.0, decay_frames=90.0, image=((0.0, 1.0),))
     assert SensorWindow.whole((26, 24)).found(image, part).region == part.region
 
 
@@ -253,14 +239,12 @@ def test_the_ends_of_a_range_are_told_beyond_the_blocks_that_were_not_seen():
 
 def test_a_range_of_few_frames_of_poor_pixels_has_statistics():
     frames = camera(13, lambda rng, shape: 3.0 * rows_of_frames(rng, shape), (16, 24), noise=0.42)
-    numbers = np.arange(FRAMES)
-    maps = observe(frames, numbers, n_run=FRAMES, block_frames=50).maps
+    numbers, maps = np.arange(FRAMES), seen(frames).maps
     some = np.flatnonzero(numbers // 20 % 3 == 0)
     part = Part(when=When(range=((600, 760),)))
-    found = part_statistics(frames[some], numbers[some], maps, [part], block_frames=20)
-    assert found["space.row.readout.variance@frames=600:760"] > 5.0
     quiet = Part(when=When(range=((900, 1060),)))
-    found = part_statistics(frames[some], numbers[some], maps, [quiet], block_frames=20)
+    found = part_statistics(frames[some], numbers[some], maps, [part, quiet], block_frames=20)
+    assert found["space.row.readout.variance@frames=600:760"] > 5.0
     assert abs(found["space.row.readout.variance@frames=900:1060"]) < 4.0
 
 
@@ -269,7 +253,7 @@ def test_a_range_of_few_frames_of_poor_pixels_has_statistics():
 def test_estimators_look_at_frames_of_a_period_that_have_no_next_one(tag, rows):
     every_tenth = placed(np.s_[7::10], 1.5, *((2,) if rows > 1 else (1, 2)))
     frames, numbers = camera(14, every_tenth, (16, 24)), np.arange(FRAMES)
-    evidence = observe(frames, numbers, n_run=FRAMES, block_frames=50)
+    evidence = seen(frames)
     [part] = suspected_parts(evidence, frames)
     assert part == Part(when=When(every=10, phase=7))
     own = part_evidence(frames, numbers, evidence.maps, part, n_run=FRAMES, block_frames=50)
@@ -277,6 +261,14 @@ def test_estimators_look_at_frames_of_a_period_that_have_no_next_one(tag, rows):
     [found] = guesses[tag]
     # a guess: the fit of 150 frames takes a part of it
     assert 0.7 < getattr(found, found.strength) / 1.5 < 1.2
+
+
+def stack_of(window):
+    """Return frames of zeros of a window of 8 rows of 6 columns."""
+    rows, columns = ((0, 8), (0, 6)) if window is None else (window.rows, window.columns)
+    zeros = np.zeros((400, rows[1] - rows[0], columns[1] - columns[0]), np.uint16)
+    taken = {"n_run": None, "bit_depth": 12, "integration_time": 1.0, "window": window}
+    return FrameStack.of(zeros, np.arange(400), None, **taken)
 
 
 @pytest.mark.parametrize(
@@ -288,26 +280,14 @@ def test_estimators_look_at_frames_of_a_period_that_have_no_next_one(tag, rows):
         ((0, 7), (0, 5), set()),
     ],
 )
-def test_the_shape_of_a_line_is_known_where_the_window_has_it_from_end_to_end(
-    rows: tuple[int, int], columns: tuple[int, int], whole: set[str]
-) -> None:
-    stack = np.zeros((400, rows[1] - rows[0], columns[1] - columns[0]), np.uint16)
-    window = SensorWindow(rows, columns, (8, 6))
-    frames = FrameStack.of(
-        stack, np.arange(400), None, n_run=None, bit_depth=12, integration_time=1.0, window=window
-    )
-    assert frames.whole_lines == whole
+def test_the_shape_of_a_line_is_known_where_the_window_has_it_from_end_to_end(rows, columns, whole):
+    assert stack_of(SensorWindow(rows, columns, (8, 6))).whole_lines == whole
 
 
-def test_what_is_measured_in_a_window_is_told_on_the_sensor() -> None:
-    stack = np.zeros((400, 4, 5), np.uint16)
-    taken = {"n_run": None, "bit_depth": 12, "integration_time": 1.0}
+def test_what_is_measured_in_a_window_is_told_on_the_sensor():
     measured = EmpiricalResponse(response=0.1, terms=(ResponseTerm(place=(0, 0, -1), columns=(0, 2)),))
-    window = SensorWindow((2, 6), (1, 6), (8, 6))
-    of_window = FrameStack.of(stack, np.arange(400), None, **taken, window=window)  # type: ignore[arg-type]
+    of_window = stack_of(SensorWindow((2, 6), (1, 6), (8, 6)))
     found = of_window.on_sensor(measured)
-    assert isinstance(found, EmpiricalResponse)
     assert found.terms[0].columns == (1, 3)
     assert of_window.effects([found]) == (measured,)
-    whole = FrameStack.of(stack, np.arange(400), None, **taken, window=None)  # type: ignore[arg-type]
-    assert whole.on_sensor(measured) == measured
+    assert stack_of(None).on_sensor(measured) == measured

@@ -37,26 +37,30 @@ def frames(
     return np.floor(dn + 0.5).astype(np.uint16), PixelMaps(*maps, EVERYWHERE)
 
 
-def measured(stack: tuple[np.ndarray, PixelMaps], inside: np.ndarray = EVERYWHERE) -> EmpiricalNoise | None:
-    """Return what is measured beside a model without common changes."""
-    data = scores(*stack, inside)
-    found = measured_mode(data, nothing(data), stack[1], inside)
+def scores(frames: np.ndarray, maps: PixelMaps) -> dict[Any, Sums]:
+    evidence: Any = None
+    return common_scores(PartSamples(frames, np.arange(len(frames)), maps, evidence, EVERYWHERE))
+
+
+def told(data: dict[Any, Sums], model: dict[Any, Sums] | None = None) -> EmpiricalNoise | None:
+    """Return what sums tell beside those of a model, by default of one without common changes."""
+    nothing = dict.fromkeys(data, Sums(np.ones((1, 1)), np.ones(1), np.arange(1)))
+    found = measured_mode(data, model or nothing, frames(1)[1], EVERYWHERE)
     return None if found is None else found.effect
 
 
-def scores(frames: np.ndarray, maps: PixelMaps, inside: np.ndarray = EVERYWHERE) -> dict[Any, Sums]:
-    """Return the sums of scores of frames."""
-    evidence: Any = None
-    return common_scores(PartSamples(frames, np.arange(len(frames)), maps, evidence, inside))
+def measured(stack: tuple[np.ndarray, PixelMaps]) -> EmpiricalNoise | None:
+    """Return what is measured of frames beside such a model."""
+    return told(scores(*stack))
 
 
-def nothing(data: dict[Any, Sums]) -> dict[Any, Sums]:
-    """Return the sums of a model that makes none of them."""
-    return dict.fromkeys(data, Sums(np.ones((1, 1)), np.ones(1), np.arange(1)))
+def sums_of(changes: str, sums: np.ndarray, numbers: np.ndarray | None = None) -> dict[Any, Sums]:
+    """Return sums of frames of the information 100 each."""
+    numbers = np.arange(len(sums)) if numbers is None else numbers
+    return {("frame", changes): Sums(sums, np.full(1, 100.0), numbers)}
 
 
 def drawn(*shape: int) -> np.ndarray:
-    """Return random numbers of mean 0 and variance 1."""
     return np.random.default_rng(9).standard_normal(shape)
 
 
@@ -65,7 +69,9 @@ def drawn(*shape: int) -> np.ndarray:
     [("frame", (FRAMES, 1, 1)), ("row", (FRAMES, SHAPE[0], 1)), ("column", (FRAMES, 1, SHAPE[1]))],
 )
 def test_a_gain_that_moves_is_told_by_what_shares_it(of: str, shape: tuple[int, ...]) -> None:
-    found = measured(frames(1, gain=1.0 + 0.02 * drawn(*shape)))
+    data = scores(*frames(1, gain=1.0 + 0.02 * drawn(*shape)))
+    assert told(data, data) is None  # what a model makes is taken off
+    found = told(data)
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.burst, mode.shape) == (of, "gain", None, ())
     # its own variance is known to sqrt(2 / n); the scores see a little less where the peaks overlap
@@ -109,22 +115,10 @@ def test_bursts_are_told_however_strong_they_are(size: float) -> None:
     """Far beyond chance a Gaussian of the same power explains nearly as much as bursts do."""
     rng = np.random.default_rng(int(10 * size))
     some = rng.random((FRAMES, 1)) < 0.03
-    data = {
-        ("frame", "noise"): Sums(
-            rng.standard_normal((FRAMES, 1)) * 10.0 + 100.0 * size * some,
-            np.full(1, 100.0),
-            np.arange(FRAMES),
-        )
-    }
-    found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
-    assert found.effect.modes[0].burst == pytest.approx(some.mean(), rel=0.2)
-
-
-def test_a_strong_gaussian_change_is_no_burst() -> None:
-    sums = np.random.default_rng(8).standard_normal((FRAMES, 1))
-    data = {("frame", "noise"): Sums(80.0 * sums, np.full(1, 100.0), np.arange(FRAMES))}
-    found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
-    assert found.effect.modes[0].burst is None
+    found = told(sums_of("noise", rng.standard_normal((FRAMES, 1)) * 10.0 + 100.0 * size * some))
+    assert found.modes[0].burst == pytest.approx(some.mean(), rel=0.2)
+    gaussian = told(sums_of("noise", 80.0 * np.random.default_rng(8).standard_normal((FRAMES, 1))))
+    assert gaussian.modes[0].burst is None
 
 
 def test_noise_of_changing_size_has_the_law_that_is_simulated() -> None:
@@ -134,9 +128,7 @@ def test_noise_of_changing_size_has_the_law_that_is_simulated() -> None:
     weights, widths = mode.model_copy(update={"burst": None}).widths(0.2)
     # of 1 + 0.2 x, x normal: its mean square is 1 + 0.2^2
     assert weights @ widths**2 == pytest.approx(1.04, rel=1e-6)
-    quiet, loud = (
-        simulated(mode, size, read_noise=0.3, light=1e-9).std(axis=(1, 2)) for size in (0.0, 2.0 * 0.2)
-    )
+    quiet, loud = (simulated(mode, size, 0.3, light=1e-9).std(axis=(1, 2)) for size in (0.0, 2.0 * 0.2))
     ratio = np.sort(loud**2 / quiet.mean() ** 2)
     assert abs(np.mean(ratio > 1.25) - 0.1) < 5 * np.sqrt(0.09 / FRAMES)
 
@@ -156,9 +148,7 @@ def test_frames_that_are_left_out_are_no_neighbours() -> None:
     sums = 80.0 * power[:, None] + 10.0 * np.random.default_rng(3).standard_normal((FRAMES, 1))
     seen = np.flatnonzero(np.arange(FRAMES) % 4 < 2)
     for numbers, known in ((seen, True), (np.arange(seen.size), False)):  # and as if none were missing
-        data = {("frame", "gain"): Sums(sums[seen], np.full(1, 100.0), numbers)}
-        found = measured_mode(data, nothing(data), frames(1)[1], EVERYWHERE)
-        [correlation] = found.effect.modes[0].correlation
+        [correlation] = told(sums_of("gain", sums[seen], numbers)).modes[0].correlation
         # half of the pairs that are taken for neighbours without the numbers are none
         assert bool(abs(correlation - 0.47) < 4 / np.sqrt(seen.size / 2)) is known
 
@@ -178,9 +168,8 @@ def test_a_wave_of_gain_or_light_is_told_by_its_frequencies(
     found = measured(stack)
     (mode,) = found.modes
     assert (mode.of, mode.changes, mode.lags, mode.burst) == (of, changes, (), None)
-    assert mode.wave is not None
-    told = mode.wave[0], mode.wave[2 if of == "column" else 1]
-    known = told if np.sign(told[0]) == np.sign(per_frame) else (-told[0], -told[1])
+    wave = np.array([mode.wave[0], mode.wave[2 if of == "column" else 1]])
+    known = wave * np.sign(wave[0] * per_frame)
     # of a sine of amplitude a in n values of which each holds the information i (Rife and Boorstyn 1974)
     sums = scores(*stack)[of, changes]
     error = np.sqrt(24.0 / (amplitude**2 * sums.information.sum() * FRAMES)) / (2.0 * np.pi)
@@ -195,10 +184,9 @@ def test_a_wave_that_a_model_makes_is_not_measured_again() -> None:
     """In frames simulated with it its phase is another, and chance is another."""
     frame, row, _ = np.ogrid[:FRAMES, : SHAPE[0], : SHAPE[1]]
     sine = [0.03 * np.sin(2.0 * np.pi * (0.163 * frame + 0.21 * row) + phase) for phase in (0.4, 2.0)]
-    stacks = [frames(20 + seed, gain=1.0 + each) for seed, each in enumerate(sine)]
-    (data, model), maps = (scores(*stack) for stack in stacks), stacks[1][1]
-    assert measured_mode(data, nothing(data), maps, EVERYWHERE) is not None
-    assert measured_mode(data, model, maps, EVERYWHERE) is None
+    data, model = (scores(*frames(20 + seed, gain=1.0 + each)) for seed, each in enumerate(sine))
+    assert told(data) is not None
+    assert told(data, model) is None
 
 
 @pytest.mark.parametrize("wave", [(0.163, 0.21, 0.0), (0.5, 0.5, 0.0)])
@@ -239,12 +227,6 @@ def test_an_offset_in_bursts_is_told_with_how_often_and_how_large() -> None:
     assert re.search(r"only in \S+ % of the frames", found.describe())
 
 
-def test_what_a_model_makes_is_taken_off() -> None:
-    stack = frames(6, gain=1.0 + 0.03 * drawn(FRAMES, 1, 1))
-    data = scores(*stack)
-    assert measured_mode(data, data, stack[1], EVERYWHERE) is None
-
-
 def simulated(mode: NoiseMode, noise_dn: float, read_noise: float = 1e-6, light: float = 4.0) -> np.ndarray:
     """Return frames of a sensor, with next to no read noise (e-), in which something is shared."""
     sensor = a_uniform_sensor(SHAPE, light, 1 / STEP, 100.0, read_noise)
@@ -263,15 +245,14 @@ def test_the_simulated_change_has_its_size(on: Any) -> None:
 
 
 def test_simulated_bursts_are_as_rare_and_where_they_are_told() -> None:
-    mode = NoiseMode(
-        of="frame", share=1.0, changes="light", signal_dn=4 * STEP, burst=0.04, shape=((1.0, 0.0), (0.0, 0.0))
-    )
+    corner = ((1.0, 0.0), (0.0, 0.0))
+    mode = NoiseMode(of="frame", share=1.0, changes="light", signal_dn=4 * STEP, burst=0.04, shape=corner)
     found = simulated(mode, 2.0 * np.sqrt(0.04) / 2.0 * 4 * STEP)
-    corner, rest = found[:, :8, :10].mean(axis=(1, 2)), found[:, 8:, 10:].mean(axis=(1, 2))
-    high = corner > 6 * STEP
+    there, rest = found[:, :8, :10].mean(axis=(1, 2)), found[:, 8:, 10:].mean(axis=(1, 2))
+    high = there > 6 * STEP
     assert abs(high.mean() - 0.04) < 5 * np.sqrt(0.04 / FRAMES)
     # twice the light more: a root mean square over the sensor of half of that
-    assert corner[high].mean() == pytest.approx(12 * STEP, rel=0.03)
+    assert there[high].mean() == pytest.approx(12 * STEP, rel=0.03)
     assert rest.max() < 6 * STEP
 
 
@@ -281,8 +262,8 @@ def test_a_hit_by_a_particle_needs_no_tables_of_its_codes_and_outweighs_no_other
     hit = stack.copy()
     hit[700, 3, 4] = 60000
     pixels = np.arange(stack[0].size)
-    first, last = (hit.reshape(FRAMES, -1).astype(np.int64).take(pixels, axis=1).min(axis=0), hit.max(axis=0))
-    length = codes_within_reach(maps, pixels, first, last.ravel().astype(np.int64))
+    first, last = (each(axis=0).ravel().astype(np.int64) for each in (hit.min, hit.max))
+    length = codes_within_reach(maps, pixels, first, last)
     assert int(stack.max() - stack.min()) <= length < 1000
     found, usual = measured((hit, maps)), measured((stack, maps))
     assert found.modes[0].changes == usual.modes[0].changes
@@ -293,9 +274,7 @@ def test_a_hit_by_a_particle_needs_no_tables_of_its_codes_and_outweighs_no_other
 def test_a_shape_that_was_found_in_a_window_is_there_on_the_sensor_and_nowhere_else(of: Any) -> None:
     """And as it was in the window, or in another one that shows a part of it."""
     sensor, window = (40, 60), ((10, 26), (20, 40))
-    form: dict[str, Any] = (
-        {"shape": ((0.5, 1.0), (1.5, 0.2))} if of == "frame" else {"profile": (1.0, -0.5, 2.0)}
-    )
+    form: Any = {"shape": ((0.5, 1.0), (1.5, 0.2))} if of == "frame" else {"profile": (1.0, -0.5, 2.0)}
     found = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of=of, share=1.0, **form),))
     of_sensor = found.to_sensor(*window, sensor)
     size = (16, 20)
@@ -308,11 +287,9 @@ def test_a_shape_that_was_found_in_a_window_is_there_on_the_sensor_and_nowhere_e
     whole, inside = relative(of_sensor, sensor), relative(found, size)
     np.testing.assert_allclose(whole[10:26, 20:40], inside)
     assert np.mean(inside**2) == pytest.approx(1.0, abs=0.2)  # of a few pixels, not of a line
-    beyond = np.ones(sensor, bool)
-    beyond[
-        slice(10, 26) if of != "row" else slice(None), slice(20, 40) if of != "column" else slice(None)
-    ] = False
-    assert not whole[beyond].any()
+    y, x = np.indices(sensor)
+    rows, columns = (y >= 10) & (y < 26), (x >= 20) & (x < 40)
+    assert not whole[~{"frame": rows & columns, "row": columns, "column": rows}[of]].any()
     other = relative(of_sensor.to_window((0, 20), (30, 60), sensor), (20, 30))
     np.testing.assert_allclose(other, whole[:20, 30:])
     if of == "frame":

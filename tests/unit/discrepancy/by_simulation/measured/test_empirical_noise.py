@@ -17,13 +17,11 @@ from pchem_pipeline.discrepancy.by_simulation.measured.noise import (
 from pchem_pipeline.discrepancy.by_simulation.measured.samples import PartSamples
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise, NoiseMode, spectrum
-from pchem_pipeline.model.law.mass import sample_mass
-from pchem_pipeline.model.law.sample_law import SampleLaw
+from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise, NoiseMode
 
 ROWS, COLUMNS, FRAMES, STEP = 14, 16, 900, 12.0
 SHAPE = (ROWS, COLUMNS)
+EVERYWHERE = np.ones(SHAPE, bool)
 AMPLITUDE, NEXT = 0.9, 0.7  # DN, and the weight of the neighbour
 POWER = AMPLITUDE**2 * (1 + NEXT**2)
 COVARIANCE = AMPLITUDE**2 * NEXT
@@ -49,7 +47,6 @@ def of_earlier_frames(rng: np.random.Generator) -> np.ndarray:
 
 
 def nothing(rng: np.random.Generator) -> float:
-    """No noise."""
     return 0.0
 
 
@@ -63,10 +60,9 @@ def stack(seed: int, noise: Any, read_noise: float = 0.25, exposure: float = 1.2
     return np.floor(dn + 0.5).clip(0).astype(np.uint16)
 
 
-def measured(frames: np.ndarray, inside: np.ndarray | None = None) -> EmpiricalNoise | None:
+def measured(frames: np.ndarray, inside: np.ndarray = EVERYWHERE) -> EmpiricalNoise | None:
     """Return what is measured beside a model that makes no covariances."""
     numbers = np.arange(FRAMES)
-    inside = np.ones(SHAPE, bool) if inside is None else inside
     evidence = observe(frames, numbers, n_run=FRAMES, block_frames=30)
     found = residual_covariances(PartSamples(frames, numbers, evidence.maps, evidence, inside))
     noise = measured_noise(found, NOTHING, evidence, inside)
@@ -106,12 +102,8 @@ def test_nothing_is_measured_where_there_is_nothing():
 def test_the_shape_of_what_lines_share_is_measured(axis):
     slope = np.linspace(-1.5, 1.5, SHAPE[axis - 1])
 
-    def tilted(rng):
-        if axis == 2:
-            return rng.standard_normal((FRAMES, ROWS, 1)) * slope
-        return rng.standard_normal((FRAMES, 1, COLUMNS)) * slope[:, None]
-
-    found = measured(stack(7, tilted))
+    along, size = {1: (np.s_[:, None], (FRAMES, 1, COLUMNS)), 2: (np.s_[:], (FRAMES, ROWS, 1))}[axis]
+    found = measured(stack(7, lambda rng: rng.standard_normal(size) * slope[along]))
     (mode,) = found.modes  # near samples share it, and nothing else
     assert mode.of == ("row" if axis == 2 else "column")
     shape = mode.along(np.linspace(0.0, 1.0, slope.size))
@@ -119,36 +111,28 @@ def test_the_shape_of_what_lines_share_is_measured(axis):
     power = np.mean(slope**2)
     assert found.share_of(mode) ** 2 == pytest.approx(power, rel=0.25)
     noise = simulated(EmpiricalNoise(noise_dn=1.0, modes=(mode,)))
-    size = noise.std(axis=0)
-    wanted = abs(shape) if axis == 2 else abs(shape)[:, None]
+    wanted = np.broadcast_to(abs(shape)[along], SHAPE)
     # a standard deviation of 600 values has an error of 2.9 %
-    np.testing.assert_allclose(size, np.broadcast_to(wanted, SHAPE), rtol=0.15, atol=0.02)
+    np.testing.assert_allclose(noise.std(axis=0), wanted, rtol=0.15, atol=0.02)
 
 
 def test_only_a_part_is_looked_at():
-    def in_left_half(rng):
-        noise = of_whole_rows(rng) * np.ones(SHAPE)
-        noise[:, :, COLUMNS // 2 :] = 0.0
-        return noise
-
-    frames = stack(5, in_left_half)
-    left = np.zeros(SHAPE, bool)
-    left[:, : COLUMNS // 2] = True
+    left = np.broadcast_to(np.arange(COLUMNS) < COLUMNS // 2, SHAPE)
+    frames = stack(5, lambda rng: of_whole_rows(rng) * left)
     found = measured(frames, left)
     assert found.noise_dn**2 == pytest.approx(POWER, rel=0.25)
     assert measured(frames, ~left) is None
 
 
 def test_what_a_model_makes_is_taken_off():
-    frames = stack(6, of_whole_rows)
-    evidence = observe(frames, np.arange(FRAMES), n_run=FRAMES, block_frames=30)
-    inside = np.ones(SHAPE, bool)
-    data = residual_covariances(PartSamples(frames, np.arange(FRAMES), evidence.maps, evidence, inside))
-    assert measured_noise(data, data, evidence, inside) is None
-    by_chance = {key: Covariance(2.0 * one.error, one.error) for key, one in data.pairs.items()}
-    assert measured_noise(data, Covariances(by_chance, {}), evidence, inside) == measured_noise(
-        data, NOTHING, evidence, inside
-    )
+    frames, numbers = stack(6, of_whole_rows), np.arange(FRAMES)
+    evidence = observe(frames, numbers, n_run=FRAMES, block_frames=30)
+    data = residual_covariances(PartSamples(frames, numbers, evidence.maps, evidence, EVERYWHERE))
+    pairs = {key: Covariance(2.0 * one.error, one.error) for key, one in data.pairs.items()}
+    models = data, Covariances(pairs, {}), NOTHING
+    own, by_chance, nothing = (measured_noise(data, model, evidence, EVERYWHERE) for model in models)
+    assert own is None
+    assert by_chance == nothing
 
 
 def simulated(effect: EmpiricalNoise, n_frames: int = 600) -> np.ndarray:
@@ -171,9 +155,8 @@ def simulated(effect: EmpiricalNoise, n_frames: int = 600) -> np.ndarray:
 )
 def test_the_simulated_noise_has_its_power_and_correlations(mode):
     noise = simulated(EmpiricalNoise(noise_dn=2.0, modes=(mode,)))
-    values = {
-        "sample": noise, "row": noise[:, :, :1], "column": noise[:, :1], "frame": noise[:, :1, :1]
-    }[mode.of]  # fmt: skip
+    parts = {"sample": np.s_[:], "row": np.s_[:, :, :1], "column": np.s_[:, :1], "frame": np.s_[:, :1, :1]}
+    values = noise[parts[mode.of]]
     np.testing.assert_array_equal(noise, np.broadcast_to(values, noise.shape))
     # neighbours count for less than one each
     error = 2.0 / np.sqrt(values.size)
@@ -183,22 +166,6 @@ def test_the_simulated_noise_has_its_power_and_correlations(mode):
         two = values[tuple(slice(max(n, 0), s + min(n, 0)) for n, s in zip(lag, values.shape, strict=True))]
         assert np.mean(one * two) / 4.0 == pytest.approx(wanted, abs=5 * error + 0.03)
         assert abs(wanted) > 10 * (error if mode.of != "frame" else error / 4)
-
-
-def test_the_law_of_a_pixel_has_its_variance():
-    effect = EmpiricalNoise.typical()[0].scaled(4.0)
-    maps = PixelMaps(*(np.array([v]) for v in (1.2, 1 / STEP, 100.0, 3.0)), np.ones(1, bool))
-    codes = np.arange(60, 220)
-    law = sample_mass(effect.sample_law(SampleLaw(), maps), (1.2, 1 / STEP, 100.0, 3.0), codes)[0]
-    wider = np.sqrt(9.0 + effect.noise_dn**2)
-    plain = sample_mass(SampleLaw(), (1.2, 1 / STEP, 100.0, wider), codes)[0]
-    np.testing.assert_allclose(law, plain, atol=1e-4)
-
-
-def test_the_spectrum_of_one_distance_is_a_cosine():
-    found = spectrum(((0, 1, 0),), (0.5,))
-    assert found.shape == (1, 8, 1)
-    np.testing.assert_allclose(found[0, :, 0], np.cos(2 * np.pi * np.arange(8) / 8), atol=1e-12)
 
 
 def test_it_is_found_beside_a_named_effect_and_closes_the_gap():

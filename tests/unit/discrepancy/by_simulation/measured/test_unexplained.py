@@ -1,6 +1,6 @@
 """Of all that can be measured what explains most is simulated first; what fails is told and no more."""
 
-from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,52 +25,35 @@ from pchem_pipeline.effects.operators.replace import Empirical
 TAP = Part(Region(columns=((8, 16),)))
 
 
-@dataclass
-class Goodness:
-    """Fits nothing, and says the same of every set."""
-
-    passes: bool = True
-    small: bool = True
-    present: tuple[()] = ()
-
-    def passes_goodness_of_fit(self, _: Any) -> bool:
-        return self.passes
-
-    def residual_is_small(self, _: Any) -> bool:
-        return self.small
-
-    def model(self, effects: Any) -> Any:
-        return effects
-
-
-def unexplained_beside(fit: Goodness, work: Any = None) -> Unexplained:
-    """Return what measures frames, with fits of which so much is said."""
-    return Unexplained(work, fit)  # type: ignore[arg-type]
+def unexplained_beside(work: Any = None, *, small: bool = True) -> Unexplained:
+    """Return what measures frames, with fits that say the same of every set."""
+    fit: Any = SimpleNamespace(
+        present=(),
+        passes_goodness_of_fit=lambda _: True,
+        residual_is_small=lambda _: small,
+        model=lambda effects: effects,
+    )
+    return Unexplained(work, fit)
 
 
 def test_the_form_and_part_that_explain_most_come_first() -> None:
-    effect = Empirical.typical()[0]
-
-    def moves(part: Part, *_: Any) -> Measurement | None:
-        return Measurement(effect, 30.0) if part == Part() else None
-
-    def noise(part: Part, *_: Any) -> Measurement:
-        return Measurement(effect, 700.0 if part == TAP else 20.0)
+    of = partial(Measurement, Empirical.typical()[0])
 
     def broken(*_: Any) -> Measurement:
         raise ValueError("no such line")
 
     frames: Any = SimpleNamespace(parts=(TAP,), samples=lambda part: 300 if part == TAP else 1000)
-    nothing: Any = None
-    effort = Effort(1.0)
-    observed = ObservedFrames(frames, nothing, nothing)
-    work = SimpleNamespace(frames=frames, observed=observed, effort=effort)
-    unexplained = unexplained_beside(Goodness(), work)
-    forms = {"moves": moves, "noise": noise, "broken": broken}
+    nothing, effort, counted = None, Effort(1.0), Effort(1.0)
+    work = SimpleNamespace(frames=frames, observed=ObservedFrames(frames, nothing, nothing), effort=effort)
+    unexplained = unexplained_beside(work)
+    forms = {
+        "moves": lambda part, *_: of(30.0) if part == Part() else None,
+        "noise": lambda part, *_: of(700.0 if part == TAP else 20.0),
+        "broken": broken,
+    }
     found = [(one.part, one.form) for one in unexplained._likeliest((), forms)]
     assert found == [(TAP, "noise"), (Part(), "moves"), (Part(), "noise")]
     assert "no such line" in unexplained.defects["broken"]
-    counted = Effort(1.0)
     counted.ask(1300)
     assert effort.spent == counted.spent > 0.0
 
@@ -83,7 +66,7 @@ def test_effects_that_leave_a_tenth_of_what_they_closed_get_no_name_where_the_fi
 
 
 def test_the_clearer_of_noise_and_gain_is_told_and_a_wave_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    unexplained = unexplained_beside(Goodness())
+    unexplained = unexplained_beside()
     samples = SimpleNamespace(of=lambda _: None, maps=None, evidence=None, inside=None)
     monkeypatch.setattr(unexplained, "_of", lambda *_: samples)
     effect = EmpiricalNoise.typical()[0]
@@ -109,7 +92,7 @@ def test_the_clearer_of_noise_and_gain_is_told_and_a_wave_first(monkeypatch: pyt
 def test_what_is_measured_is_yielded_until_one_leaves_little_and_measured_once(
     little: bool, measured: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    unexplained = unexplained_beside(Goodness(small=little))
+    unexplained = unexplained_beside(small=little)
     one = Measurement(Empirical.typical()[0], 9.0)
     likely = [_Likely(Part(), form, one) for form in ("any", "fails", "other")]
     asked: list[Any] = []
@@ -127,12 +110,8 @@ def test_what_is_measured_is_yielded_until_one_leaves_little_and_measured_once(
     [(0.0, True, True), (0.4, True, True), (0.6, True, False), (0.6, False, True), (2.0, False, False)],
 )
 def test_what_is_measured_must_close_half_of_the_gap(after: float, measured: bool, closes: bool) -> None:
-    gaps = {
-        name: Gap(value, 0.01, (value - 0.1, value + 0.1), {}) for name, value in (("b", 1.0), ("a", after))
-    }
-    judge: Any = SimpleNamespace(
-        gap=lambda _: gaps["b"], gap_at=lambda *_: gaps["a"], widens=lambda _: after > 1.0
-    )
+    first, last = (Gap(value, 0.01, (value - 0.1, value + 0.1), {}) for value in (1.0, after))
+    judge: Any = SimpleNamespace(gap=lambda _: first, gap_at=lambda *_: last, widens=lambda _: after > 1.0)
     nothing: Any = None
     work: Any = SimpleNamespace(effort=Effort(None))
     data = Prepared(DiscrepancySettings(), "frames", nothing, nothing, nothing, nothing, work.effort, {})

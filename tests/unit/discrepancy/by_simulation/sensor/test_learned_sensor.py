@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.plain_camera import PlainCamera
 from helpers.small_sensors import context_of
+from helpers.small_sensors import seen as seen_in
 from scipy import stats
 
 from pchem_pipeline.base.errors import ConfigError
@@ -30,7 +31,6 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import (
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
 from pchem_pipeline.discrepancy.effort import Effort
-from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
 from pchem_pipeline.effects.framework.compose import added_exposures
 from pchem_pipeline.effects.framework.effect import Effect, Plane
@@ -60,23 +60,22 @@ def logs_error(seen, some):
     return found[np.isfinite(found).all(axis=1)]
 
 
-def seen_in(frames):
-    return observe(frames, np.arange(len(frames)), n_run=len(frames), block_frames=50)
-
-
 def truth_in_logs(camera, seed):
     """Return the parameters of a camera's pixels as a fit has them, (row, column, 4)."""
     exposure, step, bias, noise = camera.maps(np.random.default_rng(seed))
     return np.stack([np.log(exposure), np.log(step), bias, 2 * np.log(noise * step)], axis=-1)
 
 
-def learnt(camera, seed):
-    """Return the truth (n, 4), the fits' evidence, and the sensor learnt from the same frames."""
-    frames = camera.frames(seed)
+def learnt_from(frames):
+    """Return the fits' evidence of frames, and the sensor learnt from them."""
     seen = seen_in(frames)
     fit = Refit(seen.maps, {}, seen.covariance)
-    sensor = learn_sensor(frames, np.arange(len(frames)), fit, (), seen.ambiguous)
-    return truth_in_logs(camera, seed), seen, sensor
+    return seen, learn_sensor(frames, np.arange(len(frames)), fit, (), seen.ambiguous)
+
+
+def learnt(camera, seed):
+    """Return the truth (n, 4), the fits' evidence, and the sensor learnt from the same frames."""
+    return truth_in_logs(camera, seed), *learnt_from(camera.frames(seed))
 
 
 def test_bright_pixels_find_their_gain_under_a_strong_effect():
@@ -102,10 +101,9 @@ def test_a_poor_sensor_with_a_bent_curve_is_learnt_under_its_law():
     effect = AdcInl(inl_lsb=1.5, period_dn=120.0)
     values = bias + step * (rng.poisson(exposure, shape) + noise * rng.standard_normal(shape))
     frames = np.rint(values + 1.5 * np.sin(2 * np.pi * values / 120.0)).astype(np.uint16)
-    numbers = np.arange(1500)
     seen = seen_in(frames)
     fit = refit_maps(frames, seen.maps, [effect], seen.covariance)
-    sensor = learn_sensor(frames, numbers, fit, [effect], MANY_MISTAKEN + 0.1)
+    sensor = learn_sensor(frames, np.arange(1500), fit, [effect], MANY_MISTAKEN + 0.1)
     off = logs(sensor.draw(1), sensor.drawn)[:, 0] - np.log(exposure[sensor.drawn])
     assert abs(np.median(off)) < 0.05
 
@@ -132,9 +130,9 @@ def test_a_sensor_is_learnt_from_corrected_samples(effect):
     fit = Refit(seen.maps, {}, seen.covariance)
     sensor = learn_sensor(frames, numbers, fit, [effect], seen.ambiguous, before=before)
     some = sensor.drawn & inside
-    off = (logs(sensor.draw(1), some) - truth[some]) / np.median(logs_error(seen, some), axis=0)
-    plain = logs(seen.maps, some & seen.maps.usable) - truth[some & seen.maps.usable]
-    plain /= np.median(logs_error(seen, some), axis=0)
+    error, both = np.median(logs_error(seen, some), axis=0), some & seen.maps.usable
+    off = (logs(sensor.draw(1), some) - truth[some]) / error
+    plain = (logs(seen.maps, both) - truth[both]) / error
     limit = 5 * 1.25 * np.sqrt(2 / some.sum())
     assert (np.abs(np.median(off, axis=0)) < limit).all()
     assert (np.abs(np.median(plain, axis=0))[:2] > 2 * limit).all()
@@ -143,19 +141,16 @@ def test_a_sensor_is_learnt_from_corrected_samples(effect):
 def test_pixels_of_a_noisy_sensor_scatter_as_the_true_ones():
     """At 0.5 e- and 600 frames the fits scatter several times as much in gain and noise as the truth does."""
     truth, seen, sensor = learnt(PlainCamera(0.5, 1.5, 12.0, (24, 24), 600, SPREAD), 3)
-    every = sensor.drawn
-    fits = logs(seen.maps, seen.maps.usable)
-    drawn = logs(sensor.draw(1), every)
-    spread, real = drawn.std(axis=0), truth[every].std(axis=0)
-    assert (fits.std(axis=0) > 3 * real)[[1, 3]].all()
+    truth, drawn = truth[sensor.drawn], logs(sensor.draw(1), sensor.drawn)
+    spread, real, of_fits = (each.std(axis=0) for each in (drawn, truth, logs(seen.maps, seen.maps.usable)))
+    assert (of_fits > 3 * real)[[1, 3]].all()
     assert (spread > 0.6 * real).all()
-    assert (spread < np.minimum(4 * real, fits.std(axis=0))).all()
+    assert (spread < np.minimum(4 * real, of_fits)).all()
     # the middle of all pixels lies within its error
-    far = sensor.posterior.population.centre - np.median(truth[every], axis=0)
+    far = sensor.posterior.population.centre - np.median(truth, axis=0)
     assert (np.abs(far) < 4 * np.sqrt(np.diag(sensor.posterior.population.uncertainty))).all()
     # and it is the same pixel that is bright or has a high bias
-    assert np.corrcoef(drawn[:, 0], truth[every][:, 0])[0, 1] > 0.7
-    assert np.corrcoef(drawn[:, 2], truth[every][:, 2])[0, 1] > 0.7
+    assert all(np.corrcoef(drawn[:, i], truth[:, i])[0, 1] > 0.7 for i in (0, 2))
 
 
 def test_pixels_of_a_sharp_sensor_stay_what_they_are():
@@ -208,11 +203,9 @@ def test_a_sensor_of_which_no_pixel_is_known_is_not_learnt():
     with pytest.raises(NotFittedError, match="no pixel"):
         sensor.corrected(seen.maps, none)
     unknown = Refit(seen.maps, {}, np.full((8, 8, 4, 4), np.nan))
-    frames = np.zeros((8, 8, 8), np.uint16)
-    with pytest.raises(NotFittedError, match="no pixel"):
-        learn_sensor(frames, np.arange(8), unknown, (Lawless(row_noise_dn=1.0),), 0.0)
-    with pytest.raises(NotFittedError, match="no pixel"):
-        learn_sensor(frames, np.arange(8), unknown, (), 0.0)
+    for effects in ((Lawless(row_noise_dn=1.0),), ()):
+        with pytest.raises(NotFittedError, match="no pixel"):
+            learn_sensor(np.zeros((8, 8, 8), np.uint16), np.arange(8), unknown, effects, 0.0)
 
 
 def test_errors_of_estimates_are_taken_off():
@@ -236,13 +229,11 @@ def test_errors_of_estimates_are_taken_off():
 
 def test_a_replicate_mistakes_as_many_biases_as_the_frames_do():
     """Begun at the truth, hardly a fit is an electron off; treated as the data are, as many as of frames."""
-    rng = np.random.default_rng(5)
-    shape = (32, 32)
-    ones = np.ones(shape)
-    maps = PixelMaps(2.7 * ones, ones / 11, 100 + rng.standard_normal(shape), 0.41 * 11 * ones, ones > 0)
-    numbers = np.arange(600)
+    rng, ones, numbers = np.random.default_rng(5), np.ones((32, 32)), np.arange(600)
+    bias = 100 + rng.standard_normal((32, 32))
+    maps = PixelMaps(2.7 * ones, ones / 11, bias, 0.41 * 11 * ones, ones > 0)
     known = Acquisition(numbers, 1200, 50, 12)
-    anew = Acquisition(numbers, 1200, 50, 12, other=np.arange(600, 1200))
+    anew = replace(known, other=np.arange(600, 1200))
     truth = truth_of(maps).bias
 
     def mistaken(taken, seed):
@@ -262,13 +253,11 @@ def test_a_replicate_mistakes_as_many_biases_as_the_frames_do():
 def test_a_replicate_of_two_parts_has_the_statistics_of_both():
     ones = np.ones((16, 16))
     maps = PixelMaps(1.5 * ones, ones / 10, 100 * ones, 3.0 * ones, ones > 0)
-    taken = Acquisition(np.arange(200), 400, 20, 12, other=np.arange(200, 400))
-    found = by_part(Replicate("x", maps, (), 1, taken)())
-    assert len(found) == 2
-    assert found[0].keys() == found[1].keys()
-    assert found[0]["shape.C2.mean"] != pytest.approx(found[1]["shape.C2.mean"])
-    [alone] = by_part(Replicate("x", maps, (), 1, Acquisition(np.arange(200), 400, 20, 12))())
-    assert alone.keys() == found[0].keys()
+    taken = Acquisition(np.arange(200), 400, 20, 12)
+    both = replace(taken, other=np.arange(200, 400))
+    [alone], [first, second] = (by_part(Replicate("x", maps, (), 1, each)()) for each in (taken, both))
+    assert alone.keys() == first.keys() == second.keys()
+    assert first["shape.C2.mean"] != pytest.approx(second["shape.C2.mean"])
 
 
 def test_read_noise_that_the_fit_takes_for_signal_is_given_back():
@@ -307,9 +296,8 @@ def test_a_sensor_is_moved_to_another_law_as_the_fits_of_its_pixels_are():
     camera, rng = PlainCamera(0.3, 2.5, 12.0, (20, 20), 1500, SPREAD), np.random.default_rng(5)
     truth, noisy = truth_in_logs(camera, 4), np.tile(np.arange(20) < 10, (20, 1))
     frames = camera.frames(4) + np.rint(noisy * 2.5 * rng.standard_normal((1500, 20, 1)))
-    frames, numbers = frames.astype(np.uint16), np.arange(1500)
-    seen = seen_in(frames)
-    plain = learn_sensor(frames, numbers, Refit(seen.maps, {}, seen.covariance), (), seen.ambiguous)
+    frames = frames.astype(np.uint16)
+    seen, plain = learnt_from(frames)
     effect = RowNoise(row_noise_dn=2.5, region=Region(columns=((0, 10),)))
     fit = refit_maps(frames, seen.maps, [effect], seen.covariance)
     sensor = plain.refitted(seen.maps, fit.maps)
@@ -335,11 +323,8 @@ def test_what_an_effect_without_a_law_adds_is_not_simulated_twice():
     truth = camera.maps(np.random.default_rng(9))[3]
     frames = camera.frames(9).astype(float)
     frames[:, 1:] += effect.share * frames[:, :-1]
-    frames = np.rint(frames).astype(np.uint16)
-    numbers = np.arange(len(frames))
-    seen = seen_in(frames)
-    sensor = learn_sensor(frames, numbers, Refit(seen.maps, {}, seen.covariance), (), seen.ambiguous)
-    taken = Acquisition(numbers, len(frames), 50, 12)
+    seen, sensor = learnt_from(np.rint(frames).astype(np.uint16))
+    taken = Acquisition(np.arange(len(frames)), len(frames), 50, 12)
 
     def too_noisy(one):
         drawn = one.draw(4)

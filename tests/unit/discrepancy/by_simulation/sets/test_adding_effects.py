@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from helpers.refitted_world import NAMES, M, Mean, World
 from scipy import stats
 
 from pchem_pipeline.discrepancy.build_verdict import Findings
@@ -16,21 +17,17 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import Repli
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     PRICE_OF_MORE,
     Hypothesis,
-    SetFit,
     fit_set,
-    likeliest_sets,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import Screened
 from pchem_pipeline.discrepancy.by_simulation.explainer import FrameExplainer
-from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, Refitter
-from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, chosen
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
+from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison
 from pchem_pipeline.discrepancy.by_simulation.sets.search import Search, Trial, _grown, compare
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
 from pchem_pipeline.discrepancy.gap import StatisticsGap
 from pchem_pipeline.discrepancy.null import Covariance, Measured, NullModel
-from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import Prepared
@@ -39,8 +36,6 @@ from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
 from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise, NoiseMode
 
-NAMES = tuple(name for name in STATISTICS if not name.startswith("frame.repeated"))[:24]
-M = len(NAMES)
 STRENGTHS = {
     "row_noise": "row_noise_dn",
     "frame_noise": "frame_noise_dn",
@@ -76,58 +71,15 @@ def hypothesis(tag: str, strength: float = 0.1, **more: float) -> Hypothesis:
     return Hypothesis(one, 1.5 * statistics([one]))
 
 
-class World:
-    """Refitted models that can be drawn from, and how often that was done."""
-
-    def __init__(self, truth: Sequence[Effect], seed: int = 1) -> None:
-        self.rng = np.random.default_rng(seed)
-        self.drawn = 0
-        self.unfit: Callable[[Sequence[Effect]], bool] = lambda _: False
-        self.null = NullModel.from_replicates(NAMES, self.rng.standard_normal((40, M)))
-        mean = statistics(truth)
-        self.z = Measured(*(mean + self.rng.standard_normal(M) for _ in range(3)))
-
-    def draw(self, effects: tuple[Effect, ...], count: int) -> np.ndarray:
-        if self.unfit(effects):
-            raise NotFittedError("hardly a pixel can be fitted with it")
-        self.drawn += count
-        vectors = statistics(effects) + np.random.default_rng(7).standard_normal((count, M))
-        return vectors
-
-    def refitter(self) -> Refitter:
-        return Refitter(self.draw, self.null, self.z.both)
-
-    def likely(self, *hypotheses: Hypothesis, mean: np.ndarray | float = 0.0) -> list[SetFit]:
-        noise = self.refitter().noise(self.null.covariance, 40)
-        return likeliest_sets(hypotheses, self.z.both - self.null.mean - mean, noise)
-
-    def compare(
-        self, *hypotheses: Hypothesis, beside: Sequence[Hypothesis] = (), **how: Any
-    ) -> Comparison | None:
-        grown = (lambda one: self.likely(*beside, mean=one.mean)) if beside else (lambda _: [])
-        return self.best_of(hypotheses, self.likely(*hypotheses), beside=grown, **how)
-
-    def best_of(
-        self,
-        hypotheses: Sequence[Hypothesis],
-        sets: list[SetFit],
-        likelihood: HistogramLikelihood | None = None,
-        **how: Any,
-    ) -> Comparison | None:
-        search = Search(self.refitter(), likelihood or HistogramLikelihood())
-        compare(search, hypotheses, sets, **how)
-        search.refitter = replace(search.refitter, allow=lambda _: None)
-        return chosen(search)
-
-    def chosen(self, *hypotheses: Hypothesis, **how: Any) -> frozenset[str] | None:
-        """Return the tags of the chosen set; None where none holds."""
-        found = self.compare(*hypotheses, **how)
-        return None if found is None else found.chosen.tags
+def world_of(
+    *, mean: Mean = statistics, seed: int = 1, beside: np.ndarray | float = 0.0, **strengths: float
+) -> World:
+    return World([effect(*each) for each in strengths.items()], mean, seed, beside)
 
 
 @pytest.mark.parametrize("strength", [0.03, 0.1, 0.4, 1.2])
 def test_a_strength_is_refined_by_refits_until_it_stops_moving(strength: float) -> None:
-    world = World([effect("row_noise", strength)])
+    world = world_of(row_noise=strength)
     found = world.refitter().refined([hypothesis("row_noise")])
     assert found.settled
     wanted, [got] = factor(effect("row_noise", strength)), [factor(e) for e in found.effects]
@@ -136,7 +88,7 @@ def test_a_strength_is_refined_by_refits_until_it_stops_moving(strength: float) 
     assert world.drawn <= 6 * 7
 
 
-def test_a_dip_on_the_way_to_the_best_strength_is_crossed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dip_on_the_way_to_the_best_strength_is_crossed() -> None:
     """As of row noise of 0.4 e-: what it moves goes slowly with its strength, many others to and fro.
 
     So steps are short, the next one explains less, and the data ask for the same on both sides of that.
@@ -148,8 +100,7 @@ def test_a_dip_on_the_way_to_the_best_strength_is_crossed(monkeypatch: pytest.Mo
         slow, to_and_fro = 40.0 + 18.0 * np.tanh(way / 1.2), np.exp(-0.5 * ((way - dip) / 0.08) ** 2)
         return (np.eye(M)[0] * slow + (np.arange(M) >= M // 2) * 1.6 * to_and_fro) * (way > -50.0)
 
-    monkeypatch.setitem(globals(), "statistics", bent)
-    world = World([effect("row_noise", 0.1)])
+    world = world_of(row_noise=0.1, mean=bent)
     start = Hypothesis(effect("row_noise", 0.1 * np.exp(0.5)), bent([effect("row_noise", 0.1)]))
     found = world.refitter().refined([start])
     assert np.log(factor(found.effects[0]) / best) < dip - 0.15
@@ -171,8 +122,7 @@ def test_slopes_that_are_too_steep_cost_few_steps(monkeypatch: pytest.MonkeyPatc
         world.drawn += count
         return weak(effects) + world.rng.standard_normal((count, M))
 
-    monkeypatch.setitem(globals(), "statistics", weak)
-    world = World([effect("row_noise", 0.1)])
+    world = world_of(row_noise=0.1, mean=weak)
     monkeypatch.setattr(world, "draw", draw)
     start = Hypothesis(effect("row_noise", 0.1 * np.exp(-0.7)), (np.arange(M) >= M // 2) * 18.0)
     found = world.refitter().refined([start])
@@ -188,11 +138,10 @@ def test_the_error_of_a_strong_effect_is_that_of_its_slope(
 ) -> None:
     """The normal quantile of a sum of squares goes as a cubic root where one mode is nearly all of it."""
     monkeypatch.setitem(TRUTH, "row_noise", (np.eye(M)[0] * 40.0, power))
-    truth, off = [effect(tag, 0.1) for tag in tags], []
+    off = []
     for seed in range(12):
-        world = World(truth, seed)
         guesses = [effect(tag, 0.103) for tag in tags]
-        refitter = world.refitter()
+        refitter = world_of(**dict.fromkeys(tags, 0.1), seed=seed).refitter()
         found = refitter.refined([Hypothesis(guess, statistics([guess])) for guess in guesses])
         found = refitter.sharpened(found, 24)
         # chance, and 3 % that are allowed to the details of an effect
@@ -210,11 +159,9 @@ def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
     factors = {}
     for place in (None, Region(rows=((3, 8),))):
         for chance in (0.0, 8.0):
-            world = World([effect("row_noise", 0.2)])
+            world = world_of(row_noise=0.2, beside=chance * np.eye(M)[1])
             names = (NAMES[0], f"{NAMES[0]}@rows=3:8", *NAMES[2:])
             world.null = replace(world.null, names=names)
-            world.z = replace(world.z, train=world.z.train + chance * np.eye(M)[1])
-            world.z = replace(world.z, test=world.z.test + chance * np.eye(M)[1])
             guess = hypothesis("row_noise", 0.2)
             found = world.refitter().refined([replace(guess, effect=guess.effect.at_place(place))])
             factors[place is None, chance] = factor(found.effects[0]) * float(np.exp(found.change[0]))
@@ -224,22 +171,27 @@ def test_a_part_that_stands_out_makes_no_effect_stronger_that_acts_everywhere(
 
 def test_an_expensive_refit_is_not_repeated_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pchem_pipeline.discrepancy.by_simulation.sets.refits.is_expensive", lambda _: True)
-    world = World([effect("row_noise", 2.0)])
+    world = world_of(row_noise=2.0)
     found = world.refitter().refined([hypothesis("row_noise", 0.02)])
     assert world.drawn <= 3 * 6
     assert not found.settled
 
 
-@pytest.mark.parametrize("paid", [1, 2, 3])
-def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> None:
-    world, asked = World([effect("row_noise", 1.2)]), []
+def limit(paid: int) -> Callable[[str], None]:
+    """Return what allows so many refits."""
+    left = iter(range(paid))
 
     def allow(words: str) -> None:
-        asked.append(words)
-        if len(asked) > paid:
+        if next(left, None) is None:
             raise EffortSpentError(words)
 
-    found = replace(world.refitter(), allow=allow).refined([hypothesis("row_noise")])
+    return allow
+
+
+@pytest.mark.parametrize("paid", [1, 2, 3])
+def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> None:
+    world = world_of(row_noise=1.2)
+    found = replace(world.refitter(), allow=limit(paid)).refined([hypothesis("row_noise")])
     assert world.drawn == 6 * paid
     whole = world.refitter().refined([hypothesis("row_noise")])
     assert (found.effects == (effect("row_noise", 0.1),)) == (paid == 1)
@@ -247,14 +199,13 @@ def test_a_refit_that_meets_the_limit_keeps_the_steps_before_it(paid: int) -> No
 
 
 def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> None:
-    world = World([effect("row_noise", 0.5), effect("frame_noise", 0.3)])
+    world = world_of(row_noise=0.5, frame_noise=0.3)
     known = world.refitter().refined([hypothesis("row_noise"), hypothesis("frame_noise")])
     drift = hypothesis("exposure_drift")
 
     def begun(members: Sequence[Hypothesis], *tried: Refitted) -> tuple[Hypothesis, ...]:
-        return Search(world.refitter(), HistogramLikelihood(), [Trial.of(one) for one in tried])._started(
-            members
-        )
+        trials = [Trial.of(one) for one in tried]
+        return Search(world.refitter(), HistogramLikelihood(), trials)._started(members)
 
     first, second = begun([hypothesis("row_noise"), drift], known)
     assert (first.effect, second) == (hypothesis("row_noise").effect, drift)  # one in common is not enough
@@ -267,7 +218,7 @@ def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> No
 
 
 def test_a_set_that_cannot_come_to_another_is_not_simulated_further() -> None:
-    world = World([effect("row_noise", 0.4), effect("frame_noise", 0.4)])
+    world = world_of(row_noise=0.4, frame_noise=0.4)
     told: list[str] = []
     search = Search(world.refitter(), HistogramLikelihood(), report=told.append)
     both = search.at_best_fit([hypothesis("row_noise", 0.4), hypothesis("frame_noise", 0.4)])
@@ -281,23 +232,17 @@ def test_a_set_that_cannot_come_to_another_is_not_simulated_further() -> None:
 
 
 def test_a_promising_set_does_not_wait_for_the_best_strengths_of_its_effects() -> None:
-    world = World([effect("row_noise", 0.4), effect("frame_noise", 0.4)])
+    world = world_of(row_noise=0.4, frame_noise=0.4)
     hypotheses = [hypothesis(tag) for tag in STRENGTHS]
-    asked: list[str] = []
-
-    def allow(words: str) -> None:
-        asked.append(words)
-        if len(asked) > 3:  # each of the two, and both
-            raise EffortSpentError(words)
-
-    search = Search(replace(world.refitter(), allow=allow), HistogramLikelihood())
+    three = limit(3)  # each of the two, and both
+    search = Search(replace(world.refitter(), allow=three), HistogramLikelihood())
     compare(search, hypotheses, world.likely(*hypotheses))
     assert search.limit is not None
     assert search.best.tags == {"row_noise", "frame_noise"}
 
 
 def test_a_single_effect_that_leaves_nothing_stands_alone() -> None:
-    world = World([effect("row_noise", 0.5)])
+    world = world_of(row_noise=0.5)
     # frame noise helps the fingerprint of row noise out where that is extrapolated
     mimic = Hypothesis(effect("frame_noise", 0.1), 20.0 * (np.eye(M)[0] + np.eye(M)[1]))
     found = world.compare(hypothesis("row_noise"), mimic)
@@ -318,8 +263,8 @@ def likelihood_of(behind: Callable[[str, str], tuple[float, float] | None]) -> H
 def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    world = World([effect("row_noise", 0.5)])
-    twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
+    world, guess = world_of(row_noise=0.5), hypothesis("row_noise", 0.5)
+    twin = Hypothesis(effect("frame_noise", 0.5), guess.fingerprint)
     row, asked = TRUTH["row_noise"], []
 
     def decided(one: str, other: str) -> tuple[float, float]:
@@ -327,10 +272,9 @@ def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
         return (12.0, 4.0) if one == "frame_noise" else (-12.0, 4.0)
 
     monkeypatch.setitem(TRUTH, "frame_noise", (row[0] + 0.5 * np.eye(M)[1], row[1]))
-    plain: Any = world.compare(hypothesis("row_noise", 0.5), twin)
-    found: Any = world.compare(hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(decided))
-    open_: Any = world.compare(
-        hypothesis("row_noise", 0.5), twin, likelihood=likelihood_of(lambda *_: (-3.0, 4.0))
+    plain, found, open_ = (
+        world.compare(guess, twin, likelihood=likelihood_of(behind) if behind else None)
+        for behind in (None, decided, lambda *_: (-3.0, 4.0))
     )
     assert plain.chosen.tags == open_.chosen.tags == {"row_noise"}
     assert found.chosen.tags == {"frame_noise"}
@@ -344,13 +288,12 @@ def test_histograms_decide_between_effects_that_the_statistics_tell_badly_apart(
 
 def test_statistics_that_are_all_off_a_little_are_no_good_fit() -> None:
     """Each by less than chance may leave among so many, but all of them by more than it does together."""
-    world, guess = World([effect("row_noise", 0.5)]), [hypothesis("row_noise", 0.5)]
+    world, guess = world_of(row_noise=0.5), [hypothesis("row_noise", 0.5)]
     fitted = world.refitter().refined(guess)
     assert world.refitter().passes_goodness_of_fit(fitted)
     scatter = world.refitter().scatter(fitted.covariance, len(fitted.vectors))
-    off = replace(
-        world.refitter(), target=fitted.mean + 2.6 * scatter * np.where(np.arange(M) % 2, 1.0, -1.0)
-    )
+    to_and_fro = np.where(np.arange(M) % 2, 1.0, -1.0)
+    off = replace(world.refitter(), target=fitted.mean + 2.6 * scatter * to_and_fro)
     left = off.refined(guess)
     assert np.abs(left.rest).max() < 2.0
     assert not off.passes_goodness_of_fit(left)
@@ -360,10 +303,10 @@ def test_predictions_that_lie_near_each_other_are_not_told_apart_by_chance(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Two errors apart, they are told apart by two nats; by chance the likelihood makes nearly five of it."""
-    row, world = TRUTH["row_noise"], World([effect("row_noise", 0.5)], seed=20)
+    row, world = TRUTH["row_noise"], world_of(row_noise=0.5, seed=20)
     twin = Hypothesis(effect("frame_noise", 0.5), hypothesis("row_noise", 0.5).fingerprint)
     monkeypatch.setitem(TRUTH, "frame_noise", (row[0] + 0.35 * np.eye(M)[1], row[1]))
-    found: Any = world.compare(hypothesis("row_noise", 0.5), twin)
+    found = world.compare(hypothesis("row_noise", 0.5), twin)
     _, second = found.rivals_of(found.chosen.hypotheses[0])
     assert second.score < -4.0
     assert second.stderr == pytest.approx(2.4, abs=0.1)
@@ -372,39 +315,33 @@ def test_predictions_that_lie_near_each_other_are_not_told_apart_by_chance(
 
 def test_what_a_strong_effect_hides_is_asked_for_beside_it() -> None:
     """Nothing in the frames leads to the noise of frames: it is guessed of what the rows' leaves."""
-    world = World([effect("row_noise", 0.3), effect("frame_noise", 0.04)])
+    world = world_of(row_noise=0.3, frame_noise=0.04)
     alone = world.compare(hypothesis("row_noise"))
     assert alone.chosen.tags == {"row_noise"}
     grown = world.compare(hypothesis("row_noise"), beside=[hypothesis("frame_noise", 0.04)])
     assert grown.chosen.tags == {"row_noise", "frame_noise"}
 
 
-def seeds(refitter: Refitter, *tried: Refitted) -> list[frozenset[str]]:
-    """Return the sets, of those that were tried, beside which others are asked for."""
-    asked: list[frozenset[str]] = []
-    search = Search(refitter, HistogramLikelihood(), [Trial.of(one) for one in tried])
-    _grown(search, lambda one: asked.append(one.tags) or [])  # type: ignore[func-returns-value]
-    return asked
-
-
 def test_a_part_of_a_better_set_is_not_grown_again() -> None:
-    refitter = World([effect(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift")]).refitter()
+    refitter = world_of(row_noise=0.3, frame_noise=0.3, exposure_drift=0.3).refitter()
     row, frame, drift = (hypothesis(tag) for tag in ("row_noise", "frame_noise", "exposure_drift"))
     # of all that there is to explain each explains nearly as much
     far = replace(refitter, null=replace(refitter.null, mean=refitter.null.mean - 1e4 * np.eye(M)[0]))
-    alone, both, other = (refitter.refined(one) for one in ([row], [row, frame], [row, drift]))
-    assert seeds(far, alone, both) == [{"row_noise", "frame_noise"}]
-    assert len(seeds(far, other, both)) == 2
+    alone, both, other = map(refitter.refined, ([row], [row, frame], [row, drift]))
+    for tried, seeds in (((alone, both), [both.tags]), ((other, both), [other.tags, both.tags])):
+        asked: list[frozenset[str]] = []
+        search = Search(far, HistogramLikelihood(), [Trial.of(one) for one in tried])
+        _grown(search, lambda one, asked=asked: asked.append(one.tags) or [])  # type: ignore[misc]
+        assert sorted(asked, key=sorted) == sorted(seeds, key=sorted)
 
 
 def test_an_effect_that_its_set_lets_vanish_does_not_take_the_others_with_it() -> None:
     """Of three effects that the fingerprints ask for one is not there, and something is left."""
-    true = effect("row_noise", 0.3), effect("frame_noise", 0.3), effect("interpixel_capacitance", 0.1)
-    world = World(true)
+    world = world_of(row_noise=0.3, frame_noise=0.3, interpixel_capacitance=0.1)
     row, frame, drift = (hypothesis(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift"))
     shift, noise = world.z.both - world.null.mean, world.refitter().noise(world.null.covariance, 40)
     fit = fit_set([row, frame, drift], shift, noise)
-    found = world.best_of([row, frame, drift], [fit])
+    found = world.compare(row, frame, drift, sets=[fit])
     assert found.chosen.tags == {"row_noise", "frame_noise"}
 
 
@@ -413,13 +350,13 @@ def test_what_is_measured_competes_with_several_effects_at_its_price(left: float
     """One thing is simpler than three effects, if it leaves nothing either; with two it is not compared."""
     tags = ("row_noise", "frame_noise", "exposure_drift")
     guesses = [hypothesis(tag, 0.3) for tag in tags]
-    best = World([effect(tag, 0.3) for tag in tags]).compare(*guesses).chosen
+    best = world_of(**dict.fromkeys(tags, 0.3)).compare(*guesses).chosen
     assert len(best.tags) == 3
     noise = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
     whole = replace(best, hypotheses=(Hypothesis(noise, best.parts.sum(axis=0)),))
     assert whole.price == PRICE_OF_MORE
     whole = replace(whole, score=best.score - 10.0, rest=best.rest + left)
-    world = World([effect(tag, 0.3) for tag in tags])
+    world = world_of(**dict.fromkeys(tags, 0.3))
     found = world.compare(*guesses, measured=lambda kept: [] if kept else [whole])
     assert (found.chosen is whole) == (left == 0.0)
 
@@ -427,13 +364,13 @@ def test_what_is_measured_competes_with_several_effects_at_its_price(left: float
         raise AssertionError("two effects leave nothing")
 
     for some in (tags[:1], tags[:2]):
-        world = World([effect(tag, 0.3) for tag in some])
-        assert world.chosen(*guesses[: len(some)], measured=never) == set(some)
+        found = world_of(**dict.fromkeys(some, 0.3)).compare(*guesses[: len(some)], measured=never)
+        assert found.chosen.tags == set(some)
 
 
 def test_a_description_that_leaves_nothing_keeps_no_named_effect_from_its_refit() -> None:
     """Noise in a few rows was not refitted, since a description of two parts had left nothing before."""
-    refitter = World([effect("row_noise", 0.3), effect("frame_noise", 0.05)]).refitter()
+    refitter = world_of(row_noise=0.3, frame_noise=0.05).refitter()
     named = refitter.refined([hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.05)])
     noise = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
     described = replace(named, hypotheses=(Hypothesis(noise, named.parts.sum(axis=0)),))
@@ -446,14 +383,15 @@ def test_a_description_that_leaves_nothing_keeps_no_named_effect_from_its_refit(
         assert sum(one.tags == {"exposure_drift"} for one in search.tried) == refits
 
 
+def placed(one: Hypothesis, place: str) -> Hypothesis:
+    return replace(one, effect=one.effect.at_place(Region.model_validate(place)))
+
+
 @pytest.mark.parametrize("second", ["columns=0:8", "columns=16:24"])
 def test_effects_that_meet_in_one_part_are_one_cause_without_a_name(second: str) -> None:
-    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.06)])
-    guesses = [
-        Hypothesis(h.effect.at_place(Region.model_validate(place)), h.fingerprint)
-        for h, place in ((hypothesis("row_noise"), "columns=0:8"), (hypothesis("frame_noise"), second))
-    ]
-    found = world.compare(*guesses)
+    world = world_of(row_noise=0.1, frame_noise=0.06)
+    row, frame = hypothesis("row_noise"), hypothesis("frame_noise")
+    found = world.compare(placed(row, "columns=0:8"), placed(frame, second))
     assert len(found.chosen.tags) == (1 if second == "columns=0:8" else 2)
 
 
@@ -483,6 +421,12 @@ def test_what_is_left_in_the_family_of_a_signature_speaks_against_a_name(
     assert unexplained_of_its_kind(placed, part, there, null).startswith("it leaves a misfit")
 
 
+def guesses_of(shape: tuple[int, int]) -> Callable[..., list[Effect]]:
+    """Return what asks effects for guesses in a sensor of that shape."""
+    taken: Any = SimpleNamespace(window=SensorWindow.whole(shape))
+    return ReplicateSimulator(None, (), taken, (), list, 1).guesses  # type: ignore[arg-type]
+
+
 def test_what_the_model_leaves_is_asked_for_guesses_before_what_the_frames_show() -> None:
     beside, frames = (SimpleNamespace(strongest=lambda *_, z=z: z) for z in (5.0, 0.0))
 
@@ -502,10 +446,7 @@ def test_what_the_model_leaves_is_asked_for_guesses_before_what_the_frames_show(
         def typical() -> list[Effect]:
             return [effect("frame_noise", 0.3)]
 
-    taken: Any = SimpleNamespace(window=SensorWindow.whole((4, 4)))
-    simulator = ReplicateSimulator(None, (), taken, (), list, 1)  # type: ignore[arg-type]
-    classes: Any = {"seen": Seen, "unseen": Unseen}
-    guesses: Any = simulator.guesses
+    classes, guesses = {"seen": Seen, "unseen": Unseen}, guesses_of((4, 4))
     assert guesses(classes, [frames], (), beside) == [effect("row_noise", 0.1), effect("frame_noise", 0.3)]
     assert guesses(classes, [frames]) == [effect("row_noise", 0.2)]
 
@@ -522,32 +463,24 @@ def test_of_guesses_in_parts_those_that_stand_out_most_are_kept() -> None:
         def estimate(_: Any) -> list[Effect]:
             return [effect("row_noise", 0.1), effect("row_noise", 0.2)]
 
-    taken: Any = SimpleNamespace(window=SensorWindow.whole((30, 4)))
-    simulator = ReplicateSimulator(None, (), taken, (), list, 1)  # type: ignore[arg-type]
-    classes: Any = {"seen": Seen}
-    found = simulator.guesses(classes, [quiet], parts)  # type: ignore[list-item]
+    found = guesses_of((30, 4))({"seen": Seen}, [quiet], parts)
     assert found[:2] == [effect("row_noise", 0.1), effect("row_noise", 0.2)]
     placed = found[2:]
     assert len(placed) == 36
     # the likeliest in every part, then the next ones where most is wrong
-    assert {each.region for each in placed if each == effect("row_noise", 0.1).at_place(each.region)} == {
-        part.region for part, _ in parts
-    }
-    second = [each.region for each in placed if each == effect("row_noise", 0.2).at_place(each.region)]
-    assert set(second) <= {part.region for part, own in parts if own is loud}
+    first, second = ({e.region for e in placed if e.row_noise_dn == strength} for strength in (0.1, 0.2))  # type: ignore[attr-defined]
+    assert first == {part.region for part, _ in parts}
+    assert second <= {part.region for part, own in parts if own is loud}
 
 
 def test_a_set_is_fitted_again_with_the_kind_of_an_effect_that_does_better() -> None:
-    world = World([effect(tag, 0.3) for tag in ("row_noise", "frame_noise", "exposure_drift")])
-    row, frame, other = (
-        hypothesis("row_noise"), hypothesis("frame_noise"), hypothesis("frame_noise").effect
-    )  # fmt: skip
+    world = world_of(row_noise=0.3, frame_noise=0.3, exposure_drift=0.3)
+    row, frame = hypothesis("row_noise"), hypothesis("frame_noise")
     search = Search(world.refitter(), HistogramLikelihood())
     for members in ((row,), (frame,), (row, frame), (row, frame)):
         search.add(members)
     assert len(search.trials) == 3
-    elsewhere = Hypothesis(other.at_place(Region(rows=((1, 2),))), frame.fingerprint)
-    search.add((row, elsewhere))
+    search.add((row, placed(frame, "rows=1:2")))
     assert len(search.trials) == 4
 
 
@@ -570,9 +503,7 @@ def test_effects_that_move_the_same_statistics_are_seen_where_they_leave_nothing
     own, shared = np.eye(M)[0], np.eye(M)[1:5].sum(axis=0)
     monkeypatch.setitem(TRUTH, "row_noise", (strong * (2.0 * own + shared), 1.0))
     monkeypatch.setitem(TRUTH, "frame_noise", (-20.0 * shared, 1.0))
-    world = World([effect("row_noise", 0.1), effect("frame_noise", 0.1)])
-    left = rest * np.eye(M)[5]
-    world.z = Measured(world.z.train + left, world.z.test + left, world.z.final + left)
+    world = world_of(row_noise=0.1, frame_noise=0.1, beside=rest * np.eye(M)[5])
     found = world.compare(hypothesis("row_noise"), beside=[hypothesis("frame_noise")])
     assert found.chosen.tags == ({"row_noise"} if rest else {"row_noise", "frame_noise"})
 
@@ -598,7 +529,7 @@ def add(world: World, monkeypatch: pytest.MonkeyPatch, *hypotheses: Hypothesis, 
 
 def test_slopes_beyond_all_that_an_effect_does_do_not_lift_the_floor() -> None:
     # near the limit of a strength a small step may spoil all fits: nothing is at the floor by that
-    world = World([effect("row_noise", 0.5)])
+    world = world_of(row_noise=0.5)
     work: Any = SimpleNamespace(mapped=lambda _: UNMOVED)
     one = world.refitter().simulated((hypothesis("row_noise", 0.5),), None, 12)
     gaps = StatisticsGap(world.null, 100_000)
@@ -613,7 +544,7 @@ def test_slopes_beyond_all_that_an_effect_does_do_not_lift_the_floor() -> None:
 
 
 def test_what_is_found_enters_the_model_at_its_best_strength(monkeypatch: pytest.MonkeyPatch) -> None:
-    search, extended = add(World([effect("row_noise", 0.5)]), monkeypatch, hypothesis("row_noise"))
+    search, extended = add(world_of(row_noise=0.5), monkeypatch, hypothesis("row_noise"))
     assert [e.tag for e in search.model] == ["row_noise"]
     assert search.model[0].row_noise_dn == pytest.approx(0.5, rel=0.05)
     assert np.abs(extended.mean[0] - statistics(search.model)[0]) < 3.0
@@ -624,10 +555,8 @@ def test_what_explains_all_but_is_not_certain_is_told_without_a_name(
     monkeypatch: pytest.MonkeyPatch, rest: float
 ) -> None:
     """Weak over-dispersion, 4 standard errors strong, was 'unexplained: no known effect explains it'."""
-    world = World([effect("row_noise", 0.5)])
+    world = world_of(row_noise=0.5, beside=rest * np.eye(M)[5])
     monkeypatch.setattr(Acceptance, "established", lambda *_: ())
-    left = rest * np.eye(M)[5]
-    world.z = Measured(world.z.train + left, world.z.test + left, world.z.final)
     search, told = add(world, monkeypatch, hypothesis("row_noise"))
     assert (told is None) == (rest > 0.0)
     if told is not None:
@@ -652,21 +581,21 @@ def established(
 ) -> set[str]:
     """Return the tags of the effects of a set that are certain, which do ``parts`` and are known so well."""
     effects = effects or [effect(tag, 0.1) for tag in ("row_noise", "frame_noise")[: len(parts)]]
-    m, unused = len(null.names), cast("Any", None)
-    added: dict[str, Any] = {
-        "hypotheses": tuple(Hypothesis(e, part) for e, part in zip(effects, parts, strict=True)),
+    n, m, unused = len(parts), len(null.names), cast("Any", None)
+    hypotheses = tuple(Hypothesis(e, part) for e, part in zip(effects, parts, strict=True))
+    added = {
         "parts": parts,
         "slopes": parts,
         "mean": seen,
-        "change": np.zeros(len(parts)),
-        "stderr": np.full(len(parts), stderr),
-        "vectors": np.zeros((400, m)),
-        "covariance": Covariance(np.full(m, scatter**2), np.zeros((0, m))),
-        "rest": np.zeros(m),
+        "change": np.zeros(n),
+        "stderr": np.full(n, stderr),
     }
+    added |= {"vectors": np.zeros((400, m)), "rest": np.zeros(m), **more}
+    covariance = Covariance(np.full(m, scatter**2), np.zeros((0, m)))
+    one: Any = SimpleNamespace(hypotheses=hypotheses, covariance=covariance, **added)
     z = Measured(seen, seen, seen if final is None else final)
     accept = Acceptance(null, z, unused, DiscrepancySettings(model_error=0.0))
-    return {h.tag for h in accept.established(cast("Any", SimpleNamespace(**{**added, **more})))}
+    return {h.tag for h in accept.established(one)}
 
 
 @pytest.mark.parametrize(
@@ -682,20 +611,14 @@ def established(
 def test_what_gets_no_name_needs_fewer_errors_and_more_of_them_in_the_final_frames(
     error: float, in_final: float, with_name: bool, without: bool
 ) -> None:
-    null, part = World([]).null, np.eye(M)[0] * 6.0
+    null, part = world_of().null, np.eye(M)[0] * 6.0
     seen = null.mean + np.eye(M)[0] * in_final
+    # missing codes where the pixels have no samples: no statistic moves, and no strength is off
+    assert not established(null, 0.0 * part[None], 0.0, seen, mean=null.mean)
     noise = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
     for one, there in ((effect("row_noise", 0.1), with_name), (noise, without)):
         found = established(null, part[None], error, seen, effects=[one], mean=null.mean + part)
         assert bool(found) is there
-
-
-def test_an_effect_that_moves_nothing_is_not_there() -> None:
-    """Seen: missing codes where the pixels have no samples; no statistic moves, and no strength is off."""
-    world = World([])
-    assert not established(
-        world.null, np.zeros((1, M)), 0.0, world.z.both, final=world.z.final, mean=world.null.mean
-    )
 
 
 @pytest.mark.parametrize(
@@ -705,7 +628,7 @@ def test_an_effect_beyond_doubt_is_there_though_few_frames_know_its_strength_bad
     size: float, other: float, there: bool
 ) -> None:
     """Light that flickers in 97 of 1,000 frames moved statistics by 480 sd; its strength had 4.3 errors."""
-    null = World([]).null
+    null = world_of().null
     parts = np.array([np.eye(M)[0] * size, np.eye(M)[0] * other])[: 2 if other else 1]
     found = established(null, parts, 0.26, null.mean + np.eye(M)[0] * size)
     assert ("row_noise" in found) is there
@@ -728,43 +651,32 @@ def test_a_few_events_are_an_effect_though_they_hardly_tell_its_strength(
     rng, first, size = np.random.default_rng(3), np.eye(9)[0], 1.3
     null = NullModel.from_replicates((name, *NAMES[:8]), rng.standard_normal((40, 9)))
     scatter = size * rng.standard_normal((16, 9))
+    mean, shown = null.mean + made * first, null.mean + seen * first
     found = established(
-        null,
-        made * first[None],
-        0.36,
-        null.mean + seen * first,
-        final=null.mean + final * first,
-        scatter=size,
-        mean=null.mean + made * first,
-        vectors=null.mean + made * first + scatter - scatter.mean(axis=0),
-        rest=(seen - made) * first / (size * np.sqrt(1 / 2 + 1 / 16)),
-    )
+        null, made * first[None], 0.36, shown, final=null.mean + final * first, scatter=size, mean=mean,
+        vectors=mean + scatter - scatter.mean(axis=0), rest=(shown - mean) / (size * np.sqrt(1 / 2 + 1 / 16)),
+    )  # fmt: skip
     assert bool(found) is there
 
 
 def test_strong_effects_need_not_add_up_to_be_there() -> None:
     """Column noise beside a ghost that alone would move the statistics by more than both together do."""
-    null, own, shared = World([]).null, np.eye(M)[0] * 100.0, np.eye(M)[1] * 100.0
+    null, own, shared = world_of().null, np.eye(M)[0] * 100.0, np.eye(M)[1] * 100.0
     parts = np.array([own + 0.5 * shared, 3.6 * shared + 1.4 * own])
     found = established(null, parts, 0.02, null.mean + own + 2.6 * shared)
     assert found == {"row_noise", "frame_noise"}
 
 
-def test_what_the_final_frames_do_not_show_gets_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World([effect("row_noise", 0.1)])
-    search, extended = add(world, monkeypatch, hypothesis("row_noise"), final=np.zeros(M))
-    added = search.close(search.gap(world.null), extended, False).additions
-    assert not any(each.named for each in added)
-
-
 def test_what_widens_the_gap_of_the_final_frames_is_not_certain(monkeypatch: pytest.MonkeyPatch) -> None:
     """They have some of it, by what it does to one statistic, and the opposite of what it does to another."""
     monkeypatch.setitem(TRUTH, "row_noise", ((np.eye(M)[0] + np.eye(M)[5]) * 40.0, 1.0))
-    world = World([effect("row_noise", 0.1)])
-    for of_other, outside in ((-0.5, True), (0.3, False)):
-        final = 40.0 * (np.eye(M)[0] + of_other * np.eye(M)[5])
-        search, _ = add(world, monkeypatch, hypothesis("row_noise"), final=final)
-        assert (search.extension is not None and search.extension.certain) != outside
+    world = world_of(row_noise=0.1)
+    for of_one, of_other, certain in ((1.0, -0.5, False), (1.0, 0.3, True), (0.0, 0.0, False)):
+        final = 40.0 * (of_one * np.eye(M)[0] + of_other * np.eye(M)[5])
+        search, extended = add(world, monkeypatch, hypothesis("row_noise"), final=final)
+        assert (search.extension is not None and search.extension.certain) is certain
+    added = search.close(search.gap(world.null), extended, False).additions
+    assert not any(each.named for each in added)  # what the final frames do not show at all
 
 
 @pytest.mark.parametrize(
@@ -773,7 +685,7 @@ def test_what_widens_the_gap_of_the_final_frames_is_not_certain(monkeypatch: pyt
 def test_an_effect_that_can_go_no_further_gets_no_name(
     monkeypatch: pytest.MonkeyPatch, anisotropy: float, against: str
 ) -> None:
-    world = World([effect("interpixel_capacitance", 0.1)])
+    world = world_of(interpixel_capacitance=0.1)
     guess = hypothesis("interpixel_capacitance", anisotropy=anisotropy)
     search, extended = add(world, monkeypatch, guess)
     before = search.gap(world.null)
@@ -785,7 +697,7 @@ def test_an_effect_that_can_go_no_further_gets_no_name(
 def test_a_rival_in_a_pair_is_measured_where_the_effect_in_whose_place_it_stands_is(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    world = World([effect("interpixel_capacitance", 0.2), effect("frame_noise", 0.1)])
+    world = world_of(interpixel_capacitance=0.2, frame_noise=0.1)
     tags = ("interpixel_capacitance", "frame_noise", "exposure_drift")
     search, extended = add(world, monkeypatch, *(hypothesis(tag) for tag in tags))
     before = search.gap(world.null)
@@ -802,7 +714,7 @@ def test_a_rival_in_a_pair_is_measured_where_the_effect_in_whose_place_it_stands
 def test_strengths_that_no_pixel_can_be_fitted_with_end_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """A trial step, the best correction and a part of a set may all be such."""
     monkeypatch.setitem(TRUTH, "row_noise", (np.eye(M)[0] * 40.0, 1.0))
-    world = World([effect("row_noise", 0.1)])
+    world = world_of(row_noise=0.1)
     guess = Hypothesis(effect("row_noise", 0.098), statistics([effect("row_noise", 0.098)]))
     refitter = world.refitter()
     near = refitter.refined([guess])
@@ -816,7 +728,7 @@ def test_strengths_that_no_pixel_can_be_fitted_with_end_no_search(monkeypatch: p
 def test_an_effect_is_held_to_what_it_moves_only_where_the_data_disagree_with_the_model(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    world = World([effect("interpixel_capacitance", 0.2)])
+    world = world_of(interpixel_capacitance=0.2)
     search, extended = add(world, monkeypatch, hypothesis("interpixel_capacitance"))
     before = search.gap(world.null)
     search.extension = replace(search.extension, last=extended.shifted(np.eye(M)[3] * 20.0))

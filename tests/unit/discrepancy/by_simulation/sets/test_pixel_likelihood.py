@@ -47,6 +47,14 @@ def maps_of(read_noise_e: float) -> PixelMaps:
     return PixelMaps.known([np.full((SIDE, SIDE), v) for v in values], np.ones((SIDE, SIDE), np.bool_))
 
 
+def likelihood_of(frames: NDArray[np.uint16], read_noise_e: float = 0.3, *more: Any) -> PixelLikelihood:
+    return PixelLikelihood(frames, maps_of(read_noise_e), (), Effort(None), *more)
+
+
+def histograms_of(frames: NDArray[np.uint16], present: tuple[Effect, ...] = ()) -> Histograms:
+    return Histograms(frames, maps_of(0.28), present, Effort(None), samples_of)
+
+
 def mixture(rng: np.random.Generator, share: float, factor: float) -> NDArray[np.float64]:
     shape = FRAMES, SIDE, SIDE
     return rng.normal(0.0, 0.25, shape) * np.where(rng.random(shape) < share, factor, 1.0)
@@ -86,7 +94,7 @@ def test_numbers_of_a_tail_in_a_part_are_told_by_the_samples_there() -> None:
     tails = frames_of(mixture(np.random.default_rng(5), 0.3, 2.0), 6)
     frames[:2000, 4:8] = tails[:2000, 4:8]
     guesses = [HEAVY(share=0.02, factor=3.0, region=there, when=when), HEAVY(share=0.02, factor=3.0)]
-    placed, everywhere = Histograms(frames, maps_of(0.28), (), Effort(None), samples_of).with_numbers(guesses)
+    placed, everywhere = histograms_of(frames).with_numbers(guesses)
     assert (placed.region, placed.when) == (there, when)
     assert placed.share == pytest.approx(0.3, abs=0.08)  # type: ignore[attr-defined]
     assert placed.factor == pytest.approx(2.0, abs=0.15)  # type: ignore[attr-defined]
@@ -99,18 +107,12 @@ def test_guesses_of_few_pixels_and_other_effects_stay_as_they_are() -> None:
     frames = frames_of(mixture(np.random.default_rng(5), 0.1, 2.2), 6)
     placed = HEAVY(share=0.02, factor=3.0, region=Region(rows=((0, 1),), columns=((0, 8),)))
     others: list[Effect] = [placed, effect_class("row_noise")(row_noise_dn=1.0)]
-    assert Histograms(frames, maps_of(0.28), (), Effort(None), samples_of).with_numbers(others) == others
+    assert histograms_of(frames).with_numbers(others) == others
     present = (effect_class("row_noise")(row_noise_dn=1.0, region=Region(rows=((0, 4),))),)
     everywhere = [HEAVY(share=0.02, factor=3.0)]
-    assert (
-        Histograms(frames, maps_of(0.28), present, Effort(None), samples_of).with_numbers(everywhere)
-        == everywhere
-    )
-    assert [identifiable_from_histograms(each) for each in (*others, HEAVY(share=0.1))] == [
-        False,
-        False,
-        True,
-    ]
+    assert histograms_of(frames, present).with_numbers(everywhere) == everywhere
+    assert not any(identifiable_from_histograms(each) for each in others)
+    assert identifiable_from_histograms(HEAVY(share=0.1))
 
 
 def test_a_strong_effect_for_which_no_estimator_speaks_is_found_where_a_plain_fit_is_led_astray() -> None:
@@ -122,15 +124,17 @@ def test_a_strong_effect_for_which_no_estimator_speaks_is_found_where_a_plain_fi
     strong[:, 2:7] = True
     width = np.sqrt(0.25**2 + np.where(strong, 0.7**2 * charge, 0.0))
     frames = np.rint(100.0 + STEP * (charge + width * rng.standard_normal(shape))).astype(np.uint16)
-    maps = fitted_maps(frames, np.zeros((SIDE, SIDE), np.bool_))
-    part, kinds = Part(there), {"signal_dependent_noise": GROWING, "noise_skew": SKEW}
-    found = Histograms(frames, maps, (), Effort(None), samples_of).suggested(kinds, [part], ())
+    clean = np.where(strong, np.roll(frames, 7, axis=1), frames)  # rows of the rest
+    kinds = {"signal_dependent_noise": GROWING, "noise_skew": SKEW}
+    found, nothing = (
+        Histograms(each, fitted_maps(each, np.zeros((SIDE, SIDE), np.bool_)), (), Effort(None), samples_of)
+        .suggested(kinds, [Part(there)], ())
+        for each in (frames, clean)
+    )  # fmt: skip
     assert found[0].tag == "signal_dependent_noise"
     assert found[0].region == there
     assert found[0].noise_e == pytest.approx(0.7, rel=0.1)  # type: ignore[attr-defined]
-    clean = np.where(strong, np.roll(frames, 7, axis=1), frames)  # rows of the rest
-    maps = fitted_maps(clean, np.zeros((SIDE, SIDE), np.bool_))
-    assert Histograms(clean, maps, (), Effort(None), samples_of).suggested(kinds, [part], ()) == []
+    assert nothing == []
 
 
 def test_a_strength_is_told_though_the_plain_fit_has_the_bias_off_by_an_electron() -> None:
@@ -166,7 +170,7 @@ def test_bits_that_flip_are_told_from_wide_tails() -> None:
     flipped = frames_of(np.random.default_rng(25).normal(0.0, 0.25, (FRAMES, SIDE, SIDE)), 26)
     flipped ^= (np.random.default_rng(27).random(flipped.shape) < 0.002).astype(np.uint16) << 5
     for frames, right, wrong in ((wide, tails, bit), (flipped, bit, tails)):
-        likelihood = PixelLikelihood(frames, maps_of(0.25), (), Effort(None))
+        likelihood = likelihood_of(frames, 0.25)
         [[rise, _]] = likelihood.fitted([right])
         assert rise > max((other for other, _ in likelihood.fitted([wrong])), default=0.0) + 20.0
 
@@ -175,18 +179,21 @@ def test_a_skew_is_told_from_tails_and_tails_from_a_skew() -> None:
     rng = np.random.default_rng(8)
     skew, heavy = SKEW(share=0.4), HEAVY(share=0.2, factor=1.6)
     for noise, right, wrong in ((exgaussian(rng, 0.4), skew, heavy), (mixture(rng, 0.2, 1.8), heavy, skew)):
-        likelihood = PixelLikelihood(frames_of(noise, 9), maps_of(0.3), (), Effort(None))
+        likelihood = likelihood_of(frames_of(noise, 9))
         answer, back = likelihood.behind([wrong], [right]), likelihood.behind([right], [wrong])
-        assert back is not None
         assert answer[0] < -4.0 * answer[1] < 0.0
         assert back == pytest.approx((-answer[0], answer[1]))
+    # of noise without either nothing is said: chance makes a nat of each number, and of that half
+    plain = frames_of(np.random.default_rng(10).normal(0.0, 0.3, (FRAMES, SIDE, SIDE)), 11)
+    answer = likelihood_of(plain).behind([SKEW(share=0.1)], [HEAVY(share=0.05, factor=1.5)])
+    assert abs(answer[0]) < 4.0
 
 
 def test_a_set_begins_where_its_numbers_are_likeliest_together() -> None:
     frames = frames_of(exgaussian(np.random.default_rng(14), 0.4), 15)
     row = Hypothesis(effect_class("row_noise")(row_noise_dn=0.5), np.ones(3))
     skew = Hypothesis(SKEW(share=0.25), np.array([1.0, 0.0, -2.0]))
-    likelihood = PixelLikelihood(frames, maps_of(0.3), (), Effort(None))
+    likelihood = likelihood_of(frames)
     same, moved = likelihood.begun([row, skew])
     assert same is row
     fit = likelihood._fit([skew.effect], [row.effect])
@@ -202,20 +209,11 @@ def test_a_set_begins_where_its_numbers_are_likeliest_together() -> None:
     assert still is far  # so far away it is another hypothesis
 
 
-def test_of_noise_without_either_nothing_is_said() -> None:
-    noise = np.random.default_rng(10).normal(0.0, 0.3, (FRAMES, SIDE, SIDE))
-    likelihood = PixelLikelihood(frames_of(noise, 11), maps_of(0.3), (), Effort(None))
-    answer = likelihood.behind([SKEW(share=0.1)], [HEAVY(share=0.05, factor=1.5)])
-    assert abs(answer[0]) < 4.0  # fits of nothing: chance makes a nat of each number, and of that half
-
-
 def test_what_no_law_of_a_sample_holds_is_not_told() -> None:
     frames = frames_of(mixture(np.random.default_rng(12), 0.1, 2.2), 13)
-    likelihood = PixelLikelihood(frames, maps_of(0.28), (), Effort(None), 64)
-    row, column = (
-        effect_class("row_noise")(row_noise_dn=1.0),
-        effect_class("column_noise")(column_noise_dn=1.0),
-    )
+    likelihood = likelihood_of(frames, 0.28, 64)
+    row = effect_class("row_noise")(row_noise_dn=1.0)
+    column = effect_class("column_noise")(column_noise_dn=1.0)
     heavy, skew = HEAVY(share=0.1, factor=2.0), SKEW(share=0.2)
     asked: list[Sequence[Effect]] = []
 
@@ -234,7 +232,7 @@ def test_what_no_law_of_a_sample_holds_is_not_told() -> None:
 def test_a_fit_that_went_astray_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was 23,000 nats below the plain one, and another effect took the place of the true one."""
     frames = frames_of(exgaussian(np.random.default_rng(17), 0.4), 18)
-    likelihood = PixelLikelihood(frames, maps_of(0.3), (), Effort(None), 64)
+    likelihood = likelihood_of(frames, 0.3, 64)
     heavy, skew = HEAVY(share=0.1, factor=2.0), SKEW(share=0.3)
     answer = likelihood.behind([heavy], [skew])
     assert answer is not None
@@ -249,7 +247,7 @@ def test_a_fit_that_went_astray_says_nothing(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(SetComparison, "fit", astray)
     # what was asked before is not fitted again, at whatever strength
     assert likelihood.behind([HEAVY(share=0.2, factor=2.0)], [SKEW(share=0.2)]) == answer
-    likelihood = PixelLikelihood(frames, maps_of(0.3), (), Effort(None), 64)
+    likelihood = likelihood_of(frames, 0.3, 64)
     assert likelihood.behind([heavy], [skew]) is None
     hypothesis = Hypothesis(skew, np.ones(2))
     assert likelihood.begun([hypothesis]) == (hypothesis,)
@@ -264,7 +262,7 @@ def test_what_a_fit_raises_is_noted_unless_its_numbers_are_no_law(
 ) -> None:
     defects: dict[str, str] = {}
     frames = frames_of(exgaussian(np.random.default_rng(17), 0.4), 18)
-    likelihood = PixelLikelihood(frames, maps_of(0.3), (), Effort(None), 64, defects)
+    likelihood = likelihood_of(frames, 0.3, 64, defects)
 
     def broken(*_: Any) -> FittedSet:
         raise raised
