@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+import xxhash
 import zarr
 from astropy.io import fits
 from helpers.camera_files import not_opened, opened, write_fits, write_hdf5
@@ -46,8 +47,7 @@ def test_resolve(tmp_path):
     assert names("d*/*.npy") == ["d2/f1.npy", "d2/f9.npy", "d2/f10.npy", "d10/f1.npy"]
     assert names("**/f1.npy") == ["d2/f1.npy", "d10/f1.npy"]
     assert names(str(tmp_path / "d10" / "f1.npy")) == ["d10/f1.npy"]
-    literal = tmp_path / "odd[1].npy"
-    np.save(literal, STACK)
+    np.save(tmp_path / "odd[1].npy", STACK)
     assert names("odd[1].npy") == ["odd[1].npy"]
     folder = tmp_path / "run [1]"
     folder.mkdir()
@@ -62,14 +62,14 @@ def test_missing_and_empty(tmp_path):
     not_opened(r"\*\.tif: matches no file", tmp_path / "*.tif")
     (tmp_path / "empty").mkdir()
     not_opened("has no camera files", tmp_path / "empty")
-    (tmp_path / "empty" / "a.tif").touch()
-    not_opened(r"a\.tif: the file is empty", tmp_path / "empty")
-    (tmp_path / "b.xyz").write_bytes(b"what is this")
-    not_opened(r"b\.xyz: unknown camera format", tmp_path / "b.xyz")
-    (tmp_path / "c.tif").write_bytes(b"II*\0nonsense")
-    not_opened(r"c\.tif: not a valid TIFF", tmp_path / "c.tif")
-    (tmp_path / "d.fits").write_text("hello")
-    not_opened(r"d\.fits: not a valid FITS", tmp_path / "d.fits")
+    for name, content, words in (
+        ("a.tif", b"", "the file is empty"),
+        ("b.xyz", b"what is this", "unknown camera format"),
+        ("c.tif", b"II*\0nonsense", "not a valid TIFF"),
+        ("d.fits", b"hello", "not a valid FITS"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        not_opened(f"{name}: {words}", tmp_path / name)
     with pytest.raises(ConfigError, match=r"unknown input\.format 'jpeg'; choose one of: auto, npy"):
         opened(tmp_path / "b.xyz", format="jpeg")
 
@@ -204,12 +204,7 @@ def test_one_message_lists_all_bad_files(tmp_path):
     assert "skipped (input.on_bad_file: skip)" in reader.report.message()
     assert [file.path.name for file in reader.report.good] == [f"f{i}.tif" for i in range(5)]
     assert len(reader.report.bad) == 8
-
-
-def test_skip_with_nothing_left(tmp_path):
-    for name in ("a.tif", "b.tif"):
-        (tmp_path / name).write_bytes(b"II*\0rubbish")
-    not_opened("2 of 2 input files cannot be used", tmp_path / "*.tif", on_bad_file="skip")
+    not_opened("2 of 2 input files cannot be used", tmp_path / "f1[01].tif", on_bad_file="skip")
 
 
 def test_duplicate_by_link_and_by_content(tmp_path):
@@ -223,11 +218,7 @@ def test_duplicate_by_link_and_by_content(tmp_path):
     other[6, 8, 9] ^= 1
     np.save(tmp_path / "b.npy", other)
     assert opened(tmp_path / "*.npy").shape[0] == 24
-
-
-def test_large_files_that_differ_between_the_samples(tmp_path):
-    """Equal beginning, middle and end is not equal content."""
-    big = np.zeros((8, 200, 200), np.uint16)
+    big = np.zeros((8, 200, 200), np.uint16)  # equal beginning, middle and end is not equal content
     np.save(tmp_path / "a.npy", big)
     big[2, 100, 100] = 1
     np.save(tmp_path / "b.npy", big)
@@ -239,9 +230,6 @@ def test_gaps_in_the_numbers(tmp_path):
         np.save(tmp_path / f"frame_{i:04d}.npy", STACK[i])
     message = open_frames(InputSettings(files=(".",)), tmp_path).report.message()
     assert message == "2 of the numbered files frame_#.npy are missing between the first and the last"
-    for i in (4, 5):
-        np.save(tmp_path / f"frame_{i:04d}.npy", STACK[i])
-    assert open_frames(InputSettings(files=(".",)), tmp_path).report.message() == ""
 
 
 def test_read_into_checks_its_arguments(tmp_path):
@@ -261,6 +249,9 @@ def test_read_into_checks_its_arguments(tmp_path):
 
 
 def test_identity(tmp_path):
+    data = np.random.default_rng(1).bytes((1 << 22) + 12345)
+    (tmp_path / "a").write_bytes(data)
+    assert hash_file(tmp_path / "a") == xxhash.xxh3_128(data).hexdigest()
     first, second = tmp_path / "one", tmp_path / "two"
     for folder in (first, second):
         folder.mkdir()
@@ -284,14 +275,6 @@ def test_identity(tmp_path):
     (second / "a_00003.npy").unlink()
     with pytest.raises(InputError, match="check that it is still there"):
         quick_identity(there.paths)
-
-
-def test_hash_of_a_file_is_that_of_its_bytes(tmp_path):
-    import xxhash
-
-    data = np.random.default_rng(1).bytes((1 << 22) + 12345)
-    (tmp_path / "a").write_bytes(data)
-    assert hash_file(tmp_path / "a") == xxhash.xxh3_128(data).hexdigest()
 
 
 def test_unreadable_file(tmp_path, monkeypatch):
@@ -380,13 +363,11 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path):
         middle = np.quantile(wanted[0][~excluded], 0.5, method="lower")
         np.testing.assert_array_equal(frames.read(), np.where(excluded, middle, wanted))
         np.testing.assert_array_equal(frames.read(2, 5, 1, 4), np.where(excluded, middle, wanted)[2:5, 1:4])
+    no_image = np.array([{"no": "image"}])
     for values, words in (
         (mask[1:], r"mask of shape \(5, 8\)"),
         (np.ones((6, 8)), "every pixel is excluded"),
-        (
-            np.array([{"no": "image"}]),
-            r"mask.npy: cannot be read as an image \(Object arrays.*write it again",
-        ),
+        (no_image, r"mask.npy: cannot be read as an image \(Object arrays.*write it again"),
     ):
         np.save(tmp_path / "mask.npy", values)
         not_opened(words, tmp_path / "a.npy", mask="mask.npy")

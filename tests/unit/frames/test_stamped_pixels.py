@@ -27,15 +27,9 @@ def pco(stack, first=95, shift=0, text=False):
     """Write number, date and time of each frame as PCO cameras do, two decimal digits a pixel."""
     for t, frame in enumerate(stack):
         at = 8_250_013 * t // 777
-        stamp = [
-            *bcd(first + t, 4),
-            *bcd(2024, 2),
-            *bcd(1031, 2),
-            *bcd(12, 1),
-            *bcd(at // 60_000_000 % 60, 1),
-        ]
-        stamp += [*bcd(at // 1_000_000 % 60, 1), *bcd(at % 1_000_000, 3)]
-        assert len(stamp) == 14
+        parts = [(first + t, 4), (2024, 2), (1031, 2), (12, 1), (at // 60_000_000 % 60, 1)]
+        parts += [(at // 1_000_000 % 60, 1), (at % 1_000_000, 3)]
+        stamp = [digit for part in parts for digit in bcd(*part)]
         frame[0, :14] = np.array(stamp) << shift
         if text:
             frame[:8, 16:271] = RNG.integers(0, 2, (8, 255)) * 255
@@ -51,31 +45,24 @@ def binary(stack, order, first=250, at=24):
     return stack
 
 
+#: stamped frames, the pixels of a stamp, and layouts beside npy
 STAMPED = {
-    "16 bits": lambda: (pco(noise()), 20),
-    "8 bits": lambda: (pco(noise("uint8")), 40),
-    "32 bits": lambda: (binary(noise("uint32"), ">"), 10),
-    "from one": lambda: (pco(noise(), first=1), 20),
-    "left-justified": lambda: (pco(noise() << 2, shift=2), 20),
-    "little-endian": lambda: (binary(noise(), "<"), 20),
-    "big-endian": lambda: (binary(noise(), ">"), 20),
-    "8 bits, binary": lambda: (binary(noise("uint8"), ">"), 40),
+    "16 bits": (lambda: pco(noise()), 20, ("tiff, zlib", "zarr", "dcimg")),
+    "8 bits": (lambda: pco(noise("uint8")), 40, ()),
+    "32 bits": (lambda: binary(noise("uint32"), ">"), 10, ("tiff, zlib", "zarr")),
+    "from one": (lambda: pco(noise(), first=1), 20, ()),
+    "left-justified": (lambda: pco(noise() << 2, shift=2), 20, ()),
+    "little-endian": (lambda: binary(noise(), "<"), 20, ()),
+    "big-endian": (lambda: binary(noise(), ">"), 20, ()),
+    "8 bits, binary": (lambda: binary(noise("uint8"), ">"), 40, ("tiff, zlib", "zarr", "dcimg")),
 }
 
 
-OTHER_LAYOUTS = {
-    "16 bits": ("tiff, zlib", "zarr", "dcimg"),
-    "8 bits, binary": ("tiff, zlib", "zarr", "dcimg"),
-    "32 bits": ("tiff, zlib", "zarr"),
-}
-
-
-@pytest.mark.parametrize("name", STAMPED)
-def test_stamped_pixels_are_no_samples(tmp_path, name):
-    stack, width = STAMPED[name]()
-    expected = np.zeros(SHAPE, bool)
+@pytest.mark.parametrize(("make", "width", "layouts"), STAMPED.values(), ids=STAMPED)
+def test_stamped_pixels_are_no_samples(tmp_path, make, width, layouts):
+    stack, expected = make(), np.zeros(SHAPE, bool)
     expected[0, :width] = True
-    for layout in ("npy", *OTHER_LAYOUTS.get(name, ())):
+    for layout in ("npy", *layouts):
         frames = opened(write(tmp_path / layout, layout, stack))
         np.testing.assert_array_equal(frames.excluded, expected)
         assert f"{width} pixels from the first one on hold a stamp" in frames.report.message()

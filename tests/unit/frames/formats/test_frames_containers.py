@@ -146,25 +146,20 @@ def test_hdf5_links_into_other_files(tmp_path, there):
 
 def test_hdf5_samples_in_a_raw_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with h5py.File("a.h5", "w") as file:
-        file.create_dataset("frames", data=STACK, external=[("samples.bin", 0, STACK.nbytes)])
-    np.testing.assert_array_equal(read(tmp_path / "a.h5"), STACK)
-    monkeypatch.chdir(tmp_path.parent)
-    refused(r"a\.h5: the samples of /frames are in samples\.bin, which is not", tmp_path / "a.h5")
-
-
-def test_hdf5_samples_cut_or_of_others(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     other = tmp_path / "folder" / "a.h5"
     other.parent.mkdir()
     for path, name in (("a.h5", "samples.bin"), (other, str(tmp_path / "samples.bin")), ("fifo.h5", "fifo")):
         with h5py.File(path, "w") as file:
             file.create_dataset("frames", STACK.shape, STACK.dtype, external=[(name, 0, STACK.nbytes)])
+    (tmp_path / "samples.bin").write_bytes(STACK.tobytes())
+    np.testing.assert_array_equal(read(tmp_path / "a.h5"), STACK)
     (tmp_path / "samples.bin").write_bytes(STACK.tobytes()[:-1])
     refused(rf"samples.bin, truncated: {STACK.nbytes} bytes", tmp_path / "a.h5")
     refused(r"source /.*/samples.bin is not in the same folder or below", other)
     os.mkfifo(tmp_path / "fifo")
     refused(r"source /.*/fifo is not a regular file", tmp_path / "fifo.h5")
+    monkeypatch.chdir(tmp_path.parent)
+    refused(r"a\.h5: the samples of /frames are in samples\.bin, which is not", tmp_path / "a.h5")
 
 
 @pytest.mark.parametrize("case", ["itself", "by another", "outside", "fifo", "numbered"])
@@ -218,12 +213,11 @@ def test_hdf5_filter_that_is_not_installed(tmp_path):
 
 
 def test_hdf5_left_open_by_its_writer(tmp_path):
-    path = tmp_path / "a.h5"
+    path, copy = tmp_path / "a.h5", tmp_path / "copy.h5"
     with h5py.File(path, "w", libver="latest") as file:
         file["frames"] = STACK
         file.swmr_mode = True
         file.flush()
-        copy = tmp_path / "copy.h5"
         copy.write_bytes(path.read_bytes())
     refused(r"copy\.h5: is open for writing or was not closed; .*h5clear -s", copy)
 
@@ -242,13 +236,11 @@ def test_matlab_file(tmp_path):
 
 def test_hdf5_candidates_are_listed(tmp_path):
     path = tmp_path / "two.h5"
-    write_hdf5(path, **{"dark/frames": STACK}, **{"light/frames": STACK + 1})
+    write_hdf5(path, **{"dark/frames": STACK, "light/frames": STACK + 1})
     refused(r"several datasets: dark/frames \(7, 19, 22\), light/frames .*input.dataset", path)
     check_windows(path, STACK, dataset="/dark/frames")
     refused(r"no dataset 'flat', only: dark/frames", path, dataset="flat")
-    with h5py.File(path, "w") as file:
-        for i in range(15):
-            file[f"frame{i}"] = STACK[0]
+    write_hdf5(path, **{f"frame{i}": STACK[0] for i in range(15)})
     refused(r"and 3 more; choose one", path)
     write_hdf5(path, temperature=np.arange(4))
     refused("no dataset of frames", path)
@@ -295,11 +287,9 @@ def test_events_of_several_frames_are_read_in_turn(tmp_path, chunks):
         file.create_dataset("image", data=events, chunks=chunks)
         file["time"] = np.arange(3.0)
     with h5py.File(tmp_path / "b.h5", "w") as file:
-        file.create_dataset(
-            "image", data=events.astype(">u2")[:, None], chunks=chunks and (1, 1, *chunks[1:])
-        )
-    group = zarr.open_group(tmp_path / "a.zarr", mode="w")
-    group.create_array("image", data=events, chunks=chunks or events.shape)
+        more = chunks and (1, 1, *chunks[1:])
+        file.create_dataset("image", data=events.astype(">u2")[:, None], chunks=more)
+    zarr.create_array(tmp_path / "a.zarr", name="image", data=events, chunks=chunks or events.shape)
     frames = events.reshape(-1, *STACK.shape[1:])
     for name in ("a.h5", "b.h5", "a.zarr"):
         reader = opened(tmp_path / name)

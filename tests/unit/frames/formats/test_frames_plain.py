@@ -11,15 +11,13 @@ import pytest
 from helpers.camera_files import opened, read, refused
 from helpers.layouts import packed
 
-from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.ser import SerReader
 from pchem_pipeline.frames.settings import InputSettings
 
 STACK = np.random.default_rng(14).integers(0, 65536, (5, 11, 13)).astype(np.uint16)
 
 
-def raw_bytes(stack, dtype, header, padding, last_padding=True):
-    """Lay frames out by hand."""
+def raw_bytes(stack, dtype, header=0, padding=0, last_padding=True):
     frames = [frame.astype(dtype).tobytes() + b"\xaa" * padding for frame in stack]
     data = b"\x55" * header + b"".join(frames)
     return data if last_padding or not padding else data[:-padding]
@@ -129,7 +127,7 @@ notes =
 @pytest.mark.parametrize(("order", "dtype"), [("big", ">u2"), ("little", "<u2")])
 def test_dax_movie_with_its_inf(tmp_path, order, dtype):
     path = tmp_path / "movie.dax"
-    path.write_bytes(raw_bytes(STACK, dtype, 0, 0))
+    path.write_bytes(raw_bytes(STACK, dtype))
     refused(r"raw frames need input.shape and input.dtype", path)
     path.with_suffix(".inf").write_text(INF.format(order=order))
     for place in (path, tmp_path, tmp_path / "movie.*"):
@@ -137,7 +135,7 @@ def test_dax_movie_with_its_inf(tmp_path, order, dtype):
         np.testing.assert_array_equal(reader.read(), STACK)
     assert reader.integration_time == 0.05
     assert reader.camera.words() == "DU897_BV, sensor at -68 °C, gain 30, binning 1 x 1"
-    path.write_bytes(raw_bytes(STACK, dtype, 0, 0)[:-1])
+    path.write_bytes(raw_bytes(STACK, dtype)[:-1])
     refused(r"movie\.dax: truncated: 5 frames need 1430 bytes", path)
     for old, new, words in (
         ("13 x 11", "none", "raw frames need input.shape;"),
@@ -145,13 +143,6 @@ def test_dax_movie_with_its_inf(tmp_path, order, dtype):
     ):
         path.with_suffix(".inf").write_text(INF.format(order=order).replace(old, new))
         refused(words, path)
-
-
-def test_raw_needs_a_description(tmp_path):
-    path = tmp_path / "a.raw"
-    path.write_bytes(bytes(100))
-    refused(r"raw frames need input.shape and input.dtype; .*sidecar a\.raw\.json", path)
-    refused(r"raw frames need input.dtype;", path, shape=(5, 5))
 
 
 @pytest.mark.parametrize(
@@ -169,25 +160,21 @@ def test_raw_with_a_bad_sidecar(tmp_path, text, words):
     path = tmp_path / "a.raw"
     path.write_bytes(bytes(100))
     path.with_name("a.raw.json").write_text(text)
-    with pytest.raises(InputError, match=words) as caught:
-        read(path)
-    assert "\n" not in str(caught.value)
+    refused(words, path)
 
 
-def test_raw_truncated_or_of_another_shape(tmp_path):
+def test_raw_without_its_description_truncated_or_of_another_shape(tmp_path):
     path = tmp_path / "a.raw"
-    path.write_bytes(raw_bytes(STACK, "<u2", 0, 0)[:-1])
+    path.write_bytes(raw_bytes(STACK, "<u2")[:-1])
+    refused(r"raw frames need input.shape and input.dtype; .*sidecar a\.raw\.json", path)
+    refused(r"raw frames need input.dtype;", path, shape=(5, 5))
     raw: dict[str, Any] = {"shape": (11, 13), "dtype": "uint16"}
     refused(r"a\.raw: truncated, or not 11 x 13 uint16: 1429 bytes .*input.shape", path, **raw)
     words = r"truncated: 5 frames need 1430 bytes, the file has 1429 \(4 complete frames\)"
     refused(words, path, shape=(5, 11, 13), dtype="uint16")
-    refused("truncated, or not", path, shape=(11, 13), dtype="uint16", header_bytes=10_000)
-
-
-def test_raw_with_more_frames_than_stated(tmp_path):
-    path = tmp_path / "a.raw"
-    path.write_bytes(raw_bytes(STACK, "<u2", 0, 0))
-    reader = opened(tmp_path / "a.raw", shape=(3, 11, 13), dtype="uint16")
+    refused("truncated, or not", path, header_bytes=10_000, **raw)
+    path.write_bytes(raw_bytes(STACK, "<u2"))
+    reader = opened(path, shape=(3, 11, 13), dtype="uint16")
     np.testing.assert_array_equal(reader.read(), STACK[:3])
     assert "has 5 frames; the first 3 are used" in reader.report.message()
 
@@ -233,9 +220,7 @@ def ser_bytes(stack, depth, colour=0, flag=0, times=False):
     head = b"LUCAM-RECORDER" + struct.pack("<7i", 0, colour, flag, columns, rows, depth, n) + bytes(120)
     head += struct.pack("<2q", 637_000_000_000_000_000, 637_000_000_000_000_000)
     assert len(head) == 178
-    tail = (
-        struct.pack(f"<{n}q", *(637_000_000_000_000_000 + 5_000_000 * i for i in range(n))) if times else b""
-    )
+    tail = (637_000_000_000_000_000 + 5_000_000 * np.arange(n)).astype("<i8").tobytes() if times else b""
     return head + stack.tobytes() + tail
 
 
@@ -252,19 +237,11 @@ def test_ser(tmp_path):
         assert reader.timestamps is None
     path.write_bytes(ser_bytes(STACK.astype(">u2"), 16, flag=0))
     np.testing.assert_array_equal(read(path, byte_order="big"), STACK)
-
-
-@pytest.mark.parametrize(("colour", "pattern"), [(8, "RGGB"), (11, "BGGR"), (16, "CYYM")])
-def test_ser_with_a_mosaic_is_read_as_its_samples(tmp_path, colour, pattern):
-    path = tmp_path / "a.ser"
-    path.write_bytes(ser_bytes(STACK, 16, colour=colour))
-    reader = opened(path)
-    np.testing.assert_array_equal(reader.read(), STACK)
-    assert f"a.ser: colour mosaic ({pattern}): read as the monochrome samples" in reader.report.notes[0]
-
-
-def test_ser_times(tmp_path):
-    path = tmp_path / "a.ser"
+    for colour, pattern in ((8, "RGGB"), (11, "BGGR"), (16, "CYYM")):
+        path.write_bytes(ser_bytes(STACK, 16, colour=colour))
+        reader = opened(path)
+        np.testing.assert_array_equal(reader.read(), STACK)
+        assert f"a.ser: colour mosaic ({pattern}): read as the monochrome samples" in reader.report.notes[0]
     path.write_bytes(ser_bytes(STACK, 16, times=True))
     times = SerReader.open(path, InputSettings()).timestamps
     np.testing.assert_allclose(np.diff(times), 0.5, atol=1e-6)

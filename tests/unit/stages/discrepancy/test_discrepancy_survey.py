@@ -4,12 +4,12 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from helpers.discrepancy_material import verdict_of
 from helpers.quick_stacks import stack, sums_of
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
 from pchem_pipeline.discrepancy.scan_pairs import pairs_bytes
-from pchem_pipeline.discrepancy.verdict import Examined
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.stages.discrepancy import survey as module
@@ -158,22 +158,10 @@ def test_the_sums_of_all_frames_tell_the_place():
     assert places_of_sums(None, (32, 48)) is None
 
 
-def test_the_verdict_says_what_was_looked_at_over_the_whole_sensor(verdict):
+def test_the_verdict_says_what_was_looked_at_over_the_whole_sensor():
+    verdict = verdict_of("named")
     told = Survey({}, {SUMS: 1.0, PAIRS: 0.4}).told(verdict, 0.1).examined
     assert (told.share, told.surveyed, told.surveyed_by) == (0.1, 0.1, {SUMS: 1.0, PAIRS: 0.4})
     told = Survey({}, {SUMS: 1.0, SHAPES: 1.0, PAIRS: 0.4}).told(verdict, 0.1).examined
     assert told.surveyed == 0.4
     assert Survey().told(verdict, 1.0).examined.surveyed == 1.0
-
-
-@pytest.fixture
-def verdict():
-    class Told:
-        examined = Examined(frames=9, rows=(0, 9), columns=(0, 9), train=3, test=3, final=3)
-
-        def model_copy(self, update):
-            copy = Told()
-            copy.examined = update["examined"]
-            return copy
-
-    return Told()
