@@ -9,7 +9,6 @@ import pchem_pipeline
 from pchem_pipeline.compute import environment
 from pchem_pipeline.compute.environment import available_memory, available_workers, prepare_environment
 
-PACKAGE = Path(pchem_pipeline.__file__).parent
 CODE = (
     "import os; from pchem_pipeline.compute.environment import prepare_environment as p\n"
     "p(); first = os.environ['NUMBA_CACHE_DIR']; p(); assert first == os.environ['NUMBA_CACHE_DIR']\n"
@@ -17,15 +16,16 @@ CODE = (
 )
 
 
-def cache_folder(place, **environment):
-    environment = {"PYTHONPATH": str(place), "PATH": "/usr/bin:/bin", **environment}
+def cache_folder(**environment):
+    place = str(Path(pchem_pipeline.__file__).parents[1])
+    environment = {"PYTHONPATH": place, "PATH": "/usr/bin:/bin", **environment}
     command = [sys.executable, "-c", CODE]
     result = subprocess.run(command, cwd="/", env=environment, capture_output=True, text=True, check=True)
     return Path(result.stdout.strip())
 
 
 def test_the_cache_lies_in_the_users_cache_folder(tmp_path):
-    home = cache_folder(PACKAGE.parent, HOME=str(tmp_path), XDG_CACHE_HOME=str(tmp_path / "cache"))
+    home = cache_folder(HOME=str(tmp_path), XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert home.is_relative_to(tmp_path / "cache")
 
 
@@ -43,7 +43,7 @@ def test_a_folder_in_the_temporary_one_is_taken_if_nobody_else_can_write_it(tmp_
             pytest.skip("nobody else may give folders away")
         os.chown(expected, 4321, -1)
     nowhere = {"HOME": "/proc/nowhere", "XDG_CACHE_HOME": "/proc/nowhere", "TMPDIR": str(tmp_path)}
-    first, second = (cache_folder(PACKAGE.parent, **nowhere) for _ in range(2))
+    first, second = (cache_folder(**nowhere) for _ in range(2))
     assert first.parent == tmp_path
     if trap == "none":
         assert first == second == expected
@@ -81,12 +81,9 @@ def job(tmp_path, monkeypatch):
     return tmp_path, lambda text: files.update({"/proc/self/cgroup": text})
 
 
-def test_a_job_without_limits_has_the_machine(job):
-    assert (available_workers(), available_memory()) == (16, 32000000 << 10)
-
-
 def test_limits_of_a_job_are_seen_at_every_level_of_its_cgroup(job):
     root, enter = job
+    assert (available_workers(), available_memory()) == (16, 32000000 << 10)  # without limits the machine
     enter("0::/slurm/job_7/step_0\n")
     write(root / "slurm/job_7/step_0", memory__max="max", memory__current=5 << 20, cpu__max="max 100000")
     write(root / "slurm/job_7", memory__max=700 << 20, memory__current=300 << 20, cpu__max="350000 100000")

@@ -134,12 +134,6 @@ def test_chosen_exposures_are_no_worse_than_given_ones():
     assert max(free.exposures) <= 8.0001
 
 
-@pytest.mark.parametrize("lights", [[0.0, 0.0], [0.0, -1.0]])
-def test_wrong_samples_get_their_line(lights):
-    with pytest.raises(ConfigError, match="--samples"):
-        best_split([ONE_PERCENT], lights, point())
-
-
 def one(targets, there, *, given=True, budget=None, max_frames=1e7):
     limits = {"budget": budget, "max_exposure": 10.0, "max_frames": max_frames}
     return plan_one_sample([parse_target(t) for t in targets], there, exposure_given=given, **limits)
@@ -194,12 +188,13 @@ def test_few_frames_must_show_electrons_at_all():
     assert plan.frames == plan.needed > 2 * plan.bounds[0]
 
 
-@pytest.mark.parametrize(
-    ("exposure", "noise", "gain"), [(0.0, 0.3, 0.1), (1.0, 0.0, 0.1), (1.0, np.nan, 0.1), (1, 0.2, 1.0)]
-)
-def test_impossible_pixels_get_their_line(exposure, noise, gain):
-    with pytest.raises(ConfigError, match="--"):
-        Point(exposure, noise, gain)
+def test_impossible_pixels_and_samples_get_their_line():
+    for pixel in ((0.0, 0.3, 0.1), (1.0, 0.0, 0.1), (1.0, np.nan, 0.1), (1, 0.2, 1.0)):
+        with pytest.raises(ConfigError, match="--"):
+            Point(*pixel)
+    for lights in ([0.0, 0.0], [0.0, -1.0]):
+        with pytest.raises(ConfigError, match="--samples"):
+            best_split([ONE_PERCENT], lights, point())
 
 
 def test_the_real_fit_confirms_a_plan():
@@ -224,21 +219,16 @@ def test_the_joint_fit_confirms_a_split():
 
 
 def test_the_command_in_words_and_files(tmp_path):
-    target, path = ("conversion_gain=1%",), tmp_path / "plan.json"
-    text = make_plan(read_noise=0.3, exposure=2.0, target=target, json=path)
-    content = json.loads(path.read_text())
-    assert f"{content['frames']:,.0f} frames" in text
-    assert content["frames"] == frames_needed(ONE_PERCENT, Point(2.0, 0.3, 0.09))
-    assert "best exposure" in text
-
-
-def test_the_command_for_samples_and_budgets():
-    text = make_plan(read_noise=0.6, samples="0,2,8", target=("conversion_gain=1%",), frames=5000)
-    assert "3 samples" in text
-    assert "evenly divided" in text
-    text = make_plan(read_noise=0.3, frames=2000, target=("bias=0.02e-",))
-    assert "(the best)" in text
-    assert "2,000 frames are enough" in text
+    path, gain = tmp_path / "plan.json", ("conversion_gain=1%",)
+    frames = frames_needed(ONE_PERCENT, Point(2.0, 0.3, 0.09))
+    for given, words in (
+        ({"exposure": 2.0, "target": gain, "json": path}, (f"{frames:,.0f} frames", "best exposure")),
+        ({"samples": "0,2,8", "target": gain, "frames": 5000}, ("3 samples", "evenly divided")),
+        ({"frames": 2000, "target": ("bias=0.02e-",)}, ("(the best)", "2,000 frames are enough")),
+    ):
+        text = make_plan(read_noise=0.6 if "samples" in given else 0.3, **given)
+        assert all(each in text for each in words)
+    assert json.loads(path.read_text())["frames"] == frames
 
 
 @pytest.mark.parametrize(

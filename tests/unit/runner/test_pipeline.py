@@ -1,6 +1,7 @@
 """The driver of the stages, with small stages of our own."""
 
 import contextlib
+import errno
 import functools
 import json
 import re
@@ -88,11 +89,10 @@ def make(tmp_path, monkeypatch):
     reporter.close()
 
 
-def test_a_second_run_does_nothing(make):
-    assert execute("fit", make()).state == "complete"
-    assert len(CALLS) == 12
-    assert execute("fit", make()).state == "complete"
-    assert len(CALLS) == 12
+def test_a_second_run_does_nothing_nor_does_a_setting_that_no_stage_reads(make):
+    for config in ("", "", "compute: {workers: 7}"):
+        assert execute("fit", make(config)).state == "complete"
+        assert len(CALLS) == 12
 
 
 def test_what_a_hand_took_out_of_the_store_is_made_again(make, monkeypatch):
@@ -118,6 +118,8 @@ def test_what_a_hand_took_out_of_the_store_is_made_again(make, monkeypatch):
 
 
 def test_a_changed_setting_redoes_the_stages_that_read_it(make):
+    with pytest.raises(StoreError, match="maps needs fit first; run: pchem fit"):
+        execute("maps", make())
     execute("fit", make())
     execute("maps", make())
     changed = make("fit: {gap_threshold: 7}")
@@ -161,11 +163,6 @@ def test_a_worker_that_wakes_after_another_run_writes_nothing(make):
     context.store.write("fit/bias", (slice(0, 8), slice(0, 8)), np.zeros((8, 8)))  # this thread has no turn
 
 
-def test_a_setting_that_no_stage_reads_redoes_nothing(make):
-    execute("fit", make())
-    assert status(FAKES["fit"], make("compute: {workers: 7}")).state == "complete"
-
-
 def test_one_bad_tile_stops_nothing_and_is_retried(make):
     BROKEN.add("1.2")
     context = make()
@@ -188,9 +185,8 @@ def test_one_bad_tile_stops_nothing_and_is_retried(make):
 
 def test_an_undivided_stage_starts_again_when_upstream_grew(make):
     BROKEN.add("0.0")
-    execute("fit", make())
-    execute("maps", make())
-    execute("ensemble", make())
+    for name in FAKES:
+        execute(name, make())
     assert status(FAKES["ensemble"], make()).state == "complete"
     BROKEN.clear()
     execute("fit", make())
@@ -198,27 +194,18 @@ def test_an_undivided_stage_starts_again_when_upstream_grew(make):
     assert status(FAKES["ensemble"], make()).words() == "stale - new maps"
 
 
-def test_tiles_redo_a_part_only_with_force(make):
-    execute("fit", make())
+def test_tiles_of_a_new_stage_leave_it_partial_and_redo_a_part_only_with_force(make):
+    assert execute("fit", make(roi=(0, 1, 0, 1))).words() == "partial 1 of 12"
+    assert execute("fit", make()).state == "complete"
     CALLS.clear()
-    execute("fit", make(roi=(0, 3, 0, 9)))
+    assert execute("fit", make(roi=(0, 3, 0, 9))).state == "complete"
     assert CALLS == []
     execute("fit", make(roi=(0, 3, 0, 9), force=True))
     assert CALLS == ["0.0", "0.1"]
     execute("fit", make(force=True))
     assert len(CALLS) == 2 + 12
-
-
-def test_tiles_of_a_new_stage_leave_it_partial(make):
-    assert execute("fit", make(roi=(0, 1, 0, 1))).words() == "partial 1 of 12"
-    assert execute("fit", make()).state == "complete"
-
-
-def test_regions_outside_are_refused_even_where_nothing_is_to_be_done(make):
-    assert execute("fit", make()).state == "complete"
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError):  # even where nothing is to be done
         execute("fit", make(roi=(0, 9, 90, 99)))
-    assert execute("fit", make(roi=(0, 1, 0, 1))).state == "complete"
 
 
 def test_changes_of_the_input_are_said_in_words():
@@ -229,16 +216,13 @@ def test_changes_of_the_input_are_said_in_words():
     assert differences(digest, other) == ["the input has changed"]
 
 
-def test_a_stage_without_its_upstream_names_the_command(make):
-    with pytest.raises(StoreError, match="maps needs fit first; run: pchem fit"):
-        execute("maps", make())
-
-
 def test_a_signal_stops_between_units_and_the_rest_is_done_later(make):
     context = make()
 
     class Interrupting(SerialExecutor):
         def map(self, function, items, on_result):
+            assert context.store.records.read("fit").keys == 12  # the total is known while it runs
+
             def hear(item, outcome):
                 if len(CALLS) == 3:
                     context.stop.signal = signal.SIGTERM
@@ -320,19 +304,6 @@ def test_a_stage_killed_while_it_begins_anew_is_still_known(make, monkeypatch, m
     np.testing.assert_array_equal(make().store.read("maps/bias")[0], 14)
 
 
-def test_the_total_is_known_while_a_stage_runs(make):
-    context, totals = make(), []
-
-    class Looking(SerialExecutor):
-        def map(self, function, items, on_result):
-            totals.append(context.store.records.read("fit").keys)
-            super().map(function, items, on_result)
-
-    context.executor = Looking()
-    execute("fit", context)
-    assert totals == [12]
-
-
 def test_handlers_turn_the_first_signal_into_a_request_and_are_removed():
     before = signal.getsignal(signal.SIGTERM)
     with stop_on_signals() as stop:
@@ -376,27 +347,21 @@ def test_what_the_shell_ignores_stays_ignored():
         assert stop.signal == signal.SIGINT
 
 
-def test_a_full_disk_stops_the_run_at_once(make, monkeypatch):
-    import errno
-
-    def full(self, name, region, data):
+@pytest.mark.parametrize(
+    ("raised", "error", "words"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), StoreError, "free space"),
+        (InputError("frames.raw vanished; put it back"), InputError, "put it back"),
+    ],
+)
+def test_a_full_disk_or_vanished_camera_files_stop_the_run_at_once(make, monkeypatch, raised, error, words):
+    def fail(self, name, region, data):
         with self._translated(name):
-            raise OSError(errno.ENOSPC, "No space left on device")
+            raise raised
 
-    monkeypatch.setattr(RunStore, "write", full)
-    with pytest.raises(StoreError, match="free space"):
+    monkeypatch.setattr(RunStore, "write", fail)
+    with pytest.raises(error, match=words):
         execute("fit", make())
-    assert CALLS == ["0.0"]
-
-
-def test_vanished_camera_files_stop_the_run_at_once(make, monkeypatch):
-    def vanished(self, name, region, data):
-        raise InputError("frames.raw vanished; put it back")
-
-    monkeypatch.setattr(RunStore, "write", vanished)
-    with pytest.raises(InputError, match="put it back") as caught:
-        execute("fit", make())
-    assert caught.value.exit_code == 4
     assert CALLS == ["0.0"]
 
 
@@ -406,10 +371,8 @@ def test_record_keeps_what_was_used(make):
     record = context.store.records.read("fit")
     assert record.content["settings"] == {"fit.gap_threshold": 5.0}
     assert record.versions["numpy"] == np.__version__
-    assert record.seconds > 0
-    assert record.peak_rss_bytes > 0
-    text = json.dumps(record.content)
-    assert str(context.store.path) not in text
+    assert min(record.seconds, record.peak_rss_bytes) > 0
+    assert str(context.store.path) not in json.dumps(record.content)
 
 
 @pytest.mark.parametrize(("begun", "stays"), [([], False), (["histogram"], True)])
