@@ -1,10 +1,12 @@
 """Camera files of a test: opened, read, and refused."""
 
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 from astropy.io import fits
 from numpy.typing import NDArray
@@ -21,6 +23,18 @@ def opened(path: Path, **settings: Any) -> FrameSequence:
 
 def read(path: Path, **settings: Any) -> NDArray[Any]:
     return opened(path, **settings).read()
+
+
+def check_reads(reader: FrameSequence, stack: NDArray[Any]) -> None:
+    """Assert that a reader gives these frames, whole and in windows, as does what another process gets."""
+    n, rows, _ = stack.shape
+    assert (reader.shape, reader.dtype) == (stack.shape, stack.dtype.newbyteorder("="))
+    windows = [(0, 1, 0, rows), (n - 1, n, rows - 1, rows), (n // 3, n - 1, rows // 4, rows // 2 + 1)]
+    windows += [(0, n, 0, (rows + 1) // 2), (n // 2, n // 2, 0, 1)]
+    for each in (reader, pickle.loads(pickle.dumps(reader))):
+        np.testing.assert_array_equal(each.read(), stack)
+        for t0, t1, y0, y1 in windows:
+            np.testing.assert_array_equal(each.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
 
 
 def refused(words: str, path: Path, use: Callable[..., Any] = read, **settings: Any) -> None:

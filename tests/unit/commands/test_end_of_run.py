@@ -62,15 +62,12 @@ def test_the_first_screen_is_told_and_the_path_alone_is_a_result(target, capsys)
     assert lines[-1] == "  pchem view 'my run.yaml'"
 
 
-def test_a_serious_answer_is_one_line_even_where_quiet(target, capsys):
+def test_a_serious_answer_is_one_line_even_where_quiet_and_strict_makes_it_exit_code_3(target, capsys):
     run(target, "serious", quiet=True)
     assert capsys.readouterr().err == "warning: To be believed? No: 60 % flagged: so.\n"
     for level in ("caution", "good"):
         run(target, level, quiet=True, strict=True)
         assert capsys.readouterr().err == ""
-
-
-def test_strict_makes_it_exit_code_3(target, capsys):
     with pytest.raises(NotBelievedError, match="To be believed") as raised:
         run(target, "serious", quiet=True, strict=True)
     assert raised.value.exit_code == ExitCode.INCOMPLETE == 3

@@ -145,11 +145,13 @@ def test_other_urls_and_paths_are_taken(url):
     assert parse_config(f"input: {{files: ['{url}']}}").input.files == (url,)
 
 
-def test_yaml_in_many_scripts():
+def test_many_scripts_and_keys_of_earlier_versions_are_read():
     text = "Ελληνικά кириллица 日本語 한국어 عربى עברית हिन्दी ไทย ქართული አማርኛ 😀"
     config = parse_config(f"run: {{store: '{text}.zarr'}}\ninput: {{files: ['{text}.npy']}}")
     assert parse_config(dump_config(config)) == config
     assert text in dump_config(config)
+    text = "input: {files: [a.npy]}\nreport: {figure_formats: [svg], dpi: 72, map_stretch: linear}\n"
+    assert parse_config(text) == parse_config("input: {files: [a.npy]}\n")
 
 
 ROW = {"tag": "row_noise", "row_noise_dn": 1.2}
@@ -245,8 +247,3 @@ def test_no_setting_is_called_what_yaml_takes_for_true_or_false():
     for kind in (RunConfig, *effect_classes().values()):
         for name in names(kind, set()):
             assert yaml.safe_load(name) == name, (kind, name)
-
-
-def test_keys_of_earlier_versions_are_read_and_do_nothing():
-    text = "input: {files: [a.npy]}\nreport: {figure_formats: [svg], dpi: 72, map_stretch: linear}\n"
-    assert parse_config(text) == parse_config("input: {files: [a.npy]}\n")

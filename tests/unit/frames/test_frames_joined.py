@@ -55,7 +55,7 @@ def test_resolve(tmp_path):
     assert resolve_files(InputSettings(files=("*.npy",)), folder) == [folder / "f.npy"]
 
 
-def test_missing_and_empty(tmp_path):
+def test_files_that_are_missing_empty_or_of_one_frame(tmp_path):
     with pytest.raises(ConfigError, match=r"input\.files is empty"):
         open_frames(InputSettings(), tmp_path)
     not_opened(r"none\.tif: no such file or folder", tmp_path / "none.tif")
@@ -72,9 +72,17 @@ def test_missing_and_empty(tmp_path):
         not_opened(f"{name}: {words}", tmp_path / name)
     with pytest.raises(ConfigError, match=r"unknown input\.format 'jpeg'; choose one of: auto, npy"):
         opened(tmp_path / "b.xyz", format="jpeg")
+    np.save(tmp_path / "one.npy", STACK[0])
+    not_opened(r"one\.npy: 1 frame of \d+ x \d+ pixels in total; at least 2 needed", tmp_path / "one.npy")
+    np.save(tmp_path / "zero.npy", STACK[:0])
+    not_opened(r"zero\.npy: has no frames", tmp_path / "zero.npy")
+    fits.PrimaryHDU().writeto(tmp_path / "zero.fits")
+    not_opened("no image", tmp_path / "zero.fits")
+    write_hdf5(tmp_path / "zero.h5", a=STACK[:0])
+    not_opened("no frames", tmp_path / "zero.h5")
 
 
-def test_formats_of_a_folder_are_told_by_content(tmp_path):
+def test_formats_are_told_by_content_and_may_be_mixed(tmp_path):
     np.save(tmp_path / "a.npy", STACK)
     tifffile.imwrite(tmp_path / "a.tif", STACK + 1, photometric="minisblack")
     not_opened(r"several formats \(npy, tiff\); set input.format", tmp_path / ".")
@@ -82,9 +90,6 @@ def test_formats_of_a_folder_are_told_by_content(tmp_path):
     np.testing.assert_array_equal(reader.read(), STACK + 1)
     tifffile.imwrite(tmp_path / "really_tiff.fits", STACK, photometric="minisblack")
     np.testing.assert_array_equal(opened(tmp_path / "*.fits").read(), STACK)
-
-
-def test_mixed_formats_are_concatenated(tmp_path):
     tifffile.imwrite(tmp_path / "p1.tif", STACK[:5], photometric="minisblack", compression="zlib")
     fits.PrimaryHDU(STACK[5]).writeto(tmp_path / "p2.fits")
     write_hdf5(tmp_path / "p3.h5", x=STACK[6:9])
@@ -96,14 +101,7 @@ def test_mixed_formats_are_concatenated(tmp_path):
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(reader)).read(), STACK)
 
 
-def test_region_through_a_small_scratch_buffer(tmp_path, monkeypatch):
-    np.save(tmp_path / "a.npy", STACK)
-    monkeypatch.setattr("pchem_pipeline.frames.sequence.SCRATCH_BYTES", 3 * 17 * 19 * 2)
-    reader = opened(tmp_path / "a.npy", roi=(0, 17, 5, 6))
-    np.testing.assert_array_equal(reader.read(), STACK[:, :, 5:6])
-
-
-def test_range_and_region_out_of_bounds(tmp_path):
+def test_ranges_and_regions(tmp_path, monkeypatch):
     np.save(tmp_path / "a.npy", STACK)
     beyond = r"input\.roi \[0, 18, 0, 5\] exceeds .* \(--roi 0:18,0:5; all pixels: 0:\d+,0:\d+\)"
     not_opened(beyond, tmp_path / "a.npy", roi=(0, 18, 0, 5))
@@ -114,9 +112,13 @@ def test_range_and_region_out_of_bounds(tmp_path):
     for name, value in [*bad, ("shape", (4,)), ("bit_depth", 0), ("unknown", 1)]:
         with pytest.raises(ValidationError):
             InputSettings(files=("a.npy",), **{name: value})
+    # a region is read through a small buffer, too
+    monkeypatch.setattr("pchem_pipeline.frames.sequence.SCRATCH_BYTES", 3 * 17 * 19 * 2)
+    reader = opened(tmp_path / "a.npy", roi=(0, 17, 5, 6))
+    np.testing.assert_array_equal(reader.read(), STACK[:, :, 5:6])
 
 
-def test_bit_shift(tmp_path):
+def test_bit_shift_and_bit_depth(tmp_path):
     np.save(tmp_path / "a.npy", STACK << 4)
     reader = opened(tmp_path / "a.npy", bit_shift=4)
     np.testing.assert_array_equal(reader.read(), STACK)
@@ -130,9 +132,6 @@ def test_bit_shift(tmp_path):
         reader.read()
     not_opened("removes all bits of uint16", tmp_path / "a.npy", bit_shift=16)
     not_opened("bit depth of 14 does not fit", tmp_path / "a.npy", bit_shift=4, bit_depth=14)
-
-
-def test_bit_depth_is_checked_and_left_justified_values_say_their_shift(tmp_path):
     np.save(tmp_path / "a.npy", STACK)
     np.testing.assert_array_equal(opened(tmp_path / "a.npy", bit_depth=12).read(), STACK)
     with pytest.raises(InputError, match=r"a\.npy: values exceed the bit depth of 11; correct"):
@@ -152,17 +151,6 @@ def test_files_that_contradict_each_other(tmp_path):
     assert opened(tmp_path / "*.fits", integration_time=3.0).integration_time == 3.0
     fits.PrimaryHDU(STACK[2]).writeto(tmp_path / "f2.fits", overwrite=True)
     assert opened(tmp_path / "*.fits").integration_time is None
-
-
-def test_zero_and_one_frame(tmp_path):
-    np.save(tmp_path / "one.npy", STACK[0])
-    not_opened(r"one\.npy: 1 frame of \d+ x \d+ pixels in total; at least 2 needed", tmp_path / "one.npy")
-    np.save(tmp_path / "zero.npy", STACK[:0])
-    not_opened(r"zero\.npy: has no frames", tmp_path / "zero.npy")
-    fits.PrimaryHDU().writeto(tmp_path / "zero.fits")
-    not_opened("no image", tmp_path / "zero.fits")
-    write_hdf5(tmp_path / "zero.h5", a=STACK[:0])
-    not_opened("no frames", tmp_path / "zero.h5")
 
 
 def make_bad_folder(folder):
@@ -371,13 +359,6 @@ def test_pixels_of_a_mask_and_those_with_the_marker_are_excluded(tmp_path):
     ):
         np.save(tmp_path / "mask.npy", values)
         not_opened(words, tmp_path / "a.npy", mask="mask.npy")
-
-
-def test_fits_adds_what_its_header_says(tmp_path):
-    stack = np.random.default_rng(4).integers(0, 4096, (9, 6, 8)).astype(np.uint16)
-    write_fits(tmp_path / "a.fits", (stack.astype(np.int32) - 1000).astype(np.int16), BZERO=1000)
-    frames = opened(tmp_path / "a.fits")
-    np.testing.assert_array_equal(frames.read(), stack)
 
 
 def test_files_with_names_that_are_special_and_files_that_are_none(tmp_path):

@@ -183,9 +183,14 @@ def test_the_best_exposure_ends_without_flags():
         assert low <= simulated([target], bright.point, bright.frames).n_flagged <= high
 
 
-def test_few_frames_must_show_electrons_at_all():
+def test_few_frames_must_show_electrons_at_all_and_those_of_no_use_are_not_simulated():
     plan = one(["bias=0.09e-"], point(0.05, 0.3))
     assert plan.frames == plan.needed > 2 * plan.bounds[0]
+    given = ([ONE_PERCENT], point(), [2.0], [1.0])
+    assert frames_simulated(*given, 2000, 1999) == np.inf
+    assert frames_simulated(*given, 100, 200) == np.inf
+    enough = frames_simulated(*given, 100, 1e5)
+    assert enough == pytest.approx(frames_needed(ONE_PERCENT, point()), rel=0.25)
 
 
 def test_impossible_pixels_and_samples_get_their_line():
@@ -263,14 +268,6 @@ def test_rivals_need_more_frames_than_the_bound_asks_for(exposure, noise, gain):
         found = simulated(["conversion_gain=1%"], best, plan.best_frames, n, every_flag=True)
         assert found.n_flagged < few
         assert found.checks[0].reached
-
-
-def test_frames_of_no_use_are_not_simulated():
-    given = ([ONE_PERCENT], point(), [2.0], [1.0])
-    assert frames_simulated(*given, 2000, 1999) == np.inf
-    assert frames_simulated(*given, 100, 200) == np.inf
-    enough = frames_simulated(*given, 100, 1e5)
-    assert enough == pytest.approx(frames_needed(ONE_PERCENT, point()), rel=0.25)
 
 
 def test_the_section_of_the_report_is_of_the_median_pixel():

@@ -304,7 +304,7 @@ def test_a_stage_killed_while_it_begins_anew_is_still_known(make, monkeypatch, m
     np.testing.assert_array_equal(make().store.read("maps/bias")[0], 14)
 
 
-def test_handlers_turn_the_first_signal_into_a_request_and_are_removed():
+def test_handlers_turn_the_first_signal_into_a_request_but_what_the_shell_ignores_and_are_removed():
     before = signal.getsignal(signal.SIGTERM)
     with stop_on_signals() as stop:
         signal.raise_signal(signal.SIGTERM)
@@ -312,6 +312,14 @@ def test_handlers_turn_the_first_signal_into_a_request_and_are_removed():
         with pytest.raises(InterruptedRunError):
             stop.check()
     assert signal.getsignal(signal.SIGTERM) is before
+    with sigint(signal.SIG_IGN), stop_on_signals() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.signal is None
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.signal == signal.SIGTERM
+    with sigint(signal.default_int_handler), stop_on_signals() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.signal == signal.SIGINT
 
 
 def test_at_once_a_signal_ends_what_guards_against_errors():
@@ -334,17 +342,6 @@ def test_at_once_a_signal_ends_what_guards_against_errors():
         signal.raise_signal(signal.SIGTERM)  # behind the block it is only remembered
         assert stop.signal == signal.SIGTERM
     assert passed == [()]
-
-
-def test_what_the_shell_ignores_stays_ignored():
-    with sigint(signal.SIG_IGN), stop_on_signals() as stop:
-        signal.raise_signal(signal.SIGINT)
-        assert stop.signal is None
-        signal.raise_signal(signal.SIGTERM)
-        assert stop.signal == signal.SIGTERM
-    with sigint(signal.default_int_handler), stop_on_signals() as stop:
-        signal.raise_signal(signal.SIGINT)
-        assert stop.signal == signal.SIGINT
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ class StrangeError(Exception):
     """An error of a library of its own."""
 
 
-def test_a_storage_that_fails_later_is_one_line(folder, monkeypatch):
+def test_what_the_storage_refuses_is_one_line(folder, monkeypatch):
     from zarr.storage import FsspecStore
 
     store = RunStore.create(folder)
@@ -113,9 +113,6 @@ def test_a_storage_that_fails_later_is_one_line(folder, monkeypatch):
     ):  # fmt: skip
         with pytest.raises(StoreError, match=r"error \(no route to host\); check address, keys and network"):
             ask(of)
-
-
-def test_what_the_storage_refuses_is_one_line():
     error = refused("s3://lab/x", ValueError("first\n second"))
     assert str(error) == ("s3://lab/x: object storage error (first second); check address, keys and network")
     assert isinstance(pickle.loads(pickle.dumps(error)), RemoteError)

@@ -38,10 +38,12 @@ def test_what_a_named_effect_is_told_with():
     assert "DEFECT: candidate odd_plugin failed and was not compared: ValueError: boom" in text
 
 
-def test_no_line_ends_between_a_number_and_its_unit():
+def test_lines_end_not_between_a_number_and_its_unit_and_keep_to_the_columns():
     for length in range(60, 100):
         found = verdict_of("consistent").model_copy(update={"sentence": "x" * length + " 5.7 % and 2 DN"})
         assert "5.7 %" in verdict_text(found)
+    text = verdict_text(verdict_of("named", defects={"a\nb": "x" * 300}))
+    assert all(len(line) <= 100 for line in text.splitlines())
 
 
 @pytest.mark.parametrize(
@@ -59,17 +61,17 @@ def test_a_verdict_says_what_would_decide_why_rivals_lost_and_what_is_left(verdi
     assert words in words_of(verdict, **changes)
 
 
-def test_a_strangers_message_keeps_the_columns():
-    text = verdict_text(verdict_of("named", defects={"a\nb": "x" * 300}))
-    assert all(len(line) <= 100 for line in text.splitlines())
-
-
-def test_numbers_that_are_not_known_are_said_so():
+def test_numbers_that_are_not_known_are_said_so_and_a_single_candidate_has_no_probability():
     gap = dict.fromkeys(("before", "after", "floor", "closed_fraction"))
     steps = [{**step("row_noise", "named", 477.0, 31.0), "rivals": [], "candidates": []}]
     text = verdict_text(verdict_of("named", gap=gap, steps=steps, where=[{"statistic": "code.top"}]))
     assert "gap between" not in text
     assert "code.top (sigma not known)" in text
+    alone = step(None, "ambiguous", 120.0, 120.0)
+    alone["candidates"] = alone["candidates"][:1]
+    text = verdict_text(verdict_of("ambiguous", steps=[alone]))
+    assert "row_noise: row_noise_dn = 0.3512 ± 0.0041 DN" in text
+    assert "probability" not in text
 
 
 def test_a_gap_that_chance_makes_is_not_said_to_be_closed():
@@ -79,14 +81,6 @@ def test_a_gap_that_chance_makes_is_not_said_to_be_closed():
     assert "gap between data and model: 0.6 → 0 micronats per sample (sampling noise: up to 1)" in text
     assert "closed" not in text
     assert "instead of" not in text
-
-
-def test_a_single_candidate_has_its_numbers_and_no_probability():
-    alone = step(None, "ambiguous", 120.0, 120.0)
-    alone["candidates"] = alone["candidates"][:1]
-    text = verdict_text(verdict_of("ambiguous", steps=[alone]))
-    assert "row_noise: row_noise_dn = 0.3512 ± 0.0041 DN" in text
-    assert "probability" not in text
 
 
 def test_a_place_is_told_once():

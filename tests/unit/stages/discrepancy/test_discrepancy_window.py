@@ -56,16 +56,13 @@ def stored(survey):
     return Survey.of_numbers(json.loads(json.dumps(survey.numbers())))
 
 
-def test_odd_frames_are_not_looked_at():
+def test_odd_frames_are_not_looked_at_and_those_delivered_twice_once():
     seen = stored(Survey(left_out=(0, 700)))
     for shape in ((900, 16, 16), (17750, 512, 512)):
         numbers = seen.window(shape, WHOLE, None).numbers
         assert not np.isin(numbers, (0, 700)).any()
         assert np.all(np.diff(numbers) > 0)
     assert seen.told(verdict_of("named"), 1.0).examined.left_out == (0, 700)
-
-
-def test_frames_delivered_twice_follow_each_other_without_their_copies():
     copied = tuple(range(1, 1800, 2))
     seen = stored(Survey(left_out=(6, *copied), copied=copied))
     window = seen.window((1800, 16, 16), WHOLE, None)

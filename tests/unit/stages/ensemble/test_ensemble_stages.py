@@ -320,12 +320,7 @@ def test_region_and_range_of_frames_find_their_truth(finished, tmp_path):
     assert abs(facts["error_rate"] - facts["expected_error_rate"]) < 5 * facts["error_rate_stderr"]
 
 
-def test_frames_that_do_not_exist(sensor):
-    with pytest.raises(ConfigError, match="first_frame: 1000, but the run has frames 0 to 399"):
-        execute("ensemble", sensor(first_frame=1000))
-
-
-def test_no_pixel_with_a_value(sensor, tmp_path):
+def test_no_pixel_with_a_value_and_frames_that_do_not_exist(sensor, tmp_path):
     context = sensor()
     for name in PARAMETERS:
         context.store.write_array(f"fit/{name}", np.full((NY, NX), np.nan))
@@ -334,6 +329,8 @@ def test_no_pixel_with_a_value(sensor, tmp_path):
     assert context.store.records.read("ensemble").notes[0].startswith("no pixel has a value")
     assert not context.store.has("ensemble/density")
     assert execute("ensemble", context) == state
+    with pytest.raises(ConfigError, match="first_frame: 1000, but the run has frames 0 to 399"):
+        execute("ensemble", make_context(tmp_path, first_frame=1000))
 
 
 def test_tiles_that_the_fit_finishes_later_are_added(finished, sensor, tmp_path):

@@ -159,15 +159,12 @@ def test_without_summaries(tmp_path, frames, expected):
     assert "summaries" in context.store.attributes("summary")["missing"]
 
 
-def test_too_little_memory_is_said(tmp_path, frames):
+def test_too_little_memory_is_said_and_incomplete_input_refused(tmp_path):
     wide = np.zeros((70, 3, 12000), np.uint8)
     context = completed(make_context(tmp_path, wide, tile=256, band_memory=16, window_frames=70), "histogram")
     assert any("more than histogram.band_memory" in note for note in context.notes)
-
-
-def test_incomplete_input_is_refused(tmp_path, frames):
-    context = make_context(tmp_path, frames)
     context.store.records.write(StageRecord("ingest", 1, "abc", {}, keys=2))
+    context.store.records.forget("histogram")
     with pytest.raises(StoreError, match="not complete"):
         execute("histogram", context)
 
