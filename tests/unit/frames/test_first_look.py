@@ -8,6 +8,7 @@ import pytest
 import zarr
 from helpers import layouts
 from helpers.camera_files import not_opened, opened, read
+from helpers.drawn_pixels import codes
 from helpers.plain_camera import LAYOUTS, PlainCamera
 
 from pchem_pipeline.frames.first_look import limits_in
@@ -62,9 +63,8 @@ def test_it_is_said_of_hdf5_and_not_where_there_is_nothing_to_see(tmp_path):
 
 
 def camera(bias, noise, step, *, frames=60):
-    rng = np.random.default_rng(8)
-    electrons = rng.poisson(1.2, (frames, 20, 24)) + noise * rng.standard_normal((frames, 20, 24))
-    return np.rint(bias + step * electrons).clip(0, 65535).astype(np.uint16)
+    dn = codes(np.random.default_rng(8), (frames, 20, 24), 1.2, step, noise, bias)
+    return dn.clip(0, 65535).astype(np.uint16)
 
 
 CAMERAS = {

@@ -216,7 +216,15 @@ def test_changes_of_the_input_are_said_in_words():
     assert differences(digest, other) == ["the input has changed"]
 
 
-def test_a_signal_stops_between_units_and_the_rest_is_done_later(make):
+@pytest.mark.parametrize(
+    ("heard", "number", "words"),
+    [
+        (3, signal.SIGTERM, "partial 3 of 12"),
+        # between the last unit and the end of a stage it must not leave it complete
+        (12, signal.SIGINT, "partial 12 of 12 - interrupted"),
+    ],
+)
+def test_a_signal_stops_behind_a_unit_and_the_rest_is_done_later(make, heard, number, words):
     context = make()
 
     class Interrupting(SerialExecutor):
@@ -224,38 +232,20 @@ def test_a_signal_stops_between_units_and_the_rest_is_done_later(make):
             assert context.store.records.read("fit").keys == 12  # the total is known while it runs
 
             def hear(item, outcome):
-                if len(CALLS) == 3:
-                    context.stop.signal = signal.SIGTERM
+                if len(CALLS) == heard:
+                    context.stop.signal = number
                 on_result(item, outcome)
 
             super().map(function, items, hear)
 
     context.executor = Interrupting()
-    with pytest.raises(InterruptedRunError, match="stopped by SIGTERM") as caught:
+    with pytest.raises(InterruptedRunError, match=f"stopped by {number.name}") as caught:
         execute("fit", context)
-    assert caught.value.exit_code == 143
-    assert status(FAKES["fit"], make()).words() == "partial 3 of 12"
-    CALLS.clear()
-    execute("fit", make())
-    assert len(CALLS) == 9
-
-
-def test_work_after_the_last_unit_is_made_up_for(make):
-    """A stop between the last unit and the end of a stage must not leave it complete."""
-    context = make()
-
-    class StopAtTheEnd(SerialExecutor):
-        def map(self, function, items, on_result):
-            super().map(function, items, on_result)
-            context.stop.signal = signal.SIGINT
-
-    context.executor = StopAtTheEnd()
-    with pytest.raises(InterruptedRunError):
-        execute("fit", context)
-    assert status(FAKES["fit"], make()).words() == "partial 12 of 12 - interrupted"
+    assert caught.value.exit_code == 128 + number
+    assert status(FAKES["fit"], make()).words() == words
     CALLS.clear()
     assert execute("fit", make()).state == "complete"
-    assert CALLS == []
+    assert len(CALLS) == 12 - heard
 
 
 def test_a_stage_stopped_before_its_first_unit_starts_anew(make, monkeypatch):

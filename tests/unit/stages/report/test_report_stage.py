@@ -46,7 +46,7 @@ def folder(base, tmp_path):
     return tmp_path / "run"
 
 
-def test_a_run_gets_page_numbers_and_figures(folder):
+def test_a_run_gets_page_and_numbers(folder, undrawn):
     context = completed(make_context(folder, title="My <sensor>"), "report")
     store = folder / "run.zarr"
     numbers = json.loads((store / "report.json").read_text())
