@@ -50,6 +50,12 @@ def not_opened(words: str, path: Path, **settings: Any) -> None:
     refused(words, path, opened, **settings)
 
 
+def overwrite(path: Path, at: int, content: bytes) -> None:
+    with path.open("r+b") as file:
+        file.seek(at)
+        file.write(content)
+
+
 def write_hdf5(path: Path, **arrays: Any) -> Path:
     with h5py.File(path, "w") as file:
         for name, values in arrays.items():

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -60,31 +61,19 @@ def test_ingest_crops_the_input_to_the_region_and_run_does_every_stage(calls):
     assert result.stdout == "/x/run.zarr\n"  # there is no report in this folder
 
 
-@pytest.mark.parametrize(
-    ("name", "given", "error", "words"),
-    [
-        ("c.yaml", {"integration_time": 1}, ConfigError, "--integration-time: only with camera files"),
-        ("none.tif", {}, InputError, "does not exist"),
-    ],
-)
-def test_what_a_run_cannot_begin_with_is_named(tmp_path, name, given, error, words):
-    with pytest.raises(error, match=words):
-        find_or_start([tmp_path / name], None, given)
+def test_what_a_run_cannot_begin_with_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="--integration-time: only with camera files"):
+        find_or_start([tmp_path / "c.yaml"], None, {"integration_time": 1})
+    with pytest.raises(InputError, match="does not exist"):
+        find_or_start([tmp_path / "none.tif"], None, {})
 
 
-EMPTY = r"^--roi .* contains no pixel; write y0:y1,x0:x1"
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        *((text, "y0:y1,x0:x1") for text in ("1,2", "a:b,c:d", "0:1", "0:1,2:3,4:5")),
-        *((text, EMPTY) for text in ("4:2,0:5", "0:4,5:5", "-1:4,0:5")),
-    ],
-)
-def test_a_wrong_or_empty_roi_shows_how(text, words):
-    with pytest.raises(ConfigError, match=words):
-        invoke("fit", "run.zarr", "--roi", text)
+def test_a_wrong_or_empty_roi_shows_how():
+    empty = ("4:2,0:5", "0:4,5:5", "-1:4,0:5")
+    for text in ("1,2", "a:b,c:d", "0:1", "0:1,2:3,4:5", *empty):
+        words = r"^--roi .* contains no pixel; write y0:y1,x0:x1" if text in empty else "y0:y1,x0:x1"
+        with pytest.raises(ConfigError, match=words):
+            invoke("fit", "run.zarr", "--roi", text)
 
 
 def test_init_writes_a_valid_file_once_whose_first_line_names_its_schema(tmp_path, monkeypatch):
@@ -141,10 +130,7 @@ def test_help_groups_commands_and_options_and_cuts_no_first_line():
     ],
 )
 def test_errors_are_one_line_with_their_exit_code(monkeypatch, capsys, error, code, words):
-    def fail(**_):
-        raise error
-
-    monkeypatch.setattr(app, "app", fail)
+    monkeypatch.setattr(app, "app", Mock(side_effect=error))
     with pytest.raises(SystemExit) as caught:
         app.main([])
     assert caught.value.code == code
@@ -192,17 +178,14 @@ def test_what_is_written_beside_a_store_lies_on_this_machine(arguments, tmp_path
         parse_config("simulate: {output: 's3://lab/frames'}")
 
 
-@pytest.mark.parametrize(
-    ("wanted", "words"),
-    [
+def test_what_cannot_be_drawn_is_refused_before_anything_is_read():
+    for wanted, words in (
         ({"formats": ("pdf", "jpg")}, "--format: jpg cannot be drawn; choose from pdf, svg, png"),
         ({"formats": ()}, "--format: no format"),
         ({"width": "88 px"}, "--width '88 px': write a length such as 88mm"),
-    ],
-)
-def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted, words):
-    with pytest.raises(ConfigError, match=words):
-        figures_of_run(Path("nowhere.zarr"), Path("out"), **wanted)
+    ):
+        with pytest.raises(ConfigError, match=words):
+            figures_of_run(Path("nowhere.zarr"), Path("out"), **wanted)
 
 
 @pytest.mark.parametrize("option", ["--only", "--format"])

@@ -30,17 +30,14 @@ def ingested(place, config=None):
     store.records.write(StageRecord("ingest", 1, "f", {}, finished=True))
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
+def test_a_wrong_option_is_one_line(tmp_path, file):
+    for given, words in (
         ({"integration_time": 0.0}, r"input\.integration_time: .* greater than 0 \(given: 0\.0\)"),
         ({"integration_time": float("nan")}, r"input\.integration_time: .* finite"),
         ({"bit_depth": 40}, r"input\.bit_depth: .* 32 \(given: 40\)"),
-    ],
-)
-def test_a_wrong_option_is_one_line(tmp_path, file, given, words):
-    with pytest.raises(ConfigError, match=f"^the command line: {words}"):
-        find_or_start([file], tmp_path / "run.zarr", given)
+    ):
+        with pytest.raises(ConfigError, match=f"^the command line: {words}"):
+            find_or_start([file], tmp_path / "run.zarr", given)
     assert not (tmp_path / "run.yaml").exists()
 
 

@@ -25,17 +25,14 @@ def test_rows_tell_rate_and_remaining_time():
     assert rows([PART], both)[1].strip() == "running (ingest and histogram) 8 of 64 MiB, 2/s, 28 s left"
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
+def test_paces_in_words():
+    for change, words in (
         ({"rate": 0.05, "remaining": 1120.0}, "running 8 of 64 tiles, 20 s each, 18 min 40 s left"),
         ({"rate": 0.005, "remaining": 11200.0}, "running 8 of 64 tiles, 200 s each, 3 h 06 min left"),
         ({"rate": None, "remaining": None}, "running 8 of 64 tiles"),
         ({"stage": "ingest: hash"}, "running (hash) 8 of 64 tiles, 2/s, 28 s left"),
-    ],
-)
-def test_paces_in_words(change, words):
-    assert pace_words({**PACE, **change}) == words
+    ):
+        assert pace_words({**PACE, **change}) == words
     assert pace_words({"stage": ""}) == "running"
     codes = {"stage": "fit: \x1b[2Jgone", "done": 1, "total": 2, "unit": "\x1b[31mtile"}  # of a terminal
     assert "\x1b" not in "".join(rows([StageState("fit", "partial")], codes))

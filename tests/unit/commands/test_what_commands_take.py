@@ -88,7 +88,7 @@ def test_an_effect_can_be_hidden_in_a_place():
     assert effect.when == When(range=((10, 20),))
 
 
-def test_a_region_of_frames_of_another_size_is_refused(tmp_path, monkeypatch):
+def test_frames_of_another_size_are_refused_and_of_another_dataset_taken(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sensor = SensorInfo("frames", 5, 4, 4, "uint16", None, None, "copy", {}, whole=(8, 9))
     config = RunConfig.model_validate({"input": {"files": ["a.npy"], "roi": [2, 6, 3, 7]}})
@@ -103,22 +103,18 @@ def test_a_region_of_frames_of_another_size_is_refused(tmp_path, monkeypatch):
     words = r"other.npy: frames of 12 x 12 .* \[2, 6, 3, 7\] of frames of 8 x 9"
     with pytest.raises(InputError, match=words):
         open_like_run(target, sensor, ["other.npy"])
-
-
-def test_the_dataset_of_other_frames_may_be_another(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
     dark = np.full((5, 4, 4), 100, np.uint16)
     light = dark + 20
     write_hdf5(tmp_path / "night.h5", **{"dark/frames": dark, "light/frames": light})
     sensor = SensorInfo("frames", 5, 4, 4, "uint16", None, None, "copy", {})
-    for own, given, found in (
+    for own, other, found in (
         ("dark/frames", None, dark),
         ("dark/frames", "light/frames", light),
         (None, "light/frames", light),
     ):
         config = RunConfig.model_validate({"input": {"files": ["a.h5"], "dataset": own}})
         target = Target(config, tmp_path, tmp_path / "run.zarr")
-        frames = open_like_run(target, sensor, ["night.h5"], given)
+        frames = open_like_run(target, sensor, ["night.h5"], other)
         np.testing.assert_array_equal(frames.read(), found)
     with pytest.raises(InputError, match=r"several datasets: .*; choose one with input\.dataset"):
         open_like_run(target, sensor, ["night.h5"])

@@ -90,6 +90,10 @@ def test_limits_of_a_job_are_seen_at_every_level_of_its_cgroup(job):
     write(root / "slurm/job_7", memory__stat=f"anon 9\ninactive_file {200 << 20}")
     write(root / "slurm/job_8", memory__max=1 << 20, memory__current=0, cpu__max="100000 100000")
     assert (available_workers(), available_memory()) == (3, 600 << 20)
+    # a limit from which a job is slowed down counts
+    enter("damaged\n0::/job\n")
+    write(root / "job", memory__max="max", memory__high=700 << 20, memory__current=100 << 20, cpu__max="1 0")
+    assert (available_workers(), available_memory()) == (16, 600 << 20)
 
 
 def test_limits_of_version_1(job):
@@ -106,13 +110,6 @@ def test_limits_of_version_1(job):
     enter("4:memory:/of/the/host\n")  # in a container, which sees its own as the root
     write(root / "memory", memory__limit_in_bytes=500 << 20, memory__usage_in_bytes=100 << 20)
     assert available_memory() == 400 << 20
-
-
-def test_a_limit_from_which_a_job_is_slowed_down_counts(job):
-    root, enter = job
-    enter("damaged\n0::/job\n")
-    write(root / "job", memory__max="max", memory__high=700 << 20, memory__current=100 << 20, cpu__max="1 0")
-    assert (available_workers(), available_memory()) == (16, 600 << 20)
 
 
 def test_what_slurm_gave_is_a_limit_without_cgroups_too(job, monkeypatch):

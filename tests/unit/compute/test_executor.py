@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -65,13 +66,10 @@ def test_stop_lets_running_items_finish_and_starts_no_others(backend):
 
 
 def test_a_dead_worker_process_or_a_machine_without_shared_memory_is_one_clear_line(monkeypatch):
-    def lock():
-        raise PermissionError
-
     executor = make_executor(ComputeSettings(backend="processes", workers=1))
     with pytest.raises(IncompleteRunError, match="worker process died"):
         executor.map(die, [1], lambda *_: None)
-    monkeypatch.setattr(executor_module._SPAWN, "Lock", lock)
+    monkeypatch.setattr(executor_module._SPAWN, "Lock", Mock(side_effect=PermissionError))
     with pytest.raises(ConfigError, match="use --backend threads"):
         make_executor(ComputeSettings(backend="processes", workers=2)).map(abs, [1], lambda *_: None)
 

@@ -56,15 +56,16 @@ def test_numpy_files(tmp_path):
     np.save(tmp_path / "channels.npy", np.array([WANTED, [0, 0, 0, 0, 9]]))
     np.savez(tmp_path / "one.npz", dn=DN, counts=COUNTS)
     np.savez(tmp_path / "two.npz", dn=DN, counts=np.stack([COUNTS, COUNTS[::-1]]))
-    for name, origin in [("columns.npy", 100), ("line.npy", 0), ("one.npz", 100)]:
+    for name, counts, origin in (
+        ("columns.npy", [WANTED], [100]),
+        ("line.npy", [WANTED], [0]),
+        ("one.npz", [WANTED], [100]),
+        ("channels.npy", [WANTED, [9, 0, 0, 0, 0]], [0, 4]),
+        ("two.npz", [WANTED, [2, 7, 0, 0, 3]], [100, 100]),
+    ):
         found = read(tmp_path, name)
-        assert found.counts[0].tolist() == [WANTED]
-        assert found.origin.tolist() == [[origin]]
-    assert read(tmp_path, "channels.npy").counts[0].tolist() == [WANTED, [9, 0, 0, 0, 0]]
-    assert read(tmp_path, "channels.npy").origin.tolist() == [[0, 4]]
-    two = read(tmp_path, "two.npz")
-    assert two.counts[0].tolist() == [WANTED, [2, 7, 0, 0, 3]]
-    assert two.names == ("two:0", "two:1")
+        assert (found.counts[0].tolist(), found.origin.tolist()) == (counts, [origin])
+    assert found.names == ("two:0", "two:1")
 
 
 def test_several_files_and_large_counts(tmp_path):
@@ -152,20 +153,13 @@ def test_all_bad_files_in_one_message(tmp_path):
         read(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("name", "format", "expected"),
-    [
-        ("a.csv", "auto", True),
-        ("*.csv", "auto", True),
-        ("a.csv", "raw", False),
-        ("a.npy", "auto", False),
-        ("a.npy", "histogram", True),
-        (".", "auto", False),
-    ],
-)
-def test_what_is_a_histogram_input(tmp_path, name, format, expected):
+def test_what_is_a_histogram_input(tmp_path):
     (tmp_path / "a.csv").write_text("1,2\n2,3\n")
     np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), np.uint8))
-    assert is_histogram_input(InputSettings(files=(name,), format=format), tmp_path) == expected
+    given = [("a.csv", "auto"), ("*.csv", "auto"), ("a.npy", "histogram")]
+    other = [("a.csv", "raw"), ("a.npy", "auto"), (".", "auto")]
+    for name, format in (*given, *other):
+        found = is_histogram_input(InputSettings(files=(name,), format=format), tmp_path)
+        assert found == ((name, format) in given)
     with pytest.raises(InputError, match="mixed"):
         is_histogram_input(InputSettings(files=("a.csv", "a.npy")), tmp_path)

@@ -272,8 +272,11 @@ def test_unreadable_file(tmp_path, monkeypatch):
         return real(path, *args, **rest)
 
     monkeypatch.setattr(Path, "open", deny)
-    not_opened(r"a\.npy: cannot be read \(Permission denied\)", tmp_path / "a.npy")
-    not_opened(r"a\.npy: cannot be read \(Permission denied\)", tmp_path / "a.npy", format="npy")
+    for format in ("auto", "npy"):
+        not_opened(r"a\.npy: cannot be read \(Permission denied\)", tmp_path / "a.npy", format=format)
+
+
+BIAS = {"BIASSEC": "[7:8,1:6]"}
 
 
 @pytest.mark.parametrize(
@@ -288,13 +291,8 @@ def test_unreadable_file(tmp_path, monkeypatch):
         ({"DATASEC": "whole"}, {}, None, None),
         # between both a column of neither
         ({"TRIMSEC": "[1:5,1:6]", "BIASSEC": "[7:8,1:6]"}, {}, (0, 6, 0, 5), np.s_[:, 6:]),
-        ({"BIASSEC": "[7:8,1:6]"}, {}, (0, 6, 0, 6), np.s_[:, 6:]),
-        (
-            {"BIASSEC": "[7:8,1:6]"},
-            {"overscan": [(0, 2, 0, 8)], "roi": (1, 6, 0, 8)},
-            (1, 5, 0, 8),
-            np.s_[:1],
-        ),
+        (BIAS, {}, (0, 6, 0, 6), np.s_[:, 6:]),
+        (BIAS, {"overscan": [(0, 2, 0, 8)], "roi": (1, 6, 0, 8)}, (1, 5, 0, 8), np.s_[:1]),
         ({"TRIMSEC": "[1:5,1:6]"}, {"overscan": []}, (0, 6, 0, 5), np.s_[:0]),
     ],
 )

@@ -70,16 +70,13 @@ def plug_in(monkeypatch, *points):
     registry._plugins.cache_clear()
 
 
-def test_reader_from_a_plug_in(tmp_path, monkeypatch):
+def test_reader_from_a_plug_in_which_is_not_loaded_without_need(tmp_path, monkeypatch):
     plug_in(monkeypatch, ("textframes", f"{__name__}:TextReader"))
     (tmp_path / "a.txf").write_text("TEXTFRAMES\n1 2|3 4\n5 6|7 8\n")
     for name, format in (("a.txf", "auto"), (".", "auto"), ("a.txf", "textframes")):
         found = open_frames(InputSettings(files=(name,), format=format), tmp_path).read()
         np.testing.assert_array_equal(found, np.arange(1, 9).reshape(2, 2, 2))
     assert "textframes" in registry.reader_names()
-
-
-def test_plug_in_is_not_loaded_without_need(tmp_path, monkeypatch):
     plug_in(monkeypatch, ("broken", "there_is_no_such_module:Reader"))
     np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), np.uint8))
     assert open_frames(InputSettings(files=("a.npy",)), tmp_path).shape == (2, 3, 4)
@@ -87,28 +84,20 @@ def test_plug_in_is_not_loaded_without_need(tmp_path, monkeypatch):
         open_frames(InputSettings(files=("a.npy",), format="broken"), tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("points", "words"),
-    [
+def test_doubles_and_what_is_no_reader_are_refused(monkeypatch):
+    for points, words in (
         ([("tiff", "other.package:Tiff")], "'tiff': pchem_pipeline itself and other.package:Tiff"),
         ([("lab", "one.package:Lab"), ("lab", "two.package:Lab")], "'lab': one.package:Lab and two.package"),
-        ([("lab", "one.package:Lab")] * 2, ""),  # one that is listed twice is no double
-    ],
-)
-def test_doubles_are_refused(monkeypatch, points, words):
-    plug_in(monkeypatch, *points)
-    if not words:
-        assert registry.reader_names()[-1] == "lab"
-        return
-    with pytest.raises(ConfigError, match=f"named {words}"):
-        registry.reader_names()
-
-
-@pytest.mark.parametrize(("name", "cls"), [("noreader", "EntryPoint"), ("othername", "TextReader")])
-def test_plug_in_that_is_no_reader(monkeypatch, name, cls):
-    plug_in(monkeypatch, (name, f"{__name__}:{cls}"))
-    with pytest.raises(ConfigError, match=f"must be a FrameReader with format_name = '{name}'"):
-        registry.reader_class(name)
+    ):
+        plug_in(monkeypatch, *points)
+        with pytest.raises(ConfigError, match=f"named {words}"):
+            registry.reader_names()
+    plug_in(monkeypatch, *[("lab", "one.package:Lab")] * 2)  # one that is listed twice is no double
+    assert registry.reader_names()[-1] == "lab"
+    for name, cls in (("noreader", "EntryPoint"), ("othername", "TextReader")):
+        plug_in(monkeypatch, (name, f"{__name__}:{cls}"))
+        with pytest.raises(ConfigError, match=f"must be a FrameReader with format_name = '{name}'"):
+            registry.reader_class(name)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +106,7 @@ def test_plug_in_that_is_no_reader(monkeypatch, name, cls):
 def test_missing_library_is_named_with_what_installs_it(tmp_path, monkeypatch, format, library):
     stack = np.zeros((2, 3, 4), np.uint16)
     by_hand = {"nd2": nd2_bytes, "sif": sif_bytes}.get(format)
-    actions = [lambda: open_frames(InputSettings(files=(str(path),)), tmp_path)]
+    actions = [lambda: opened(path)]
     if by_hand:
         path = tmp_path / f"a.{format}"
         path.write_bytes(by_hand(stack))

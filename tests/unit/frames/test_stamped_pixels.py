@@ -71,14 +71,7 @@ def test_stamped_pixels_are_no_samples(tmp_path, make, width, layouts):
         np.testing.assert_array_equal(found[:, ~expected], stack[:, ~expected])
 
 
-def test_a_text_beside_the_stamp_is_none_either(tmp_path):
-    frames = opened(write(tmp_path, "npy", pco(noise(), text=True)))
-    expected = np.zeros(SHAPE, bool)
-    expected[:8, :271] = True
-    np.testing.assert_array_equal(frames.excluded, expected)
-
-
-def test_a_region_is_left_with_its_own_part_of_the_stamp(tmp_path):
+def test_a_region_is_left_with_its_own_part_of_the_stamp_and_a_text_beside_is_no_sample_either(tmp_path):
     path = write(tmp_path, "npy", pco(noise()))
     frames = opened(path, roi=(0, 5, 7, 60), frame_range=(3, 19))
     assert frames.excluded is not None
@@ -86,6 +79,10 @@ def test_a_region_is_left_with_its_own_part_of_the_stamp(tmp_path):
     beside = opened(path, roi=(1, 12, 0, 60))
     assert beside.excluded is None
     assert "stamp" not in beside.report.message()
+    frames = opened(write(tmp_path, "npy", pco(noise(), text=True)))
+    expected = np.zeros(SHAPE, bool)
+    expected[:8, :271] = True
+    np.testing.assert_array_equal(frames.excluded, expected)
 
 
 def test_stamps_of_single_files_and_a_mask_go_together(tmp_path):

@@ -3,6 +3,7 @@
 import json
 import shutil
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -254,15 +255,13 @@ def test_the_yaml_of_another_run_stays(finished, run):
 
 
 def test_a_model_that_is_not_there_or_cannot_be_written_leaves_all_as_it_is(run, monkeypatch):
-    def refuse(*_):
-        raise StoreError("no permission to write there")
-
     [only] = json.loads(invoke("model", run, "--json").stdout)["models"]
     assert (only["number"], only["current"], only["results"]) == (1, True, ["fit", "maps"])
     with pytest.raises(ConfigError, match="has no model 7"):
         invoke("model", run, "--use", "7")
     verdict(run, ROW)
-    monkeypatch.setattr("pchem_pipeline.config.load.write_atomic", refuse)
+    refusal = StoreError("no permission to write there")
+    monkeypatch.setattr("pchem_pipeline.config.load.write_atomic", Mock(side_effect=refusal))
     with pytest.raises(StoreError, match="no permission"):
         adopt_verdict(find_run(run))
     assert find_run(run.parent / "run.zarr").config.model == settings()

@@ -7,6 +7,7 @@ import json
 import re
 import signal
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -44,8 +45,8 @@ def double_tile(tile, store):
 
 def fit_run(context):
     context.create("fit/bias")
-    value = context.config.fit.gap_threshold
-    context.run_units(context.tiles(), functools.partial(number_tile, value=value))
+    task = functools.partial(number_tile, value=context.config.fit.gap_threshold)
+    context.run_units(context.tiles(), task)
 
 
 def maps_run(context):
@@ -80,10 +81,9 @@ def make(tmp_path, monkeypatch):
     reporter = Reporter("off", quiet=True, log=tmp_path / "log.jsonl")
 
     def context(config="", **options):
-        text = f"input: {{files: [a]}}\nrun: {{tile: 8}}\n{config}"
-        return StageContext(
-            parse_config(text), tmp_path, store, SerialExecutor(), reporter, StopRequest(), Command(**options)
-        )
+        found = parse_config(f"input: {{files: [a]}}\nrun: {{tile: 8}}\n{config}")
+        command = Command(**options)
+        return StageContext(found, tmp_path, store, SerialExecutor(), reporter, StopRequest(), command)
 
     yield context
     reporter.close()
@@ -91,8 +91,15 @@ def make(tmp_path, monkeypatch):
 
 def test_a_second_run_does_nothing_nor_does_a_setting_that_no_stage_reads(make):
     for config in ("", "", "compute: {workers: 7}"):
-        assert execute("fit", make(config)).state == "complete"
+        context = make(config)
+        assert execute("fit", context).state == "complete"
         assert len(CALLS) == 12
+    # the record keeps what was used
+    record = context.store.records.read("fit")
+    assert record.content["settings"] == {"fit.gap_threshold": 5.0}
+    assert record.versions["numpy"] == np.__version__
+    assert min(record.seconds, record.peak_rss_bytes) > 0
+    assert str(context.store.path) not in json.dumps(record.content)
 
 
 def test_what_a_hand_took_out_of_the_store_is_made_again(make, monkeypatch):
@@ -209,11 +216,12 @@ def test_tiles_of_a_new_stage_leave_it_partial_and_redo_a_part_only_with_force(m
 
 
 def test_changes_of_the_input_are_said_in_words():
-    settings = {"version": 1, "settings": {}, "upstream": {}}
-    time, later = ({**settings, "input": {"integration_time": value}} for value in (4.87, 5.0))
-    assert differences(time, later) == ["input.integration_time 4.87 -> 5.0"]
-    digest, other = ({**settings, "input": {"content": value}} for value in ("ab", "cd"))
-    assert differences(digest, other) == ["the input has changed"]
+    def told(name, *values):
+        same = {"version": 1, "settings": {}, "upstream": {}}
+        return differences(*({**same, "input": {name: value}} for value in values))
+
+    assert told("integration_time", 4.87, 5.0) == ["input.integration_time 4.87 -> 5.0"]
+    assert told("content", "ab", "cd") == ["the input has changed"]
 
 
 @pytest.mark.parametrize(
@@ -275,19 +283,12 @@ def test_a_stage_stopped_before_its_first_unit_starts_anew(make, monkeypatch):
 
 
 @pytest.mark.parametrize("moment", ["unmark_all", "write", "delete"])
-def test_a_stage_killed_while_it_begins_anew_is_still_known(make, monkeypatch, moment):
+def test_a_stage_killed_while_it_begins_anew_is_still_known(make, moment):
     for name in ("fit", "maps"):
         execute(name, make("fit: {gap_threshold: 3}"))
     owner = RunStore if moment == "delete" else type(make().store.records)
-    real = getattr(owner, moment)
-
-    def killed(*arguments):
-        raise SystemExit
-
-    monkeypatch.setattr(owner, moment, killed)
-    with pytest.raises(SystemExit):
+    with patch.object(owner, moment, side_effect=SystemExit), pytest.raises(SystemExit):
         execute("fit", make("fit: {gap_threshold: 7}"))
-    monkeypatch.setattr(owner, moment, real)
     assert status(FAKES["fit"], make("fit: {gap_threshold: 7}")).state != "missing"
     for name in ("fit", "maps"):
         assert execute(name, make("fit: {gap_threshold: 7}")).state == "complete"
@@ -350,16 +351,6 @@ def test_a_full_disk_or_vanished_camera_files_stop_the_run_at_once(make, monkeyp
     with pytest.raises(error, match=words):
         execute("fit", make())
     assert CALLS == ["0.0"]
-
-
-def test_record_keeps_what_was_used(make):
-    context = make()
-    execute("fit", context)
-    record = context.store.records.read("fit")
-    assert record.content["settings"] == {"fit.gap_threshold": 5.0}
-    assert record.versions["numpy"] == np.__version__
-    assert min(record.seconds, record.peak_rss_bytes) > 0
-    assert str(context.store.path) not in json.dumps(record.content)
 
 
 @pytest.mark.parametrize(("begun", "stays"), [([], False), (["histogram"], True)])

@@ -1,5 +1,7 @@
 """Frames appended to a finished run: what all frames together give, without reading the old ones."""
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from helpers.commands import arrays_of, assert_equal_arrays, assert_same_results
@@ -188,17 +190,12 @@ def of_all_frames(tmp_path_factory, frames):
         ),
     ],
 )
-def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, monkeypatch, frames, of_all_frames, places):
+def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, frames, of_all_frames, places):
     run = begun(tmp_path, frames, 600, ("ingest", "histogram", "fit"))
-
-    def killed(*arguments, **named):
-        raise KeyboardInterrupt
-
     for place in places:
-        with monkeypatch.context() as patch:
-            patch.setattr(f"pchem_pipeline.{place}", killed)
-            with pytest.raises(KeyboardInterrupt):
-                append_frames(run, QUIET)
+        killed = patch(f"pchem_pipeline.{place}", side_effect=KeyboardInterrupt)
+        with killed, pytest.raises(KeyboardInterrupt):
+            append_frames(run, QUIET)
     if len(places) > 1:
         assert [state.why for state in run_status(run) if state.stage == "fit"] == ["the run has no input"]
     assert [state.state for state in append_frames(run, QUIET)] == ["complete", "complete"]

@@ -90,14 +90,11 @@ def test_reference_copies_nothing(folder):
     assert (context.sensor.n_frames, context.sensor.shape) == (40, (30, 26))
     assert open_source(context).shape == STACK.shape
     place = folder / "cam" / "f9.tif"
-    for change, refused in ((0, False), (1, True)):  # touched; other frames of the same shape
-        tifffile.imwrite(place, STACK[10:20] ^ change, photometric="minisblack")
-        os.utime(place, ns=(change, change))
-        if refused:
-            with pytest.raises(InputError, match=r"files changed since they were ingested .*; run: pchem"):
-                open_source(context)
-        else:
-            assert open_source(context).shape == STACK.shape
+    os.utime(place, ns=(0, 0))
+    assert open_source(context).shape == STACK.shape
+    tifffile.imwrite(place, STACK[10:20] ^ 1, photometric="minisblack")  # other frames of the same shape
+    with pytest.raises(InputError, match=r"files changed since they were ingested .*; run: pchem"):
+        open_source(context)
 
 
 def test_stop_and_resume(folder, small_chunks, monkeypatch):

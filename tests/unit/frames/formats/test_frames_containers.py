@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import zarr
 from helpers import layouts
-from helpers.camera_files import check_reads, opened, read, refused, write_hdf5
+from helpers.camera_files import check_reads, opened, overwrite, read, refused, write_hdf5
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.hdf5 import Hdf5Reader
@@ -72,29 +72,23 @@ def test_nexus_facts_of_frames_that_are_linked(tmp_path):
         detector["description"] = "Maker Model"
         file["entry/data/data"] = STACK
         detector["data"] = file["entry/data/data"]
-    check_reads(opened(path), STACK)
-    reader = Hdf5Reader.open(path, InputSettings())
-    assert (reader.integration_time, reader.bit_depth) == (pytest.approx(0.25), 16)
-    assert reader.camera.name == "Maker Model"
-
-
-def write_parts(folder, from_row=0):
-    """Write the stack as a virtual dataset of three files, maybe without their first rows."""
-    _, rows, columns = STACK.shape
-    layout = h5py.VirtualLayout((len(STACK), rows - from_row, columns), STACK.dtype)
-    for i, (start, end) in enumerate([(0, 3), (3, 6), (6, 7)]):
-        write_hdf5(folder / f"part{i}.h5", data=STACK[start:end])
-        source = h5py.VirtualSource(f"part{i}.h5", "data", (end - start, rows, columns))
-        layout[start:end] = source[:, from_row:] if from_row else source
-    with h5py.File(folder / "all.h5", "w") as file:
-        file.create_virtual_dataset("data", layout)
-    return folder / "all.h5"
+    reader = opened(path)
+    check_reads(reader, STACK)
+    found = reader.integration_time, reader.bit_depth, reader.camera.name
+    assert found == (pytest.approx(0.25), 16, "Maker Model")
 
 
 @pytest.mark.parametrize("from_row", [0, 4])
 def test_hdf5_virtual_dataset(tmp_path, from_row):
     """The library reads parts that it does not find as 0; they must not pass for frames."""
-    path = write_parts(tmp_path, from_row)
+    path, (_, rows, columns) = tmp_path / "all.h5", STACK.shape
+    layout = h5py.VirtualLayout((len(STACK), rows - from_row, columns), STACK.dtype)
+    for i, (start, end) in enumerate([(0, 3), (3, 6), (6, 7)]):
+        write_hdf5(tmp_path / f"part{i}.h5", data=STACK[start:end])
+        source = h5py.VirtualSource(f"part{i}.h5", "data", (end - start, rows, columns))
+        layout[start:end] = source[:, from_row:] if from_row else source
+    with h5py.File(path, "w") as file:
+        file.create_virtual_dataset("data", layout)
     np.testing.assert_array_equal(read(path), STACK[:, from_row:])
     assert "in 3 other files" in Hdf5Reader.open(path, InputSettings()).notes[0]
     write_hdf5(tmp_path / "part1.h5", data=STACK[3:5])
@@ -118,15 +112,14 @@ def test_hdf5_virtual_dataset_without_an_end(tmp_path):
     refused(r"missing or truncated|no frames", tmp_path / "all.h5")
 
 
-@pytest.mark.parametrize("there", [True, False])
-def test_hdf5_links_into_other_files(tmp_path, there):
+def test_hdf5_links_into_other_files(tmp_path):
     """A master file names its data files, whose frames it does not hold; its masks are no frames."""
     path = tmp_path / "master.h5"
     with h5py.File(path, "w") as file:
         file["mask"] = np.zeros(STACK.shape[1:], np.uint32)
         file["entry/data_000001"] = h5py.ExternalLink("data_000001.h5", "/data")
-    if there:
-        write_hdf5(tmp_path / "data_000001.h5", data=STACK)
+    refused(r"in other files: entry/data_000001 in data_000001\.h5; give those", path)
+    write_hdf5(tmp_path / "data_000001.h5", data=STACK)
     refused(r"in other files: entry/data_000001 in data_000001\.h5; give those", path)
     refused("in other files", path, dataset="/entry/data_000001")
     with h5py.File(path, "a") as file:
@@ -194,11 +187,8 @@ def test_hdf5_where_files_cannot_be_locked(tmp_path, monkeypatch):
 def test_hdf5_with_a_filter_that_is_not_installed_or_left_open_by_its_writer(tmp_path):
     path = tmp_path / "a.h5"
     layouts.hdf5(path, STACK, chunks=(1, 19, 22), compression="gzip")
-    data = bytearray(path.read_bytes())
-    place = data.index(b"deflate\0") - 8
-    assert data[place : place + 2] == b"\1\0"
-    data[place : place + 2] = (40_000).to_bytes(2, "little")
-    path.write_bytes(data)
+    place = path.read_bytes().index(b"deflate\0") - 8
+    overwrite(path, place, (40_000).to_bytes(2, "little"))
     refused(r"/frames needs HDF5 filter 40000 \(deflate\), which is not", path)
     path, copy = tmp_path / "a.h5", tmp_path / "copy.h5"
     with h5py.File(path, "w", libver="latest") as file:
@@ -215,8 +205,7 @@ def test_matlab_file(tmp_path):
     with h5py.File(path, "w", userblock_size=512) as file:
         file["frames"] = STACK
         file["frames"].attrs["MATLAB_class"] = np.bytes_("uint16")
-    with path.open("r+b") as stream:
-        stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64")
+    overwrite(path, 0, b"MATLAB 7.3 MAT-file, Platform: GLNXA64")
     np.testing.assert_array_equal(read(path), STACK)
     assert "last axis read as frames" in Hdf5Reader.open(path, InputSettings()).notes[0]
 
@@ -233,21 +222,28 @@ def test_hdf5_candidates_are_listed(tmp_path):
     refused("no dataset of frames", path)
 
 
-def test_hdf5_damaged_chunk(tmp_path):
+def test_damaged_chunks(tmp_path):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         dataset = file.create_dataset("frames", data=STACK, chunks=(1, 19, 22), compression="gzip")
         place = dataset.id.get_chunk_info(3).byte_offset
     reader = opened(tmp_path / "a.h5")
-    data = bytearray(path.read_bytes())
-    data[place : place + 60] = bytes(60)
-    path.write_bytes(data)
+    overwrite(path, place, bytes(60))
     np.testing.assert_array_equal(reader.read(0, 3), STACK[:3])
     with pytest.raises(InputError, match=r"a\.h5: cannot be decoded"):
         reader.read()
     write_hdf5(path, frames=STACK[:4])
     with pytest.raises(InputError, match="the shape of the dataset changed while it was being read"):
         reader.read(0, 2)
+    path = tmp_path / "a.zarr"
+    zarr.create_array(path, data=STACK, chunks=(3, 19, 22))
+    reader = opened(tmp_path / "a.zarr")
+    chunk = sorted(file for file in path.rglob("*") if file.is_file() and file.name != "zarr.json")[0]
+    chunk.write_bytes(chunk.read_bytes()[:20])
+    with pytest.raises(InputError, match=r"a\.zarr: cannot be decoded"):
+        reader.read()
+    (path / "zarr.json").write_text("{")
+    refused("not a valid zarr store", path)
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -284,26 +280,13 @@ def test_events_of_several_frames_are_read_in_turn(tmp_path, chunks):
         assert "read as 3 x 7 frames" in reader.report.notes[0]
 
 
-@pytest.mark.parametrize("axes", [["c", "y", "x"], [{"name": "c"}, {"name": "y"}, {"name": "x"}]])
-def test_channels_of_ome_zarr_are_reported(tmp_path, axes):
+def test_channels_of_ome_zarr_are_reported(tmp_path):
     path = tmp_path / "image.zarr"
     group = zarr.open_group(path, mode="w", zarr_format=2)
     group.create_array("0", data=STACK)
-    group.attrs["multiscales"] = [{"axes": axes, "datasets": [{"path": "0"}]}]
-    reader = ZarrReader.open(path, InputSettings())
-    np.testing.assert_array_equal(reader.read(), STACK)
-    assert "7 channels; read as frames" in reader.notes[0]
-    group.attrs["multiscales"] = [{"axes": ["t", "y", "x"], "datasets": [{"path": "0"}]}]
-    assert not ZarrReader.open(path, InputSettings()).notes
-
-
-def test_zarr_damage(tmp_path):
-    path = tmp_path / "a.zarr"
-    zarr.create_array(path, data=STACK, chunks=(3, 19, 22))
-    reader = opened(tmp_path / "a.zarr")
-    chunk = sorted(file for file in path.rglob("*") if file.is_file() and file.name != "zarr.json")[0]
-    chunk.write_bytes(chunk.read_bytes()[:20])
-    with pytest.raises(InputError, match=r"a\.zarr: cannot be decoded"):
-        reader.read()
-    (path / "zarr.json").write_text("{")
-    refused("not a valid zarr store", path)
+    named = [{"name": name} for name in "cyx"]
+    for axes, channels in ((["c", "y", "x"], 1), (named, 1), (["t", "y", "x"], 0)):
+        group.attrs["multiscales"] = [{"axes": axes, "datasets": [{"path": "0"}]}]
+        reader = ZarrReader.open(path, InputSettings())
+        np.testing.assert_array_equal(reader.read(), STACK)
+        assert ["7 channels; read as frames" in note for note in reader.notes] == [True] * channels

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 from helpers import layouts
-from helpers.camera_files import opened, read, refused
+from helpers.camera_files import opened, overwrite, read, refused
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
@@ -24,15 +24,12 @@ def test_twelve_bits_packed(tmp_path):
     layouts.tiff(path, STACK[0], metadata=None)
     bits = "".join(f"{value:012b}" for value in STACK[0].ravel())  # rows of 34 samples are whole bytes
     packed = int(bits, 2).to_bytes(len(bits) // 8, "big")
-    raw = bytearray(path.read_bytes())
-    with tifffile.TiffFile(path) as file:
+    with tifffile.TiffFile(path, mode="r+b") as file:
         page = file.pages[0]
-        bits_at, counts_at = (page.tags[name].valueoffset for name in ("BitsPerSample", "StripByteCounts"))
+        page.tags["BitsPerSample"].overwrite(12)
+        page.tags["StripByteCounts"].overwrite(len(packed))
         start = page.dataoffsets[0]
-    raw[bits_at : bits_at + 2] = (12).to_bytes(2, "little")
-    raw[counts_at : counts_at + 4] = len(packed).to_bytes(4, "little")
-    raw[start : start + len(packed)] = packed
-    path.write_bytes(raw)
+    overwrite(path, start, packed)
     reader = TiffReader.open(path, InputSettings())
     assert reader.bit_depth == 12
     np.testing.assert_array_equal(reader.read(), STACK[:1])
@@ -91,7 +88,7 @@ def test_volumes_planes_and_colour_are_refused(tmp_path, data, options, words):
     refused(words, tmp_path / "a.tif")
 
 
-def test_pages_are_frames_although_metadata_tell_several_series(tmp_path):
+def test_pages_are_frames_although_metadata_tell_several_series_or_they_are_coded_differently(tmp_path):
     path = tmp_path / "series.tif"
     with tifffile.TiffWriter(path) as writer:
         for block in (STACK[:2], STACK[2:3], STACK[3:]):
@@ -99,17 +96,13 @@ def test_pages_are_frames_although_metadata_tell_several_series(tmp_path):
     with tifffile.TiffFile(path) as file:
         assert file.series[0].shape != STACK.shape
     np.testing.assert_array_equal(read(path), STACK)
-
-
-def test_pages_coded_differently(tmp_path):
-    path = tmp_path / "mixed.tif"
     codings: list[dict[str, Any]] = [
         {"compression": "zlib", "rowsperstrip": 5}, {}, {"compression": "lzw"}, {"tile": (16, 16)},
     ]  # fmt: skip
     with tifffile.TiffWriter(path) as writer:
         for i, frame in enumerate(STACK):
             writer.write(frame, photometric="minisblack", metadata=None, **codings[i % len(codings)])
-    reader = opened(tmp_path / "mixed.tif")
+    reader = opened(path)
     np.testing.assert_array_equal(reader.read(), STACK)
     np.testing.assert_array_equal(reader.read(0, 6, 7, 18), STACK[:, 7:18])
 
@@ -216,17 +209,13 @@ def test_strips_that_were_never_written_are_lost_or_damaged(tmp_path):
     tifffile.imwrite(path, STACK, photometric="minisblack", metadata=None, rowsperstrip=8, compression="lzw")
     with tifffile.TiffFile(path) as file:
         place = file.pages[1].tags["StripOffsets"].offset
-    data = bytearray(path.read_bytes())
-    data[place : place + 2] = (40_000).to_bytes(2, "little")  # a tag that no program knows
-    path.write_bytes(data)
+    overwrite(path, place, (40_000).to_bytes(2, "little"))  # a tag that no program knows
     refused(r"unfinished\.tif: page 1 has 0 strips or tiles and 3 sizes", path)
     path = tmp_path / "broken.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", compression="zlib")
     with tifffile.TiffFile(path) as file:
         start = file.pages[2].dataoffsets[0]
-    data = bytearray(path.read_bytes())
-    data[start : start + 40] = bytes(40)
-    path.write_bytes(data)
+    overwrite(path, start, bytes(40))
     refused(r"broken\.tif: page 2 cannot be decoded", path)
 
 

@@ -4,10 +4,12 @@ import contextlib
 import json
 import signal
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from helpers.discrepancy_material import verdict_of
+from helpers.small_stacks import Stack
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.discrepancy.scan import Suspect
@@ -33,16 +35,6 @@ from pchem_pipeline.stages.discrepancy.window import (
 )
 
 WHOLE = DiscrepancySettings(max_pixels=1 << 25)
-
-
-class Stack:
-    """Frames in memory."""
-
-    def __init__(self, values):
-        self.values, self.shape, self.dtype, self.rows_per_read = values, values.shape, values.dtype, 1
-
-    def read_into(self, buffer, t0, t1, y0=0, y1=None):
-        buffer[...] = self.values[t0:t1, y0:y1]
 
 
 def test_a_small_stack_or_the_region_asked_for_is_looked_at_whole():
@@ -258,9 +250,6 @@ def test_the_limits_of_the_run_are_in_the_model_of_the_search_once():
 def test_a_stop_in_the_middle_of_a_comparison_makes_no_verdict(monkeypatch, error):
     """Not even where the search takes whatever a candidate raises for a defect of the candidate."""
 
-    def run_units(*_, **__):
-        raise error
-
     def search(context, *_):
         try:
             discrepancy._Mapper(context)([])
@@ -268,7 +257,7 @@ def test_a_stop_in_the_middle_of_a_comparison_makes_no_verdict(monkeypatch, erro
             pytest.fail("the stop was taken for a defect")
 
     context = SimpleNamespace(sensor=SimpleNamespace(kind="frames"), reporter=Reporter(quiet=True))
-    context.run_units = run_units
+    context.run_units = Mock(side_effect=error)
     context.stop = SimpleNamespace(at_once=contextlib.nullcontext)
     monkeypatch.setattr(discrepancy, "_start", lambda _: ((), None))
     monkeypatch.setattr(discrepancy, "_run_frames", search)

@@ -413,11 +413,9 @@ def test_export_for_programs_that_localise_single_molecules(finished, tmp_path):
     variance = imread(next(path for path in written if path.name.startswith("variance_")))
     np.testing.assert_allclose(variance[fitted], noise[fitted] ** 2, rtol=1e-6)
     assert (variance[~fitted] == 1e8).all()  # such a pixel does not count
-    np.testing.assert_allclose(
-        imread(tmp_path / "camera_maps/camera_off.tiff")[fitted], bias[fitted], rtol=1e-6
-    )
-    in_dn = imread(tmp_path / "camera_maps/camera_var.tiff")
-    np.testing.assert_allclose(in_dn[fitted], (noise / gain)[fitted] ** 2, rtol=1e-6)
+    for name, in_dn in (("off", bias), ("var", (noise / gain) ** 2)):
+        found = imread(tmp_path / f"camera_maps/camera_{name}.tiff")
+        np.testing.assert_allclose(found[fitted], in_dn[fitted], rtol=1e-6)
     camera = yaml.safe_load((tmp_path / "decode_camera.yaml").read_text())["Camera"]
     assert camera["read_sigma"] == pytest.approx(np.nanmedian(noise))
     [entry] = yaml.safe_load((tmp_path / "picasso_config.yaml").read_text())["Cameras"].values()

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -112,10 +113,8 @@ def test_what_a_run_lacks_is_said(folder):
 
 
 def test_a_figure_that_cannot_be_drawn_fails_the_report_with_its_reason(folder, monkeypatch):
-    def fail(figure):
-        raise MemoryError("no room to draw")
-
-    monkeypatch.setattr("pchem_pipeline.stages.report.report.draw_figure", fail)
+    failing = Mock(side_effect=MemoryError("no room to draw"))
+    monkeypatch.setattr("pchem_pipeline.stages.report.report.draw_figure", failing)
     state = execute("report", make_context(folder))
     assert state.state == "failed"
     assert state.why.startswith("1 of 1 units failed, first all: out of memory (no room to draw); use fewer")
@@ -135,9 +134,7 @@ def test_the_good_pixel_nearest_to_a_corner_of_all_good_ones_is_chosen():
         assert (label.startswith("high"), label.endswith("high exposure")) == (low > 0.5, high > 0.5)
         distance = np.hypot(ranks[0] + 0.5 / ranks[0].size - low, ranks[1] + 0.5 / ranks[1].size - high)
         assert distance[(y - 20) * 70 + x] == pytest.approx(distance.min())
-
-
-def test_few_or_no_pixels_to_choose_from():
+    # few or no pixels to choose from
     nan, one = np.full((2, 2), np.nan), np.array([[0.3, np.nan], [0.2, np.nan]])
     words = np.array([[2, 2], [8, 2]], dtype=np.uint16)
     assert choose_pixels(nan, nan, words) == [("no fit", 0, 0), ("no fit", 1, 0)]
