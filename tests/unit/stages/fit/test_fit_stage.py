@@ -55,7 +55,7 @@ def test_a_good_sensor_keeps_its_words(tmp_path):
 def test_samples_cut_off_at_a_code_that_no_file_states_are_censored(tmp_path, low, high):
     """A fifth of the samples at 200 DN, in 16 bits: the gain came out twelve times too large."""
     rng = np.random.default_rng(3)
-    dn = codes(rng, (1500, 8, 10), 1.5, 40.0, 0.3, 100.0 + 2.0 * rng.standard_normal((8, 10)))
+    dn = codes(rng, (1500, 12, 14), 1.5, 40.0, 0.3, 100.0 + 2.0 * rng.standard_normal((12, 14)))
     np.save(tmp_path / "frames.npy", dn.clip(low, high).astype(np.uint16))
     context = stage_context(tmp_path, input={"files": ["frames.npy"]})
     completed(context, "ingest", "histogram", "fit")
