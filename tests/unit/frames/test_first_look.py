@@ -82,7 +82,11 @@ def test_swapped_bytes_are_refused_with_their_cure_and_others_are_not(tmp_path, 
     settings = {"shape": frames.shape[1:], "dtype": "uint16"}
     frames.astype("<u2").tofile(path)
     notes = opened(path, **settings).report.notes
-    assert notes == [f"a.raw: {words}" for words in LEFT if name == "12 bits in 16"]
+    shifted = (
+        "a.raw: the lowest 4 bits of the samples are 0 (left-justified samples); set input.bit_shift: 4 "
+        "(--bit-shift 4), else all DN are 16 times too large"
+    )
+    assert notes == [shifted] * (name == "12 bits in 16")
     for order, right in (("little", "big"), ("big", "little")):
         frames.astype("<u2" if order == "big" else ">u2").tofile(path)
         path.with_name("a.raw.json").write_text(json.dumps({"byte_order": order}))
@@ -90,12 +94,6 @@ def test_swapped_bytes_are_refused_with_their_cure_and_others_are_not(tmp_path, 
         np.testing.assert_array_equal(read(path, **settings, byte_order=right), frames)
     np.save(tmp_path / "a.npy", frames.byteswap())
     not_opened(r"write the file again with swapped bytes", tmp_path / "a.npy")
-
-
-LEFT = [
-    "the lowest 4 bits of the samples are 0 (left-justified samples); set input.bit_shift: 4 (--bit-shift "
-    "4), else all DN are 16 times too large"
-]
 
 
 def test_codes_at_which_samples_pile_up_are_limits(tmp_path):

@@ -80,22 +80,13 @@ def test_a_flipped_bit_is_never_silent_and_a_missing_array_names_the_cure(store)
         store.read("maps/bias")
 
 
-def of_another_schema(path):
-    RunStore.create(path)._root.attrs["pchem_schema"] = 99
-
-
-def half_written(path):
-    path.mkdir()
-    (path / "zarr.json").write_text("{")
-
-
 @pytest.mark.parametrize(
     ("made", "words"),
     [
         (lambda path: None, "pchem run"),
         (lambda path: zarr.create_group(path, zarr_format=3), "not a run; to read its frames: pchem run"),
-        (of_another_schema, r"version 99.* needs 1"),
-        (half_written, "damaged"),
+        (lambda path: RunStore.create(path)._root.attrs.update(pchem_schema=99), r"version 99.* needs 1"),
+        (lambda path: (path.mkdir(), (path / "zarr.json").write_text("{")), "damaged"),
     ],
 )
 def test_what_is_no_run_is_refused_with_the_cure(tmp_path, made, words):
@@ -190,8 +181,7 @@ def test_markers_that_a_writer_removes_while_they_are_listed_are_no_markers(tmp_
 
 def test_a_new_group_is_never_on_the_disk_without_its_attributes(tmp_path, monkeypatch):
     store = RunStore.create(tmp_path / "run.zarr")
-    written = []
-    write = disk.write
+    written, write = [], disk.write
     monkeypatch.setattr(disk, "write", lambda path, data: (written.append(bytes(data)), write(path, data))[1])
     store.set_attributes("applied", {"provenance": "theirs"})
     assert written

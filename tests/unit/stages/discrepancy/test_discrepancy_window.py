@@ -9,6 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from helpers.discrepancy_material import verdict_of
+from helpers.drawn_pixels import codes
 from helpers.small_stacks import Stack
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
@@ -21,7 +22,6 @@ from pchem_pipeline.effects.operators.curve import Clipping
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.signals import InterruptedRunError
 from pchem_pipeline.stages.discrepancy import discrepancy
-from pchem_pipeline.stages.discrepancy.discrepancy import _limits
 from pchem_pipeline.stages.discrepancy.survey import Survey
 from pchem_pipeline.stages.discrepancy.window import (
     Window,
@@ -179,9 +179,7 @@ def test_another_window_of_the_same_size_lies_as_far_away_as_there_is_room(rows,
 
 
 def test_the_work_is_that_of_all_searches_and_looks(monkeypatch):
-    rng = np.random.default_rng(2)
-    light = 11.0 * (rng.poisson(2.0, (400, 32, 32)) + 0.3 * rng.standard_normal((400, 32, 32)))
-    values = np.rint(100.0 + light).astype(np.uint16)
+    values = codes(np.random.default_rng(2), (400, 32, 32), 2.0, 11.0, 0.3, 100.0).astype(np.uint16)
     sensor = SimpleNamespace(bit_depth=12, integration_time=1.0, seen_limits=(None, None), adc_limits=None)
     context = SimpleNamespace(sensor=sensor, store=None)
     search = discrepancy._Search(context, Stack(values), (), None, Survey({}, {}), lambda _: None)
@@ -235,15 +233,15 @@ def context(low, high, **ends):
 
 
 def test_the_limits_of_the_run_are_in_the_model_of_the_search_once():
-    assert _limits(context(None, None), ()) == ()
-    assert _limits(context(None, 135), ()) == (Clipping(high=135),)
-    assert _limits(context(40, 135), ()) == (Clipping(low=40, high=135),)
-    assert _limits(context(None, 135), (Clipping(high=130),)) == ()
+    assert discrepancy._limits(context(None, None), ()) == ()
+    assert discrepancy._limits(context(None, 135), ()) == (Clipping(high=135),)
+    assert discrepancy._limits(context(40, 135), ()) == (Clipping(low=40, high=135),)
+    assert discrepancy._limits(context(None, 135), (Clipping(high=130),)) == ()
     # the end of the ADC is no code that is seen to be a limit, but samples lie there
     cut = {"minimum": np.array([[0, 0, 3]]), "maximum": np.array([[90, 80, 95]])}
-    assert _limits(context(None, None, **cut), ()) == (Clipping(low=0),)
+    assert discrepancy._limits(context(None, None, **cut), ()) == (Clipping(low=0),)
     few = {"minimum": np.r_[0, np.full(200, 9)], "maximum": np.full(201, 99)}
-    assert _limits(context(None, None, **few), ()) == ()
+    assert discrepancy._limits(context(None, None, **few), ()) == ()
 
 
 @pytest.mark.parametrize("error", [InterruptedRunError(signal.SIGINT), StoreError("no space left")])

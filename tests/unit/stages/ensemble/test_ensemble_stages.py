@@ -32,7 +32,6 @@ from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
-from pchem_pipeline.stages.ensemble.ensemble import on_axis
 from pchem_pipeline.stages.fit.fit import code_sums
 from pchem_pipeline.stages.report.stored import read_run
 from pchem_pipeline.stages.table import STAGES
@@ -290,7 +289,7 @@ def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis()
     maps = [np.array([[1.0, np.nan, 1.0]])] * 4
     content = code_sums({"counts": counts, "origin": origin, **outside}, maps)
     assert content == {"dn": [101, 102, 103, 104, 105], "samples": [1, 10, 12, 10, 11], "outside": 101}
-    samples, beyond = on_axis(content, DnAxis(102, 3))
+    samples, beyond = ensemble_stage.on_axis(content, DnAxis(102, 3))
     assert samples.tolist() == [10, 12, 10]
     assert beyond == 101 + 1 + 11
 
@@ -431,15 +430,13 @@ def test_export_for_programs_that_localise_single_molecules(finished, tmp_path):
         ADAPTERS["pyme"](found, tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("serial", "folder"), [("../../etc", "etc"), ("..", "camera"), ("SN 7/2", "SN_7_2"), (None, "camera")]
-)
-def test_a_serial_number_never_leads_out_of_the_folder(finished, tmp_path, serial, folder):
+def test_a_serial_number_never_leads_out_of_the_folder(finished, tmp_path):
     sensor = SensorInfo.read(finished.store)
-    sensor = replace(sensor, camera=replace(sensor.camera, serial=serial), integration_time=1.0)
-    target = SimpleNamespace(config=finished.config, sensor=lambda _: sensor)
-    written = ADAPTERS["pyme"](Calibration.of(target, finished.store), tmp_path)
-    assert {path.parent for path in written} == {tmp_path / "pyme" / folder}
+    for serial, folder in (("../../etc", "etc"), ("..", "camera"), ("SN 7/2", "SN_7_2"), (None, "camera")):
+        found = replace(sensor, camera=replace(sensor.camera, serial=serial), integration_time=1.0)
+        target = SimpleNamespace(config=finished.config, sensor=lambda _, found=found: found)
+        written = ADAPTERS["pyme"](Calibration.of(target, finished.store), tmp_path)
+        assert {path.parent for path in written} == {tmp_path / "pyme" / folder}
 
 
 def test_export_says_what_is_wrong(finished, tmp_path):

@@ -86,7 +86,6 @@ def test_the_limit_is_shared_by_the_workers():
     assert allowed_bytes(config, 4) == 1000 << 20
     assert BASE_BYTES + 4 * band_bytes(config, 4) <= 1000 << 20
     free = RunConfig.model_validate({"input": {"files": ["a"]}})
-    assert band_bytes(free, 4) == 640 << 20
     assert allowed_bytes(free, 4) >= BASE_BYTES + 4 * (640 << 20)
     # what a row needs does not depend on the number of frames, so neither do the plans
     few, many = (bytes_per_row(512, n_frames, 2, 64, free.histogram) for n_frames in (5000, 60_000))
