@@ -18,6 +18,18 @@ PARAMETERS: dict[str, Any] = {
 }
 
 
+class Stack:
+    """Frames in memory, as a source; counts how often each row of a frame was read."""
+
+    def __init__(self, values: NDArray[Any]) -> None:
+        self.values, self.shape, self.dtype, self.rows_per_read = values, values.shape, values.dtype, 1
+        self.read = np.zeros(values.shape[:2], int)
+
+    def read_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int = 0, y1: int | None = None) -> None:
+        buffer[...] = self.values[t0:t1, y0:y1]
+        self.read[t0:t1, y0:y1] += 1
+
+
 def small_stack(
     shape: tuple[int, int],
     n_frames: int,

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -50,49 +51,35 @@ def test_a_stage_command_runs_its_stage(calls, name):
     assert command == common
 
 
-def test_ingest_crops_the_input_to_the_region(calls):
+def test_ingest_crops_the_input_to_the_region_and_run_does_every_stage(calls):
     invoke("ingest", "c.yaml", "--roi", "0:8,8:16")
     [(target, _, command)] = calls
-    assert target.config.input.roi == (0, 8, 8, 16)
-    assert command.roi is None
-
-
-def test_run_does_every_stage(calls):
+    assert (target.config.input.roi, command.roi) == ((0, 8, 8, 16), None)
     result = invoke("run", "c.yaml")
-    [(_, stages, _)] = calls
+    _, stages, _ = calls[1]
     assert stages == ("ingest", "histogram", "fit", "maps", "ensemble", "report")
     assert result.stdout == "/x/run.zarr\n"  # there is no report in this folder
 
 
-@pytest.mark.parametrize(
-    ("name", "given", "error", "words"),
-    [
-        ("c.yaml", {"integration_time": 1}, ConfigError, "--integration-time: only with camera files"),
-        ("none.tif", {}, InputError, "does not exist"),
-    ],
-)
-def test_what_a_run_cannot_begin_with_is_named(tmp_path, name, given, error, words):
-    with pytest.raises(error, match=words):
-        find_or_start([tmp_path / name], None, given)
+def test_what_a_run_cannot_begin_with_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="--integration-time: only with camera files"):
+        find_or_start([tmp_path / "c.yaml"], None, {"integration_time": 1})
+    with pytest.raises(InputError, match="does not exist"):
+        find_or_start([tmp_path / "none.tif"], None, {})
 
 
-EMPTY = r"^--roi .* contains no pixel; write y0:y1,x0:x1"
+def test_a_wrong_or_empty_roi_shows_how():
+    empty = ("4:2,0:5", "0:4,5:5", "-1:4,0:5")
+    for text in ("1,2", "a:b,c:d", "0:1", "0:1,2:3,4:5", *empty):
+        words = r"^--roi .* contains no pixel; write y0:y1,x0:x1" if text in empty else "y0:y1,x0:x1"
+        with pytest.raises(ConfigError, match=words):
+            invoke("fit", "run.zarr", "--roi", text)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        *((text, "y0:y1,x0:x1") for text in ("1,2", "a:b,c:d", "0:1", "0:1,2:3,4:5")),
-        *((text, EMPTY) for text in ("4:2,0:5", "0:4,5:5", "-1:4,0:5")),
-    ],
-)
-def test_a_wrong_or_empty_roi_shows_how(text, words):
-    with pytest.raises(ConfigError, match=words):
-        invoke("fit", "run.zarr", "--roi", text)
-
-
-def test_the_schema_is_that_of_the_yaml_and_the_first_line_names_it(tmp_path, monkeypatch):
+def test_init_writes_a_valid_file_once_whose_first_line_names_its_schema(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    assert invoke("init", "d.yaml", "--simulated").stdout == "d.yaml\n"
+    assert load_config(tmp_path / "d.yaml").simulate is not None
     said = invoke("init", "c.yaml", "x.fits", "--schema").stdout
     assert said.splitlines() == ["c.yaml", "pchem.schema.json"]
     assert (tmp_path / "c.yaml").read_text().startswith("# yaml-language-server: $schema=pchem.schema.json\n")
@@ -102,15 +89,22 @@ def test_the_schema_is_that_of_the_yaml_and_the_first_line_names_it(tmp_path, mo
     assert fit["additionalProperties"] is False  # an editor marks a misspelt key
     assert all("description" in each for each in fit["properties"].values())
     assert load_config(tmp_path / "c.yaml").input.files == ("x.fits",)
+    with pytest.raises(ConfigError, match=r"c\.yaml exists"):
+        invoke("init", "c.yaml")
+    invoke("init", "c.yaml", "--simulated", "--force")
+    assert load_config(tmp_path / "c.yaml").simulate is not None
+
+
+def pchem(*arguments, **options):
+    """Run the package in a process of its own."""
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+    return subprocess.run([sys.executable, "-m", "pchem_pipeline", *arguments], text=True, **options)
 
 
 def test_help_has_a_short_name_and_the_package_is_the_command():
     assert invoke("-h").stdout == invoke("--help").stdout
     assert "y0:y1,x0:x1" in invoke("fit", "-h").stdout
-    answer = subprocess.run(
-        [sys.executable, "-m", "pchem_pipeline", "--version"], capture_output=True, text=True
-    )
-    assert answer.stdout == f"pchem {__version__}\n"
+    assert pchem("--version").stdout == f"pchem {__version__}\n"
 
 
 def test_help_groups_commands_and_options_and_cuts_no_first_line():
@@ -127,16 +121,6 @@ def test_help_groups_commands_and_options_and_cuts_no_first_line():
     assert "--workers" in common
 
 
-def test_init_writes_a_valid_file_once(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert invoke("init", "c.yaml", "x.fits").stdout == "c.yaml\n"
-    assert load_config(tmp_path / "c.yaml").input.files == ("x.fits",)
-    with pytest.raises(ConfigError, match=r"c\.yaml exists"):
-        invoke("init", "c.yaml")
-    invoke("init", "c.yaml", "--simulated", "--force")
-    assert load_config(tmp_path / "c.yaml").simulate is not None
-
-
 @pytest.mark.parametrize(
     ("error", "code", "words"),
     [
@@ -146,10 +130,7 @@ def test_init_writes_a_valid_file_once(tmp_path, monkeypatch):
     ],
 )
 def test_errors_are_one_line_with_their_exit_code(monkeypatch, capsys, error, code, words):
-    def fail(**_):
-        raise error
-
-    monkeypatch.setattr(app, "app", fail)
+    monkeypatch.setattr(app, "app", Mock(side_effect=error))
     with pytest.raises(SystemExit) as caught:
         app.main([])
     assert caught.value.code == code
@@ -160,12 +141,8 @@ def test_a_library_that_cannot_be_imported_is_one_line(tmp_path):
     (tmp_path / "zarr.yaml").write_text("a: [b")
     npy = tmp_path / "a.npy"
     np.save(npy, np.zeros((2, 3, 4), np.uint16))
-    found = subprocess.run(
-        [sys.executable, "-m", "pchem_pipeline", "run", npy, "--store", tmp_path / "a.zarr"],
-        env={**os.environ, "ZARR_CONFIG": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True,
-        text=True,
-    )
+    environment = {**os.environ, "ZARR_CONFIG": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    found = pchem("run", npy, "--store", tmp_path / "a.zarr", env=environment)
     assert (found.returncode, len(found.stderr.splitlines())) == (2, 1)
     assert f"zarr cannot be imported (A config file at '{tmp_path}/zarr.yaml' is malformed" in found.stderr
 
@@ -173,13 +150,7 @@ def test_a_library_that_cannot_be_imported_is_one_line(tmp_path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
 def test_a_full_disk_behind_stdout_is_one_line():
     with Path("/dev/full").open("w") as full:
-        found = subprocess.run(
-            [sys.executable, "-m", "pchem_pipeline", "--version"],
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
+        found = pchem("--version", stdout=full)
     assert found.returncode == ExitCode.INPUT
     assert found.stderr == "pchem: cannot write to stdout (No space left on device); check where it goes\n"
 
@@ -203,32 +174,23 @@ def test_what_is_written_beside_a_store_lies_on_this_machine(arguments, tmp_path
     with pytest.raises(ConfigError, match=r"^s3://lab/.*: only stores can be in an object storage; give a"):
         invoke(*arguments)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_simulated_frames_lie_on_this_machine():
     with pytest.raises(ConfigError, match=r"^s3://lab/frames: only stores"):
         parse_config("simulate: {output: 's3://lab/frames'}")
 
 
-@pytest.mark.parametrize(
-    ("wanted", "words"),
-    [
+def test_what_cannot_be_drawn_is_refused_before_anything_is_read():
+    for wanted, words in (
         ({"formats": ("pdf", "jpg")}, "--format: jpg cannot be drawn; choose from pdf, svg, png"),
         ({"formats": ()}, "--format: no format"),
         ({"width": "88 px"}, "--width '88 px': write a length such as 88mm"),
-    ],
-)
-def test_what_cannot_be_drawn_is_refused_before_anything_is_read(wanted, words):
-    with pytest.raises(ConfigError, match=words):
-        figures_of_run(Path("nowhere.zarr"), Path("out"), **wanted)
+    ):
+        with pytest.raises(ConfigError, match=words):
+            figures_of_run(Path("nowhere.zarr"), Path("out"), **wanted)
 
 
 @pytest.mark.parametrize("option", ["--only", "--format"])
-def test_a_list_of_nothing_does_not_mean_all(option):
+def test_a_list_of_nothing_does_not_mean_all_and_a_folder_without_a_run_is_told(tmp_path, option):
     with pytest.raises(ConfigError, match=f"{option}: ' ,' is no name"):
         invoke("figures", "run.zarr", option, " ,")
-
-
-def test_a_folder_without_a_run_is_told(tmp_path):
     with pytest.raises(StoreError, match="there is no run at"):
         figures_of_run(tmp_path, tmp_path / "out")

@@ -7,15 +7,8 @@ from pchem_pipeline.commands.compare.history import append_history, read_history
 
 
 def row(name, **more):
-    return {
-        "label": "",
-        "date": "",
-        "run": f"{name}.zarr",
-        "bias_median": "1.5",
-        **more,
-        "id": name,
-        "reference": "a",
-    }
+    first = {"label": "", "date": "", "run": f"{name}.zarr", "bias_median": "1.5"}
+    return {**first, **more, "id": name, "reference": "a"}
 
 
 def test_lines_are_added_and_those_there_stay(tmp_path):
@@ -49,21 +42,18 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert [each.name for each in tmp_path.iterdir()] == ["history.csv"]
 
 
+HEAD = "label,date,run,bias_median,id,reference"
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("label;date;run\n", "is no history of this version; move it away"),
         ("label,date,run,bias_median\n", "is no history of this version; move it away"),
-        (
-            "label,date,run,bias_median,id,reference\n,,a.zarr,1.5,a,a\n,,b.zarr,1|5,b,a\n",
-            "row 3: damaged .*1|5",
-        ),
-        (
-            "label,date,run,bias_median,id,reference\n,yesterday,a.zarr,1.5,a,a\n",
-            "row 2: damaged .*yesterday",
-        ),
-        ("label,date,run,bias_median,id,reference\n,,a.zarr,1.5,a,a,a\n", "row 2: damaged"),
-        ("label,date,run,bias_median,id,reference\n,,a.z\udcff", "cannot be read"),
+        (f"{HEAD}\n,,a.zarr,1.5,a,a\n,,b.zarr,1|5,b,a\n", "row 3: damaged .*1|5"),
+        (f"{HEAD}\n,yesterday,a.zarr,1.5,a,a\n", "row 2: damaged .*yesterday"),
+        (f"{HEAD}\n,,a.zarr,1.5,a,a,a\n", "row 2: damaged"),
+        (f"{HEAD}\n,,a.z\udcff", "cannot be read"),
     ],
 )
 def test_a_damaged_history_is_refused(tmp_path, text, said):

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -40,14 +41,13 @@ def target(tmp_path, monkeypatch):
     return Target(config, tmp_path, tmp_path / "my run.zarr", tmp_path / "my run.yaml")
 
 
-def run(target, level, *, strict=False, stages=STAGES, **options):
+def run(target, level, *, strict=False, **options):
     (target.store / "report.json").write_text(json.dumps(numbers(level)))
     said: list[str] = []
     try:
-        first_screen.run_to_first_screen(target, stages, Command(**options), said.append, strict=strict)
+        first_screen.run_to_first_screen(target, STAGES, Command(**options), said.append, strict=strict)
     finally:
         assert said == [str(target.store / "report.html")]
-    return said
 
 
 def test_the_first_screen_is_told_and_the_path_alone_is_a_result(target, capsys):
@@ -62,15 +62,12 @@ def test_the_first_screen_is_told_and_the_path_alone_is_a_result(target, capsys)
     assert lines[-1] == "  pchem view 'my run.yaml'"
 
 
-def test_a_serious_answer_is_one_line_even_where_quiet(target, capsys):
+def test_a_serious_answer_is_one_line_even_where_quiet_and_strict_makes_it_exit_code_3(target, capsys):
     run(target, "serious", quiet=True)
     assert capsys.readouterr().err == "warning: To be believed? No: 60 % flagged: so.\n"
     for level in ("caution", "good"):
         run(target, level, quiet=True, strict=True)
         assert capsys.readouterr().err == ""
-
-
-def test_strict_makes_it_exit_code_3(target, capsys):
     with pytest.raises(NotBelievedError, match="To be believed") as raised:
         run(target, "serious", quiet=True, strict=True)
     assert raised.value.exit_code == ExitCode.INCOMPLETE == 3
@@ -78,10 +75,8 @@ def test_strict_makes_it_exit_code_3(target, capsys):
 
 
 def test_an_incomplete_run_tells_what_it_has(target, capsys, monkeypatch):
-    def fail(*_):
-        raise IncompleteRunError("12 of 40 pixels")
-
-    monkeypatch.setattr(first_screen, "run_stages", fail)
+    incomplete = Mock(side_effect=IncompleteRunError("12 of 40 pixels"))
+    monkeypatch.setattr(first_screen, "run_stages", incomplete)
     with pytest.raises(IncompleteRunError):
         run(target, "serious")
     assert "To be believed? No." in capsys.readouterr().err
@@ -89,11 +84,10 @@ def test_an_incomplete_run_tells_what_it_has(target, capsys, monkeypatch):
 
 def test_without_a_report_the_store_is_told(target, capsys):
     said: list[str] = []
+    first_screen.run_to_first_screen(target, STAGES, Command(dry_run=True), said.append)
+    assert said == []
     first_screen.run_to_first_screen(target, ("maps",), Command(), said.append, strict=True)
     assert said == [str(target.store)]
-    dry: list[str] = []
-    first_screen.run_to_first_screen(target, STAGES, Command(dry_run=True), dry.append)
-    assert dry == []
     assert capsys.readouterr().err == ""
 
 

@@ -25,18 +25,17 @@ def test_rows_tell_rate_and_remaining_time():
     assert rows([PART], both)[1].strip() == "running (ingest and histogram) 8 of 64 MiB, 2/s, 28 s left"
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
+def test_paces_in_words():
+    for change, words in (
         ({"rate": 0.05, "remaining": 1120.0}, "running 8 of 64 tiles, 20 s each, 18 min 40 s left"),
         ({"rate": 0.005, "remaining": 11200.0}, "running 8 of 64 tiles, 200 s each, 3 h 06 min left"),
         ({"rate": None, "remaining": None}, "running 8 of 64 tiles"),
         ({"stage": "ingest: hash"}, "running (hash) 8 of 64 tiles, 2/s, 28 s left"),
-    ],
-)
-def test_paces_in_words(change, words):
-    assert pace_words({**PACE, **change}) == words
+    ):
+        assert pace_words({**PACE, **change}) == words
     assert pace_words({"stage": ""}) == "running"
+    codes = {"stage": "fit: \x1b[2Jgone", "done": 1, "total": 2, "unit": "\x1b[31mtile"}  # of a terminal
+    assert "\x1b" not in "".join(rows([StageState("fit", "partial")], codes))
 
 
 @pytest.fixture
@@ -49,21 +48,16 @@ def looks(monkeypatch):
     return []
 
 
-def test_watching_ends_with_the_work_and_tells_what_changed(looks):
+@pytest.mark.parametrize("terminal", [False, True])
+def test_watching_ends_with_the_work_and_tells_what_changed(looks, terminal):
     written: list[str] = []
-    watch(TARGET, written.append, follow=True, sleep=looks.append)
+    watch(TARGET, written.append, follow=True, terminal=terminal, sleep=looks.append)
     assert len(looks) == 2
-    assert written == [
-        "ingest      complete\nfit         running 8 of 64 tiles, 2/s, 28 s left",
-        "fit         running 16 of 64 tiles, 2/s, 24 s left",
-        "fit         complete",
-    ]
-
-
-def test_a_terminal_is_drawn_over(looks):
-    written: list[str] = []
-    watch(TARGET, written.append, follow=True, terminal=True, sleep=looks.append)
-    assert written[1].startswith("\x1b[2A\x1b[Jingest      complete\nfit ")
+    first, again, last = written
+    assert first == "ingest      complete\nfit         running 8 of 64 tiles, 2/s, 28 s left"
+    over = "\x1b[2A\x1b[Jingest      complete\n" if terminal else ""  # what is there is drawn over
+    assert again == f"{over}fit         running 16 of 64 tiles, 2/s, 24 s left"
+    assert last == f"{over}fit         complete"
 
 
 def test_json_lines_and_ctrl_c(looks):
@@ -84,8 +78,3 @@ def test_the_command_looks_once_unless_asked(looks, monkeypatch):
     assert result.stdout.splitlines() == rows([DONE, PART], PACE)
     result = invoke("status", "run.yaml", "--json")
     assert json.loads(result.stdout)["progress"]["done"] == 16
-
-
-def test_codes_of_a_terminal_are_not_handed_on():
-    progress = {"stage": "fit: \x1b[2Jgone", "done": 1, "total": 2, "unit": "\x1b[31mtile"}
-    assert "\x1b" not in "".join(rows([StageState("fit", "partial")], progress))

@@ -1,8 +1,8 @@
 """What commands refuse before they write, which frames they take for the same, and tables for others."""
 
-import h5py
 import numpy as np
 import pytest
+from helpers.camera_files import write_hdf5
 
 from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.commands.apply.source import open_like_run
@@ -64,24 +64,19 @@ def test_a_pixel_has_a_new_defect_unless_what_it_is_seen_in_agrees_within_the_er
 
 
 @pytest.mark.parametrize(
-    ("asked", "said"),
+    ("folder", "asked", "said"),
     [
-        ("rownoise@columns=2:5", r"'rownoise': no such effect; pchem info lists them; .*columns=A:B"),
-        ("row_noise@colums=2:5", "columns=A:B"),
-        ("row_noise@columns=2:9000", "the sensor has"),
-        ("clipping", "has no typical strength"),
+        ("x", "rownoise@columns=2:5", r"'rownoise': no such effect; pchem info lists them; .*columns=A:B"),
+        ("x", "row_noise@colums=2:5", "columns=A:B"),
+        ("x", "row_noise@columns=2:9000", "the sensor has"),
+        ("x", "clipping", "has no typical strength"),
+        (".", "row_noise", "is not empty; choose another folder"),
     ],
 )
-def test_what_cannot_be_hidden_is_refused(tmp_path, asked, said):
-    with pytest.raises(ConfigError, match=said):
-        run_demo(tmp_path / "x", hidden=asked, size=8, n_frames=60, seed=1)
-    assert not (tmp_path / "x").exists()
-
-
-def test_a_folder_of_something_else_is_refused(tmp_path):
+def test_what_cannot_be_hidden_and_a_folder_of_something_else_are_refused(tmp_path, folder, asked, said):
     (tmp_path / "mine.txt").touch()
-    with pytest.raises(ConfigError, match="is not empty; choose another folder"):
-        run_demo(tmp_path, hidden="row_noise", size=8, n_frames=60, seed=1)
+    with pytest.raises(ConfigError, match=said):
+        run_demo(tmp_path / folder, hidden=asked, size=8, n_frames=60, seed=1)
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
@@ -93,7 +88,7 @@ def test_an_effect_can_be_hidden_in_a_place():
     assert effect.when == When(range=((10, 20),))
 
 
-def test_a_region_of_frames_of_another_size_is_refused(tmp_path, monkeypatch):
+def test_frames_of_another_size_are_refused_and_of_another_dataset_taken(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sensor = SensorInfo("frames", 5, 4, 4, "uint16", None, None, "copy", {}, whole=(8, 9))
     config = RunConfig.model_validate({"input": {"files": ["a.npy"], "roi": [2, 6, 3, 7]}})
@@ -105,27 +100,21 @@ def test_a_region_of_frames_of_another_size_is_refused(tmp_path, monkeypatch):
     for name in ("whole", "region"):
         found = open_like_run(target, sensor, [f"{name}.npy"])
         np.testing.assert_array_equal(found.read(), frames[:, 2:6, 3:7])
-    with pytest.raises(
-        InputError, match=r"other.npy: frames of 12 x 12 .* \[2, 6, 3, 7\] of frames of 8 x 9"
-    ):
+    words = r"other.npy: frames of 12 x 12 .* \[2, 6, 3, 7\] of frames of 8 x 9"
+    with pytest.raises(InputError, match=words):
         open_like_run(target, sensor, ["other.npy"])
-
-
-def test_the_dataset_of_other_frames_may_be_another(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    dark, light = np.full((2, 5, 4, 4), 100, np.uint16)
-    light += 20
-    with h5py.File("night.h5", "w") as file:
-        file["dark/frames"], file["light/frames"] = dark, light
+    dark = np.full((5, 4, 4), 100, np.uint16)
+    light = dark + 20
+    write_hdf5(tmp_path / "night.h5", **{"dark/frames": dark, "light/frames": light})
     sensor = SensorInfo("frames", 5, 4, 4, "uint16", None, None, "copy", {})
-    for own, given, found in (
+    for own, other, found in (
         ("dark/frames", None, dark),
         ("dark/frames", "light/frames", light),
         (None, "light/frames", light),
     ):
         config = RunConfig.model_validate({"input": {"files": ["a.h5"], "dataset": own}})
         target = Target(config, tmp_path, tmp_path / "run.zarr")
-        frames = open_like_run(target, sensor, ["night.h5"], given)
+        frames = open_like_run(target, sensor, ["night.h5"], other)
         np.testing.assert_array_equal(frames.read(), found)
     with pytest.raises(InputError, match=r"several datasets: .*; choose one with input\.dataset"):
         open_like_run(target, sensor, ["night.h5"])

@@ -9,7 +9,6 @@ import pchem_pipeline
 from pchem_pipeline.compute import environment
 from pchem_pipeline.compute.environment import available_memory, available_workers, prepare_environment
 
-PACKAGE = Path(pchem_pipeline.__file__).parent
 CODE = (
     "import os; from pchem_pipeline.compute.environment import prepare_environment as p\n"
     "p(); first = os.environ['NUMBA_CACHE_DIR']; p(); assert first == os.environ['NUMBA_CACHE_DIR']\n"
@@ -17,15 +16,16 @@ CODE = (
 )
 
 
-def cache_folder(place, **environment):
-    environment = {"PYTHONPATH": str(place), "PATH": "/usr/bin:/bin", **environment}
+def cache_folder(**environment):
+    place = str(Path(pchem_pipeline.__file__).parents[1])
+    environment = {"PYTHONPATH": place, "PATH": "/usr/bin:/bin", **environment}
     command = [sys.executable, "-c", CODE]
     result = subprocess.run(command, cwd="/", env=environment, capture_output=True, text=True, check=True)
     return Path(result.stdout.strip())
 
 
 def test_the_cache_lies_in_the_users_cache_folder(tmp_path):
-    home = cache_folder(PACKAGE.parent, HOME=str(tmp_path), XDG_CACHE_HOME=str(tmp_path / "cache"))
+    home = cache_folder(HOME=str(tmp_path), XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert home.is_relative_to(tmp_path / "cache")
 
 
@@ -43,7 +43,7 @@ def test_a_folder_in_the_temporary_one_is_taken_if_nobody_else_can_write_it(tmp_
             pytest.skip("nobody else may give folders away")
         os.chown(expected, 4321, -1)
     nowhere = {"HOME": "/proc/nowhere", "XDG_CACHE_HOME": "/proc/nowhere", "TMPDIR": str(tmp_path)}
-    first, second = (cache_folder(PACKAGE.parent, **nowhere) for _ in range(2))
+    first, second = (cache_folder(**nowhere) for _ in range(2))
     assert first.parent == tmp_path
     if trap == "none":
         assert first == second == expected
@@ -81,18 +81,19 @@ def job(tmp_path, monkeypatch):
     return tmp_path, lambda text: files.update({"/proc/self/cgroup": text})
 
 
-def test_a_job_without_limits_has_the_machine(job):
-    assert (available_workers(), available_memory()) == (16, 32000000 << 10)
-
-
 def test_limits_of_a_job_are_seen_at_every_level_of_its_cgroup(job):
     root, enter = job
+    assert (available_workers(), available_memory()) == (16, 32000000 << 10)  # without limits the machine
     enter("0::/slurm/job_7/step_0\n")
     write(root / "slurm/job_7/step_0", memory__max="max", memory__current=5 << 20, cpu__max="max 100000")
     write(root / "slurm/job_7", memory__max=700 << 20, memory__current=300 << 20, cpu__max="350000 100000")
     write(root / "slurm/job_7", memory__stat=f"anon 9\ninactive_file {200 << 20}")
     write(root / "slurm/job_8", memory__max=1 << 20, memory__current=0, cpu__max="100000 100000")
     assert (available_workers(), available_memory()) == (3, 600 << 20)
+    # a limit from which a job is slowed down counts
+    enter("damaged\n0::/job\n")
+    write(root / "job", memory__max="max", memory__high=700 << 20, memory__current=100 << 20, cpu__max="1 0")
+    assert (available_workers(), available_memory()) == (16, 600 << 20)
 
 
 def test_limits_of_version_1(job):
@@ -109,13 +110,6 @@ def test_limits_of_version_1(job):
     enter("4:memory:/of/the/host\n")  # in a container, which sees its own as the root
     write(root / "memory", memory__limit_in_bytes=500 << 20, memory__usage_in_bytes=100 << 20)
     assert available_memory() == 400 << 20
-
-
-def test_a_limit_from_which_a_job_is_slowed_down_counts(job):
-    root, enter = job
-    enter("damaged\n0::/job\n")
-    write(root / "job", memory__max="max", memory__high=700 << 20, memory__current=100 << 20, cpu__max="1 0")
-    assert (available_workers(), available_memory()) == (16, 600 << 20)
 
 
 def test_what_slurm_gave_is_a_limit_without_cgroups_too(job, monkeypatch):

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -64,10 +65,13 @@ def test_stop_lets_running_items_finish_and_starts_no_others(backend):
     assert 1 <= len(started) < 20  # of 100: those that ran when it was heard
 
 
-def test_a_dead_worker_process_is_one_clear_line():
+def test_a_dead_worker_process_or_a_machine_without_shared_memory_is_one_clear_line(monkeypatch):
     executor = make_executor(ComputeSettings(backend="processes", workers=1))
     with pytest.raises(IncompleteRunError, match="worker process died"):
-        executor.map(die, [1], lambda item, outcome: None)
+        executor.map(die, [1], lambda *_: None)
+    monkeypatch.setattr(executor_module._SPAWN, "Lock", Mock(side_effect=PermissionError))
+    with pytest.raises(ConfigError, match="use --backend threads"):
+        make_executor(ComputeSettings(backend="processes", workers=2)).map(abs, [1], lambda *_: None)
 
 
 class Interrupted(BaseException):
@@ -94,10 +98,9 @@ def gone(pid):
     deadline = time.monotonic() + 10
     while time.monotonic() < deadline:
         try:
-            state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return True
         except OSError:
-            return True
-        if state == "Z":
             return True
         time.sleep(0.05)
     return False
@@ -147,15 +150,6 @@ def test_worker_processes_end_with_a_parent_that_is_killed(tmp_path):
         parent.kill()
     assert len(workers) == 2
     assert all(gone(pid) for pid in workers)
-
-
-def test_without_shared_memory_there_are_no_worker_processes(monkeypatch):
-    def lock():
-        raise PermissionError
-
-    monkeypatch.setattr(executor_module._SPAWN, "Lock", lock)
-    with pytest.raises(ConfigError, match="use --backend threads"):
-        make_executor(ComputeSettings(backend="processes", workers=2)).map(abs, [1], lambda *_: None)
 
 
 @pytest.mark.parametrize(
@@ -213,9 +207,6 @@ def test_workers_are_as_many_as_memory_is_enough_for():
     processes = make_executor(ComputeSettings(workers=4, backend="processes"))
     fewer = affordable(processes, here + 2 * BASE_BYTES + (250 << 20), 100 << 20, "it")
     assert (fewer.workers, fewer.shares_memory) == (2, False)
-
-
-def test_too_little_memory_for_the_program_is_refused():
     keep_to_limit(None)
     with pytest.raises(ConfigError, match="64 MiB, but the program needs"):
         keep_to_limit(64)
@@ -255,8 +246,5 @@ def test_after_an_error_nothing_more_is_begun_beside():
         reciprocal(0)
     assert ended.is_set()  # what was begun is waited for
     assert done == []
-
-
-def test_a_single_thread_does_nothing_that_nobody_asks_for():
-    with beside(1) as hand:
+    with beside(1) as hand:  # a single thread does nothing that nobody asks for
         hand(lambda: reciprocal(0))

@@ -41,30 +41,29 @@ def test_shipped_configs_are_valid(path):
     load_config(path)
 
 
-def test_simulated_input_is_what_is_simulated():
-    config = parse_config("simulate: {output: cam, format: fits, bit_depth: 12, integration_time: 2.5}")
-    assert config.input.files == ("cam",)
-    assert (config.input.format, config.input.bit_depth, config.input.integration_time) == ("fits", 12, 2.5)
-
-
-def test_files_may_be_one_place():
-    config = parse_config("input: {files: 'frames/*.tif'}")
-    assert config.input.files == ("frames/*.tif",)
+def test_simulated_input_is_what_is_simulated_and_files_may_be_one_place():
+    found = parse_config("simulate: {output: cam, format: fits, bit_depth: 12, integration_time: 2.5}").input
+    assert (found.files, found.format, found.bit_depth, found.integration_time) == (("cam",), "fits", 12, 2.5)
+    assert parse_config("input: {files: 'frames/*.tif'}").input.files == ("frames/*.tif",)
     files = json.loads(json_schema())["$defs"]["InputSettings"]["properties"]["files"]
     assert {kind["type"] for kind in files["anyOf"]} == {"string", "array"}
 
 
+def bomb(start):
+    """Return lines in which nine aliases a line stand for a billion values."""
+    names = "abcdefghij"
+    lines = [f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in itertools.pairwise(names)]
+    return "\n".join(["a: &a [x, x, x, x, x, x, x, x, x]", *lines, start])
+
+
 @pytest.mark.parametrize(
-    ("text", "message"),
+    ("text", "words"),
     [
         ("input: {files: 3}", "input.files: Input should be a list"),
         ("input: {files: [a]}\nfit: {algoritm: em}", "fit.algoritm: unknown key; did you mean algorithm?"),
-        (
-            "input: {files: [a]}\nrun: {bias: 1}",
-            "run.bias: unknown key; the keys here are store, title, tile, allowed_failed_pixels",
-        ),
+        ("input: {files: [a]}\nrun: {bias: 1}", "run.bias: unknown key; the keys here are store, title"),
         ("input: {files: [a], integration_time: .nan}", "input.integration_time"),
-        ("input: {files: [a], integration_time: 0}", "input.integration_time: .*greater than 0"),
+        ("input: {files: [a], integration_time: 0}", "greater than 0"),
         ("input: {files: [a], integration_time: -1}", "input.integration_time"),
         ("input: {files: [a]}\nrun: {tile: 50}", "run.tile"),
         ("input: {files: [a]}\ninput: {files: [b]}", "'input' is given twice"),
@@ -72,16 +71,37 @@ def test_files_may_be_one_place():
         ("- a", "no settings"),
         ("", "no settings"),
         ("run: {tile: 64}", "no input"),
-        ("input: {files: [a]}\nrun: !!python/object/apply:os.system [ls]", "not valid YAML"),
         ("simulate: {shape: [0, 4]}", "simulate"),
         ("simulate: {n_frames: many}", "simulate.n_frames"),
+        # hostile ones
+        ("input: " + "[" * 5000, "not valid YAML"),
+        ("input: " + "{a: " * 5000, "not valid YAML"),
+        (bomb("input: {files: *j}"), "write the settings out"),
+        ("run: &a {store: *a}", "write the settings out"),
+        ("input: !!python/object/apply:os.mkdir [trace]", "not valid YAML"),
+        ("run: {tile: " + "9" * 5000 + "}", "not valid YAML"),
+        ("run: {store: a\0b}", "not valid YAML"),
+        ("nothing: 1\nrun: {store: '" + "µ日本" * 100_000 + "'}", "nothing: unknown key"),
+        ("run: {" + ", ".join(f"k{i}: 1" for i in range(500)) + "}", "and 480 more"),
+        ("run: {tile: [" + "x, " * 50_000 + "]}", "run.tile"),
+        ("? [1, 2]\n: x", "a key is a list or a mapping"),
+        ("run: {tile: 0x" + "f" * 5000 + "}", "a number of 5002 digits"),
+        ('run: {store: "a\\0b"}', "a text is no valid name"),
+        ("\n".join(f"k{i}: 1" for i in range(30_000)), "a section of 30000 keys"),
+        ("input: {files: [a], integration_time: 1.0e-300}", "integration_time must be at least 1e-12 s"),
+        ('run: {"\\e[31m": 1}', "run.\\x1b[31m: unknown key"),
     ],
 )
-def test_wrong_settings_say_what_and_where(text, message):
-    with pytest.raises(ConfigError, match=message) as caught:
+def test_wrong_and_hostile_settings_say_what_and_where_in_one_short_line(text, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError) as caught:
         parse_config(text, "c.yaml")
-    assert str(caught.value).startswith("c.yaml: ")
-    assert "\n" not in str(caught.value)
+    said = str(caught.value)
+    assert said.startswith("c.yaml: ")
+    assert words in said
+    assert said.isprintable()
+    assert len(said) < 4100
+    assert not (tmp_path / "trace").exists()
 
 
 def test_missing_and_undecodable_files(tmp_path):
@@ -109,65 +129,22 @@ def test_settings_are_read_by_dotted_name():
     ],
 )
 @pytest.mark.parametrize("text", ["input: {{files: ['{}']}}", "run: {{store: '{}'}}"])
-def test_a_url_with_a_secret_is_refused_and_not_repeated(text, url):
+def test_a_url_with_a_secret_is_refused_and_not_repeated_and_others_are_taken(text, url):
     with pytest.raises(ConfigError, match="a password, key or signature") as caught:
         parse_config(text.format(url))
     assert "SECRET" not in str(caught.value)
+    for url in ("s3://bucket/a@b:c/*.tif", "https://host:8080/a.tif?raw=1", "C:/a@b.tif", "a:b@c"):
+        assert parse_config(f"input: {{files: ['{url}']}}").input.files == (url,)
 
 
-@pytest.mark.parametrize(
-    "url", ["s3://bucket/a@b:c/*.tif", "https://host:8080/a.tif?raw=1", "C:/a@b.tif", "a:b@c"]
-)
-def test_other_urls_and_paths_are_taken(url):
-    assert parse_config(f"input: {{files: ['{url}']}}").input.files == (url,)
-
-
-def bomb(start):
-    """Return lines in which nine aliases a line stand for a billion values."""
-    names = "abcdefghij"
-    lines = [f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in itertools.pairwise(names)]
-    return "\n".join(["a: &a [x, x, x, x, x, x, x, x, x]", *lines, start])
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("input: " + "[" * 5000, "not valid YAML"),
-        ("input: " + "{a: " * 5000, "not valid YAML"),
-        (bomb("input: {files: *j}"), "write the settings out"),
-        ("run: &a {store: *a}", "write the settings out"),
-        ("input: !!python/object/apply:os.mkdir [trace]", "not valid YAML"),
-        ("run: {tile: " + "9" * 5000 + "}", "not valid YAML"),
-        ("run: {store: a\0b}", "not valid YAML"),
-        ("nothing: 1\nrun: {store: '" + "µ日本" * 100_000 + "'}", "nothing: unknown key"),
-        ("run: {" + ", ".join(f"k{i}: 1" for i in range(500)) + "}", "and 480 more"),
-        ("run: {tile: [" + "x, " * 50_000 + "]}", "run.tile"),
-        ("? [1, 2]\n: x", "a key is a list or a mapping"),
-        ("run: {tile: 0x" + "f" * 5000 + "}", "a number of 5002 digits"),
-        ('run: {store: "a\\0b"}', "a text is no valid name"),
-        ("\n".join(f"k{i}: 1" for i in range(300_000)), "a section of 300000 keys"),
-        ("input: {files: [a], integration_time: 1.0e-300}", "integration_time must be at least 1e-12 s"),
-        ('run: {"\\e[31m": 1}', "run.\\x1b[31m: unknown key"),
-    ],
-)
-def test_hostile_yaml_is_one_short_line(text, words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError) as caught:
-        parse_config(text)
-    assert words in str(caught.value)
-    assert str(caught.value).isprintable()
-    assert len(str(caught.value)) < 4100
-    assert not (tmp_path / "trace").exists()
-
-
-def test_yaml_in_many_scripts():
+def test_many_scripts_and_keys_of_earlier_versions_are_read():
     text = "Ελληνικά кириллица 日本語 한국어 عربى עברית हिन्दी ไทย ქართული አማርኛ 😀"
     config = parse_config(f"run: {{store: '{text}.zarr'}}\ninput: {{files: ['{text}.npy']}}")
     assert parse_config(dump_config(config)) == config
     assert text in dump_config(config)
+    text = "input: {files: [a.npy]}\nreport: {figure_formats: [svg], dpi: 72, map_stretch: linear}\n"
+    assert parse_config(text) == parse_config("input: {files: [a.npy]}\n")
 
-
-# -- a model beside the YAML --------------------------------------------------------------------
 
 ROW = {"tag": "row_noise", "row_noise_dn": 1.2}
 TEXT = """# mine
@@ -202,14 +179,16 @@ def test_a_model_of_the_yaml_that_was_changed_meanwhile_is_refused(tmp_path):
     path.write_text(TEXT)
     write_model(path, model(ROW))
     path.write_text(TEXT.replace("0.7", "0.8"))
-    with pytest.raises(
-        ConfigError, match=r"run\.yaml: the section model was changed.* delete run\.effects\.yaml"
-    ):
+    words = r"run\.yaml: the section model was changed.* delete run\.effects\.yaml"
+    with pytest.raises(ConfigError, match=words):
         load_config(path)
     with pytest.raises(ConfigError, match=r"holds the model of run\.yaml; give that file"):
         load_config(effects_file(path))
     effects_file(path).unlink()
     assert load_config(path).model == model({**ROW, "row_noise_dn": 0.8})
+    write_model(path, model())
+    write_config(path, TEXT)  # a new YAML has its own model
+    assert load_config(path) == parse_config(TEXT)
 
 
 @pytest.mark.parametrize(
@@ -229,48 +208,28 @@ def test_a_damaged_file_beside_the_yaml_is_refused_by_name(tmp_path, text, words
         load_config(path)
 
 
-def test_a_new_yaml_has_its_own_model(tmp_path):
-    path = tmp_path / "run.yaml"
-    path.write_text(TEXT)
-    write_model(path, model())
-    write_config(path, TEXT)
-    assert load_config(path) == parse_config(TEXT)
-
-
 def test_every_effect_can_be_written(tmp_path):
     path = tmp_path / "run.yaml"
     path.write_text(TEXT)
     shared = {"of": "row", "share": 1.0, "changes": "gain", "signal_dn": 7.5, "burst": 0.1}
     measured = {"tag": "empirical_noise", "noise_dn": 1.5, "modes": [shared], "region": {"columns": [[3, 9]]}}
-    for effect in [
-        *(e for kind in effect_classes().values() for e in kind.typical()),
-        *model(measured).effects,
-    ]:
+    typical = [effect for kind in effect_classes().values() for effect in kind.typical()]
+    for effect in (*typical, *model(measured).effects):
         wanted = ModelSettings(effects=(effect,))
         write_model(path, wanted)
         assert load_config(path).model == wanted, effect.tag
 
 
 def test_no_setting_is_called_what_yaml_takes_for_true_or_false():
-    def names(kind, seen):
-        seen.add(kind)
-        found = set(kind.model_fields)
-        for field in kind.model_fields.values():
-            for part in parts(field.annotation):
-                if part not in seen:
-                    found |= names(part, seen)
-        return found
-
-    def parts(annotation):
+    def models(annotation):
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            return [annotation]
-        return [part for inner in get_args(annotation) for part in parts(inner)]
+            return {annotation}
+        return {part for inner in get_args(annotation) for part in models(inner)}
 
-    for kind in (RunConfig, *effect_classes().values()):
-        for name in names(kind, set()):
+    kinds, looked = {RunConfig, *effect_classes().values()}, set()
+    while kinds - looked:
+        kind = (kinds - looked).pop()
+        looked.add(kind)
+        for name, field in kind.model_fields.items():
             assert yaml.safe_load(name) == name, (kind, name)
-
-
-def test_keys_of_earlier_versions_are_read_and_do_nothing():
-    text = "input: {files: [a.npy]}\nreport: {figure_formats: [svg], dpi: 72, map_stretch: linear}\n"
-    assert parse_config(text) == parse_config("input: {files: [a.npy]}\n")
+            kinds |= models(field.annotation)

@@ -10,7 +10,7 @@ import pytest
 import tifffile
 import zarr
 from astropy.io import fits
-from helpers.camera_files import opened, write_fits, write_hdf5
+from helpers.camera_files import not_opened, opened, write_fits, write_hdf5
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
@@ -87,17 +87,13 @@ def test_hdf5_and_zarr(tmp_path):
         group["sensor_temperature"] = 250.0
         group["sensor_temperature"].attrs["units"] = "K"
     assert facts(tmp_path / "a.h5") == CameraFacts("Detector Y", "77", pytest.approx(-23.15), None)
+    with h5py.File(tmp_path / "b.h5", "w") as file:  # a free text is no camera
+        file["frames"], file["description"] = STACK, "our set-up"
+        file["frames"].attrs["description"] = "dark frames of Monday"
+    assert facts(tmp_path / "b.h5") == CameraFacts()
     attributes = {"camera": "Z", "sensor_temperature": 12.5, "start_time": "2026-01-31T13:00:00+01:00"}
     zarr.create_array(tmp_path / "a.zarr", data=STACK, attributes=attributes)
     assert facts(tmp_path / "a.zarr") == CameraFacts("Z", None, 12.5, TAKEN)
-
-
-def test_a_free_text_is_no_camera(tmp_path):
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["frames"] = STACK
-        file["frames"].attrs["description"] = "dark frames of Monday"
-        file["description"] = "our set-up"
-    assert facts(tmp_path / "a.h5") == CameraFacts()
 
 
 def test_ser_and_raw(tmp_path):
@@ -142,19 +138,10 @@ def test_files_of_two_cameras_are_no_stack(tmp_path):
 
 
 def test_files_of_two_settings_are_no_stack(tmp_path):
-    for i, gain in enumerate((0, 0, 10, 0)):
-        write_fits(
-            tmp_path / f"{i}.fits",
-            STACK[i],
-            GAIN=gain,
-            READMODE="fast",
-            IMAGETYP="DARK" if i < 3 else "LIGHT",
-        )
-    words = (
-        r"different settings: GAIN = 0 in 0\.fits and 2 more, GAIN = 10 in 2\.fits; give those of one setting"
-    )
-    with pytest.raises(InputError, match=words):
-        open_frames(InputSettings(files=("*.fits",)), tmp_path)
+    for i, (gain, kind) in enumerate(((0, "DARK"), (0, "DARK"), (10, "DARK"), (0, "LIGHT"))):
+        write_fits(tmp_path / f"{i}.fits", STACK[i], GAIN=gain, READMODE="fast", IMAGETYP=kind)
+    words = r"different settings: GAIN = 0 in 0\.fits and 2 more, GAIN = 10 in 2\.fits; give those of one"
+    not_opened(words, tmp_path / "*.fits")
     with pytest.raises(InputError, match=r"IMAGETYP = DARK in 0\.fits, IMAGETYP = LIGHT in 3\.fits"):
         open_frames(InputSettings(files=("0.fits", "3.fits")), tmp_path)
     frames = open_frames(InputSettings(files=("0.fits", "1.fits")), tmp_path)
@@ -162,22 +149,11 @@ def test_files_of_two_settings_are_no_stack(tmp_path):
     assert frames.camera.words() == "GAIN 0, READMODE fast, IMAGETYP DARK"
 
 
-@pytest.mark.parametrize(
-    ("value", "unit", "found"),
-    [
-        ("-10", "°C", -10.0),
-        (300, "K", 26.85),
-        (300, "C", None),
-        (-20, "deg_C", -20.0),
-        (-20, "degrees Celsius", -20.0),
-        (77, "F", None),
-        (77, "mK", None),
-        (float("nan"), "C", None),
-        ("warm", "C", None),
-    ],
-)
-def test_a_temperature_is_one_of_a_sensor_or_none(value, unit, found):
-    assert celsius(value, unit) == (None if found is None else pytest.approx(found))
+def test_a_temperature_is_one_of_a_sensor_or_none():
+    known = [("-10", "°C"), (300, "K"), (-20, "deg_C"), (-20, "degrees Celsius")]
+    assert [celsius(*each) for each in known] == pytest.approx([-10.0, 26.85, -20.0, -20.0])
+    for value, unit in ((300, "C"), (77, "F"), (77, "mK"), (np.nan, "C"), ("warm", "C")):
+        assert celsius(value, unit) is None, (value, unit)
 
 
 def test_names_of_a_megabyte_in_every_format(tmp_path):
@@ -209,11 +185,13 @@ def test_xml_that_stands_for_a_billion_letters_is_not_read(tmp_path):
     assert facts(tmp_path / "a.tif") == CameraFacts()
 
 
-def test_hostile_texts_become_one_short_line():
+def test_hostile_values_become_one_short_line_or_nothing():
     assert text_of(b"a\x1b[31m\n<b>\0rest") == "a [31m <b>"
     assert text_of("x" * 1_000_000) == "x" * 80
     assert (text_of(b"\0\0"), text_of(None), text_of(True)) == (None, None, None)
     assert (seconds_of("yesterday"), seconds_of("1800-01-01"), seconds_of(5)) == (None, None, None)
+    assert [bits_of(value) for value in (12, np.int16(16))] == [12, 16]
+    assert [bits_of(value) for value in (0, 33, 12.0, "12", True)] == [None] * 5
 
 
 #: what the words beside a time of 100 make of it, s
@@ -268,19 +246,25 @@ def test_the_unit_of_a_duration_is_read_wherever_it_is_stated(tmp_path):
     write_fits(tmp_path / "doubt.fits", STACK, EXPTIME=(100, "exposure in s"), TIMEUNIT="ms")
     units = {"a": {"exposure_time_unit": "ms"}, "b": {"time_unit": "ms"}, "c": {"unit": "ms"}}
     units["d"] = {"unit": "DN"}  # that of the samples says nothing about the time
+    units["e"] = {"exposure_time_units": "ms", "bit_depth_readout": 12}
     for name, unit in units.items():
         zarr.create_array(tmp_path / f"{name}.zarr", data=STACK, attributes={"exposure_time": 100, **unit})
     write_hdf5(tmp_path / "a.h5", frames=STACK, exposure_ms=100)
+    with h5py.File(write_hdf5(tmp_path / "b.h5", frames=STACK), "a") as file:  # each number an array of one
+        attributes = {"exposure_time": np.array([100.0]), "bit_depth_readout": np.array([12])}
+        file["frames"].attrs.update({"exposure_time_units": "ms", **attributes})
     STACK.astype("<u2").tofile(tmp_path / "a.raw")
     side = {"shape": STACK.shape, "dtype": "uint16", "integration_time": 100, "integration_time_unit": "ms"}
     (tmp_path / "a.raw.json").write_text(json.dumps(side))
-    seconds = dict.fromkeys(("unit.fits", "a.zarr", "b.zarr", "c.zarr", "a.h5", "a.raw"), 0.1)
+    known = ("unit.fits", "a.zarr", "b.zarr", "c.zarr", "e.zarr", "a.h5", "b.h5", "a.raw")
+    seconds = dict.fromkeys(known, 0.1)
     seconds |= {"plain.fits": 100.0, "d.zarr": 100.0, "doubt.fits": None}
     for name, right in seconds.items():
         stack = opened(tmp_path / name)
         assert stack.integration_time == (None if right is None else pytest.approx(right)), name
         assert name in stack.time_words
         assert "--integration-time" not in stack.time_words or right is None
+        assert stack.bit_depth == (12 if name in ("e.zarr", "b.h5") else None)
 
 
 def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path):
@@ -300,26 +284,3 @@ def test_statements_that_contradict_each_other_leave_the_time_unknown(tmp_path):
         assert stack.integration_time is None
         assert both in stack.time_words
         assert "set input.integration_time (--integration-time SECONDS)" in stack.time_words
-
-
-@pytest.mark.parametrize(
-    ("value", "bits"),
-    [(12, 12), (np.int16(16), 16), (0, None), (33, None), (12.0, None), ("12", None), (True, None)],
-)
-def test_bits(value, bits):
-    assert bits_of(value) == bits
-
-
-def test_every_format_with_attributes_takes_the_same_names(tmp_path):
-    """HDF5 as a program that stores each number as an array of one; zarr with the unit beside."""
-    frames = np.ones((2, 3, 4), np.uint16)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        attributes = file.create_dataset("frames", data=frames).attrs
-        attributes["exposure_time"], attributes["exposure_time_units"] = np.array([20.0]), "ms"
-        attributes["bit_depth_readout"] = np.array([12])
-    array = zarr.create_array(str(tmp_path / "capture"), shape=frames.shape, dtype=frames.dtype)
-    array[:] = frames
-    array.attrs.update(exposure_time=20, exposure_time_units="ms", bit_depth_readout=12)
-    for name in ("a.h5", "capture"):
-        stack = opened(tmp_path / name)
-        assert (stack.integration_time, stack.bit_depth) == (pytest.approx(0.02), 12)

@@ -6,13 +6,12 @@ import h5py
 import numpy as np
 import pytest
 import zarr
-from helpers.camera_files import not_opened, opened
+from helpers import layouts
+from helpers.camera_files import not_opened, opened, read
+from helpers.drawn_pixels import codes
 from helpers.plain_camera import LAYOUTS, PlainCamera
 
-from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.first_look import limits_in
-from pchem_pipeline.frames.open import open_frames
-from pchem_pipeline.frames.settings import InputSettings
 
 #: hardly any pattern: 5 % in the light, a DN in the bias
 SPREAD = (0.05, 0.005, 0.05, 1.0)
@@ -23,10 +22,9 @@ def notes_on(path, frames):
     if path.suffix == ".npy":
         np.save(path, codes)
     else:
-        with h5py.File(path, "w") as file:
-            file.create_dataset("data", data=codes, chunks=(1, *codes.shape[1:]), compression="gzip")
-    report = opened(path).report
-    return [note for note in report.notes if "last axis" in note]
+        path.unlink(missing_ok=True)
+        layouts.hdf5(path, codes, chunks=(1, *codes.shape[1:]), compression="gzip")
+    return [note for note in opened(path).report.notes if "last axis" in note]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -65,9 +63,8 @@ def test_it_is_said_of_hdf5_and_not_where_there_is_nothing_to_see(tmp_path):
 
 
 def camera(bias, noise, step, *, frames=60):
-    rng = np.random.default_rng(8)
-    electrons = rng.poisson(1.2, (frames, 20, 24)) + noise * rng.standard_normal((frames, 20, 24))
-    return np.rint(bias + step * electrons).clip(0, 65535).astype(np.uint16)
+    dn = codes(np.random.default_rng(8), (frames, 20, 24), 1.2, step, noise, bias)
+    return dn.clip(0, 65535).astype(np.uint16)
 
 
 CAMERAS = {
@@ -81,28 +78,22 @@ CAMERAS = {
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_swapped_bytes_are_refused_with_their_cure_and_others_are_not(tmp_path, name):
-    frames = CAMERAS[name]
-    settings = {"files": ("a.raw",), "shape": frames.shape[1:], "dtype": "uint16"}
-    frames.astype("<u2").tofile(tmp_path / "a.raw")
-    notes = open_frames(InputSettings(**settings), tmp_path).report.notes
-    assert notes == [f"a.raw: {words}" for words in LEFT if name == "12 bits in 16"]
-    for order in ("little", "big"):
-        frames.astype("<u2" if order == "big" else ">u2").tofile(tmp_path / "a.raw")
-        (tmp_path / "a.raw.json").write_text(json.dumps({"byte_order": order}))
-        right = "big" if order == "little" else "little"
-        with pytest.raises(InputError, match=f"look byte-swapped: set input.byte_order: {right} "):
-            open_frames(InputSettings(**settings), tmp_path)
-        np.testing.assert_array_equal(
-            open_frames(InputSettings(**settings, byte_order=right), tmp_path).read(), frames
-        )
+    frames, path = CAMERAS[name], tmp_path / "a.raw"
+    settings = {"shape": frames.shape[1:], "dtype": "uint16"}
+    frames.astype("<u2").tofile(path)
+    notes = opened(path, **settings).report.notes
+    shifted = (
+        "a.raw: the lowest 4 bits of the samples are 0 (left-justified samples); set input.bit_shift: 4 "
+        "(--bit-shift 4), else all DN are 16 times too large"
+    )
+    assert notes == [shifted] * (name == "12 bits in 16")
+    for order, right in (("little", "big"), ("big", "little")):
+        frames.astype("<u2" if order == "big" else ">u2").tofile(path)
+        path.with_name("a.raw.json").write_text(json.dumps({"byte_order": order}))
+        not_opened(f"look byte-swapped: set input.byte_order: {right} ", path, **settings)
+        np.testing.assert_array_equal(read(path, **settings, byte_order=right), frames)
     np.save(tmp_path / "a.npy", frames.byteswap())
     not_opened(r"write the file again with swapped bytes", tmp_path / "a.npy")
-
-
-LEFT = [
-    "the lowest 4 bits of the samples are 0 (left-justified samples); set input.bit_shift: 4 (--bit-shift "
-    "4), else all DN are 16 times too large"
-]
 
 
 def test_codes_at_which_samples_pile_up_are_limits(tmp_path):
@@ -135,10 +126,9 @@ def test_what_was_never_written_is_counted_or_refused(tmp_path):
         )
         not_opened(r"none of its \d chunks was written", tmp_path / name)
         array[:30] = camera(100, 0.3, 5.0)[:30]
-    [note] = opened(tmp_path / "a.zarr").report.notes
-    assert note == "a.zarr: 3 of 6 chunks were not written; read as the fill value"
-    [note] = opened(tmp_path / "b.zarr").report.notes
-    assert note == "b.zarr: 1 of 3 chunks was not written; read as the fill value"
+    for name, words in (("a.zarr", "3 of 6 chunks were"), ("b.zarr", "1 of 3 chunks was")):
+        note = f"{name}: {words} not written; read as the fill value"
+        assert opened(tmp_path / name).report.notes == [note]
     for chunks in (None, (1, 20, 24)):
         with h5py.File(tmp_path / "a.h5", "w") as file:
             file.create_dataset("data", shape=(60, 20, 24), dtype="u2", chunks=chunks)

@@ -13,15 +13,13 @@ from pchem_pipeline.frames.stream import FrameStream
 
 
 class _Source:
-    def __init__(self, frames, broken_at=None):
+    def __init__(self, frames, then=lambda t0: None):
         self._frames, self.shape, self.dtype = frames, frames.shape, frames.dtype
-        self.rows_per_read = 1
-        self._broken_at = broken_at
+        self.rows_per_read, self._then = 1, then
 
     def read_into(self, buffer, t0, t1, y0=0, y1=None):
-        if self._broken_at is not None and t0 >= self._broken_at:
-            raise OSError("gone")
         buffer[...] = self._frames[t0:t1, y0:y1]
+        self._then(t0)
 
 
 FRAMES = np.arange(21 * 7 * 3, dtype=np.uint16).reshape(21, 7, 3)
@@ -51,14 +49,8 @@ def test_every_frame_of_every_band_comes_once(step, frames, threads, cuts):
 
 def test_the_next_block_is_read_while_one_is_used():
     reading = threading.Event()
-
-    class Told(_Source):
-        def read_into(self, buffer, t0, t1, y0=0, y1=None):
-            super().read_into(buffer, t0, t1, y0, y1)
-            if t0 == 4:
-                reading.set()
-
-    with FrameStream(Told(FRAMES), [(0, 7)], 4) as stream:
+    source = _Source(FRAMES, lambda t0: reading.set() if t0 == 4 else None)
+    with FrameStream(source, [(0, 7)], 4) as stream:
         for t0, (part,) in stream:
             if t0 == 0:
                 assert reading.wait(10)
@@ -67,23 +59,19 @@ def test_the_next_block_is_read_while_one_is_used():
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_a_broken_reader_is_heard(threads):
-    seen = []
-    with (
-        pytest.raises(OSError, match="gone"),
-        FrameStream(_Source(FRAMES, broken_at=4), [(0, 3)], 4, threads=threads) as stream,
-    ):
+    def broken(t0):
+        if t0 >= 4:
+            raise OSError("gone")
+
+    seen, source = [], _Source(FRAMES, broken)
+    with pytest.raises(OSError, match="gone"), FrameStream(source, [(0, 3)], 4, threads=threads) as stream:
         seen.extend(t0 for t0, _ in stream)
     assert seen == [0]
 
 
 def test_no_thread_outlives_the_stream():
-    class Slow(_Source):
-        def read_into(self, buffer, t0, t1, y0=0, y1=None):
-            time.sleep(0.02)
-            super().read_into(buffer, t0, t1, y0, y1)
-
     before = threading.active_count()
-    with FrameStream(Slow(FRAMES), [(0, 7)], 2) as stream:
+    with FrameStream(_Source(FRAMES, lambda _: time.sleep(0.02)), [(0, 7)], 2) as stream:
         next(iter(stream))  # the block behind it is being read
         assert threading.active_count() > before
     assert threading.active_count() == before

@@ -10,12 +10,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from astropy.io import fits
+from helpers.camera_files import not_opened, opened, write_fits
 from helpers.nd2_files import nd2_bytes
 from helpers.sif_files import sif_bytes
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependencyError
+from pchem_pipeline.base.errors import ConfigError, MissingDependencyError
 from pchem_pipeline.frames import registry
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.reader import FrameReader, check_window
@@ -34,23 +33,14 @@ class TextReader(FrameReader):
     def open(cls, path, settings):
         reader = cls()
         reader.paths = (path,)
-        lines = path.read_text().splitlines()[1:]
-        reader.data = np.array(
-            [[[int(v) for v in row.split()] for row in line.split("|")] for line in lines], np.uint16
-        )
-        n, rows, columns = reader.data.shape
-        reader.shape, reader.dtype = (n, rows, columns), reader.data.dtype
+        frames = [[row.split() for row in line.split("|")] for line in path.read_text().splitlines()[1:]]
+        reader.data = np.array(frames, np.uint16)
+        reader.shape, reader.dtype = reader.data.shape, reader.data.dtype
         return reader
-
-    data: NDArray[np.uint16]
 
     def read_into(self, buffer, t0, t1, y0=0, y1=None):
         y0, y1 = check_window(self, buffer, t0, t1, y0, y1)
         buffer[...] = self.data[t0:t1, y0:y1]
-
-
-class NoReader:
-    """Not a reader at all."""
 
 
 @pytest.mark.parametrize("pack", [gzip, bz2, lzma])
@@ -59,17 +49,12 @@ class NoReader:
 def test_packed_files_are_refused(tmp_path, pack, name, given):
     """A library that unpacks by itself must not tell where frames lie in a file that it did not read."""
     path = tmp_path / name
-    fits.PrimaryHDU(np.random.default_rng(1).integers(0, 65536, (4, 30, 40)).astype(np.uint16)).writeto(
-        tmp_path / "plain.fits"
-    )
-    with pack.open(path, "wb") as stream:
-        stream.write((tmp_path / "plain.fits").read_bytes())
-    with pytest.raises(InputError, match=r"compressed with (gzip|bzip2|xz); unpack it first"):
-        open_frames(InputSettings(files=(str(path),), format=given), tmp_path)
+    stack = np.random.default_rng(1).integers(0, 65536, (4, 30, 40)).astype(np.uint16)
+    path.write_bytes(pack.compress(write_fits(tmp_path / "plain.fits", stack).read_bytes()))
+    not_opened(r"compressed with (gzip|bzip2|xz); unpack it first", path, format=given)
     samples = tmp_path / "a.raw"
     samples.write_bytes(b"PK\x03\x04" + bytes(20))
-    reader = open_frames(InputSettings(files=(str(samples),), shape=(3, 2), dtype="uint16"), tmp_path)
-    assert reader.shape == (2, 3, 2)
+    assert opened(samples, shape=(3, 2), dtype="uint16").shape == (2, 3, 2)
 
 
 @pytest.fixture(autouse=True)
@@ -85,16 +70,13 @@ def plug_in(monkeypatch, *points):
     registry._plugins.cache_clear()
 
 
-def test_reader_from_a_plug_in(tmp_path, monkeypatch):
+def test_reader_from_a_plug_in_which_is_not_loaded_without_need(tmp_path, monkeypatch):
     plug_in(monkeypatch, ("textframes", f"{__name__}:TextReader"))
     (tmp_path / "a.txf").write_text("TEXTFRAMES\n1 2|3 4\n5 6|7 8\n")
     for name, format in (("a.txf", "auto"), (".", "auto"), ("a.txf", "textframes")):
         found = open_frames(InputSettings(files=(name,), format=format), tmp_path).read()
         np.testing.assert_array_equal(found, np.arange(1, 9).reshape(2, 2, 2))
     assert "textframes" in registry.reader_names()
-
-
-def test_plug_in_is_not_loaded_without_need(tmp_path, monkeypatch):
     plug_in(monkeypatch, ("broken", "there_is_no_such_module:Reader"))
     np.save(tmp_path / "a.npy", np.zeros((2, 3, 4), np.uint8))
     assert open_frames(InputSettings(files=("a.npy",)), tmp_path).shape == (2, 3, 4)
@@ -102,28 +84,20 @@ def test_plug_in_is_not_loaded_without_need(tmp_path, monkeypatch):
         open_frames(InputSettings(files=("a.npy",), format="broken"), tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("points", "words"),
-    [
+def test_doubles_and_what_is_no_reader_are_refused(monkeypatch):
+    for points, words in (
         ([("tiff", "other.package:Tiff")], "'tiff': pchem_pipeline itself and other.package:Tiff"),
         ([("lab", "one.package:Lab"), ("lab", "two.package:Lab")], "'lab': one.package:Lab and two.package"),
-        ([("lab", "one.package:Lab")] * 2, ""),  # one that is listed twice is no double
-    ],
-)
-def test_doubles_are_refused(monkeypatch, points, words):
-    plug_in(monkeypatch, *points)
-    if not words:
-        assert registry.reader_names()[-1] == "lab"
-        return
-    with pytest.raises(ConfigError, match=f"named {words}"):
-        registry.reader_names()
-
-
-@pytest.mark.parametrize(("name", "cls"), [("noreader", "NoReader"), ("othername", "TextReader")])
-def test_plug_in_that_is_no_reader(monkeypatch, name, cls):
-    plug_in(monkeypatch, (name, f"{__name__}:{cls}"))
-    with pytest.raises(ConfigError, match=f"must be a FrameReader with format_name = '{name}'"):
-        registry.reader_class(name)
+    ):
+        plug_in(monkeypatch, *points)
+        with pytest.raises(ConfigError, match=f"named {words}"):
+            registry.reader_names()
+    plug_in(monkeypatch, *[("lab", "one.package:Lab")] * 2)  # one that is listed twice is no double
+    assert registry.reader_names()[-1] == "lab"
+    for name, cls in (("noreader", "EntryPoint"), ("othername", "TextReader")):
+        plug_in(monkeypatch, (name, f"{__name__}:{cls}"))
+        with pytest.raises(ConfigError, match=f"must be a FrameReader with format_name = '{name}'"):
+            registry.reader_class(name)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +106,7 @@ def test_plug_in_that_is_no_reader(monkeypatch, name, cls):
 def test_missing_library_is_named_with_what_installs_it(tmp_path, monkeypatch, format, library):
     stack = np.zeros((2, 3, 4), np.uint16)
     by_hand = {"nd2": nd2_bytes, "sif": sif_bytes}.get(format)
-    actions = [lambda: open_frames(InputSettings(files=(str(path),)), tmp_path)]
+    actions = [lambda: opened(path)]
     if by_hand:
         path = tmp_path / f"a.{format}"
         path.write_bytes(by_hand(stack))

@@ -10,7 +10,6 @@ import struct
 import time
 import zipfile
 import zlib
-from contextlib import contextmanager
 
 import h5py
 import hdf5plugin
@@ -31,17 +30,11 @@ STACK = np.random.default_rng(2).integers(0, 4096, (40, 16, 16)).astype(np.uint1
 BOMB = 1 << 24
 
 
-@contextmanager
-def refused_at_once(words):
+def refused_at_once(words, path, use=read):
     clock = time.process_time()
     with pytest.raises(InputError, match=words):
-        yield
+        use(path)
     assert time.process_time() - clock < 2.0
-
-
-@pytest.fixture(scope="module")
-def deflated():
-    return zlib.compress(bytes(BOMB), 9)
 
 
 @pytest.mark.parametrize("codec", ["zlib", "gzip", "zstd", "blosc", "bz2", "lz4", "lzma"])
@@ -52,20 +45,22 @@ def test_zarr(tmp_path, codec):
     zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=coded, zarr_format=3 if new else 2)
     read(path)
     (path / ("c/1/0/0" if new else "1.0.0")).write_bytes(coder.encode(bytes(BOMB)))
-    with refused_at_once(r"a\.zarr: damaged: a piece of \d+ bytes unpacks to more than"):
-        read(path)
+    refused_at_once(r"a\.zarr: damaged: a piece of \d+ bytes unpacks to more than", path)
 
 
-def test_zarr_of_many_frames_and_compressed_twice(tmp_path):
+def test_zarr_of_many_frames_compressed_twice_or_of_many_chunks_in_a_shard(tmp_path):
     gzip_, zstd = ({"name": name, "configuration": {}} for name in ("gzip", "zstd"))
     path, coder = tmp_path / "a.zarr", numcodecs.Zstd()
     zarr.create_array(path, data=STACK, chunks=(20, 16, 16), compressors=zstd)
     (path / "c/1/0/0").write_bytes(coder.encode(bytes(8)) + coder.encode(bytes(BOMB)))
-    with refused_at_once(r"unpacks to more than"):
-        read(path)
+    refused_at_once("unpacks to more than", path)
     zarr.create_array(tmp_path / "b.zarr", data=STACK, chunks=(20, 16, 16), compressors=[gzip_, zstd])
-    with refused_at_once(r"compressed twice, by \w+ and \w+; write it again with one of them"):
-        read(tmp_path / "b.zarr")
+    refused_at_once(r"compressed twice, by \w+ and \w+; write it again with one of them", tmp_path / "b.zarr")
+    path = tmp_path / "c.zarr"
+    zarr.create_array(path, shape=(80, 256, 256), chunks=(1, 8, 8), shards=(80, 256, 256), dtype="u2")
+    (path / "c/0/0").mkdir(parents=True)
+    (path / "c/0/0/0").write_bytes(b"")
+    refused_at_once("shards of more than 65536 chunks", path)
 
 
 @pytest.mark.parametrize("place", ["start", "end"])
@@ -82,8 +77,7 @@ def test_shards_are_many_pieces(tmp_path, codec, place):
     index[7] = (324 if place == "start" else 0), len(bomb)
     coded_index = index.tobytes() + bytes(4)
     (path / "c/0/0/0").write_bytes(coded_index + bomb if place == "start" else bomb + coded_index)
-    with refused_at_once(r"unpacks to more than"):
-        read(path)
+    refused_at_once("unpacks to more than", path)
 
 
 def test_another_array_of_the_store_is_no_piece(tmp_path):
@@ -93,18 +87,10 @@ def test_another_array_of_the_store_is_no_piece(tmp_path):
     read(tmp_path / "a.zarr")
 
 
-def test_zarr_of_many_chunks_in_a_shard(tmp_path):
-    path = tmp_path / "a.zarr"
-    zarr.create_array(path, shape=(80, 256, 256), chunks=(1, 8, 8), shards=(80, 256, 256), dtype="u2")
-    (path / "c/0/0").mkdir(parents=True)
-    (path / "c/0/0/0").write_bytes(b"")
-    with refused_at_once(r"shards of more than 65536 chunks"):
-        read(path)
-
-
-@pytest.mark.parametrize("codec", ["bz2", "lz4", "bitshuffle", "zstd", "blosc"])
+@pytest.mark.parametrize("codec", ["gzip", "bz2", "lz4", "bitshuffle", "zstd", "blosc"])
 def test_hdf5_filters(tmp_path, codec):
     filters = {
+        "gzip": ({"compression": "gzip"}, zlib.compress(bytes(BOMB), 9)),
         "bz2": (hdf5plugin.BZip2(), bz2.compress(bytes(BOMB >> 4))),
         "lz4": (hdf5plugin.LZ4(), struct.pack(">QI", BOMB, 1 << 12) + bytes(99)),
         "bitshuffle": (hdf5plugin.Bitshuffle(), struct.pack(">QI", BOMB, 1 << 12) + bytes(99)),
@@ -118,33 +104,23 @@ def test_hdf5_filters(tmp_path, codec):
         file.flush()
         read(tmp_path / "a.h5")
         dataset.id.write_direct_chunk((20, 0, 0), bomb)
-    with refused_at_once("unpacks to more than"):
-        read(tmp_path / "a.h5")
+    refused_at_once("unpacks to more than", tmp_path / "a.h5")
 
 
-@pytest.mark.parametrize("kind", ["deep", "twice", "claims"])
-def test_hdf5(tmp_path, deflated, kind):
-    path = tmp_path / "a.h5"
-    with h5py.File(path, "w") as file:
-        if kind == "claims":
-            layout = h5py.VirtualLayout((10**9, 16, 16), STACK.dtype)
-            layout[:40] = h5py.VirtualSource("b.h5", "x", STACK.shape)
-            file.create_virtual_dataset("frames", layout)
-        elif kind == "deep":
-            dataset = file.create_dataset("frames", data=STACK, chunks=(20, 16, 16), compression="gzip")
-            dataset.id.write_direct_chunk((20, 0, 0), deflated)
-        else:
-            record = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-            record.set_chunk((20, 16, 16))
-            for _ in range(2):
-                record.set_filter(h5py.h5z.FILTER_DEFLATE, 0, (9,))
-            space, type_ = h5py.h5s.create_simple(STACK.shape), h5py.h5t.NATIVE_UINT16
-            made = h5py.h5d.create(file.id, b"frames", type_, space, record)
-            made.write(h5py.h5s.ALL, h5py.h5s.ALL, STACK)
-    write_hdf5(tmp_path / "b.h5", x=STACK)
-    words = {"deep": "unpacks to more than", "twice": "compressed twice, by zlib and zlib"}
-    with refused_at_once(words.get(kind, "cannot hold 1000000000 frames")):
-        read(path)
+def test_hdf5_compressed_twice_or_of_more_frames_than_its_parts_have(tmp_path):
+    record = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    record.set_chunk((20, 16, 16))
+    for _ in range(2):
+        record.set_filter(h5py.h5z.FILTER_DEFLATE, 0, (9,))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        space, type_ = h5py.h5s.create_simple(STACK.shape), h5py.h5t.NATIVE_UINT16
+        h5py.h5d.create(file.id, b"frames", type_, space, record).write(h5py.h5s.ALL, h5py.h5s.ALL, STACK)
+    refused_at_once("compressed twice, by zlib and zlib", tmp_path / "a.h5")
+    layout = h5py.VirtualLayout((10**9, 16, 16), STACK.dtype)
+    layout[:40] = h5py.VirtualSource(write_hdf5(tmp_path / "b.h5", x=STACK), "x", STACK.shape)
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file.create_virtual_dataset("frames", layout)
+    refused_at_once("cannot hold 1000000000 frames", tmp_path / "c.h5")
 
 
 def test_fits(tmp_path):
@@ -163,8 +139,7 @@ def test_fits(tmp_path):
             if card.keyword.startswith("Z") or card.keyword in ("BZERO", "BSCALE"):
                 table.header.append(card)
         fits.HDUList([fits.PrimaryHDU(), table]).writeto(path, overwrite=True)
-    with refused_at_once("unpacks to more than the 512 of its shape"):
-        read(path)
+    refused_at_once("unpacks to more than the 512 of its shape", path)
 
 
 def test_tiff_of_many_pages(tmp_path):
@@ -173,8 +148,7 @@ def test_tiff_of_many_pages(tmp_path):
     with (tmp_path / "a.tif").open("wb") as stream:
         stream.write(b"II*\0" + struct.pack("<I", 8))
         stream.write(b"".join(page + struct.pack("<I", 8 + size * (i + 1)) for i in range(n)))
-    with refused_at_once(r"more than 100000 pages"):
-        read(tmp_path / "a.tif")
+    refused_at_once("more than 100000 pages", tmp_path / "a.tif")
 
 
 def test_npz(tmp_path):
@@ -183,8 +157,8 @@ def test_npz(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("dn.npy", member.getvalue())
         archive.writestr("counts.npy", bytes((1 << 28) + 1))
-    with refused_at_once(r"bytes unpacked, too large for histograms"):
-        read_histograms(InputSettings(files=("a.npz",)), tmp_path)
+    settings = InputSettings(files=("a.npz",))
+    refused_at_once("unpacked, too large for histograms", settings, lambda s: read_histograms(s, tmp_path))
 
 
 class Trap:
@@ -232,19 +206,14 @@ def linked_out(path):
 
 
 @pytest.mark.parametrize("link", ["c", "c/0/0/0"])
-def test_a_link_out_of_the_store(tmp_path, link):
+def test_a_link_may_not_lead_out_of_the_store(tmp_path, link):
     path = tmp_path / "a.zarr"
-    zarr.create_array(path, data=frames(), chunks=(6, 8, 9))
+    zarr.create_array(path, data=frames(), chunks=(2, 8, 9))
+    (path / "c/1/0/0").unlink()
+    (path / "c/1/0/0").symlink_to("../../2/0/0")
+    read(path)
     linked_out(path / link)
     refused(f"{link} is a link out of the store; copy its files into the store", path)
-
-
-def test_a_link_within_the_store(tmp_path):
-    path = tmp_path / "a.zarr"
-    zarr.create_array(path, data=frames(), chunks=(3, 8, 9))
-    (path / "c/1/0/0").unlink()
-    (path / "c/1/0/0").symlink_to("../../0/0/0")
-    read(path)
 
 
 @pytest.mark.parametrize("place", ["../b.zarr", "..", "/etc", "x/../../b.zarr"])
@@ -303,9 +272,8 @@ def test_names_in_all_scripts(tmp_path, name):
     np.save(path, frames())
     read(path)
     path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match="truncated") as caught:
         read(path)
-    assert "truncated" in str(caught.value)
     assert str(caught.value).isprintable()
 
 

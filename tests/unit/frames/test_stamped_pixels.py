@@ -27,15 +27,9 @@ def pco(stack, first=95, shift=0, text=False):
     """Write number, date and time of each frame as PCO cameras do, two decimal digits a pixel."""
     for t, frame in enumerate(stack):
         at = 8_250_013 * t // 777
-        stamp = [
-            *bcd(first + t, 4),
-            *bcd(2024, 2),
-            *bcd(1031, 2),
-            *bcd(12, 1),
-            *bcd(at // 60_000_000 % 60, 1),
-        ]
-        stamp += [*bcd(at // 1_000_000 % 60, 1), *bcd(at % 1_000_000, 3)]
-        assert len(stamp) == 14
+        parts = [(first + t, 4), (2024, 2), (1031, 2), (12, 1), (at // 60_000_000 % 60, 1)]
+        parts += [(at // 1_000_000 % 60, 1), (at % 1_000_000, 3)]
+        stamp = [digit for part in parts for digit in bcd(*part)]
         frame[0, :14] = np.array(stamp) << shift
         if text:
             frame[:8, 16:271] = RNG.integers(0, 2, (8, 255)) * 255
@@ -51,31 +45,24 @@ def binary(stack, order, first=250, at=24):
     return stack
 
 
+#: stamped frames, the pixels of a stamp, and layouts beside npy
 STAMPED = {
-    "16 bits": lambda: (pco(noise()), 20),
-    "8 bits": lambda: (pco(noise("uint8")), 40),
-    "32 bits": lambda: (binary(noise("uint32"), ">"), 10),
-    "from one": lambda: (pco(noise(), first=1), 20),
-    "left-justified": lambda: (pco(noise() << 2, shift=2), 20),
-    "little-endian": lambda: (binary(noise(), "<"), 20),
-    "big-endian": lambda: (binary(noise(), ">"), 20),
-    "8 bits, binary": lambda: (binary(noise("uint8"), ">"), 40),
+    "16 bits": (lambda: pco(noise()), 20, ("tiff, zlib", "zarr", "dcimg")),
+    "8 bits": (lambda: pco(noise("uint8")), 40, ()),
+    "32 bits": (lambda: binary(noise("uint32"), ">"), 10, ("tiff, zlib", "zarr")),
+    "from one": (lambda: pco(noise(), first=1), 20, ()),
+    "left-justified": (lambda: pco(noise() << 2, shift=2), 20, ()),
+    "little-endian": (lambda: binary(noise(), "<"), 20, ()),
+    "big-endian": (lambda: binary(noise(), ">"), 20, ()),
+    "8 bits, binary": (lambda: binary(noise("uint8"), ">"), 40, ("tiff, zlib", "zarr", "dcimg")),
 }
 
 
-OTHER_LAYOUTS = {
-    "16 bits": ("tiff, zlib", "zarr", "dcimg"),
-    "8 bits, binary": ("tiff, zlib", "zarr", "dcimg"),
-    "32 bits": ("tiff, zlib", "zarr"),
-}
-
-
-@pytest.mark.parametrize("name", STAMPED)
-def test_stamped_pixels_are_no_samples(tmp_path, name):
-    stack, width = STAMPED[name]()
-    expected = np.zeros(SHAPE, bool)
+@pytest.mark.parametrize(("make", "width", "layouts"), STAMPED.values(), ids=STAMPED)
+def test_stamped_pixels_are_no_samples(tmp_path, make, width, layouts):
+    stack, expected = make(), np.zeros(SHAPE, bool)
     expected[0, :width] = True
-    for layout in ("npy", *OTHER_LAYOUTS.get(name, ())):
+    for layout in ("npy", *layouts):
         frames = opened(write(tmp_path / layout, layout, stack))
         np.testing.assert_array_equal(frames.excluded, expected)
         assert f"{width} pixels from the first one on hold a stamp" in frames.report.message()
@@ -84,14 +71,7 @@ def test_stamped_pixels_are_no_samples(tmp_path, name):
         np.testing.assert_array_equal(found[:, ~expected], stack[:, ~expected])
 
 
-def test_a_text_beside_the_stamp_is_none_either(tmp_path):
-    frames = opened(write(tmp_path, "npy", pco(noise(), text=True)))
-    expected = np.zeros(SHAPE, bool)
-    expected[:8, :271] = True
-    np.testing.assert_array_equal(frames.excluded, expected)
-
-
-def test_a_region_is_left_with_its_own_part_of_the_stamp(tmp_path):
+def test_a_region_is_left_with_its_own_part_of_the_stamp_and_a_text_beside_is_no_sample_either(tmp_path):
     path = write(tmp_path, "npy", pco(noise()))
     frames = opened(path, roi=(0, 5, 7, 60), frame_range=(3, 19))
     assert frames.excluded is not None
@@ -99,6 +79,10 @@ def test_a_region_is_left_with_its_own_part_of_the_stamp(tmp_path):
     beside = opened(path, roi=(1, 12, 0, 60))
     assert beside.excluded is None
     assert "stamp" not in beside.report.message()
+    frames = opened(write(tmp_path, "npy", pco(noise(), text=True)))
+    expected = np.zeros(SHAPE, bool)
+    expected[:8, :271] = True
+    np.testing.assert_array_equal(frames.excluded, expected)
 
 
 def test_stamps_of_single_files_and_a_mask_go_together(tmp_path):

@@ -11,12 +11,8 @@ from pchem_pipeline.frames.stamps import stamp_notes
 
 
 def counted(*stamps):
-    return [
-        SimpleNamespace(
-            shape=(len(each), 2, 2), frame_stamps=None if np.isnan(each).any() else np.array(each)
-        )
-        for each in stamps
-    ]
+    known = [None if np.isnan(each).any() else np.array(each) for each in stamps]
+    return [SimpleNamespace(shape=(len(s), 2, 2), frame_stamps=k) for s, k in zip(stamps, known, strict=True)]
 
 
 def test_missing_repeated_and_recounted_frames_are_told_with_a_part_without():

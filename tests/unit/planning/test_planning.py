@@ -37,7 +37,7 @@ def test_known_bounds_of_17750_frames(noise, exposure, percent):
     assert frames_needed(asked, there) == pytest.approx(17_750, abs=1.5)
 
 
-def test_units_of_a_target_are_the_same_wish():
+def test_units_of_a_target_are_the_same_wish_and_every_parameter_can_be_planned_for():
     there = point()
     for texts in (
         ("conversion_gain=1%", f"conversion_gain={0.01 * GAIN}e-/DN"),
@@ -48,6 +48,9 @@ def test_units_of_a_target_are_the_same_wish():
     ):
         frames = {frames_needed(parse_target(text), there) for text in texts}
         assert max(frames) - min(frames) <= 1
+    for name, units in TARGET_NAMES.items():
+        for unit in units:
+            assert 1 < frames_needed(parse_target(f"{name}=0.001{unit}"), point()) < 1e12
 
 
 @pytest.mark.parametrize(
@@ -66,12 +69,6 @@ def test_units_of_a_target_are_the_same_wish():
 def test_a_wrong_target_gets_its_line(text, words):
     with pytest.raises(ConfigError, match=words):
         parse_target(text)
-
-
-def test_every_parameter_can_be_planned_for():
-    for name, units in TARGET_NAMES.items():
-        for unit in units:
-            assert 1 < frames_needed(parse_target(f"{name}=0.001{unit}"), point()) < 1e12
 
 
 @pytest.mark.parametrize(("text", "noise"), [("conversion_gain=1%", 0.8), ("read_noise_e=1%", 0.3)])
@@ -107,7 +104,7 @@ def brute_force(informations, gradient, steps=60):
     return best
 
 
-def test_the_best_split_is_that_of_brute_force():
+def test_the_best_split_is_that_of_brute_force_and_chosen_exposures_are_no_worse():
     there = point(noise=0.6)
     lights = [0.0, 2.0, 8.0]
     informations = np.stack([shared_information(h, 0.6) for h in lights])
@@ -122,21 +119,11 @@ def test_the_best_split_is_that_of_brute_force():
     targets = [ONE_PERCENT, parse_target("read_noise_e=1%")]
     alone = [best_split([target], lights, there).frames for target in targets]
     assert max(alone) <= best_split(targets, lights, there).frames <= sum(alone)
-
-
-def test_chosen_exposures_are_no_worse_than_given_ones():
-    there = point(noise=0.6)
     free = best_samples([ONE_PERCENT], there, 8.0)
-    assert free.frames <= best_split([ONE_PERCENT], [0.0, 2.0, 8.0], there).frames * 1.001
+    assert free.frames <= best_split([ONE_PERCENT], lights, there).frames * 1.001
     assert free.exposures[0] == 0
     assert len(free.exposures) <= 4
     assert max(free.exposures) <= 8.0001
-
-
-@pytest.mark.parametrize("lights", [[0.0, 0.0], [0.0, -1.0]])
-def test_wrong_samples_get_their_line(lights):
-    with pytest.raises(ConfigError, match="--samples"):
-        best_split([ONE_PERCENT], lights, point())
 
 
 def one(targets, there, *, given=True, budget=None, max_frames=1e7):
@@ -188,17 +175,23 @@ def test_the_best_exposure_ends_without_flags():
         assert low <= simulated([target], bright.point, bright.frames).n_flagged <= high
 
 
-def test_few_frames_must_show_electrons_at_all():
+def test_few_frames_must_show_electrons_at_all_and_those_of_no_use_are_not_simulated():
     plan = one(["bias=0.09e-"], point(0.05, 0.3))
     assert plan.frames == plan.needed > 2 * plan.bounds[0]
+    given = ([ONE_PERCENT], point(), [2.0], [1.0])
+    assert frames_simulated(*given, 2000, 1999) == np.inf
+    assert frames_simulated(*given, 100, 200) == np.inf
+    enough = frames_simulated(*given, 100, 1e5)
+    assert enough == pytest.approx(frames_needed(ONE_PERCENT, point()), rel=0.25)
 
 
-@pytest.mark.parametrize(
-    ("exposure", "noise", "gain"), [(0.0, 0.3, 0.1), (1.0, 0.0, 0.1), (1.0, np.nan, 0.1), (1, 0.2, 1.0)]
-)
-def test_impossible_pixels_get_their_line(exposure, noise, gain):
-    with pytest.raises(ConfigError, match="--"):
-        Point(exposure, noise, gain)
+def test_impossible_pixels_and_samples_get_their_line():
+    for pixel in ((0.0, 0.3, 0.1), (1.0, 0.0, 0.1), (1.0, np.nan, 0.1), (1, 0.2, 1.0)):
+        with pytest.raises(ConfigError, match="--"):
+            Point(*pixel)
+    for lights in ([0.0, 0.0], [0.0, -1.0]):
+        with pytest.raises(ConfigError, match="--samples"):
+            best_split([ONE_PERCENT], lights, point())
 
 
 def test_the_real_fit_confirms_a_plan():
@@ -223,21 +216,16 @@ def test_the_joint_fit_confirms_a_split():
 
 
 def test_the_command_in_words_and_files(tmp_path):
-    target, path = ("conversion_gain=1%",), tmp_path / "plan.json"
-    text = make_plan(read_noise=0.3, exposure=2.0, target=target, json=path)
-    content = json.loads(path.read_text())
-    assert f"{content['frames']:,.0f} frames" in text
-    assert content["frames"] == frames_needed(ONE_PERCENT, Point(2.0, 0.3, 0.09))
-    assert "best exposure" in text
-
-
-def test_the_command_for_samples_and_budgets():
-    text = make_plan(read_noise=0.6, samples="0,2,8", target=("conversion_gain=1%",), frames=5000)
-    assert "3 samples" in text
-    assert "evenly divided" in text
-    text = make_plan(read_noise=0.3, frames=2000, target=("bias=0.02e-",))
-    assert "(the best)" in text
-    assert "2,000 frames are enough" in text
+    path, gain = tmp_path / "plan.json", ("conversion_gain=1%",)
+    frames = frames_needed(ONE_PERCENT, Point(2.0, 0.3, 0.09))
+    for given, words in (
+        ({"exposure": 2.0, "target": gain, "json": path}, (f"{frames:,.0f} frames", "best exposure")),
+        ({"samples": "0,2,8", "target": gain, "frames": 5000}, ("3 samples", "evenly divided")),
+        ({"frames": 2000, "target": ("bias=0.02e-",)}, ("(the best)", "2,000 frames are enough")),
+    ):
+        text = make_plan(read_noise=0.6 if "samples" in given else 0.3, **given)
+        assert all(each in text for each in words)
+    assert json.loads(path.read_text())["frames"] == frames
 
 
 @pytest.mark.parametrize(
@@ -272,14 +260,6 @@ def test_rivals_need_more_frames_than_the_bound_asks_for(exposure, noise, gain):
         found = simulated(["conversion_gain=1%"], best, plan.best_frames, n, every_flag=True)
         assert found.n_flagged < few
         assert found.checks[0].reached
-
-
-def test_frames_of_no_use_are_not_simulated():
-    given = ([ONE_PERCENT], point(), [2.0], [1.0])
-    assert frames_simulated(*given, 2000, 1999) == np.inf
-    assert frames_simulated(*given, 100, 200) == np.inf
-    enough = frames_simulated(*given, 100, 1e5)
-    assert enough == pytest.approx(frames_needed(ONE_PERCENT, point()), rel=0.25)
 
 
 def test_the_section_of_the_report_is_of_the_median_pixel():

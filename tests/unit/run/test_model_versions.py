@@ -1,11 +1,12 @@
 """The model of a run as an artefact: its versions, and the one in force."""
 
 import json
+import shutil
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
-import yaml
 from helpers.commands import arrays_of, assert_equal_arrays, invoke
 from helpers.discrepancy_material import verdict_of
 
@@ -94,9 +95,8 @@ def test_a_verdict_makes_a_version_with_its_arrays_and_the_same_effects_without_
 
 def test_what_a_killed_command_left_is_no_version(store):
     put(store, settings())
-    write_added_exposure(
-        store, "model/0002", AddedExposure(*np.zeros((2, 1, 2, 2))), [], (0, 2), (0, 2)
-    )  # arrays without their version
+    arrays = AddedExposure(*np.zeros((2, 1, 2, 2)))  # without their version
+    write_added_exposure(store, "model/0002", arrays, [], (0, 2), (0, 2))
     assert put(store, settings(ROW)) == 2
     assert not store.has("model/0002")
     (store.path / "model/0002.json").write_text('{"number": 2}')
@@ -113,9 +113,6 @@ def test_an_effect_of_a_package_that_is_gone_is_told_and_other_versions_can_be_u
     assert put(store, settings()) == 1
     with pytest.raises(ConfigError, match=r"model 2 of the run: .*their_effect"):
         _ = version_with(store, 2).effects
-
-
-# -- a run -------------------------------------------------------------------------------------
 
 
 def configured(folder, **sections):
@@ -148,28 +145,23 @@ def finished(tmp_path_factory):
 @pytest.fixture
 def run(finished, tmp_path):
     """A copy of that run."""
-    import shutil
-
     shutil.copytree(finished.parent, tmp_path / "copy")
     return tmp_path / "copy" / "run.yaml"
 
 
-def verdict(path, *effects, closed=0.9):
+def verdict(path, *effects):
     """Leave the result of a search that started from the model in force."""
     store = RunStore.open(path.parent / "run.zarr", writable=True)
     model = model_in_force(store, load_config(path).model)
     found = verdict_of("named")
-    found = found.model_copy(
-        update={"model_effects": effects, "gap": found.gap.model_copy(update={"closed_fraction": closed})}
-    )
+    gap = found.gap.model_copy(update={"closed_fraction": 0.9})
+    found = found.model_copy(update={"model_effects": effects, "gap": gap})
     store.write_file(VERDICT_FILE, found.to_json().encode())
-    ingested = store.records.read("ingest")
-    found = RunConfig.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
     content = {
         "stage": "discrepancy",
         "version": STAGES["discrepancy"].version,
-        "settings": {"discrepancy": found.discrepancy.model_dump(mode="json")},
-        "upstream": {"ingest": ingested.fingerprint},
+        "settings": {"discrepancy": load_config(path).discrepancy.model_dump(mode="json")},
+        "upstream": {"ingest": store.records.read("ingest").fingerprint},
         "input": {"model": model.digest, "roi": []},
     }
     store.records.write(StageRecord("discrepancy", 1, fingerprint_of(content), content, 1, True))
@@ -262,21 +254,15 @@ def test_the_yaml_of_another_run_stays(finished, run):
     assert find_run(run.parent / "run.zarr").config.model == settings(ROW)
 
 
-def test_a_model_that_cannot_be_written_leaves_all_as_it_is(run, monkeypatch):
-    def refuse(*_):
-        raise StoreError("no permission to write there")
-
+def test_a_model_that_is_not_there_or_cannot_be_written_leaves_all_as_it_is(run, monkeypatch):
+    [only] = json.loads(invoke("model", run, "--json").stdout)["models"]
+    assert (only["number"], only["current"], only["results"]) == (1, True, ["fit", "maps"])
+    with pytest.raises(ConfigError, match="has no model 7"):
+        invoke("model", run, "--use", "7")
     verdict(run, ROW)
-    monkeypatch.setattr("pchem_pipeline.config.load.write_atomic", refuse)
+    refusal = StoreError("no permission to write there")
+    monkeypatch.setattr("pchem_pipeline.config.load.write_atomic", Mock(side_effect=refusal))
     with pytest.raises(StoreError, match="no permission"):
         adopt_verdict(find_run(run))
     assert find_run(run.parent / "run.zarr").config.model == settings()
     assert states(run)["fit"] == ("complete", 1)
-
-
-def test_the_command_lists_and_refuses(run):
-    shown = invoke("model", run, "--json").stdout
-    [only] = json.loads(shown)["models"]
-    assert (only["number"], only["current"], only["results"]) == (1, True, ["fit", "maps"])
-    with pytest.raises(ConfigError, match="has no model 7"):
-        invoke("model", run, "--use", "7")

@@ -1,11 +1,13 @@
 """The driver of the stages, with small stages of our own."""
 
 import contextlib
+import errno
 import functools
 import json
 import re
 import signal
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -43,8 +45,8 @@ def double_tile(tile, store):
 
 def fit_run(context):
     context.create("fit/bias")
-    value = context.config.fit.gap_threshold
-    context.run_units(context.tiles(), functools.partial(number_tile, value=value))
+    task = functools.partial(number_tile, value=context.config.fit.gap_threshold)
+    context.run_units(context.tiles(), task)
 
 
 def maps_run(context):
@@ -79,20 +81,25 @@ def make(tmp_path, monkeypatch):
     reporter = Reporter("off", quiet=True, log=tmp_path / "log.jsonl")
 
     def context(config="", **options):
-        text = f"input: {{files: [a]}}\nrun: {{tile: 8}}\n{config}"
-        return StageContext(
-            parse_config(text), tmp_path, store, SerialExecutor(), reporter, StopRequest(), Command(**options)
-        )
+        found = parse_config(f"input: {{files: [a]}}\nrun: {{tile: 8}}\n{config}")
+        command = Command(**options)
+        return StageContext(found, tmp_path, store, SerialExecutor(), reporter, StopRequest(), command)
 
     yield context
     reporter.close()
 
 
-def test_a_second_run_does_nothing(make):
-    assert execute("fit", make()).state == "complete"
-    assert len(CALLS) == 12
-    assert execute("fit", make()).state == "complete"
-    assert len(CALLS) == 12
+def test_a_second_run_does_nothing_nor_does_a_setting_that_no_stage_reads(make):
+    for config in ("", "", "compute: {workers: 7}"):
+        context = make(config)
+        assert execute("fit", context).state == "complete"
+        assert len(CALLS) == 12
+    # the record keeps what was used
+    record = context.store.records.read("fit")
+    assert record.content["settings"] == {"fit.gap_threshold": 5.0}
+    assert record.versions["numpy"] == np.__version__
+    assert min(record.seconds, record.peak_rss_bytes) > 0
+    assert str(context.store.path) not in json.dumps(record.content)
 
 
 def test_what_a_hand_took_out_of_the_store_is_made_again(make, monkeypatch):
@@ -118,6 +125,8 @@ def test_what_a_hand_took_out_of_the_store_is_made_again(make, monkeypatch):
 
 
 def test_a_changed_setting_redoes_the_stages_that_read_it(make):
+    with pytest.raises(StoreError, match="maps needs fit first; run: pchem fit"):
+        execute("maps", make())
     execute("fit", make())
     execute("maps", make())
     changed = make("fit: {gap_threshold: 7}")
@@ -161,11 +170,6 @@ def test_a_worker_that_wakes_after_another_run_writes_nothing(make):
     context.store.write("fit/bias", (slice(0, 8), slice(0, 8)), np.zeros((8, 8)))  # this thread has no turn
 
 
-def test_a_setting_that_no_stage_reads_redoes_nothing(make):
-    execute("fit", make())
-    assert status(FAKES["fit"], make("compute: {workers: 7}")).state == "complete"
-
-
 def test_one_bad_tile_stops_nothing_and_is_retried(make):
     BROKEN.add("1.2")
     context = make()
@@ -188,9 +192,8 @@ def test_one_bad_tile_stops_nothing_and_is_retried(make):
 
 def test_an_undivided_stage_starts_again_when_upstream_grew(make):
     BROKEN.add("0.0")
-    execute("fit", make())
-    execute("maps", make())
-    execute("ensemble", make())
+    for name in FAKES:
+        execute(name, make())
     assert status(FAKES["ensemble"], make()).state == "complete"
     BROKEN.clear()
     execute("fit", make())
@@ -198,80 +201,59 @@ def test_an_undivided_stage_starts_again_when_upstream_grew(make):
     assert status(FAKES["ensemble"], make()).words() == "stale - new maps"
 
 
-def test_tiles_redo_a_part_only_with_force(make):
-    execute("fit", make())
+def test_tiles_of_a_new_stage_leave_it_partial_and_redo_a_part_only_with_force(make):
+    assert execute("fit", make(roi=(0, 1, 0, 1))).words() == "partial 1 of 12"
+    assert execute("fit", make()).state == "complete"
     CALLS.clear()
-    execute("fit", make(roi=(0, 3, 0, 9)))
+    assert execute("fit", make(roi=(0, 3, 0, 9))).state == "complete"
     assert CALLS == []
     execute("fit", make(roi=(0, 3, 0, 9), force=True))
     assert CALLS == ["0.0", "0.1"]
     execute("fit", make(force=True))
     assert len(CALLS) == 2 + 12
-
-
-def test_tiles_of_a_new_stage_leave_it_partial(make):
-    assert execute("fit", make(roi=(0, 1, 0, 1))).words() == "partial 1 of 12"
-    assert execute("fit", make()).state == "complete"
-
-
-def test_regions_outside_are_refused_even_where_nothing_is_to_be_done(make):
-    assert execute("fit", make()).state == "complete"
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError):  # even where nothing is to be done
         execute("fit", make(roi=(0, 9, 90, 99)))
-    assert execute("fit", make(roi=(0, 1, 0, 1))).state == "complete"
 
 
 def test_changes_of_the_input_are_said_in_words():
-    settings = {"version": 1, "settings": {}, "upstream": {}}
-    time, later = ({**settings, "input": {"integration_time": value}} for value in (4.87, 5.0))
-    assert differences(time, later) == ["input.integration_time 4.87 -> 5.0"]
-    digest, other = ({**settings, "input": {"content": value}} for value in ("ab", "cd"))
-    assert differences(digest, other) == ["the input has changed"]
+    def told(name, *values):
+        same = {"version": 1, "settings": {}, "upstream": {}}
+        return differences(*({**same, "input": {name: value}} for value in values))
+
+    assert told("integration_time", 4.87, 5.0) == ["input.integration_time 4.87 -> 5.0"]
+    assert told("content", "ab", "cd") == ["the input has changed"]
 
 
-def test_a_stage_without_its_upstream_names_the_command(make):
-    with pytest.raises(StoreError, match="maps needs fit first; run: pchem fit"):
-        execute("maps", make())
-
-
-def test_a_signal_stops_between_units_and_the_rest_is_done_later(make):
+@pytest.mark.parametrize(
+    ("heard", "number", "words"),
+    [
+        (3, signal.SIGTERM, "partial 3 of 12"),
+        # between the last unit and the end of a stage it must not leave it complete
+        (12, signal.SIGINT, "partial 12 of 12 - interrupted"),
+    ],
+)
+def test_a_signal_stops_behind_a_unit_and_the_rest_is_done_later(make, heard, number, words):
     context = make()
 
     class Interrupting(SerialExecutor):
         def map(self, function, items, on_result):
+            assert context.store.records.read("fit").keys == 12  # the total is known while it runs
+
             def hear(item, outcome):
-                if len(CALLS) == 3:
-                    context.stop.signal = signal.SIGTERM
+                if len(CALLS) == heard:
+                    context.stop.signal = number
                 on_result(item, outcome)
 
             super().map(function, items, hear)
 
     context.executor = Interrupting()
-    with pytest.raises(InterruptedRunError, match="stopped by SIGTERM") as caught:
+    with pytest.raises(InterruptedRunError, match=f"stopped by {number.name}") as caught:
         execute("fit", context)
-    assert caught.value.exit_code == 143
-    assert status(FAKES["fit"], make()).words() == "partial 3 of 12"
-    CALLS.clear()
-    execute("fit", make())
-    assert len(CALLS) == 9
-
-
-def test_work_after_the_last_unit_is_made_up_for(make):
-    """A stop between the last unit and the end of a stage must not leave it complete."""
-    context = make()
-
-    class StopAtTheEnd(SerialExecutor):
-        def map(self, function, items, on_result):
-            super().map(function, items, on_result)
-            context.stop.signal = signal.SIGINT
-
-    context.executor = StopAtTheEnd()
-    with pytest.raises(InterruptedRunError):
-        execute("fit", context)
-    assert status(FAKES["fit"], make()).words() == "partial 12 of 12 - interrupted"
+    assert caught.value.exit_code == 128 + number
+    assert status(FAKES["fit"], make()).words() == words
     CALLS.clear()
     assert execute("fit", make()).state == "complete"
-    assert CALLS == []
+    assert len(CALLS) == 12 - heard
 
 
 def test_a_stage_stopped_before_its_first_unit_starts_anew(make, monkeypatch):
@@ -301,39 +283,19 @@ def test_a_stage_stopped_before_its_first_unit_starts_anew(make, monkeypatch):
 
 
 @pytest.mark.parametrize("moment", ["unmark_all", "write", "delete"])
-def test_a_stage_killed_while_it_begins_anew_is_still_known(make, monkeypatch, moment):
+def test_a_stage_killed_while_it_begins_anew_is_still_known(make, moment):
     for name in ("fit", "maps"):
         execute(name, make("fit: {gap_threshold: 3}"))
     owner = RunStore if moment == "delete" else type(make().store.records)
-    real = getattr(owner, moment)
-
-    def killed(*arguments):
-        raise SystemExit
-
-    monkeypatch.setattr(owner, moment, killed)
-    with pytest.raises(SystemExit):
+    with patch.object(owner, moment, side_effect=SystemExit), pytest.raises(SystemExit):
         execute("fit", make("fit: {gap_threshold: 7}"))
-    monkeypatch.setattr(owner, moment, real)
     assert status(FAKES["fit"], make("fit: {gap_threshold: 7}")).state != "missing"
     for name in ("fit", "maps"):
         assert execute(name, make("fit: {gap_threshold: 7}")).state == "complete"
     np.testing.assert_array_equal(make().store.read("maps/bias")[0], 14)
 
 
-def test_the_total_is_known_while_a_stage_runs(make):
-    context, totals = make(), []
-
-    class Looking(SerialExecutor):
-        def map(self, function, items, on_result):
-            totals.append(context.store.records.read("fit").keys)
-            super().map(function, items, on_result)
-
-    context.executor = Looking()
-    execute("fit", context)
-    assert totals == [12]
-
-
-def test_handlers_turn_the_first_signal_into_a_request_and_are_removed():
+def test_handlers_turn_the_first_signal_into_a_request_but_what_the_shell_ignores_and_are_removed():
     before = signal.getsignal(signal.SIGTERM)
     with stop_on_signals() as stop:
         signal.raise_signal(signal.SIGTERM)
@@ -341,6 +303,14 @@ def test_handlers_turn_the_first_signal_into_a_request_and_are_removed():
         with pytest.raises(InterruptedRunError):
             stop.check()
     assert signal.getsignal(signal.SIGTERM) is before
+    with sigint(signal.SIG_IGN), stop_on_signals() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.signal is None
+        signal.raise_signal(signal.SIGTERM)
+        assert stop.signal == signal.SIGTERM
+    with sigint(signal.default_int_handler), stop_on_signals() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.signal == signal.SIGINT
 
 
 def test_at_once_a_signal_ends_what_guards_against_errors():
@@ -365,51 +335,22 @@ def test_at_once_a_signal_ends_what_guards_against_errors():
     assert passed == [()]
 
 
-def test_what_the_shell_ignores_stays_ignored():
-    with sigint(signal.SIG_IGN), stop_on_signals() as stop:
-        signal.raise_signal(signal.SIGINT)
-        assert stop.signal is None
-        signal.raise_signal(signal.SIGTERM)
-        assert stop.signal == signal.SIGTERM
-    with sigint(signal.default_int_handler), stop_on_signals() as stop:
-        signal.raise_signal(signal.SIGINT)
-        assert stop.signal == signal.SIGINT
-
-
-def test_a_full_disk_stops_the_run_at_once(make, monkeypatch):
-    import errno
-
-    def full(self, name, region, data):
+@pytest.mark.parametrize(
+    ("raised", "error", "words"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), StoreError, "free space"),
+        (InputError("frames.raw vanished; put it back"), InputError, "put it back"),
+    ],
+)
+def test_a_full_disk_or_vanished_camera_files_stop_the_run_at_once(make, monkeypatch, raised, error, words):
+    def fail(self, name, region, data):
         with self._translated(name):
-            raise OSError(errno.ENOSPC, "No space left on device")
+            raise raised
 
-    monkeypatch.setattr(RunStore, "write", full)
-    with pytest.raises(StoreError, match="free space"):
+    monkeypatch.setattr(RunStore, "write", fail)
+    with pytest.raises(error, match=words):
         execute("fit", make())
     assert CALLS == ["0.0"]
-
-
-def test_vanished_camera_files_stop_the_run_at_once(make, monkeypatch):
-    def vanished(self, name, region, data):
-        raise InputError("frames.raw vanished; put it back")
-
-    monkeypatch.setattr(RunStore, "write", vanished)
-    with pytest.raises(InputError, match="put it back") as caught:
-        execute("fit", make())
-    assert caught.value.exit_code == 4
-    assert CALLS == ["0.0"]
-
-
-def test_record_keeps_what_was_used(make):
-    context = make()
-    execute("fit", context)
-    record = context.store.records.read("fit")
-    assert record.content["settings"] == {"fit.gap_threshold": 5.0}
-    assert record.versions["numpy"] == np.__version__
-    assert record.seconds > 0
-    assert record.peak_rss_bytes > 0
-    text = json.dumps(record.content)
-    assert str(context.store.path) not in text
 
 
 @pytest.mark.parametrize(("begun", "stays"), [([], False), (["histogram"], True)])

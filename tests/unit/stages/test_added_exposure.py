@@ -36,7 +36,7 @@ def test_ghost_has_the_moments_of_its_course():
     assert Persistence(peak_e=0.0, decay_frames=300.0).added_exposure(frames, numbers, MAPS) is None
 
 
-def test_effects_add_up_and_the_others_add_nothing():
+def test_effects_add_up_the_others_add_nothing_and_one_that_fails_is_named():
     one = AddedExposure(np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[0.7, 1.0], [0.3, 0.0]]))
     two = AddedExposure(np.array([[0.1, 0.2], [0.4, 0.6]]), np.array([[0.5, 0.5], [0.5, 0.5]]))
     both = one.combined_with(two)
@@ -52,15 +52,12 @@ def test_effects_add_up_and_the_others_add_nothing():
     np.testing.assert_array_equal(law.added_exposure[10], alone.exposure_e[:, 1, 2])
     assert added_exposures([RowNoise(row_noise_dn=1.0)], frames, np.arange(1000), MAPS) is None
 
-
-def test_an_effect_that_fails_is_named():
     class Broken(RowNoise):
         def added_exposure(self, *_):
             raise ZeroDivisionError("oh")
 
-    frames = np.zeros((2, 6, 8), np.uint16)
     with pytest.raises(ConfigError, match=r"row_noise .* cannot tell .* ZeroDivisionError: oh"):
-        added_exposures([Broken(row_noise_dn=1.0)], frames, np.arange(2), MAPS)
+        added_exposures([Broken(row_noise_dn=1.0)], frames, np.arange(1000), MAPS)
 
 
 def test_a_version_of_the_model_gives_it_back_and_models_with_the_same_effect_take_it_over(tmp_path):
@@ -71,9 +68,8 @@ def test_a_version_of_the_model_gives_it_back_and_models_with_the_same_effect_ta
     exposure[1, 1, 2] = 0.8
     weight = np.stack([np.ones((3, 4)), np.zeros((3, 4))])
     weight[:, 1, 2] = 0.6, 0.4
-    write_added_exposure(
-        store, "discrepancy", AddedExposure(exposure, weight), [noise, blinking], (2, 5), (3, 7)
-    )
+    found = AddedExposure(exposure, weight)
+    write_added_exposure(store, "discrepancy", found, [noise, blinking], (2, 5), (3, 7))
     plain = keep_in_force(store, model_in_force(store, ModelSettings()))
     assert read_added_exposure(store, plain) is None
     found = verdict_version(store, ModelSettings(effects=(blinking,)), plain, group="discrepancy")

@@ -1,5 +1,7 @@
 """Frames appended to a finished run: what all frames together give, without reading the old ones."""
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from helpers.commands import arrays_of, assert_equal_arrays, assert_same_results
@@ -10,6 +12,7 @@ from pchem_pipeline.commands.append import append_frames
 from pchem_pipeline.compute import memory
 from pchem_pipeline.config.load import dump_config
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import find_run
 from pchem_pipeline.runner.session import run_stages, run_status
@@ -86,25 +89,19 @@ def test_odd_frames_among_old_and_new_ones_are_in_no_sum(tmp_path, frames):
 
 
 def test_moved_frames_are_found_among_old_and_new_ones(tmp_path, frames):
-    moved = frames.copy()
-    moved[[30, 290, 500, 699]] = np.roll(moved[[30, 290, 500, 699]], 1, axis=2)
+    moved, at = frames.copy(), [30, 290, 500, 699]
+    moved[at] = np.roll(moved[at], 1, axis=2)
     append_frames(begun(tmp_path, moved, 301), QUIET)
-    odd = RunStore.open(tmp_path / "run.zarr").attributes("summary")["odd_frames"]
-    assert odd["moved_x"] == [30, 290, 500, 699]
+    assert RunStore.open(tmp_path / "run.zarr").attributes("summary")["odd_frames"]["moved_x"] == at
 
 
 def test_old_frames_are_not_read(tmp_path, frames, monkeypatch):
-    from pchem_pipeline.frames import sequence
-
     run = begun(tmp_path, frames, 600)
     assert [state.state for state in run_status(run)][:2] == ["stale", "stale"]  # a look changes nothing
     append_frames(run, Command(dry_run=True, quiet=True))
-    seen = []
-    real = sequence.FrameSequence.pieces
+    seen, real = [], FrameSequence.pieces
     monkeypatch.setattr(
-        sequence.FrameSequence,
-        "pieces",
-        lambda self, t0, t1: [seen.append((t0, t1)), *real(self, t0, t1)][1:].__iter__(),
+        FrameSequence, "pieces", lambda self, t0, t1: seen.append((t0, t1)) or real(self, t0, t1)
     )
     append_frames(run, QUIET)
     assert sum(min(t1, 600) - t0 for t0, t1 in seen if t0 < 600) <= 48  # the first look
@@ -168,7 +165,7 @@ def test_more_frames_than_sixteen_bits_can_count(tmp_path):
     append_frames(run, QUIET)
     counts = RunStore.open(tmp_path / "run.zarr").read("histogram/counts")
     assert counts.dtype == np.uint32
-    np.testing.assert_array_equal(counts.sum(axis=2), np.full((2, 3), 70_000))
+    assert (counts.sum(axis=2) == 70_000).all()
 
 
 @pytest.fixture(scope="module")
@@ -181,32 +178,24 @@ def of_all_frames(tmp_path_factory, frames):
     return arrays_of(folder / "whole.zarr", GROUPS)
 
 
-_APPEND = "pchem_pipeline.commands.append"
-
-
 @pytest.mark.parametrize(
     "places",
     [
-        pytest.param([f"{_APPEND}.extend_arrays"], id="before the arrays grow"),
-        pytest.param([f"{_APPEND}.StackCounter.count"], id="while frames are counted"),
-        pytest.param([f"{_APPEND}.execute"], id="while tiles are marked"),
+        pytest.param(["commands.append.extend_arrays"], id="before the arrays grow"),
+        pytest.param(["commands.append.StackCounter.count"], id="while frames are counted"),
+        pytest.param(["commands.append.execute"], id="while tiles are marked"),
         pytest.param(
-            [f"{_APPEND}.StackCounter.count", "pchem_pipeline.run.sensor.SensorInfo.write"],
+            ["commands.append.StackCounter.count", "run.sensor.SensorInfo.write"],
             id="and again, when the old frames are gone and all are to be taken",
         ),
     ],
 )
-def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, monkeypatch, frames, of_all_frames, places):
+def test_a_stopped_one_goes_on_by_the_same_command(tmp_path, frames, of_all_frames, places):
     run = begun(tmp_path, frames, 600, ("ingest", "histogram", "fit"))
-
-    def killed(*arguments, **named):
-        raise KeyboardInterrupt
-
     for place in places:
-        with monkeypatch.context() as patch:
-            patch.setattr(place, killed)
-            with pytest.raises(KeyboardInterrupt):
-                append_frames(run, QUIET)
+        killed = patch(f"pchem_pipeline.{place}", side_effect=KeyboardInterrupt)
+        with killed, pytest.raises(KeyboardInterrupt):
+            append_frames(run, QUIET)
     if len(places) > 1:
         assert [state.why for state in run_status(run) if state.stage == "fit"] == ["the run has no input"]
     assert [state.state for state in append_frames(run, QUIET)] == ["complete", "complete"]

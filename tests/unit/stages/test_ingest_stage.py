@@ -36,12 +36,6 @@ def small_chunks(monkeypatch):
     monkeypatch.setattr(ingest, "_UNIT_BYTES", 16 * 8 * 26 * 2)
 
 
-def write_stack(folder, parts=4):
-    folder.mkdir(exist_ok=True)
-    for i, part in enumerate(np.array_split(STACK, parts)):
-        tifffile.imwrite(folder / f"f{i + 8}.tif", part, photometric="minisblack")
-
-
 def make_context(folder, *, executor=None, command=None, stop=None, **settings):
     content = {"files": ["cam"], "mode": "copy", **settings}
     return stage_context(folder, executor, command, stop, input=content)
@@ -51,54 +45,59 @@ def run(context):
     return execute("ingest", context)
 
 
+def state_of(context):
+    return status(STAGES["ingest"], context)
+
+
+def assert_copied(context):
+    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "cam").mkdir()
+    for i, part in enumerate(np.split(STACK, 4), 8):
+        tifffile.imwrite(tmp_path / "cam" / f"f{i}.tif", part, photometric="minisblack")
+    return tmp_path
+
+
 @pytest.mark.parametrize("backend", ["serial", "threads"])
-def test_copy(tmp_path, small_chunks, backend):
-    write_stack(tmp_path / "cam")
+def test_copy(folder, small_chunks, backend):
     executor = make_executor(ComputeSettings(backend=backend, workers=2))
-    context = make_context(tmp_path, executor=executor, integration_time=4.87, bit_depth=12)
+    # tiles of the command line do not cut the input
+    given = {"executor": executor, "command": Command(roi=(0, 1, 0, 1))}
+    context = make_context(folder, **given, integration_time=4.87, bit_depth=12)
     assert run(context).state == "complete"
     array = context.store.array("frames/dn")
     assert array.chunks == (16, 8, 8)
     assert array.metadata.dimension_names == ("frame", "y", "x")
-    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+    assert_copied(context)
     sensor = SensorInfo.read(context.store)
     assert (sensor.kind, sensor.n_frames, sensor.shape, sensor.dtype) == ("frames", 40, (30, 26), "uint16")
     assert (sensor.bit_depth, sensor.integration_time, sensor.mode) == (12, None, "copy")
     assert sensor.identity["n_files"] == 4
     assert [file["name"] for file in sensor.identity["files"]] == ["f8.tif", "f9.tif", "f10.tif", "f11.tif"]
-    assert status(STAGES["ingest"], context).done == 3 * 4
+    assert state_of(context).done == 3 * 4
     assert run(context).state == "complete"
 
 
-def test_reference_copies_nothing(tmp_path):
-    write_stack(tmp_path / "cam")
-    context = make_context(tmp_path, mode="reference")
+def test_reference_copies_nothing(folder):
+    context = make_context(folder, mode="reference")
     assert context.config.input.mode == InputSettings().mode
     assert run(context).state == "complete"
     assert not context.store.has("frames/dn")
     assert context.sensor.mode == "reference"
     assert (context.sensor.n_frames, context.sensor.shape) == (40, (30, 26))
     assert open_source(context).shape == STACK.shape
-    place = tmp_path / "cam" / "f9.tif"
-    for change, refused in ((0, False), (1, True)):  # touched; other frames of the same shape
-        tifffile.imwrite(place, STACK[10:20] ^ change, photometric="minisblack")
-        os.utime(place, ns=(change, change))
-        if refused:
-            with pytest.raises(InputError, match=r"files changed since they were ingested .*; run: pchem"):
-                open_source(context)
-        else:
-            assert open_source(context).shape == STACK.shape
+    place = folder / "cam" / "f9.tif"
+    os.utime(place, ns=(0, 0))
+    assert open_source(context).shape == STACK.shape
+    tifffile.imwrite(place, STACK[10:20] ^ 1, photometric="minisblack")  # other frames of the same shape
+    with pytest.raises(InputError, match=r"files changed since they were ingested .*; run: pchem"):
+        open_source(context)
 
 
-def test_tiles_of_the_command_line_do_not_cut_the_input(tmp_path):
-    write_stack(tmp_path / "cam")
-    context = make_context(tmp_path, command=Command(roi=(0, 1, 0, 1)))
-    assert run(context).state == "complete"
-    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
-
-
-def test_stop_and_resume(tmp_path, small_chunks, monkeypatch):
-    write_stack(tmp_path / "cam")
+def test_stop_and_resume(folder, small_chunks, monkeypatch):
     stop, done = StopRequest(), []
     real = ingest._copy
 
@@ -110,17 +109,16 @@ def test_stop_and_resume(tmp_path, small_chunks, monkeypatch):
 
     monkeypatch.setattr(ingest, "_copy", copy)
     with pytest.raises(InterruptedRunError):
-        run(make_context(tmp_path, stop=stop))
+        run(make_context(folder, stop=stop))
     open_store.cache_clear()
-    context = make_context(tmp_path)
-    assert status(STAGES["ingest"], context).words().startswith("partial 5 of 12")
+    context = make_context(folder)
+    assert state_of(context).words().startswith("partial 5 of 12")
     assert run(context).state == "complete"
     assert len(done) == len(set(done)) == 12
-    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+    assert_copied(context)
 
 
-def test_identity_is_hashed_once(tmp_path, monkeypatch):
-    write_stack(tmp_path / "cam")
+def test_identity_is_hashed_once(folder, monkeypatch):
     hashed: list[list[str]] = []
     real = run_input.content_identity
 
@@ -129,64 +127,54 @@ def test_identity_is_hashed_once(tmp_path, monkeypatch):
         return real(paths, advance)
 
     monkeypatch.setattr(run_input, "content_identity", content)
-    run(make_context(tmp_path))
+    run(make_context(folder))
     assert len(hashed) == 1
-    again = make_context(tmp_path)
-    assert status(STAGES["ingest"], again).state == "complete"
+    again = make_context(folder)
+    assert state_of(again).state == "complete"
     assert len(hashed) == 1
     # another time of change, the same content: hashed again, still complete
-    os.utime(tmp_path / "cam" / "f9.tif", ns=(5, 5))
-    assert status(STAGES["ingest"], make_context(tmp_path)).state == "complete"
+    os.utime(folder / "cam" / "f9.tif", ns=(5, 5))
+    assert state_of(make_context(folder)).state == "complete"
     assert len(hashed) == 2
     # other content: stale, and why
     changed = STACK[:10].copy()
     changed[0, 0, 0] ^= 1
-    tifffile.imwrite(tmp_path / "cam" / "f8.tif", changed, photometric="minisblack")
-    state = status(STAGES["ingest"], make_context(tmp_path))
+    tifffile.imwrite(folder / "cam" / "f8.tif", changed, photometric="minisblack")
+    state = state_of(make_context(folder))
     assert (state.state, state.why) == ("stale", "the input has changed")
-    context = make_context(tmp_path)
+    context = make_context(folder)
     assert run(context).state == "complete"
     assert context.store.read("frames/dn", (slice(0, 1), slice(0, 1), slice(0, 1))).item() == changed[0, 0, 0]
 
 
-def test_moved_and_renamed_input_is_the_same(tmp_path):
-    write_stack(tmp_path / "cam")
-    run(make_context(tmp_path))
-    shutil.move(tmp_path / "cam", tmp_path / "elsewhere")
+def test_moved_and_renamed_input_is_the_same_and_one_that_is_gone_leaves_the_copy_valid(folder):
+    run(make_context(folder))
+    shutil.move(folder / "cam", folder / "elsewhere")
     for i in range(8, 12):
-        (tmp_path / "elsewhere" / f"f{i}.tif").rename(tmp_path / "elsewhere" / f"dark{i}.tif")
-    assert status(STAGES["ingest"], make_context(tmp_path, files=["elsewhere/*.tif"])).state == "complete"
-
-
-def test_input_that_is_gone_leaves_the_copy_valid(tmp_path):
-    write_stack(tmp_path / "cam")
-    run(make_context(tmp_path))
-    shutil.rmtree(tmp_path / "cam")
-    context = make_context(tmp_path)
+        (folder / "elsewhere" / f"f{i}.tif").rename(folder / "elsewhere" / f"dark{i}.tif")
+    assert state_of(make_context(folder, files=["elsewhere/*.tif"])).state == "complete"
+    shutil.rmtree(folder / "elsewhere")
+    context = make_context(folder)
     assert run(context).state == "complete"
-    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+    assert_copied(context)
     # but another, mistyped name is a mistake
     with pytest.raises(InputError, match="no such file or folder"):
-        run(make_context(tmp_path, files=["camm"]))
+        run(make_context(folder, files=["camm"]))
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "stale"),
-    [
+def test_which_settings_make_it_stale(folder):
+    run(make_context(folder))
+    for key, value, stale in (
         ("roi", (0, 10, 0, 10), True),
         ("mode", "reference", True),
         ("bit_depth", 12, True),
         ("frame_range", (0, 20), True),
         ("integration_time", 3.0, False),
         ("files", ["cam/*.tif"], False),
-    ],
-)
-def test_which_settings_make_it_stale(tmp_path, key, value, stale):
-    write_stack(tmp_path / "cam")
-    run(make_context(tmp_path))
-    state = status(STAGES["ingest"], make_context(tmp_path, **{key: value}))
-    assert state.state == ("stale" if stale else "complete")
-    assert (f"input.{key}" in state.why) == stale
+    ):
+        state = state_of(make_context(folder, **{key: value}))
+        assert state.state == ("stale" if stale else "complete"), key
+        assert (f"input.{key}" in state.why) == stale
 
 
 def test_stated_time_is_kept_apart_from_the_configured_one(tmp_path):
@@ -203,14 +191,6 @@ def test_stated_time_is_kept_apart_from_the_configured_one(tmp_path):
     assert configured.sensor.integration_time == 2.0
 
 
-def test_small_disk_is_told(tmp_path, monkeypatch):
-    write_stack(tmp_path / "cam")
-    monkeypatch.setattr(RunStore, "free_bytes", lambda self: 1000)
-    context = make_context(tmp_path)
-    run(context)
-    assert any("set input.mode: reference" in note for note in context.notes)
-
-
 def test_sidecar_belongs_to_the_content(tmp_path):
     (tmp_path / "cam").mkdir()
     (tmp_path / "cam" / "a.raw").write_bytes(STACK.tobytes())
@@ -219,7 +199,7 @@ def test_sidecar_belongs_to_the_content(tmp_path):
     run(make_context(tmp_path))
     side.write_text('{"shape": [26, 30], "dtype": "uint16"}')
     context = make_context(tmp_path)
-    assert status(STAGES["ingest"], context).state == "stale"
+    assert state_of(context).state == "stale"
     run(context)
     np.testing.assert_array_equal(context.store.read("frames/dn"), STACK.reshape(40, 26, 30))
 
@@ -248,15 +228,16 @@ def test_units_are_whole_chunks_within_memory(n, ny, nx, itemsize):
     assert (t, y) == (n, 0)
 
 
-def test_chunks_share_files_on_a_large_sensor(tmp_path, monkeypatch):
-    write_stack(tmp_path / "cam")
+def test_chunks_share_files_on_a_large_sensor_and_a_small_disk_is_told(folder, monkeypatch):
     monkeypatch.setattr(ingest, "_CHUNK", (16, 8, 8))
     monkeypatch.setattr(ingest, "_MANY_FILES", 24)
-    context = make_context(tmp_path)
+    monkeypatch.setattr(RunStore, "free_bytes", lambda self: 1000)
+    context = make_context(folder)
     run(context)
+    assert any("set input.mode: reference" in note for note in context.notes)  # the disk is small
     array = context.store.array("frames/dn")
     assert (array.chunks, array.shards) == ((16, 8, 8), (16, 8, 16))
-    np.testing.assert_array_equal(context.store.read("frames/dn"), STACK)
+    assert_copied(context)
     np.testing.assert_array_equal(
         open_store(context.store.path).read("frames/dn")[:, 3:9, 5:20], STACK[:, 3:9, 5:20]
     )
@@ -274,9 +255,8 @@ def test_no_stack_has_many_files_that_could_be_fewer(n, ny, nx):
     assert shard[2] % chunk[2] == 0
 
 
-def test_a_run_keeps_the_tiles_that_it_has(tmp_path):
-    write_stack(tmp_path / "cam")
-    context = make_context(tmp_path)
+def test_a_run_keeps_the_tiles_that_it_has(folder):
+    context = make_context(folder)
     run(context)
     assert context.tile == (64, 64)
     content = {"settings": {"run.tile": [8, 16]}}

@@ -31,10 +31,10 @@ def locked(run):
     return locks.locked(run, run / ".pchem")
 
 
-def other(lock, **changes):
-    """Put the lock of another machine, which was made long ago by its clock."""
+def other(**changes):
+    """Return the lock of another machine, which was made long ago by its clock."""
     held = {"host": "far", "machine": "far 1", "pid": 7, "time": "2020-01-01T00:00:00+00:00", **changes}
-    lock.write_bytes(json.dumps(held).encode())
+    return json.dumps(held).encode()
 
 
 def test_the_lock_is_there_while_it_is_held(run, lock):
@@ -49,20 +49,15 @@ def test_the_lock_is_there_while_it_is_held(run, lock):
     assert not is_locked(run, run / ".pchem")
 
 
-@pytest.mark.parametrize("content", [None, b"", b"\0", b"[]", b'"x"'])
+@pytest.mark.parametrize("content", [other(), b"", b"\0", b"[]", b'"x"'])
 def test_another_machine_has_it_or_nobody_knows(run, lock, content):
     """No clock frees it; the line that the message has does."""
     store = RunStore.create(run)
-    if content is None:
-        other(lock)
-    else:
-        lock.write_bytes(content)
-    words = "on far .process 7, since 2020" if content is None else "its lock memory://.* is damaged"
+    lock.write_bytes(content)
+    words = "on far .process 7, since 2020" if content == other() else "its lock memory://.* is damaged"
     with pytest.raises(LockedError, match=words) as refused, store.locked():
         pass
-    line = str(refused.value)
-    code = line[line.index('python -c "') + len('python -c "') : line.rindex('"')]
-    exec(compile(code, "cure", "exec"))
+    exec(str(refused.value).partition('python -c "')[2].rpartition('"')[0])
     with store.locked():
         pass
 
@@ -90,10 +85,10 @@ def test_of_ten_that_come_at_once_one_gets_it(run, lock):
 def test_a_killed_process_of_this_machine_leaves_no_lock(run, lock):
     gone = subprocess.Popen(["true"])
     gone.wait()
-    other(lock, machine=locks._machine(), pid=gone.pid)
+    lock.write_bytes(other(machine=locks._machine(), pid=gone.pid))
     with locked(run):
         pass
-    other(lock, machine=locks._machine(), pid=os.getpid())
+    lock.write_bytes(other(machine=locks._machine(), pid=os.getpid()))
     with pytest.raises(LockedError), locked(run):
         pass
 

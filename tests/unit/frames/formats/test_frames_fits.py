@@ -27,7 +27,7 @@ def test_facts_are_taken_from_the_header(tmp_path, keyword, extension):
     assert reader.bit_depth == 16
 
 
-def test_values_that_may_be_no_samples_are_reported(tmp_path):
+def test_values_that_may_be_no_samples_mosaics_and_lossy_compression_are_reported(tmp_path):
     for i in range(3):
         write_fits(tmp_path / f"f{i}.fits", STACK[i : i + 3], BLANK=-32768)
     reader = open_frames(InputSettings(files=(str(tmp_path),)), tmp_path)
@@ -35,18 +35,11 @@ def test_values_that_may_be_no_samples_are_reported(tmp_path):
         "f0.fits and 2 more: BLANK = -32768 marks pixels without a value; read as stored",
         "f0.fits and 2 more: its 3 planes are read as frames; if they are colours, write one file per colour",
     ]
-
-
-def test_a_mosaic_is_read_as_its_samples(tmp_path):
     path = write_fits(tmp_path / "a.fits", STACK, BAYERPAT="RGGB")
     assert (
         "colour mosaic (RGGB): read as the monochrome samples"
         in FitsReader.open(path, InputSettings()).notes[0]
     )
-
-
-def test_compression_that_loses_is_reported(tmp_path):
-    path = tmp_path / "a.fits"
     for scale, notes in ((0, 0), (4, 1)):
         unit = fits.CompImageHDU(
             STACK, compression_type="HCOMPRESS_1", hcomp_scale=scale, tile_shape=(1, *STACK.shape[1:])
@@ -112,7 +105,10 @@ def test_extensions_of_a_frame_each_are_a_stack(tmp_path, coding):
     refused(r"0 \(PRIMARY\), 1 \(", path)
 
 
-def test_scaled_values_and_no_image_are_refused(tmp_path):
+def test_an_offset_is_added_scaled_values_and_no_image_are_refused(tmp_path):
+    samples = STACK // 2
+    path = write_fits(tmp_path / "a.fits", (samples.astype(np.int32) - 1000).astype(np.int16), BZERO=1000)
+    np.testing.assert_array_equal(read(path), samples)
     scaled = write_fits(tmp_path / "f.fits", STACK.astype(np.int16), BSCALE=0.5, BZERO=10.0)
     refused(r"scaled data \(BSCALE 0.5", scaled)
     path = tmp_path / "table.fits"

@@ -8,18 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.camera_files import opened, read, refused
+from helpers.camera_files import check_reads, opened, read, refused
 from helpers.layouts import packed
 
-from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.formats.ser import SerReader
 from pchem_pipeline.frames.settings import InputSettings
 
 STACK = np.random.default_rng(14).integers(0, 65536, (5, 11, 13)).astype(np.uint16)
 
 
-def raw_bytes(stack, dtype, header, padding, last_padding=True):
-    """Lay frames out by hand."""
+def raw_bytes(stack, dtype, header=0, padding=0, last_padding=True):
     frames = [frame.astype(dtype).tobytes() + b"\xaa" * padding for frame in stack]
     data = b"\x55" * header + b"".join(frames)
     return data if last_padding or not padding else data[:-padding]
@@ -38,10 +36,7 @@ def test_raw_by_settings(tmp_path, order, dtype, header, padding, last):
     settings: dict[str, Any] = {"dtype": dtype, "byte_order": order}
     settings |= {"header_bytes": header, "frame_padding_bytes": padding}
     for shape in ((11, 13), (5, 11, 13)):
-        np.testing.assert_array_equal(read(path, shape=shape, **settings), stack)
-    reader = opened(tmp_path / "a.raw", shape=(11, 13), **settings)
-    np.testing.assert_array_equal(reader.read(1, 4, 2, 9), stack[1:4, 2:9])
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(reader)).read(4, 5, 10, 11), stack[4:5, 10:11])
+        check_reads(opened(path, shape=shape, **settings), stack)
 
 
 @pytest.mark.parametrize("packing", ["Mono10p", "Mono12p", "Mono10Packed", "Mono12Packed"])
@@ -60,11 +55,8 @@ def test_packed_raw(tmp_path, packing, rows, columns):
     path.write_bytes(b"head" + b"".join(frames))
     layout: dict[str, Any] = {"header_bytes": 4, "frame_padding_bytes": 2, "packing": packing}
     reader = opened(path, shape=(rows, columns), **layout)
-    assert (reader.shape, reader.dtype, reader.bit_depth) == (stack.shape, np.uint16, bits)
-    np.testing.assert_array_equal(reader.read(), stack)
-    again = pickle.loads(pickle.dumps(reader))
-    for t0, t1, y0, y1 in ((1, 4, 1, 2), (4, 5, rows - 1, rows), (2, 2, 0, 1), (0, 3, 0, rows - 1)):
-        np.testing.assert_array_equal(again.read(t0, t1, y0, y1), stack[t0:t1, y0:y1])
+    assert reader.bit_depth == bits
+    check_reads(reader, stack)
     path.with_name("a.raw.json").write_text(json.dumps({"shape": [rows, columns], **layout}))
     np.testing.assert_array_equal(read(path), stack)
     np.testing.assert_array_equal(read(path, bit_depth=16), stack)
@@ -129,7 +121,7 @@ notes =
 @pytest.mark.parametrize(("order", "dtype"), [("big", ">u2"), ("little", "<u2")])
 def test_dax_movie_with_its_inf(tmp_path, order, dtype):
     path = tmp_path / "movie.dax"
-    path.write_bytes(raw_bytes(STACK, dtype, 0, 0))
+    path.write_bytes(raw_bytes(STACK, dtype))
     refused(r"raw frames need input.shape and input.dtype", path)
     path.with_suffix(".inf").write_text(INF.format(order=order))
     for place in (path, tmp_path, tmp_path / "movie.*"):
@@ -137,7 +129,7 @@ def test_dax_movie_with_its_inf(tmp_path, order, dtype):
         np.testing.assert_array_equal(reader.read(), STACK)
     assert reader.integration_time == 0.05
     assert reader.camera.words() == "DU897_BV, sensor at -68 °C, gain 30, binning 1 x 1"
-    path.write_bytes(raw_bytes(STACK, dtype, 0, 0)[:-1])
+    path.write_bytes(raw_bytes(STACK, dtype)[:-1])
     refused(r"movie\.dax: truncated: 5 frames need 1430 bytes", path)
     for old, new, words in (
         ("13 x 11", "none", "raw frames need input.shape;"),
@@ -145,13 +137,6 @@ def test_dax_movie_with_its_inf(tmp_path, order, dtype):
     ):
         path.with_suffix(".inf").write_text(INF.format(order=order).replace(old, new))
         refused(words, path)
-
-
-def test_raw_needs_a_description(tmp_path):
-    path = tmp_path / "a.raw"
-    path.write_bytes(bytes(100))
-    refused(r"raw frames need input.shape and input.dtype; .*sidecar a\.raw\.json", path)
-    refused(r"raw frames need input.dtype;", path, shape=(5, 5))
 
 
 @pytest.mark.parametrize(
@@ -169,25 +154,21 @@ def test_raw_with_a_bad_sidecar(tmp_path, text, words):
     path = tmp_path / "a.raw"
     path.write_bytes(bytes(100))
     path.with_name("a.raw.json").write_text(text)
-    with pytest.raises(InputError, match=words) as caught:
-        read(path)
-    assert "\n" not in str(caught.value)
+    refused(words, path)
 
 
-def test_raw_truncated_or_of_another_shape(tmp_path):
+def test_raw_without_its_description_truncated_or_of_another_shape(tmp_path):
     path = tmp_path / "a.raw"
-    path.write_bytes(raw_bytes(STACK, "<u2", 0, 0)[:-1])
+    path.write_bytes(raw_bytes(STACK, "<u2")[:-1])
+    refused(r"raw frames need input.shape and input.dtype; .*sidecar a\.raw\.json", path)
+    refused(r"raw frames need input.dtype;", path, shape=(5, 5))
     raw: dict[str, Any] = {"shape": (11, 13), "dtype": "uint16"}
     refused(r"a\.raw: truncated, or not 11 x 13 uint16: 1429 bytes .*input.shape", path, **raw)
     words = r"truncated: 5 frames need 1430 bytes, the file has 1429 \(4 complete frames\)"
     refused(words, path, shape=(5, 11, 13), dtype="uint16")
-    refused("truncated, or not", path, shape=(11, 13), dtype="uint16", header_bytes=10_000)
-
-
-def test_raw_with_more_frames_than_stated(tmp_path):
-    path = tmp_path / "a.raw"
-    path.write_bytes(raw_bytes(STACK, "<u2", 0, 0))
-    reader = opened(tmp_path / "a.raw", shape=(3, 11, 13), dtype="uint16")
+    refused("truncated, or not", path, header_bytes=10_000, **raw)
+    path.write_bytes(raw_bytes(STACK, "<u2"))
+    reader = opened(path, shape=(3, 11, 13), dtype="uint16")
     np.testing.assert_array_equal(reader.read(), STACK[:3])
     assert "has 5 frames; the first 3 are used" in reader.report.message()
 
@@ -233,9 +214,7 @@ def ser_bytes(stack, depth, colour=0, flag=0, times=False):
     head = b"LUCAM-RECORDER" + struct.pack("<7i", 0, colour, flag, columns, rows, depth, n) + bytes(120)
     head += struct.pack("<2q", 637_000_000_000_000_000, 637_000_000_000_000_000)
     assert len(head) == 178
-    tail = (
-        struct.pack(f"<{n}q", *(637_000_000_000_000_000 + 5_000_000 * i for i in range(n))) if times else b""
-    )
+    tail = (637_000_000_000_000_000 + 5_000_000 * np.arange(n)).astype("<i8").tobytes() if times else b""
     return head + stack.tobytes() + tail
 
 
@@ -246,25 +225,16 @@ def test_ser(tmp_path):
         stack = (STACK & (2**depth - 1)).astype(dtype)
         path.write_bytes(ser_bytes(stack, depth, flag=flag))
         reader = opened(tmp_path / "a.ser")
-        np.testing.assert_array_equal(reader.read(), stack)
-        np.testing.assert_array_equal(reader.read(2, 5, 3, 8), stack[2:5, 3:8])
+        check_reads(reader, stack)
         assert reader.bit_depth == depth
         assert reader.timestamps is None
     path.write_bytes(ser_bytes(STACK.astype(">u2"), 16, flag=0))
     np.testing.assert_array_equal(read(path, byte_order="big"), STACK)
-
-
-@pytest.mark.parametrize(("colour", "pattern"), [(8, "RGGB"), (11, "BGGR"), (16, "CYYM")])
-def test_ser_with_a_mosaic_is_read_as_its_samples(tmp_path, colour, pattern):
-    path = tmp_path / "a.ser"
-    path.write_bytes(ser_bytes(STACK, 16, colour=colour))
-    reader = opened(path)
-    np.testing.assert_array_equal(reader.read(), STACK)
-    assert f"a.ser: colour mosaic ({pattern}): read as the monochrome samples" in reader.report.notes[0]
-
-
-def test_ser_times(tmp_path):
-    path = tmp_path / "a.ser"
+    for colour, pattern in ((8, "RGGB"), (11, "BGGR"), (16, "CYYM")):
+        path.write_bytes(ser_bytes(STACK, 16, colour=colour))
+        reader = opened(path)
+        np.testing.assert_array_equal(reader.read(), STACK)
+        assert f"a.ser: colour mosaic ({pattern}): read as the monochrome samples" in reader.report.notes[0]
     path.write_bytes(ser_bytes(STACK, 16, times=True))
     times = SerReader.open(path, InputSettings()).timestamps
     np.testing.assert_allclose(np.diff(times), 0.5, atol=1e-6)

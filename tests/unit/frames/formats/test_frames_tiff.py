@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tifffile
 from helpers import layouts
-from helpers.camera_files import opened, read, refused
+from helpers.camera_files import opened, overwrite, read, refused
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
@@ -21,25 +21,17 @@ STACK = np.random.default_rng(11).integers(0, 4096, (6, 21, 34)).astype(np.uint1
 def test_twelve_bits_packed(tmp_path):
     """Bits packed without gaps, as machine-vision recorders write them: two samples in three bytes."""
     path = tmp_path / "packed.tif"
-    columns = 34
-    with tifffile.TiffWriter(path) as writer:
-        writer.write(STACK[0].astype(np.uint16), photometric="minisblack", metadata=None)
-    packed = bytearray()
-    for row in STACK[0]:
-        bits = "".join(f"{int(value):012b}" for value in row)
-        packed += int(bits, 2).to_bytes(len(bits) // 8, "big")
-    raw = bytearray(path.read_bytes())
-    with tifffile.TiffFile(path) as file:
+    layouts.tiff(path, STACK[0], metadata=None)
+    bits = "".join(f"{value:012b}" for value in STACK[0].ravel())  # rows of 34 samples are whole bytes
+    packed = int(bits, 2).to_bytes(len(bits) // 8, "big")
+    with tifffile.TiffFile(path, mode="r+b") as file:
         page = file.pages[0]
-        bits_at, counts_at = (page.tags[name].valueoffset for name in ("BitsPerSample", "StripByteCounts"))
+        page.tags["BitsPerSample"].overwrite(12)
+        page.tags["StripByteCounts"].overwrite(len(packed))
         start = page.dataoffsets[0]
-    raw[bits_at : bits_at + 2] = (12).to_bytes(2, "little")
-    raw[counts_at : counts_at + 4] = len(packed).to_bytes(4, "little")
-    raw[start : start + len(packed)] = packed
-    path.write_bytes(raw)
+    overwrite(path, start, packed)
     reader = TiffReader.open(path, InputSettings())
     assert reader.bit_depth == 12
-    assert columns * 12 % 8 == 0
     np.testing.assert_array_equal(reader.read(), STACK[:1])
     np.testing.assert_array_equal(reader.read(0, 1, 5, 9), STACK[:1, 5:9])
 
@@ -55,26 +47,20 @@ def test_calibrated_frames_of_one_row_or_column_are_pages(tmp_path, shape, dtype
         assert file.series[0].shape == shape
 
 
-def test_imagej_stack_with_one_directory(tmp_path):
+def test_stacks_with_one_directory(tmp_path):
     """ImageJ writes stacks above 4 GB with one directory, the number of images in its description."""
     path = tmp_path / "big_imagej.tif"
     description = f"ImageJ=1.53t\nimages={len(STACK)}\nframes={len(STACK)}\nhyperstack=true\n"
-    tifffile.imwrite(
-        path, STACK[0], byteorder=">", description=description, metadata=None, photometric="minisblack"
-    )
+    layouts.tiff(path, STACK[0], byteorder=">", description=description, metadata=None)
     with path.open("ab") as stream, tifffile.TiffFile(path) as file:
         assert file.is_imagej
         assert len(file.pages) == 1
         assert path.stat().st_size == file.pages[0].dataoffsets[0] + STACK[0].nbytes
         stream.write(STACK[1:].astype(">u2").tobytes())
     np.testing.assert_array_equal(read(path), STACK)
-
-
-def test_metamorph_stack_with_one_directory(tmp_path):
-    """MetaMorph writes one directory, and counts the planes behind it by a tag of its own."""
+    # MetaMorph counts the planes behind it by a tag of its own
     path = tmp_path / "a.stk"
-    n = len(STACK)
-    tags: list[Any] = [(33629, "2I", n, tuple(range(2 * n)), True)]
+    tags: list[Any] = [(33629, "2I", 6, tuple(range(12)), True)]
     tifffile.imwrite(path, STACK[0], metadata=None, photometric="minisblack", extratags=tags)
     with path.open("ab") as stream, tifffile.TiffFile(path) as file:
         assert path.stat().st_size == file.pages[0].dataoffsets[0] + STACK[0].nbytes
@@ -90,11 +76,7 @@ PALETTE = {"photometric": "palette", "colormap": np.zeros((3, 256), np.uint16)}
     ("data", "options", "words"),
     [
         (STACK, {"volumetric": True, "tile": (2, 16, 16)}, "pages of 6 x 21 x 34 uint16 are volumes"),
-        (
-            STACK,
-            {"planarconfig": "separate", "compression": "zlib"},
-            "one page of 6 compressed planes; write",
-        ),
+        (STACK, {"planarconfig": "separate", "compression": "zlib"}, "one page of 6 compressed planes"),
         (RGB, {"photometric": "rgb"}, r"a\.tif: colour or multi-channel images \(RGB, 3 samples per pixel\)"),
         (np.moveaxis(RGB, -1, 1), {"photometric": "rgb", "planarconfig": "separate"}, "colour"),
         (RGB[..., 0], PALETTE, "PALETTE"),
@@ -106,7 +88,7 @@ def test_volumes_planes_and_colour_are_refused(tmp_path, data, options, words):
     refused(words, tmp_path / "a.tif")
 
 
-def test_pages_are_frames_although_metadata_tell_several_series(tmp_path):
+def test_pages_are_frames_although_metadata_tell_several_series_or_they_are_coded_differently(tmp_path):
     path = tmp_path / "series.tif"
     with tifffile.TiffWriter(path) as writer:
         for block in (STACK[:2], STACK[2:3], STACK[3:]):
@@ -114,28 +96,15 @@ def test_pages_are_frames_although_metadata_tell_several_series(tmp_path):
     with tifffile.TiffFile(path) as file:
         assert file.series[0].shape != STACK.shape
     np.testing.assert_array_equal(read(path), STACK)
-
-
-def test_pages_coded_differently(tmp_path):
-    path = tmp_path / "mixed.tif"
     codings: list[dict[str, Any]] = [
         {"compression": "zlib", "rowsperstrip": 5}, {}, {"compression": "lzw"}, {"tile": (16, 16)},
     ]  # fmt: skip
     with tifffile.TiffWriter(path) as writer:
         for i, frame in enumerate(STACK):
             writer.write(frame, photometric="minisblack", metadata=None, **codings[i % len(codings)])
-    reader = opened(tmp_path / "mixed.tif")
-    np.testing.assert_array_equal(reader.read(), STACK)
-    np.testing.assert_array_equal(reader.read(0, 6, 7, 18), STACK[:, 7:18])
-
-
-def test_previews_are_left_out_and_reported(tmp_path):
-    path = tmp_path / "preview.tif"
-    layouts.tiff_pages(path, STACK)
-    tifffile.imwrite(path, STACK[0, ::2, ::2], append=True, metadata=None, subfiletype=1)
     reader = opened(path)
     np.testing.assert_array_equal(reader.read(), STACK)
-    assert "1 reduced page" in reader.report.message()
+    np.testing.assert_array_equal(reader.read(0, 6, 7, 18), STACK[:, 7:18])
 
 
 RECORD = json.dumps({"Exposure-ms": 12.5}).encode()
@@ -223,7 +192,7 @@ def test_channels_beside_frames_are_refused(tmp_path):
     np.testing.assert_array_equal(read(ome), STACK[:3])  # the other channel lies in another file
 
 
-def test_strips_that_were_never_written(tmp_path):
+def test_strips_that_were_never_written_are_lost_or_damaged(tmp_path):
     """GDAL leaves empty strips out: offset 0 and 0 bytes, where other bytes of the file must not be read."""
     path = tmp_path / "sparse.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", metadata=None)
@@ -236,17 +205,18 @@ def test_strips_that_were_never_written(tmp_path):
     expected[2] = 0
     np.testing.assert_array_equal(reader.read(), expected)
     assert "1 of 6 strips or tiles was not written; read as the fill value" in reader.notes[0]
-
-
-def test_page_without_its_strips(tmp_path):
     path = tmp_path / "unfinished.tif"
     tifffile.imwrite(path, STACK, photometric="minisblack", metadata=None, rowsperstrip=8, compression="lzw")
     with tifffile.TiffFile(path) as file:
         place = file.pages[1].tags["StripOffsets"].offset
-    data = bytearray(path.read_bytes())
-    data[place : place + 2] = (40_000).to_bytes(2, "little")  # a tag that no program knows
-    path.write_bytes(data)
+    overwrite(path, place, (40_000).to_bytes(2, "little"))  # a tag that no program knows
     refused(r"unfinished\.tif: page 1 has 0 strips or tiles and 3 sizes", path)
+    path = tmp_path / "broken.tif"
+    tifffile.imwrite(path, STACK, photometric="minisblack", compression="zlib")
+    with tifffile.TiffFile(path) as file:
+        start = file.pages[2].dataoffsets[0]
+    overwrite(path, start, bytes(40))
+    refused(r"broken\.tif: page 2 cannot be decoded", path)
 
 
 def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path):
@@ -259,20 +229,14 @@ def test_samples_that_are_not_as_the_camera_made_them_are_reported(tmp_path):
         assert said in TiffReader.open(tmp_path / f"{name}.tif", InputSettings()).notes[0]
 
 
-def test_pages_of_another_shape_or_type(tmp_path):
+def test_previews_are_left_out_and_pages_of_another_shape_or_type_refused(tmp_path):
     path = tmp_path / "odd.tif"
+    layouts.tiff_pages(path, STACK)
+    tifffile.imwrite(path, STACK[0, ::2, ::2], append=True, metadata=None, subfiletype=1)
+    reader = opened(path)
+    np.testing.assert_array_equal(reader.read(), STACK)
+    assert "1 reduced page" in reader.report.message()
     for odd in (STACK[0, :5], STACK[0].astype(np.uint8)):
         layouts.tiff_pages(path, STACK[:2])
         tifffile.imwrite(path, odd, append=True, metadata=None)
         refused(r"odd\.tif: page 2 is .* page 0 is 21 x 34 uint16", path)
-
-
-def test_damaged_strip_is_named(tmp_path):
-    path = tmp_path / "broken.tif"
-    tifffile.imwrite(path, STACK, photometric="minisblack", compression="zlib")
-    with tifffile.TiffFile(path) as file:
-        start = file.pages[2].dataoffsets[0]
-    data = bytearray(path.read_bytes())
-    data[start : start + 40] = bytes(40)
-    path.write_bytes(data)
-    refused(r"broken\.tif: page 2 cannot be decoded", path)

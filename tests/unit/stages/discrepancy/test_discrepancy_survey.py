@@ -4,12 +4,13 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from helpers.discrepancy_material import verdict_of
 from helpers.quick_stacks import stack, sums_of
+from helpers.small_stacks import Stack
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.observe.observe import fitted_maps
 from pchem_pipeline.discrepancy.scan_pairs import pairs_bytes
-from pchem_pipeline.discrepancy.verdict import Examined
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.stages.discrepancy import survey as module
@@ -23,16 +24,6 @@ from pchem_pipeline.stages.discrepancy.survey import (
 )
 
 SHAPE, FRAMES = (40, 32), 600
-
-
-class Frames:
-    def __init__(self, values):
-        self.values, self.shape, self.dtype, self.rows_per_read = values, values.shape, values.dtype, 1
-        self.read = np.zeros(values.shape[:2], int)
-
-    def read_into(self, buffer, t0, t1, y0=0, y1=None):
-        buffer[...] = self.values[t0:t1, y0:y1]
-        self.read[t0:t1, y0:y1] += 1
 
 
 class Store:
@@ -71,7 +62,7 @@ def tap():
         return offsets
 
     values = camera(1, add)
-    return Frames(values), Store(values)
+    return Stack(values), Store(values)
 
 
 @pytest.mark.parametrize("codes", [1 << 26, 1 << 10])
@@ -126,7 +117,7 @@ def test_nothing_stands_out_of_nothing_nor_does_what_all_pixels_share():
         return rng.normal(0.0, 1.0, (FRAMES, SHAPE[0], 1))
 
     for values in (camera(2), camera(3, add)):
-        assert places_of_bands(Store(values), Frames(values))[0] == {}
+        assert places_of_bands(Store(values), Stack(values))[0] == {}
 
 
 def test_peaks_of_another_shape_stand_out_of_the_histograms():
@@ -137,7 +128,7 @@ def test_peaks_of_another_shape_stand_out_of_the_histograms():
     values = camera(
         4, lambda _: blob * 9.0 * rng.standard_normal((FRAMES, *SHAPE)) * (rng.random((FRAMES, *SHAPE)) < 0.1)
     )
-    places, _ = places_of_bands(Store(values), Frames(values))
+    places, _ = places_of_bands(Store(values), Stack(values))
     best = min(places.values(), key=lambda place: place.p)
     assert best.region.overlap(Region.of_mask(np.broadcast_to(blob, SHAPE)), SHAPE) > 0.6
 
@@ -158,22 +149,10 @@ def test_the_sums_of_all_frames_tell_the_place():
     assert places_of_sums(None, (32, 48)) is None
 
 
-def test_the_verdict_says_what_was_looked_at_over_the_whole_sensor(verdict):
+def test_the_verdict_says_what_was_looked_at_over_the_whole_sensor():
+    verdict = verdict_of("named")
     told = Survey({}, {SUMS: 1.0, PAIRS: 0.4}).told(verdict, 0.1).examined
     assert (told.share, told.surveyed, told.surveyed_by) == (0.1, 0.1, {SUMS: 1.0, PAIRS: 0.4})
     told = Survey({}, {SUMS: 1.0, SHAPES: 1.0, PAIRS: 0.4}).told(verdict, 0.1).examined
     assert told.surveyed == 0.4
     assert Survey().told(verdict, 1.0).examined.surveyed == 1.0
-
-
-@pytest.fixture
-def verdict():
-    class Told:
-        examined = Examined(frames=9, rows=(0, 9), columns=(0, 9), train=3, test=3, final=3)
-
-        def model_copy(self, update):
-            copy = Told()
-            copy.examined = update["examined"]
-            return copy
-
-    return Told()

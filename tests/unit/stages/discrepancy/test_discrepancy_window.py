@@ -4,10 +4,13 @@ import contextlib
 import json
 import signal
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from helpers.discrepancy_material import verdict_of
+from helpers.drawn_pixels import codes
+from helpers.small_stacks import Stack
 
 from pchem_pipeline.base.errors import ConfigError, StoreError
 from pchem_pipeline.discrepancy.scan import Suspect
@@ -19,7 +22,6 @@ from pchem_pipeline.effects.operators.curve import Clipping
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.signals import InterruptedRunError
 from pchem_pipeline.stages.discrepancy import discrepancy
-from pchem_pipeline.stages.discrepancy.discrepancy import _limits
 from pchem_pipeline.stages.discrepancy.survey import Survey
 from pchem_pipeline.stages.discrepancy.window import (
     Window,
@@ -35,48 +37,41 @@ from pchem_pipeline.stages.discrepancy.window import (
 WHOLE = DiscrepancySettings(max_pixels=1 << 25)
 
 
-class Stack:
-    """Frames in memory."""
-
-    def __init__(self, values):
-        self.values, self.shape, self.dtype, self.rows_per_read = values, values.shape, values.dtype, 1
-
-    def read_into(self, buffer, t0, t1, y0=0, y1=None):
-        buffer[...] = self.values[t0:t1, y0:y1]
-
-
-def test_a_small_stack_is_looked_at_whole():
+def test_a_small_stack_or_the_region_asked_for_is_looked_at_whole():
     window = choose_window((4000, 64, 64), WHOLE)
-    assert window.numbers.size == 4000
-    assert (window.rows, window.columns) == ((0, 64), (0, 64))
+    assert (window.numbers.size, window.rows, window.columns) == (4000, (0, 64), (0, 64))
+    window = choose_window((1000, 64, 64), WHOLE, (8, 24, 16, 48))
+    assert (window.rows, window.columns) == ((8, 24), (16, 48))
 
 
-def test_odd_frames_are_not_looked_at():
-    seen = Survey(left_out=(0, 700))
-    seen = Survey.of_numbers(json.loads(json.dumps(seen.numbers())))
+def stored(survey):
+    return Survey.of_numbers(json.loads(json.dumps(survey.numbers())))
+
+
+def test_odd_frames_are_not_looked_at_and_those_delivered_twice_once():
+    seen = stored(Survey(left_out=(0, 700)))
     for shape in ((900, 16, 16), (17750, 512, 512)):
         numbers = seen.window(shape, WHOLE, None).numbers
         assert not np.isin(numbers, (0, 700)).any()
         assert np.all(np.diff(numbers) > 0)
     assert seen.told(verdict_of("named"), 1.0).examined.left_out == (0, 700)
-
-
-def test_frames_delivered_twice_follow_each_other_without_their_copies():
     copied = tuple(range(1, 1800, 2))
-    seen = Survey(left_out=(6, *copied), copied=copied)
-    seen = Survey.of_numbers(json.loads(json.dumps(seen.numbers())))
+    seen = stored(Survey(left_out=(6, *copied), copied=copied))
     window = seen.window((1800, 16, 16), WHOLE, None)
     np.testing.assert_array_equal(window.numbers, np.delete(np.arange(0, 1800, 2), 3))
     np.testing.assert_array_equal(window.times, np.delete(np.arange(900), 3))
     assert split_frames(window.times, 20).train.size == 280
 
 
+def n_pixels(window):
+    return np.ptp(window.rows) * np.ptp(window.columns)
+
+
 @pytest.mark.parametrize("shape", [(17750, 512, 512), (1000, 2048, 2048), (100_000, 8, 8), (7000, 3, 4000)])
 def test_of_a_large_stack_no_more_than_allowed(shape):
     window = choose_window(shape, WHOLE)
-    rows, columns = np.ptp(window.rows), np.ptp(window.columns)
-    assert window.numbers.size * rows * columns <= 1 << 25
-    assert window.numbers.size * rows * columns > 0.8 * min(1 << 25, np.prod(shape))
+    most = min(1 << 25, np.prod(shape))
+    assert 0.8 * most < window.numbers.size * n_pixels(window) <= most
     # slow effects must show: the frames span the run
     assert window.numbers[0] < 0.02 * shape[0]
     assert window.numbers[-1] > 0.98 * shape[0] - 1
@@ -85,11 +80,9 @@ def test_of_a_large_stack_no_more_than_allowed(shape):
 
 def test_of_a_large_sensor_no_more_pixels_than_allowed():
     window = choose_window((1000, 512, 512), DiscrepancySettings())
-    pixels = np.ptp(window.rows) * np.ptp(window.columns)
-    assert 0.95 * 8192 < pixels <= 8192
+    assert 0.95 * 8192 < n_pixels(window) <= 8192
     assert window.numbers.size == 1000
-    smaller = choose_window((1000, 512, 512), DiscrepancySettings(max_pixels=400))
-    assert np.ptp(smaller.rows) * np.ptp(smaller.columns) <= 400
+    assert n_pixels(choose_window((1000, 512, 512), DiscrepancySettings(max_pixels=400))) <= 400
 
 
 @pytest.mark.parametrize("shape", [(1000, 512, 512), (6000, 64, 64), (17750, 512, 512), (400, 60, 80)])
@@ -102,26 +95,17 @@ def test_the_window_becomes_smaller_with_the_memory(shape):
         assert search_bytes(window, 100.0) <= limit << 20
         # frames stay: slow effects need the whole run, and pixels resemble each other
         assert window.numbers.size == full.numbers.size
-        sizes.append(np.ptp(window.rows) * np.ptp(window.columns))
+        sizes.append(n_pixels(window))
     assert sizes[0] < sizes[1] < sizes[2] or shape == (400, 60, 80)
     with pytest.raises(ConfigError, match=r"needs at least \d+ MiB.*--max-memory.* allows 290; raise it"):
         within_memory(settings, shape, None, 100.0, 290 << 20)
 
 
-def test_the_region_asked_for_is_looked_at():
-    window = choose_window((1000, 64, 64), WHOLE, (8, 24, 16, 48))
-    assert (window.rows, window.columns) == ((8, 24), (16, 48))
-
-
 def test_frames_of_the_window_are_those_of_the_stack():
     t, y, x = np.ogrid[:300, :9, :11]
     source = Stack((t * 10_000 + y * 100 + x).astype(np.uint32))  # a value tells where it comes from
-    window = choose_window(
-        (300, 9, 11), DiscrepancySettings(max_samples=1 << 20, block_frames=20), (2, 6, 3, 8)
-    )
-    window = type(window)(np.r_[0:40, 100:160], window.rows, window.columns)
-    stack = read_window(source, window)
-    assert np.array_equal(stack, source.values[window.numbers][:, 2:6, 3:8])
+    window = Window(np.r_[0:40, 100:160], (2, 6), (3, 8))
+    np.testing.assert_array_equal(read_window(source, window), source.values[window.numbers][:, 2:6, 3:8])
 
 
 def place(p=1e-9, **region):
@@ -139,9 +123,7 @@ def test_the_window_lies_where_the_sensor_disagrees_half_of_it_outside():
     (y0, y1), (x0, x1) = window.rows, window.columns
     assert y0 <= 20 < 40 <= y1
     assert x0 <= 30 < 50 <= x1
-
-
-def test_without_a_place_or_outside_of_the_region_asked_for_the_middle_is_looked_at():
+    # without a place, or with one outside of the region asked for, the middle is looked at
     middle = choose_window((17750, 512, 512), WHOLE)
     assert choose_window((17750, 512, 512), WHOLE, None, {}).rows == middle.rows
     elsewhere = {"lag": place(rows=[500, 512])}
@@ -175,11 +157,8 @@ def test_few_samples_are_compared_where_they_disagree_clearly(row_noise, fewest,
     assert fewer_samples(Stack(stack), settings, None, Survey(), (Clipping(low=0),)) == settings
     own = settings.model_copy(update={"replicates": 20})
     assert fewer_samples(Stack(stack), own, None, Survey(), ()).replicates == 20
-
-
-def test_what_is_wrong_with_frames_is_no_clear_disagreement():
-    stack = np.full((400, 16, 16), 7, np.uint16)
-    assert not is_clear(stack, np.arange(400), n_run=400, block_frames=20)
+    # what is wrong with frames is no clear disagreement
+    assert not is_clear(np.full_like(stack, 7), np.arange(900), n_run=900, block_frames=20)
 
 
 @pytest.mark.parametrize(
@@ -200,9 +179,7 @@ def test_another_window_of_the_same_size_lies_as_far_away_as_there_is_room(rows,
 
 
 def test_the_work_is_that_of_all_searches_and_looks(monkeypatch):
-    rng = np.random.default_rng(2)
-    light = 11.0 * (rng.poisson(2.0, (400, 32, 32)) + 0.3 * rng.standard_normal((400, 32, 32)))
-    values = np.rint(100.0 + light).astype(np.uint16)
+    values = codes(np.random.default_rng(2), (400, 32, 32), 2.0, 11.0, 0.3, 100.0).astype(np.uint16)
     sensor = SimpleNamespace(bit_depth=12, integration_time=1.0, seen_limits=(None, None), adc_limits=None)
     context = SimpleNamespace(sensor=sensor, store=None)
     search = discrepancy._Search(context, Stack(values), (), None, Survey({}, {}), lambda _: None)
@@ -228,15 +205,13 @@ def test_a_verdict_is_not_lost_where_no_pixel_of_the_other_window_can_be_used():
     values = np.full((400, 24, 24), 7, np.uint16)
     values[:, 12:, 12:] += np.arange(400, dtype=np.uint16)[:, None, None] % 5
     context = SimpleNamespace(sensor=SimpleNamespace(bit_depth=12, integration_time=1.0), note=notes.append)
-    seen = Survey({}, {})
-    search = discrepancy._Search(context, Stack(values), (), None, seen, lambda _: None)
+    search = discrepancy._Search(context, Stack(values), (), None, Survey({}, {}), lambda _: None)
     window = Window(np.arange(400), (12, 24), (12, 24))
-    found = SimpleNamespace(verdict=verdict_of("named"), model=())
-    assert search.elsewhere(DiscrepancySettings(), "x-", window, found) is None
-    assert notes[0].startswith("not checked in rows 0 to 11, columns 0 to 11: ")
-    in_part = SimpleNamespace(verdict=verdict_of("named_in_part"), model=())
-    assert search.elsewhere(DiscrepancySettings(), "x-", window, in_part) is None
-    assert len(notes) == 1
+    for verdict in ("named", "named_in_part"):  # which is not checked elsewhere
+        found = SimpleNamespace(verdict=verdict_of(verdict), model=())
+        assert search.elsewhere(DiscrepancySettings(), "x-", window, found) is None
+        [note] = notes
+    assert note.startswith("not checked in rows 0 to 11, columns 0 to 11: ")
 
 
 def test_a_name_that_does_not_hold_elsewhere_is_in_part():
@@ -258,23 +233,20 @@ def context(low, high, **ends):
 
 
 def test_the_limits_of_the_run_are_in_the_model_of_the_search_once():
-    assert _limits(context(None, None), ()) == ()
-    assert _limits(context(None, 135), ()) == (Clipping(high=135),)
-    assert _limits(context(40, 135), ()) == (Clipping(low=40, high=135),)
-    assert _limits(context(None, 135), (Clipping(high=130),)) == ()
+    assert discrepancy._limits(context(None, None), ()) == ()
+    assert discrepancy._limits(context(None, 135), ()) == (Clipping(high=135),)
+    assert discrepancy._limits(context(40, 135), ()) == (Clipping(low=40, high=135),)
+    assert discrepancy._limits(context(None, 135), (Clipping(high=130),)) == ()
     # the end of the ADC is no code that is seen to be a limit, but samples lie there
     cut = {"minimum": np.array([[0, 0, 3]]), "maximum": np.array([[90, 80, 95]])}
-    assert _limits(context(None, None, **cut), ()) == (Clipping(low=0),)
+    assert discrepancy._limits(context(None, None, **cut), ()) == (Clipping(low=0),)
     few = {"minimum": np.r_[0, np.full(200, 9)], "maximum": np.full(201, 99)}
-    assert _limits(context(None, None, **few), ()) == ()
+    assert discrepancy._limits(context(None, None, **few), ()) == ()
 
 
 @pytest.mark.parametrize("error", [InterruptedRunError(signal.SIGINT), StoreError("no space left")])
 def test_a_stop_in_the_middle_of_a_comparison_makes_no_verdict(monkeypatch, error):
     """Not even where the search takes whatever a candidate raises for a defect of the candidate."""
-
-    def run_units(*_, **__):
-        raise error
 
     def search(context, *_):
         try:
@@ -283,7 +255,7 @@ def test_a_stop_in_the_middle_of_a_comparison_makes_no_verdict(monkeypatch, erro
             pytest.fail("the stop was taken for a defect")
 
     context = SimpleNamespace(sensor=SimpleNamespace(kind="frames"), reporter=Reporter(quiet=True))
-    context.run_units = run_units
+    context.run_units = Mock(side_effect=error)
     context.stop = SimpleNamespace(at_once=contextlib.nullcontext)
     monkeypatch.setattr(discrepancy, "_start", lambda _: ((), None))
     monkeypatch.setattr(discrepancy, "_run_frames", search)

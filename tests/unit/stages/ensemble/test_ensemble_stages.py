@@ -9,9 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from astropy.io import fits
 from helpers import written_fit
 from helpers.pickled_tasks import PickledTasks
 from helpers.stage_runs import completed, stage_context
+from tifffile import imread
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
 from pchem_pipeline.base.variables import PARAMETERS, variables_of
@@ -30,7 +32,6 @@ from pchem_pipeline.run.fingerprint import status
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.stages.ensemble import ensemble as ensemble_stage
-from pchem_pipeline.stages.ensemble.ensemble import on_axis
 from pchem_pipeline.stages.fit.fit import code_sums
 from pchem_pipeline.stages.report.stored import read_run
 from pchem_pipeline.stages.table import STAGES
@@ -104,14 +105,11 @@ def assert_same(found, expected):
 
 def test_maps_are_the_fit_and_what_follows(finished):
     store = finished.store
-    truth = {name: store.read(f"truth/{name}") for name in PARAMETERS}
-    for name in PARAMETERS:
-        found = store.read(f"maps/{name}")
-        assert np.isnan(found[FAILED_PIXEL])
-        np.testing.assert_array_equal(np.delete(found, 3, 0), np.delete(truth[name], 3, 0))
-    np.testing.assert_allclose(
-        np.delete(store.read("maps/charge_rate"), 3, 0), np.delete(truth["quanta_exposure"] / 4.87, 3, 0)
-    )
+    for name in (*PARAMETERS, "charge_rate"):
+        rate = name == "charge_rate"
+        truth = store.read("truth/quanta_exposure") / 4.87 if rate else store.read(f"truth/{name}")
+        truth[FAILED_PIXEL] = np.nan
+        np.testing.assert_allclose(store.read(f"maps/{name}"), truth, rtol=1e-7 * rate)
     quality = store.read("maps/quality")
     assert (quality[0, 0], quality[FAILED_PIXEL], quality[1, 1]) == (1, 2, 0)
     attributes = store.attributes("maps")
@@ -123,8 +121,7 @@ def test_maps_are_the_fit_and_what_follows(finished):
 
 def test_no_integration_time_means_no_charge_rate(sensor, tmp_path):
     context = sensor()
-    sensor = context.sensor
-    type(sensor)(**{**vars(sensor), "integration_time": None}).write(context.store)
+    replace(context.sensor, integration_time=None).write(context.store)
     context.config = context.config.model_copy(
         update={"input": context.config.input.model_copy(update={"integration_time": None})}
     )
@@ -184,6 +181,12 @@ def test_copies_and_empty_frames_are_in_no_ensemble(sensor, tmp_path):
     assert (facts["n_frames"], facts["n_frames_all"]) == (149, FRAMES - 102)
 
 
+def check_moments(facts):
+    for row in facts["moments"]:
+        if row["observed"] is not None:
+            assert abs(row["observed"] - row["predicted"]) < 5 * row["stderr"], row
+
+
 def test_the_true_parameters_predict_to_the_noise(finished):
     facts = finished.store.attributes("ensemble")
     error = facts["rmse"]
@@ -192,9 +195,7 @@ def test_the_true_parameters_predict_to_the_noise(finished):
     assert 0.6 < error["nuced_exact"] / error["nuced_noise_floor"] < 1.5
     assert set(error) >= {"epcd_dependent", "epcd_independent", "nuced_dependent", "nuced_independent"}
     assert facts["rmse_all_frames"]["noise_floor"] == pytest.approx(error["noise_floor"] * np.sqrt(250 / 400))
-    for row in facts["moments"]:
-        if row["observed"] is not None:
-            assert abs(row["observed"] - row["predicted"]) < 5 * row["stderr"], row
+    check_moments(facts)
     assert facts["component_cases"] == [list(case) for case in COMPONENT_CASES]
 
 
@@ -260,17 +261,6 @@ def test_result_depends_on_neither_tile_nor_backend(finished, tmp_path, tile, ex
         np.testing.assert_array_equal(context.store.read(name), finished.store.read(name))
 
 
-def test_tiles_that_the_fit_finishes_later_are_added(finished, sensor, tmp_path):
-    context = sensor(tiles=["0.0", "0.1", "0.2"], frames=250)
-    state = execute("ensemble", context)
-    assert state.state == "failed"
-    assert re.search(r"fit of \S+ is not finished", state.why)
-    facts = context.store.attributes("ensemble")
-    assert (facts["n_pixels"], facts["tiles_missing"]) == (16 * NX - 1, 6)
-    again = completed(sensor(frames=250), "ensemble")
-    assert_same(ensemble_of(again.store), ensemble_of(finished.store))
-
-
 def test_samples_that_the_fit_counted_need_no_histograms(finished, sensor, tmp_path, monkeypatch):
     context = sensor(frames=250)
     store = context.store
@@ -299,7 +289,7 @@ def test_code_sums_leave_out_pixels_without_a_value_and_what_lies_off_the_axis()
     maps = [np.array([[1.0, np.nan, 1.0]])] * 4
     content = code_sums({"counts": counts, "origin": origin, **outside}, maps)
     assert content == {"dn": [101, 102, 103, 104, 105], "samples": [1, 10, 12, 10, 11], "outside": 101}
-    samples, beyond = on_axis(content, DnAxis(102, 3))
+    samples, beyond = ensemble_stage.on_axis(content, DnAxis(102, 3))
     assert samples.tolist() == [10, 12, 10]
     assert beyond == 101 + 1 + 11
 
@@ -329,12 +319,7 @@ def test_region_and_range_of_frames_find_their_truth(finished, tmp_path):
     assert abs(facts["error_rate"] - facts["expected_error_rate"]) < 5 * facts["error_rate_stderr"]
 
 
-def test_frames_that_do_not_exist(sensor):
-    with pytest.raises(ConfigError, match="first_frame: 1000, but the run has frames 0 to 399"):
-        execute("ensemble", sensor(first_frame=1000))
-
-
-def test_no_pixel_with_a_value(sensor, tmp_path):
+def test_no_pixel_with_a_value_and_frames_that_do_not_exist(sensor, tmp_path):
     context = sensor()
     for name in PARAMETERS:
         context.store.write_array(f"fit/{name}", np.full((NY, NX), np.nan))
@@ -343,21 +328,23 @@ def test_no_pixel_with_a_value(sensor, tmp_path):
     assert context.store.records.read("ensemble").notes[0].startswith("no pixel has a value")
     assert not context.store.has("ensemble/density")
     assert execute("ensemble", context) == state
+    with pytest.raises(ConfigError, match="first_frame: 1000, but the run has frames 0 to 399"):
+        execute("ensemble", make_context(tmp_path, first_frame=1000))
 
 
-def test_no_pixel_with_a_value_so_far(sensor, tmp_path):
-    """Tiles that the fit is not finished are no reason to call the ensemble done."""
-    context = sensor(tiles=["0.0"])
-    good = {name: context.store.read(f"fit/{name}") for name in PARAMETERS}
+def test_tiles_that_the_fit_finishes_later_are_added(finished, sensor, tmp_path):
+    context = sensor(tiles=["0.0", "0.1", "0.2"], frames=250)
+    state = execute("ensemble", context)
+    assert state.state == "failed"
+    assert re.search(r"fit of \S+ is not finished", state.why)
+    facts = context.store.attributes("ensemble")
+    assert (facts["n_pixels"], facts["tiles_missing"]) == (16 * NX - 1, 6)
+    # nor is it called done where no pixel has a value so far
     for name in PARAMETERS:
         context.store.write_array(f"fit/{name}", np.full((NY, NX), np.nan))
     assert execute("ensemble", context).state == "failed"
-    write_fit(context)
-    for name, values in good.items():
-        values = np.where(np.isnan(values), context.store.read(f"fit/{name}"), values)
-        context.store.write_array(f"fit/{name}", values)
-    assert execute("ensemble", make_context(tmp_path)).state == "complete"
-    assert np.isfinite(context.store.read("ensemble/density")).all()
+    again = completed(sensor(frames=250), "ensemble")
+    assert_same(ensemble_of(again.store), ensemble_of(finished.store))
 
 
 @pytest.mark.parametrize("n_samples", [(20_000, 20_000), (5_000, 80_000)])
@@ -371,10 +358,10 @@ def test_ready_made_histograms(tmp_path, n_samples):
     np.savez(tmp_path / "spectra.npz", dn=np.arange(250), counts=counts)
     context = stage_context(tmp_path, input={"files": ["spectra.npz"], "format": "histogram"})
     completed(context, "ingest", "histogram")
-    for i, name in enumerate(PARAMETERS):
-        context.store.write_array(f"fit/{name}", truth[None, :, i])
-    context.store.write_array("fit/likelihood_gap", np.full((1, len(truth)), 50.0))
-    context.store.write_array("fit/fit_status", np.zeros((1, len(truth)), np.uint32))
+    fit = dict(zip(PARAMETERS, truth.T[:, None], strict=True))
+    fit |= {"likelihood_gap": np.full((1, 2), 50.0), "fit_status": np.zeros((1, 2), np.uint32)}
+    for name, values in fit.items():
+        context.store.write_array(f"fit/{name}", values)
     context.store.records.write(StageRecord("fit", 1, "truth", {}, keys=1))
     context.store.records.mark("fit", "truth", "0.0", {})
     completed(context, "ensemble")
@@ -386,17 +373,12 @@ def test_ready_made_histograms(tmp_path, n_samples):
     facts = context.store.attributes("ensemble")
     assert 0.5 < facts["rmse"]["epcd_exact"] / facts["rmse"]["noise_floor"] < 1.6
     assert "histograms" in facts["missing"]["frames"]
-    for row in facts["moments"]:
-        if row["observed"] is not None:
-            assert abs(row["observed"] - row["predicted"]) < 5 * row["stderr"], row
+    check_moments(facts)
     with pytest.raises(InputError, match="camera files"):
         execute("electrons", context)
 
 
 def test_export(finished, tmp_path):
-    from astropy.io import fits
-    from tifffile import imread
-
     finished.store.write_config(dump_config(finished.config))
     written = export_run(finished.store.path, tmp_path / "out", ("fits", "tiff", "npz", "csv", "emva"))
     assert all(path.exists() for path in written)
@@ -419,59 +401,42 @@ def test_export(finished, tmp_path):
 
 
 def test_export_for_programs_that_localise_single_molecules(finished, tmp_path):
-    from tifffile import imread
-
     finished.store.write_config(dump_config(finished.config))
     written = export_run(finished.store.path, tmp_path, tuple(ADAPTERS))
     assert all(path.exists() for path in written)
-    bias, gain, noise = (
-        finished.store.read(f"maps/{n}") for n in ("bias", "conversion_gain", "read_noise_e")
-    )
+    names = ("bias", "conversion_gain", "read_noise_e", "quanta_exposure")
+    bias, gain, noise, exposure = (finished.store.read(f"maps/{name}") for name in names)
     fitted = np.isfinite(bias)
     assert 0 < (~fitted).sum() < bias.size / 2
     # of frames with light only the pixels' own noise is their variance without it
     variance = imread(next(path for path in written if path.name.startswith("variance_")))
     np.testing.assert_allclose(variance[fitted], noise[fitted] ** 2, rtol=1e-6)
     assert (variance[~fitted] == 1e8).all()  # such a pixel does not count
-    np.testing.assert_allclose(
-        imread(tmp_path / "camera_maps/camera_off.tiff")[fitted], bias[fitted], rtol=1e-6
-    )
-    in_dn = imread(tmp_path / "camera_maps/camera_var.tiff")
-    np.testing.assert_allclose(in_dn[fitted], (noise / gain)[fitted] ** 2, rtol=1e-6)
+    for name, in_dn in (("off", bias), ("var", (noise / gain) ** 2)):
+        found = imread(tmp_path / f"camera_maps/camera_{name}.tiff")
+        np.testing.assert_allclose(found[fitted], in_dn[fitted], rtol=1e-6)
     camera = yaml.safe_load((tmp_path / "decode_camera.yaml").read_text())["Camera"]
     assert camera["read_sigma"] == pytest.approx(np.nanmedian(noise))
     [entry] = yaml.safe_load((tmp_path / "picasso_config.yaml").read_text())["Cameras"].values()
     assert entry["Sensitivity"] == pytest.approx(np.nanmedian(gain))
-
-
-def test_dark_frames_add_their_dark_current_to_what_other_programs_expect_of_dark_frames(finished, tmp_path):
-    kept = finished.config.model_copy(
-        update={"input": finished.config.input.model_copy(update={"kind": "dark", "integration_time": None})}
-    )
-    target = SimpleNamespace(
-        config=kept, sensor=lambda store: replace(SensorInfo.read(store), integration_time=None)
-    )
-    found = Calibration.of(target, finished.store)
-    bias, gain, noise, exposure = (
-        finished.store.read(f"maps/{n}")
-        for n in ("bias", "conversion_gain", "read_noise_e", "quanta_exposure")
-    )
-    fitted = np.isfinite(bias)
+    # of dark frames they expect the dark current, too
+    dark = finished.config.input.model_copy(update={"kind": "dark", "integration_time": None})
+    config = finished.config.model_copy(update={"input": dark})
+    sensor = replace(SensorInfo.read(finished.store), integration_time=None)
+    found = Calibration.of(SimpleNamespace(config=config, sensor=lambda _: sensor), finished.store)
     np.testing.assert_allclose(found.offset[fitted], (bias + exposure / gain)[fitted], rtol=1e-12)
     np.testing.assert_allclose(found.variance[fitted], (noise**2 + exposure)[fitted], rtol=1e-12)
     with pytest.raises(ConfigError, match=r"exposure time.*set input\.integration_time"):
         ADAPTERS["pyme"](found, tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("serial", "folder"), [("../../etc", "etc"), ("..", "camera"), ("SN 7/2", "SN_7_2"), (None, "camera")]
-)
-def test_a_serial_number_never_leads_out_of_the_folder(finished, tmp_path, serial, folder):
+def test_a_serial_number_never_leads_out_of_the_folder(finished, tmp_path):
     sensor = SensorInfo.read(finished.store)
-    sensor = replace(sensor, camera=replace(sensor.camera, serial=serial), integration_time=1.0)
-    target = SimpleNamespace(config=finished.config, sensor=lambda _: sensor)
-    written = ADAPTERS["pyme"](Calibration.of(target, finished.store), tmp_path)
-    assert {path.parent for path in written} == {tmp_path / "pyme" / folder}
+    for serial, folder in (("../../etc", "etc"), ("..", "camera"), ("SN 7/2", "SN_7_2"), (None, "camera")):
+        found = replace(sensor, camera=replace(sensor.camera, serial=serial), integration_time=1.0)
+        target = SimpleNamespace(config=finished.config, sensor=lambda _, found=found: found)
+        written = ADAPTERS["pyme"](Calibration.of(target, finished.store), tmp_path)
+        assert {path.parent for path in written} == {tmp_path / "pyme" / folder}
 
 
 def test_export_says_what_is_wrong(finished, tmp_path):

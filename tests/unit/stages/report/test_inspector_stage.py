@@ -47,10 +47,13 @@ def test_a_new_array_appears_by_itself(store, data, monkeypatch, group):
     monkeypatch.setitem(variables.VARIABLES, new.path, new)
     store.write_array(new.path, np.full(SHAPE, 0.25))
     shown = inspector_of(store, data.maps, data.fit)
-    entry = next(each for each in shown.maps if each.path == new.path)
+    [entry] = [each for each in shown.maps if each.path == new.path]
     assert (entry.label, entry.unit, entry.sentence) == ("far share", "DN", "share of samples far away")
     assert entry.packed is not None
     assert (shown.sample.exact[new.path] == 0.25).all()
+    # the charge rate costs nothing
+    [entry] = [each for each in shown.maps if each.path == "maps/charge_rate"]
+    assert (entry.packed, entry.same_as) == (None, ("maps/quanta_exposure", pytest.approx(1 / 4.87)))
 
 
 def test_words_and_kinds(store):
@@ -94,26 +97,13 @@ def test_of_many_pixels_a_page_holds_few_megabytes_and_little_is_tried(store, da
     assert inspector._coarse(512 * 512)[1].startswith("a sixteenth")
 
 
-def test_the_charge_rate_costs_nothing(store, data):
-    shown = inspector_of(store, data.maps, data.fit)
-    entry = next(each for each in shown.maps if each.path == "maps/charge_rate")
-    assert entry.packed is None
-    assert entry.same_as == ("maps/quanta_exposure", pytest.approx(1 / 4.87))
-
-
-# -- which pixels ----------------------------------------------------------------------------
-
-
-def test_a_small_sensor_is_there_whole(data):
+def test_a_small_sensor_is_there_whole_of_wide_histograms_fewer_pixels(data):
     index, _ = choose_inspected(data.maps, data.fit, [(3, 4)], everything=4096, most=100)
     assert index[0] == 3 * 16 + 4
     assert sorted(index.tolist()) == list(range(12 * 16))
-
-
-def test_of_wide_histograms_fewer_pixels_are_there():
     data = report_data((60, 60))
-    assert choose_inspected(data.maps, data.fit, [], bins=2048)[0].size == 3600
-    assert choose_inspected(data.maps, data.fit, [], bins=16384)[0].size == 512
+    for bins, n_pixels in ((2048, 3600), (16384, 512)):
+        assert choose_inspected(data.maps, data.fit, [], bins=bins)[0].size == n_pixels
 
 
 def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample():
@@ -142,9 +132,6 @@ def test_of_a_large_sensor_the_telling_pixels_and_an_even_sample():
     for line, n in ((index // 120, 100), (index % 120, 120)):
         parts = np.histogram(line, bins=10, range=(0, n))[0]
         assert parts.min() > 100
-
-
-# -- the first screen and the sections -------------------------------------------------------
 
 
 def test_a_new_section_is_one_entry_in_one_list(data, monkeypatch):
