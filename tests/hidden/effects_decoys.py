@@ -13,9 +13,7 @@ class TemporalFilter(Hidden):
 
     s95 = 5e-3
     most = 1.0
-
-    def draw(self):
-        self.before = None
+    before = None
 
     def convert(self, t, dn, code):
         found = code
@@ -107,10 +105,7 @@ class Hysteresis(Hidden):
     """A sample is drawn towards the one delivered before, whatever its size; strength: DN."""
 
     s95 = 0.05
-    scaling = (0.5, 0.5, 0.5)
-
-    def draw(self):
-        self.before = None
+    before = None
 
     def convert(self, t, dn, code):
         found = code
@@ -128,10 +123,10 @@ class BlockMean(Hidden):
 
     def convert(self, t, dn, code):
         ny, nx = (size // 2 for size in code.shape)
-        blocks = code[: 2 * ny, : 2 * nx].reshape(ny, 2, nx, 2)
+        found = code.copy()
+        blocks = found[: 2 * ny, : 2 * nx].reshape(ny, 2, nx, 2)
         lost = self.rng.random((ny, 1, nx, 1)) < self.strength
         mean = blocks.sum(axis=(1, 3), keepdims=True) // 4
-        found = code.copy()
         found[: 2 * ny, : 2 * nx] = np.where(lost, mean, blocks).reshape(2 * ny, 2 * nx)
         return found
 
@@ -152,12 +147,10 @@ class Afterpulses(Hidden):
     s95 = 2e-3
     most = 0.5
     warmup = 20
-
-    def draw(self):
-        self.before = np.zeros(self.sensor.shape, np.int64)
+    before = 0
 
     def electrons(self, t, k):
-        self.before = k + self.rng.poisson(self.strength * self.before)
+        self.before = k + self.rng.poisson(self.strength * self.before, k.shape)
         return self.before
 
 
@@ -169,9 +162,7 @@ class RepelledCharge(Hidden):
 
     def electrons(self, t, k):
         gone = self.rng.binomial(k, np.clip(self.strength * np.maximum(k - 1, 0), 0, 0.9))
-        arrived = np.zeros_like(k)
-        arrived[:, 1:] = gone[:, :-1]
-        return k - gone + arrived
+        return k - gone + np.pad(gone[:, :-1], ((0, 0), (1, 0)))
 
 
 class MainsGain(Hidden):
@@ -268,11 +259,8 @@ class NegativeGhost(Hidden):
 
     s95 = 0.3
     warmup = 1
-
-    def draw(self):
-        self.before = np.zeros(self.sensor.shape)
+    before = 0.0
 
     def signal(self, t, v):
-        shifted = v - self.strength / np.median(self.sensor.step) * np.maximum(self.before - 4, 0)
-        self.before = v
-        return shifted
+        before, self.before = self.before, v
+        return v - self.strength / np.median(self.sensor.step) * np.maximum(before - 4, 0)

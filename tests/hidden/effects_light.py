@@ -136,14 +136,11 @@ class OpticalCrosstalk(Hidden):
 
     def electrons(self, t, k):
         emitted = self.rng.binomial(k, self.strength)
-        y, x = np.nonzero(emitted)
-        times = emitted[y, x]
-        y, x = np.repeat(y, times), np.repeat(x, times)
-        step = np.array([(0, 1), (0, -1), (1, 0), (-1, 0)])[self.rng.integers(0, 4, y.size)]
-        y, x = y + step[:, 0], x + step[:, 1]
-        inside = (y >= 0) & (y < k.shape[0]) & (x >= 0) & (x < k.shape[1])
+        places = np.repeat(np.argwhere(emitted), emitted[emitted > 0], axis=0)
+        places += np.array([(0, 1), (0, -1), (1, 0), (-1, 0)])[self.rng.integers(0, 4, len(places))]
+        inside = ((places >= 0) & (places < k.shape)).all(axis=1)
         k = k.copy()
-        np.add.at(k, (y[inside], x[inside]), 1)
+        np.add.at(k, tuple(places[inside].T), 1)
         return k
 
 
@@ -197,10 +194,8 @@ class Glow(Hidden):
         cy = 0.0 if corner == "corner" else self.between("row", 0.2, 0.8) * ny
         away = np.hypot(y - cy, x)
         reach = max(ny, nx) / 5
-        if self.pick("falloff", "exponential", "gaussian", p=(0.7, 0.3)) == "exponential":
-            self.shape = np.exp(-away / reach)
-        else:
-            self.shape = np.exp(-0.5 * (away / reach) ** 2)
+        power = 1 if self.pick("falloff", "exponential", "gaussian", p=(0.7, 0.3)) == "exponential" else 2
+        self.shape = np.exp(-((away / reach) ** power) / power)
         self.affected = self.shape > 0.1
         if self.pick("course", "bursts", "grows", p=(0.7, 0.3)) == "bursts":
             self.size = self.rng.random(n) < 0.02

@@ -43,13 +43,11 @@ class RtsNoise(Hidden):
     def _trap(self, n_reads: int) -> np.ndarray:
         """States at successive reads, (read, pixel); a fresh start in every frame."""
         n = self.occupied.size
-        state = self.rng.random(n) < self.occupied
-        states = []
+        states = [self.rng.random(n) < self.occupied]
         for _ in range(n_reads):
-            states.append(state)
             fresh = self.rng.random(n) < self.occupied
-            state = np.where(self.rng.random(n) < self.kept, state, fresh)
-        return np.array(states, float)
+            states.append(np.where(self.rng.random(n) < self.kept, states[-1], fresh))
+        return np.array(states[:-1], float)
 
     def noise(self, t, n, k):
         if self.reads:

@@ -39,8 +39,7 @@ class ChargeDiffusion(Hidden):
             stay -= moved
             shifted = np.roll(moved, way, axis)
             # what leaves the sensor does not come back on the other side
-            edge = (slice(None),) * axis + (0 if way == 1 else -1,)
-            shifted[edge] = 0
+            shifted[(slice(None),) * axis + (0 if way == 1 else -1,)] = 0
             arrived += shifted
         return stay + arrived
 

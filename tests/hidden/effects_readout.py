@@ -126,9 +126,8 @@ class AdcDnl(Hidden):
             error = min(self.strength * np.sqrt(2.0**bit), 0.45)
             edges = self.sign() * error * ((codes >> bit) & 1)
         elif kind == "random":
-            edges = np.clip(
-                2.5 / np.sqrt(2) * self.strength * self.rng.standard_normal(codes.size), -0.4, 0.4
-            )
+            random = self.rng.standard_normal(codes.size)
+            edges = np.clip(2.5 / np.sqrt(2) * self.strength * random, -0.4, 0.4)
         elif kind == "missing":
             period = int(self.pick("period", 11, 13, 19))
             edges = min(self.strength * np.sqrt(2 * period), 1.0) * (codes % period == 5)
@@ -136,9 +135,8 @@ class AdcDnl(Hidden):
             low, high = self.sensor.code_range
             code = int(self.rng.uniform(low + 0.1 * (high - low), high - 0.3 * (high - low)))
             wider = min(8 * self.strength, 0.45)
-            edges = np.where(codes > code, wider / 2, np.where(codes == code, -wider / 2, 0.0))
-            # the next ones make up for it
-            edges[code + 2 :] = 0.0
+            edges = np.zeros(codes.size)
+            edges[code : code + 2] = -wider / 2, wider / 2  # the next ones make up for it
             self.parameters["code"] = code
         self.edges = edges
 
@@ -184,9 +182,8 @@ class Clipping(Hidden):
         caught = self.strength * (6 / 7 if self.side == "low" else 8 / 7) * frames.size
         counts = np.bincount(frames.ravel(), minlength=2**self.sensor.bits)
         # beyond[c]: samples that a limit at code c would catch; the limit that comes nearest to what is asked
-        total = np.cumsum(counts if self.side == "low" else counts[::-1])
-        beyond = np.concatenate([[0], total[:-1]])
-        beyond = beyond if self.side == "low" else beyond[::-1]
+        way = 1 if self.side == "low" else -1
+        beyond = np.concatenate([[0], np.cumsum(counts[::way])[:-1]])[::way]
         limit = int(np.argmin(np.abs(np.log(np.maximum(beyond, 0.01) / caught))))
         touched = frames < limit if self.side == "low" else frames > limit
         frames[touched] = limit
