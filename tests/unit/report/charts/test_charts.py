@@ -10,8 +10,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from helpers.discrepancy_material import discrepancy_data
-from helpers.quick_stacks import stack, sums_of
-from helpers.report_material import report_data
+from helpers.report_material import with_stability
 
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.base.wording import symbol, without_formulas
@@ -42,7 +41,6 @@ from pchem_pipeline.report.charts.on_page import page_chart, rounded
 from pchem_pipeline.report.charts.on_paper import Look, draw_chart, drawing_bytes
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector import json_for_html
 from pchem_pipeline.report.pages.page import draw_figure
 from pchem_pipeline.report.style.palette import DIVERGING, LIGHT, MAP_COLOURS, shades
@@ -52,12 +50,7 @@ HOSTILE = "</script><script>alert(1)</script><!-- & $\\mu$"
 
 @pytest.fixture(scope="module")
 def charts() -> dict[str, Figure]:
-    frames = stack(np.random.default_rng(2), (300, 12, 16))
-    data = replace(
-        report_data((12, 16)),
-        stability=stability_figures(sums_of(frames)),
-        discrepancy=discrepancy_data("named"),
-    )
+    data = with_stability((12, 16), discrepancy=discrepancy_data("named"))
     return {each.name: each for each in run_figures(data)}
 
 

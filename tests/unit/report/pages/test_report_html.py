@@ -11,15 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.html_page import HOSTILE, Page, harmless
-from helpers.quick_stacks import stack, sums_of
-from helpers.report_material import report_data
+from helpers.report_material import report_data, with_stability
 
 from pchem_pipeline import __version__
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import MAP_NAMES, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.catalogue import report_figures
 from pchem_pipeline.report.figures.figure import DataTable, csv_text
-from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector import text_of
 from pchem_pipeline.report.pages.page import GLOSSARY, chart_script, explained, figure_tables
 from pchem_pipeline.report.pages.report import citation, render_report
@@ -36,8 +34,7 @@ FIGURES = {
 
 @pytest.fixture(scope="module")
 def data() -> ReportData:
-    frames = stack(np.random.default_rng(2), (300, 24, 32))
-    return replace(report_data((24, 32)), stability=stability_figures(sums_of(frames)))
+    return with_stability((24, 32))
 
 
 @pytest.fixture(scope="module")
