@@ -188,16 +188,12 @@ def test_cautions_are_of_pixels_with_a_value_and_failures_have_reasons() -> None
 NO_ENSEMBLE: dict[str, Any] = {"ensemble": {}, "ensemble_facts": {}, "moments": ()}
 
 
-def all_failed() -> ReportData:
-    data = report_data((8, 8))
-    nan = np.full((8, 8), np.nan)
-    lost = replace(
-        data.pixels[0],
-        parameters=dict.fromkeys(data.pixels[0].parameters, float("nan")),
-        stderr={},
-        status="no data",
-    )
-    return replace(
+@pytest.mark.usefixtures("undrawn")
+def test_all_pixels_failed_and_nothing_at_all() -> None:
+    data, nan = report_data((8, 8)), np.full((8, 8), np.nan)
+    unknown = dict.fromkeys(data.pixels[0].parameters, float("nan"))
+    lost = replace(data.pixels[0], parameters=unknown, stderr={}, status="no data")
+    failed = replace(
         data,
         maps=dict.fromkeys(data.maps, nan),
         fit={"fit_status": np.full((8, 8), int(FitStatus.TOO_FEW_BINS), np.uint16), "goodness_p": nan},
@@ -205,15 +201,11 @@ def all_failed() -> ReportData:
         **NO_ENSEMBLE,
         missing=dict.fromkeys(("maps", "ensemble", "electrons", "components"), "no pixel has a value"),
     )
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_all_pixels_failed_and_nothing_at_all() -> None:
-    page = Page(render_report(all_failed())["report.html"])
+    page = Page(render_report(failed)["report.html"])
     assert "None of the 64 pixels could be fitted" in page.text
     assert "no pixel has a value" in page.text
-    assert "not known" not in sentence(all_failed())
-    assert [answer.level for answer in answers(all_failed())] == ["serious", "serious"]
+    assert "not known" not in sentence(failed)
+    assert [answer.level for answer in answers(failed)] == ["serious", "serious"]
     assert {str(a["id"]) for a in page.of("figure")} == {"figure-pixel_fits", "figure-fit_status"}
     rendered = render_report(ReportData(title="empty", shape=(4, 4)))
     assert "None of the 16 pixels" in Page(rendered["report.html"]).text

@@ -29,16 +29,6 @@ def test_decades_make_a_logarithmic_axis_but_not_for_signed_data() -> None:
     assert not robust_range(values - values.mean()).logarithmic
 
 
-@pytest.mark.parametrize(
-    "values", [np.full(5, np.nan), np.empty(0), np.zeros(4), np.full(3, -7.5), np.array([1.0])]
-)
-def test_degenerate_values_give_an_axis(values: np.ndarray) -> None:
-    shown = robust_range(values)
-    assert shown.low < shown.high
-    edges = histogram_edges(values, shown, 128)
-    assert np.all(np.diff(edges) > 0)
-
-
 def test_edges_cover_the_range_with_a_bounded_number_of_bins() -> None:
     values = np.random.default_rng(3).normal(size=200_000)
     shown = robust_range(values)
