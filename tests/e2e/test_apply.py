@@ -181,15 +181,10 @@ def exposures(lab, *folders):
         image = fits.PrimaryHDU(samples)
         image.header.update(
             {"OBJECT": "M 13", "FILTER": "V", "EXPTIME": (1.0, "[s] shutter"), "BITDEPTH": 14}
-            | {
-                "DATAMAX": 16383,
-                "DATE-OBS": f"2026-03-0{number + 1}T21:00:00.125",
-                "RADESYS": "ICRS",
-                "BUNIT": "adu",
-            }
+            | {"DATE-OBS": f"2026-03-0{number + 1}T21:00:00.125", "CRVAL1": 250.4 + 0.01 * number}
+            | {"DATAMAX": 16383, "RADESYS": "ICRS", "BUNIT": "adu", "CRVAL2": 36.46, "HISTORY": "guided"}
             | {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 12.5, "CRPIX2": 8.5}
-            | {"CRVAL1": 250.4 + 0.01 * number, "CRVAL2": 36.46, "CD1_1": -1e-4, "CD1_2": 2e-5}
-            | {"CD2_1": 2e-5, "CD2_2": 1e-4, "HISTORY": "guided", "HIERARCH LAB DOME": "open"}
+            | {"CD1_1": -1e-4, "CD1_2": 2e-5, "CD2_1": 2e-5, "CD2_2": 1e-4, "HIERARCH LAB DOME": "open"}
         )
         path = lab.folder / name
         path.parent.mkdir(exist_ok=True)

@@ -125,7 +125,7 @@ def test_mouse_and_keys_zoom_and_read_values(report):
     assert canvas.evaluate(SHOWN) == before
 
 
-def test_the_legend_has_values_and_hides_what_it_names_and_a_picture_is_saved(report, data, tmp_path):
+def test_the_legend_has_values_and_hides_what_it_names(report, data):
     page = report()
     figure = chart(page, "electron_numbers")
     button = figure.get_by_role("button", name="estimated electron numbers")
@@ -147,12 +147,6 @@ def test_the_legend_has_values_and_hides_what_it_names_and_a_picture_is_saved(re
     button.press("Enter")
     page.wait_for_timeout(50)
     assert (button.get_attribute("aria-pressed"), canvas.evaluate(SHOWN)) == ("true", before)
-    figure = chart(page, "ensemble")
-    with page.expect_download() as download:
-        figure.get_by_role("button", name="Save ensemble as SVG").click()
-    path = tmp_path / "ensemble.svg"
-    download.value.save_as(path)
-    assert "<svg" in path.read_text()
 
 
 def test_paper_and_readers_without_scripts_get_the_plain_picture(report):
@@ -190,6 +184,8 @@ def test_pictures_are_dark_on_a_dark_screen_and_light_as_files(report, tmp_path)
         with page.expect_download() as download:
             figure.get_by_role("button", name=f"Save map_bias as {kind}").click()
         download.value.save_as(tmp_path / kind)
-    assert "prefers-color-scheme" not in (tmp_path / "SVG").read_text()
+    svg = (tmp_path / "SVG").read_text()
+    assert "<svg" in svg
+    assert "prefers-color-scheme" not in svg
     with PIL.Image.open(tmp_path / "PNG") as saved:
         assert min(saved.convert("RGB").getpixel((20, 20))) > 250

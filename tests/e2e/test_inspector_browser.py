@@ -1,5 +1,7 @@
 """The inspector in a real browser: Debian's Chromium, headless, driven by Playwright."""
 
+import base64
+import gzip
 import json
 import re
 from dataclasses import dataclass
@@ -107,15 +109,9 @@ def shown_value(store, name, i):
 
 def in_full(tab):
     """Pixels whose histogram is in the file: those that Next visits."""
-    found = tab.page.evaluate(
-        "async () => { const t = document.getElementById('inspector-sample').textContent;"
-        "const b = Uint8Array.from(atob(t), (c) => c.charCodeAt(0));"
-        "const s = new Blob([b]).stream().pipeThrough(new DecompressionStream('gzip'));"
-        "const v = new DataView(await new Response(s).arrayBuffer());"
-        "const n = JSON.parse(document.getElementById('inspector-facts').textContent).sample.n;"
-        "return Array.from({length: n}, (_, i) => v.getUint32(4 * i, true)); }"
-    )
-    return set(found)
+    facts, sample = (tab.page.locator(f"#inspector-{name}").text_content() for name in ("facts", "sample"))
+    content = gzip.decompress(base64.b64decode(sample))
+    return set(np.frombuffer(content, "<u4", json.loads(facts)["sample"]["n"]).tolist())
 
 
 def test_the_policy_of_the_page_forbids_network_and_other_scripts(browser, store):
