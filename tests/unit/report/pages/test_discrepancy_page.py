@@ -58,7 +58,7 @@ def rendered(base: ReportData, data: DiscrepancyData | None) -> dict[str, str]:
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
-    ("verdict", "level"), zip(VERDICTS, ("note", "caution", "caution", "serious", "good"), strict=True)
+    ("verdict", "level"), [*zip(VERDICTS, ("note", "caution", "caution", "serious", "good"), strict=True)]
 )
 def test_the_verdict_comes_first(base: ReportData, verdict: str, level: str) -> None:
     data = discrepancy_data(verdict)
