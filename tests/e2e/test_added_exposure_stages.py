@@ -11,13 +11,8 @@ from pchem_pipeline.runner.session import run_stages, run_status
 from pchem_pipeline.store.run_store import RunStore
 
 QUIET = Command(quiet=True)
-BLINKING = {
-    "tag": "dark_current_rts",
-    "fraction": 0.12,
-    "step_e": 1.2,
-    "dwell_low_frames": 60,
-    "dwell_high_frames": 60,
-}
+BLINKING = {"tag": "dark_current_rts", "fraction": 0.12, "step_e": 1.2}
+BLINKING |= {"dwell_low_frames": 60, "dwell_high_frames": 60}
 
 
 def states(path):

@@ -76,19 +76,16 @@ def test_without_a_store_it_goes_with_the_run(frames):
     assert not path.parent.exists()
 
 
-@pytest.mark.parametrize(
-    ("stack", "words"),
-    [
+def test_what_is_no_stack_is_refused():
+    for stack, words in (
         (np.zeros((4, 4), np.uint16), "give an array"),
         (np.zeros((0, 4, 4), np.uint16), "of at least 2 frames"),
         ([[[0.5]], [[1.5]]], "give integers"),
         (np.zeros((4, 4, 4)), "give integers"),
         (np.full((4, 4, 4), -1), "from -1 to -1 DN"),
-    ],
-)
-def test_what_is_no_stack_is_refused(stack, words):
-    with pytest.raises(ConfigError, match=words):
-        pchem_pipeline.characterise(stack)
+    ):
+        with pytest.raises(ConfigError, match=words):
+            pchem_pipeline.characterise(stack)
 
 
 def test_plain_histograms_in_one_call(frames):

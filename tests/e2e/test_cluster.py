@@ -37,24 +37,14 @@ def workers_of(file, **settings):
     return ComputeSettings(backend="distributed", scheduler=str(file), **settings)
 
 
-class Counted:
-    """What an executor says, and how often it asks whether to go on."""
-
-    def __init__(self):
-        self.lines, self.asked = [], 0
-
-    def check(self):
-        self.asked += 1
-
-
 def numbers_of_workers(folder):
     return {int(path.name.split("-")[1]) for path in folder.glob("[0-9]*-*")}
 
 
 def test_a_killed_worker_costs_nothing_but_time_and_the_last_one_is_waited_for(processes, tmp_path):
     file, (_, first, last) = processes
-    heard = Counted()
-    executor = make_executor(workers_of(file, wait_for_workers=2), heard.lines.append, heard.check)
+    lines = []
+    executor = make_executor(workers_of(file, wait_for_workers=2), lines.append)
     executor._client.wait_for_workers(2, timeout=60)
     found = {}
 
@@ -69,7 +59,7 @@ def test_a_killed_worker_costs_nothing_but_time_and_the_last_one_is_waited_for(p
     who = numbers_of_workers(tmp_path)
     assert first.pid in who  # it had its share, and the other one did the rest
     assert len(who) == 2
-    assert heard.lines == []
+    assert lines == []
     found.clear()
     try:
         task = functools.partial(slow_square, tmp_path)
@@ -78,7 +68,7 @@ def test_a_killed_worker_costs_nothing_but_time_and_the_last_one_is_waited_for(p
     finally:
         executor.close()
     assert 1 <= len(found) < 10
-    assert len(heard.lines) == 1
+    assert len(lines) == 1
 
 
 def test_other_versions_are_refused_and_a_scheduler_that_goes_away_is_one_line(
@@ -127,18 +117,18 @@ def test_a_worker_over_its_memory_is_one_line_and_the_run_goes_on_to_the_same_bi
 
 
 def test_a_scheduler_without_workers_is_said_and_given_up(tmp_path):
-    heard, words = Counted(), r"had no worker for 1 s \(compute.wait_for_workers\)"
+    lines, asked, words = [], [], r"had no worker for 1 s \(compute.wait_for_workers\)"
     with cluster_processes(tmp_path, 0) as (file, _):
         with pytest.raises(IncompleteRunError, match=words) as caught:
-            make_executor(workers_of(file, wait_for_workers=1), heard.lines.append, heard.check)
+            make_executor(workers_of(file, wait_for_workers=1), lines.append, lambda: asked.append(1))
 
         def stopped():
             raise InterruptedRunError(signal.SIGTERM)
 
         with pytest.raises(InterruptedRunError, match="stopped by SIGTERM"):
             make_executor(workers_of(file), check=stopped)
-    assert heard.lines == [f"waiting for workers of the dask scheduler {file}"]
-    assert heard.asked > 3
+    assert lines == [f"waiting for workers of the dask scheduler {file}"]
+    assert len(asked) > 3
     assert str(file) in str(caught.value)
     assert "\n" not in str(caught.value)
 

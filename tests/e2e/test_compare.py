@@ -37,17 +37,12 @@ def copies(shell, finished):
     return RunStore.open(shell.folder / "b.zarr", writable=True)
 
 
-def here(shell, *names):
+def here(shell, *names, **options):
     """Compare in this process: the lines that are printed."""
-    lines = []
+    lines, paths = [], [shell.folder / name for name in names]
     with contextlib.suppress(ChangedError):
-        compare_runs(
-            [shell.folder / name for name in names],
-            shell.folder / "compare",
-            progress="off",
-            write=lines.append,
-        )
-    return "\n".join(lines)
+        compare_runs(paths, shell.folder / "compare", progress="off", write=lines.append, **options)
+    return lines
 
 
 def compared(shell, *names, **options):
@@ -82,10 +77,9 @@ def test_nothing_changed_is_proven_by_digests(shell, copies):
         assert rows[name]["sha256"] == [digest, digest]
         assert rows[name]["n_values"] == values.size
     page = (shell.folder / "compare" / "compare.html").read_text(encoding="utf-8")
-    assert "Nothing changed" in page
-    assert "bit-identical" in page
-    assert 'id="figure-tables"' in page  # figures are saved with their numbers, words explained
-    assert 'id="term-read-noise"' in page
+    # figures are saved with their numbers, words explained
+    for words in ("Nothing changed", "bit-identical", 'id="figure-tables"', 'id="term-read-noise"'):
+        assert words in page
     for source in re.findall(r'(?:src|srcset|href)="([^"]*)"', page):
         assert source.startswith(("data:image/", "#"))
 
@@ -102,8 +96,7 @@ def test_one_value_that_moved_is_found(shell, copies, undrawn):
     assert what.startswith("  maps/bias: 1 value of 560 changed")
     assert result.last == f"pchem: changed; see {shell.folder}/out/compare.html"
     [limited] = compared(shell, "a.zarr", "b.zarr", limits=["bias=0.1"]).pairs
-    states = {row.name: row.state for row in limited.arrays}
-    assert [name for name, state in states.items() if state != "identical"] == ["maps/bias"]
+    assert [row.name for row in limited.arrays if row.state != "identical"] == ["maps/bias"]
     [equal] = compared(shell, "a.zarr", "b.zarr", tolerance=1e-6).pairs
     assert not limited.changed
     assert not equal.changed
@@ -116,13 +109,16 @@ def test_lost_and_new_arrays_settings_and_versions(shell, copies, undrawn):
     shutil.rmtree(shell.folder / "a.zarr" / "ensemble" / "epcd_independent")
     text = stored_config(copies.path) or ""
     copies.write_config(text.replace("gap_threshold: 5.0", "gap_threshold: 7.0"))
-    assert "fit/goodness_p: missing" in here(shell, "a.zarr", "b.zarr")
+    assert "fit/goodness_p: missing" in "\n".join(here(shell, "a.zarr", "b.zarr"))
     [pair] = numbers(shell)["comparisons"]
     assert pair["what"] == ["fit/goodness_p: missing."]  # what is new, or no result, counts nothing
     assert pair["settings"] == [
         {"name": "fit.gap_threshold", "one": "5.0", "other": "7.0", "stages": ["fit"]}
     ]
     assert pair["versions"] == []
+    put(copies, "maps/quality", np.full_like(copies.read("maps/quality"), 2))
+    other_capture(copies)
+    assert "No pixel has a good fit in both runs." in "\n".join(here(shell, "a.zarr", "b.zarr"))
 
 
 def other_capture(store, *, exposure=1.0, seed=1, noise=2**0.5):
@@ -144,7 +140,7 @@ def test_another_capture_agrees_until_it_is_warmer(shell, copies, finished, undr
     shutil.copytree(finished, shell.folder / "warm <b>.zarr")
     warm = RunStore.open(shell.folder / "warm <b>.zarr", writable=True)
     other_capture(warm, exposure=1.2, seed=2)
-    lines = here(shell, "a.zarr", "b.zarr", "warm <b>.zarr").splitlines()
+    lines = here(shell, "a.zarr", "b.zarr", "warm <b>.zarr")
     assert lines[:2] == [
         "b.zarr since the reference a.zarr: no change",
         "warm <b>.zarr since the reference a.zarr:",
@@ -173,18 +169,15 @@ def test_the_history_of_a_camera(shell, copies, finished, undrawn):
     other_capture(third, seed=3)
     bias, error = third.read("maps/bias"), third.read("maps/bias_stderr")
     good = np.argwhere(third.read("maps/quality") == 0)[:40]
-    for y, x in good:
-        bias[y, x] += 12 * error[y, x]
+    bias[tuple(good.T)] += 12 * error[tuple(good.T)]
     put(third, "maps/bias", bias)
     exposure = third.read("maps/quanta_exposure")
-    places = [tuple(place) for place in good[:3].tolist()]
-    words = third.read("fit/fit_status")
-    origin = third.read("histogram/origin")
-    for place in places:  # a flagged pixel is hot, too
-        exposure[place] = 60.0
-        origin[place] += 50  # its samples are others, too
+    words, origin = third.read("fit/fit_status"), third.read("histogram/origin")
+    y, x = good[:3].T
+    exposure[y, x] = 60.0
+    origin[y, x] += 50  # the samples are others, too
     put(third, "histogram/origin", origin)
-    words[places[0]] |= int(FitStatus.BIAS_AMBIGUOUS)
+    words[y[0], x[0]] |= int(FitStatus.BIAS_AMBIGUOUS)  # a flagged pixel is hot, too
     put(third, "maps/quanta_exposure", exposure)
     put(third, "fit/fit_status", words)
     labels = ["-20 C", "-10 C", "0 C"]
@@ -211,28 +204,20 @@ def test_the_history_of_a_camera(shell, copies, finished, undrawn):
     assert "flag_poor_fit" in rows[0]
     assert rows[0]["defects_new"] == rows[0]["defects_gone"] == ""
     new = rows[2]["defects_new"].split()
-    assert set(new) >= {f"{y}/{x}" for y, x in places}
+    assert set(new) >= {f"{y}/{x}" for y, x in good[:3]}
     known = exposure[np.isfinite(exposure)]
     data = report_data(exposure.shape)
-    data = replace(
-        data,
-        maps={**data.maps, "quanta_exposure": exposure},
-        fit={**data.fit, "fit_status": words},
-        defects=stored_defects(third, open_run(third.path).config),
-    )
+    now = {"maps": {**data.maps, "quanta_exposure": exposure}, "fit": {**data.fit, "fit_status": words}}
+    data = replace(data, **now, defects=stored_defects(third, open_run(third.path).config))
     share = next(each for each in criteria(data) if each.setting == "hot_pixels").found  # of the report
     assert share == percent(int(rows[2]["hot_pixels"]), known.size)
     page = Page((shell.folder / "history" / "compare.html").read_text(encoding="utf-8")).text
     assert "The camera over time" in page
     assert re.search(rf"Defects ?: {len(new)} new\b", page)
     assert "-20 C" in page
-    for each in ({"labels": ["one"]}, {"rate": 0.0}):
-        with pytest.raises(ConfigError, match="--"):
-            compared(shell, "a.zarr", "b.zarr", **each)
 
 
-def test_the_history_has_date_and_temperature_of_the_files(shell, copies, finished):
-    """The sensor's temperature and the date of the frames come from the camera files."""
+def test_the_history_has_date_and_temperature_of_the_files(shell, copies):
     other_capture(copies)
     for name, temperature, taken in (("a", -20.0, 1.75e9), ("b", -5.5, 1.76e9)):
         store = RunStore.open(shell.folder / f"{name}.zarr", writable=True)
@@ -260,18 +245,7 @@ def test_nights_of_one_camera(shell, finished, monkeypatch):
         return store
 
     def lines(n, *limits):
-        written = []
-        paths = [shell.folder / f"night{each}.zarr" for each in (0, n)]
-        with contextlib.suppress(ChangedError):
-            compare_runs(
-                paths,
-                shell.folder / "compare",
-                limits=limits,
-                quiet=True,
-                progress="off",
-                write=written.append,
-            )
-        return written
+        return here(shell, "night0.zarr", f"night{n}.zarr", limits=limits, quiet=True)
 
     tonight(0)
     history = shell.folder / "compare" / HISTORY
@@ -314,29 +288,20 @@ def test_nights_of_one_camera(shell, finished, monkeypatch):
     assert len(history.read_text().splitlines()) == 1 + 6
 
 
-@pytest.mark.parametrize(
-    ("limit", "said"),
-    [
-        ("bais=3", "compare.bais: unknown key; did you mean bias?"),
-        ("bias", "write name=value, such as bias=0.5"),
-        ("bias=-1", "compare.bias: give a number from 0 on, or per cent"),
-        ("dark_current=5%", "compare.dark_current: .* has no such map; omit this limit"),
-    ],
-)
-def test_a_wrong_limit_is_refused(shell, copies, limit, said):
-    with pytest.raises(ConfigError, match=said):
-        compared(shell, "a.zarr", "b.zarr", limits=[limit])
-
-
-def test_nothing_to_compare_is_a_change(shell, copies, undrawn):
-    other_capture(copies)
-    put(copies, "maps/quality", np.full_like(copies.read("maps/quality"), 2))
-    assert "No pixel has a good fit in both runs." in here(shell, "a.zarr", "b.zarr")
-
-
 def test_bad_input_gets_one_line(shell, finished):
     assert shell.refused(2, "compare", finished) == "pchem: compare: give two runs or more"
     RunStore.create(shell.folder / "empty.zarr")
     for name, words in (("nothing", "does not exist"), ("empty", "")):
         with pytest.raises(StoreError, match=rf"{name}\.zarr.*{words}"):
             here(shell, finished, f"{name}.zarr")
+    for limit, words in (
+        ("bais=3", "compare.bais: unknown key; did you mean bias?"),
+        ("bias", "write name=value, such as bias=0.5"),
+        ("bias=-1", "compare.bias: give a number from 0 on, or per cent"),
+        ("dark_current=5%", "compare.dark_current: .* has no such map; omit this limit"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            compared(shell, finished, finished, limits=[limit])
+    for each in ({"labels": ["one"]}, {"rate": 0.0}):
+        with pytest.raises(ConfigError, match="--"):
+            compared(shell, finished, finished, **each)

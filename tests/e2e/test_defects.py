@@ -82,6 +82,10 @@ def test_what_was_planted_is_found_and_nothing_else(sensor):
             assert float(row["usual"]) == pytest.approx(2.0, rel=0.02)
         if row["kind"] == "stuck":
             assert float(row["value"]) == 3000 + int(row["y"]) * SHAPE[1] + int(row["x"])
+    frame = open_run(folder / "run.zarr").defects()  # a notebook has the same table
+    assert list(frame.columns) == list(rows[0])
+    assert frame.kind.tolist() == [row["kind"] for row in rows]
+    assert frame.value.iloc[0] == pytest.approx(float(rows[0]["value"]))
 
 
 def test_regions_lie_on_the_pixels_of_the_maps(sensor):
@@ -121,15 +125,6 @@ def test_the_mask_excludes_faults_from_another_run(sensor):
     assert set(again[again != 0]) == {int(Defect.EXCLUDED)}
 
 
-def test_a_notebook_has_the_same_table(sensor):
-    folder, _ = sensor
-    frame = open_run(folder / "run.zarr").defects()
-    rows = table(folder / "export" / "defects.csv")
-    assert list(frame.columns) == list(rows[0])
-    assert frame.kind.tolist() == [row["kind"] for row in rows]
-    assert frame.query("kind == 'hot'").value.median() == pytest.approx(40.0, rel=0.05)
-
-
 def test_a_comparison_tells_what_is_new_gone_and_of_another_kind(sensor):
     folder, planted = sensor
     # the first hot pixel is stuck now, the last saturated one is ordinary, and another one is hot
@@ -156,10 +151,8 @@ def test_a_comparison_tells_what_is_new_gone_and_of_another_kind(sensor):
     assert changed["defects"] == {"new": 1, "gone": 1, "of_another_kind": 1, "pixels": expected}
     assert "Defects: 1 new, 1 gone, 1 of another kind." in changed["what"]
     row = table(folder / "compare" / "history.csv")[2]
-    assert [row[f"{kind}_pixels"] for kind in ("hot", "stuck", "saturated", "dead", "noisy")] == [
-        "12", "13", "5", "12", "12"
-    ]  # fmt: skip
+    counted = {"hot": "12", "stuck": "13", "saturated": "5", "dead": "12", "noisy": "12"}
+    assert row.items() >= {f"{kind}_pixels": n for kind, n in counted.items()}.items()
     [place] = (f"{each['y']}/{each['x']}" for each in expected if not each["now"])
     assert row["defects_gone"] == place
-    page = (folder / "compare" / "compare.html").read_text(encoding="utf-8")
-    assert "Defects that changed" in page
+    assert "Defects that changed" in (folder / "compare" / "compare.html").read_text(encoding="utf-8")

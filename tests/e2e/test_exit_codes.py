@@ -4,10 +4,9 @@ import shutil
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from helpers.commands import Shell
 
 from pchem_pipeline.base.errors import ExitCode
-from pchem_pipeline.cli.app import app
 
 CONFIG = "run: {{store: run.zarr, tile: 8}}\ninput: {{files: [a.npy, b.npy], mode: {mode}}}\n"
 
@@ -51,15 +50,9 @@ TABLE = {
 REFERENCED = {(_refused, _gone): {}, (_gone, _no_histogram): {"histogram": INPUT, "run": INPUT}}
 
 
-def _invoke(folder, command, *options):
-    until = ("--until", "histogram") if command == "run" else ()
-    place = ("--output", str(folder / command)) if command == "export" else ()
-    return CliRunner().invoke(app, [command, str(folder / "run.yaml"), *until, *place, *options])
-
-
 def _code(folder, command):
-    error = _invoke(folder, command).exception
-    return ExitCode.OK if error is None else getattr(error, "exit_code", ExitCode.INTERNAL)
+    until = ("--until", "histogram") if command == "run" else ()
+    return Shell(folder)(command, "run.yaml", *until).code
 
 
 @pytest.fixture(scope="module")
@@ -99,5 +92,5 @@ def test_missing_files_are_named_with_the_cure(counted, tmp_path):
     shutil.copytree(counted["copy"], tmp_path / "run")
     _gone(tmp_path / "run")
     _no_store(tmp_path / "run")
-    message = str(_invoke(tmp_path / "run", "ingest").exception)
+    message = Shell(tmp_path / "run").refused(INPUT, "ingest", "run.yaml")
     assert "a.npy and 1 more (last b.npy): no such file or folder; restore it" in message

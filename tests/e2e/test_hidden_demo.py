@@ -27,7 +27,4 @@ def test_a_hidden_effect_is_found_and_told(shell):
     assert float(plain[3]) - float(extended[3]) == pytest.approx(excess, rel=0.3)
     assert result["effects"] == ["row_noise"]
     assert "tag: row_noise" in (shell.folder / "out" / "demo.effects.yaml").read_text()
-    page = (run / "discrepancy.html").read_text(encoding="utf-8")
-    assert "What the model is missing" in page
-    for name in ("maps", "codes", "frames", "lines", "gap", "pulls"):
-        assert f'id="figure-discrepancy_{name}"' in page
+    assert "What the model is missing" in (run / "discrepancy.html").read_text(encoding="utf-8")

@@ -66,14 +66,9 @@ def joint(tmp_path_factory):
 
 def write(folder, name, samples, tile=8, **input_settings):
     path = folder / f"{name}.yaml"
-    lines = [
-        f"run: {{store: {name}.zarr, tile: {tile}}}",
-        "input:",
-        *(f"  {key}: {value}" for key, value in input_settings.items()),
-        "  samples:",
-        *(f"    - {{run: {sample}}}" for sample in samples),
-    ]
-    path.write_text("\n".join([*lines, ""]))
+    settings = "".join(f"  {key}: {value}\n" for key, value in input_settings.items())
+    listed = "".join(f"    - {{run: {sample}}}\n" for sample in samples)
+    path.write_text(f"run: {{store: {name}.zarr, tile: {tile}}}\ninput:\n{settings}  samples:\n{listed}")
     return path
 
 
@@ -106,32 +101,25 @@ def test_dark_current_is_the_slope_and_the_pulls_are_normal(joint):
     assert abs(p.mean() - 0.5) < 5 / np.sqrt(12 * p.size)
 
 
-def test_report_numbers_and_yaml_are_there(joint):
+def test_report_numbers_and_yaml_are_there_and_the_shown_sample(joint):
     numbers = json.loads((joint / "dark.zarr" / "report.json").read_text())
     assert numbers["samples"]["against"] == "integration_time"
     assert [each["x"] for each in numbers["samples"]["rows"]] == [1.0, 2.0, 5.0, None]
     assert 0.3 < numbers["summary"]["dark_current"]["median"] < 0.7
     page = (joint / "dark.zarr" / "report.html").read_text()
     for words in (
-        "Dark current as the slope of H",
-        "Variance against mean",
-        "spurious charge",
-        "dark_5s.zarr",
+        *("Dark current as the slope of H", "Variance against mean", "spurious charge", "dark_5s.zarr"),
         "4 samples; maps and ensemble show dark_5s.zarr",
     ):
         assert words in page
     assert 'id="figure-exposures"' in page
     assert "bias: true" in (joint / "dark.yaml").read_text()
-
-
-def test_the_shown_sample_stands_in_fit_and_maps(joint):
-    store = RunStore.open(joint / "dark.zarr")
-    shown = RunStore.open(joint / "dark_5s.zarr")
-    for name in ("fit", "maps"):
-        for end in ("", "_stderr"):
-            np.testing.assert_array_equal(
-                store.read(f"{name}/quanta_exposure{end}"), store.read(f"samples/quanta_exposure{end}")[2]
-            )
+    # the shown sample stands in fit and maps
+    store, shown = (RunStore.open(joint / f"{name}.zarr") for name in ("dark", "dark_5s"))
+    for end in ("", "_stderr"):
+        wanted = store.read(f"samples/quanta_exposure{end}")[2]
+        for name in ("fit", "maps"):
+            np.testing.assert_array_equal(store.read(f"{name}/quanta_exposure{end}"), wanted)
     np.testing.assert_array_equal(store.read("histogram/counts"), shown.read("histogram/counts"))
     assert store.has("ensemble/density")
 
@@ -188,13 +176,10 @@ def test_light_levels_and_no_line(joint):
 
 def test_what_looks_at_a_run_looks_at_this_one(joint, tmp_path):
     shell = Shell(joint)
-    assert (
-        "maps.fits"
-        in shell.ok("export", "dark.zarr", "-o", str(tmp_path), "--format", "fits,csv,defects").stdout
-    )
+    here = ("-o", tmp_path)
+    assert "maps.fits" in shell.ok("export", "dark.zarr", *here, "--format", "fits,csv,defects").stdout
     assert "spurious_charge" in (tmp_path / "summary.csv").read_text()
     shutil.copytree(joint / "dark.zarr", joint / "same.zarr")
-    here = ("-o", tmp_path)
     words = shell.ok("compare", "dark.zarr", "same.zarr", *here).stdout
     assert words == "no change\n"
     drawn = shell.ok("figures", "dark.zarr", *here, "--only", "exposures,pixel_fits").stdout
@@ -205,9 +190,8 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, tmp_path):
     assert "4 samples of 6,000 frames in all" in repr(run)
     assert run.pixel(2, 3).histogram.sum() == 1500
     assert "dark_current" in run.maps
-    answer = RunView(RunStore.open(joint / "dark.zarr")).answer(
-        "GET", "/api/pixel?y=2&x=3", {"host": "127.0.0.1:1"}, 1
-    )
+    view, host = RunView(RunStore.open(joint / "dark.zarr")), {"host": "127.0.0.1:1"}
+    answer = view.answer("GET", "/api/pixel?y=2&x=3", host, 1)
     assert answer.status == 200
     assert json.loads(answer.content)
     refused = shell.refused(4, "electrons", "dark.zarr")
@@ -264,23 +248,16 @@ def test_a_refused_list_leaves_its_name_free(joint):
     assert kept.exists()
 
 
-@pytest.mark.parametrize(
-    ("runs", "options", "words"),
-    [
+def test_what_is_no_joint_fit_says_so(joint):
+    for runs, options, words in (
         (["dark_1s.yaml"], {}, r"dark_1s\.yaml is a single run; a joint fit needs several"),
-        (["dark.yaml"], {"store": "x.zarr"}, "only with runs"),
-        (["dark_1s.yaml", "dark_2s.yaml"], {"store": "dark.zarr"}, "exists with other settings"),
+        (["dark.yaml"], {"store": joint / "x.zarr"}, "only with runs"),
+        (["dark_1s.yaml", "dark_2s.yaml"], {"store": joint / "dark.zarr"}, "exists with other settings"),
         (["nothing.yaml"], {}, "no such file"),
         (["dark.yaml"], {"against": "none"}, r"--against: only with runs; .*input\.against"),
-    ],
-)
-def test_what_is_no_joint_fit_says_so(joint, runs, options, words):
-    options = {name: joint / value if name == "store" else value for name, value in options.items()}
-    with pytest.raises(ConfigError, match=words):
-        find_joint([joint / run for run in runs], **options)
-
-
-def test_a_joint_fit_of_runs_may_be_without_a_line(joint):
+    ):
+        with pytest.raises(ConfigError, match=words):
+            find_joint([joint / run for run in runs], **options)
     runs = [joint / "dark_1s.yaml", joint / "dark_2s.yaml"]
     target, _ = find_joint(runs, store=joint / "unordered.zarr", against="none")
     assert target.config.input.against == "none"

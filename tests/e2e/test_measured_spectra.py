@@ -25,8 +25,7 @@ input:
 def measured(tmp_path_factory):
     """The spectra, run through every stage."""
     shell = Shell(tmp_path_factory.mktemp("measured"))
-    files = "".join(f"    - {path}\n" for path in SPECTRA)
-    (shell.folder / "sipm.yaml").write_text(YAML + files)
+    (shell.folder / "sipm.yaml").write_text(YAML + "".join(f"    - {path}\n" for path in SPECTRA))
     with undrawn():
         yield shell, shell.ok("run", "sipm.yaml")
 

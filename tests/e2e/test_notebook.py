@@ -49,12 +49,19 @@ def test_maps_are_lazy_and_know_their_units(run, store, finished):
         assert len(getattr(run, name).data_vars) > 3
     assert run.ensemble.density.coords["dn"].attrs["units"] == "DN"
     assert int(run.ensemble.counts.sum()) == int(store.read("ensemble/counts").sum())
-
-
-def test_the_model_is_told(run):
     [first] = run.model_versions
     assert (first.number, first.source, first.effects) == (1, "config", ())
     assert run.model == first
+
+
+def test_runs_and_figures_are_told_in_few_words(run):
+    first, answers, medians = repr(run).split("\n")
+    assert first == "<Run run.zarr: 20 x 28 pixels, 1,200 frames; complete>"
+    assert answers.startswith("Is the sensor within limits? ")
+    told = run.group("maps").attrs["summary"]["read_noise_e"]["median"]
+    assert f"median read noise {told:.4f} ± " in medians
+    assert len(repr(run.figures)) < 100 * len(run.figures)
+    assert repr(run.figures["ensemble"]) == "<Figure ensemble: Ensemble histogram and its prediction>"
 
 
 def test_masks_leave_out_what_is_not_to_be_believed(run, store):
@@ -84,12 +91,9 @@ def test_a_pixel_is_that_of_the_store(run, store):
     assert pixel.plot(width="60mm")._repr_png_().startswith(b"\x89PNG")
     assert pixel.plot().axes[0].get_title("left").startswith(f"pixel y = {y}, x = {x}\n")
     assert len(run.pixels([(0, 0), (1, 2)])) == 2
-
-
-@pytest.mark.parametrize("place", [(-1, 0), (20, 0), (0, 28)])
-def test_pixels_outside_are_refused(run, place):
-    with pytest.raises(ConfigError, match="is outside the sensor of 20 x 28"):
-        run.pixel(*place)
+    for place in ((-1, 0), (20, 0), (0, 28)):
+        with pytest.raises(ConfigError, match="is outside the sensor of 20 x 28"):
+            run.pixel(*place)
 
 
 def test_figures_are_those_of_pchem_figures(run, finished, tmp_path):
@@ -98,9 +102,7 @@ def test_figures_are_those_of_pchem_figures(run, finished, tmp_path):
     drawn = drawing_bytes(run.figure("electron_numbers"), "svg", dpi=600, title="Estimated electron numbers")
     assert drawn == (tmp_path / "electron_numbers.svg").read_bytes()
     assert run.figure("map_bias", width=60).get_figwidth() == pytest.approx(60 / 25.4)
-    with pytest.raises(
-        ConfigError, match="this run has no figure nothing; it has electron_cells, pixel_fits"
-    ):
+    with pytest.raises(ConfigError, match="has no figure nothing; it has electron_cells, pixel_fits"):
         run.figure("nothing")
 
 
@@ -124,19 +126,13 @@ def test_plots_go_into_axes_of_the_user(run):
         others = Figure().subplots(1, sum(len(stack.panels) for stack in found.chart.stacks))
         assert run.figure(name, ax=others) is others
         assert all(each.has_data() for each in np.ravel(others))
-
-
-@pytest.mark.parametrize(
-    ("ax", "words"),
-    [
+    for ax, words in (
         (Figure(), "ax: Figure; give 1 axes of matplotlib"),
         (Figure().subplots(3), r"ax: Axes, Axes, Axes; give 2 axes .* plt\.subplots\(2\)"),
         ([], "ax: nothing; give 2 axes"),
-    ],
-)
-def test_other_axes_are_refused(run, ax, words):
-    with pytest.raises(ConfigError, match=words):
-        run.pixel(3, 5).plot(ax=ax)
+    ):
+        with pytest.raises(ConfigError, match=words):
+            pixel.plot(ax=ax)
 
 
 def test_the_table_has_a_row_for_each_pixel(run, store):
@@ -170,20 +166,14 @@ def test_frames_in_memory_are_calibrated_as_files_are(run, camera, tmp_path):
     assert (tmp_path / "night.zarr" / "applied" / "electrons" / "zarr.json").stat().st_mtime_ns == made
     assert not again.electrons.variable._in_memory
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(kept)).electrons, found.electrons)
-
-
-@pytest.mark.parametrize(
-    ("frames", "error", "words"),
-    [
-        (np.zeros((3, 4, 5), np.uint16), InputError, "frames of 4 x 5 pixels, the run run.zarr has 20 x 28"),
+    for wrong, error, words in (
+        (frames[:, :4, :5], InputError, "frames of 4 x 5 pixels, the run run.zarr has 20 x 28"),
         (np.zeros((3, 20, 28)), ConfigError, "frames of float64: PCH-EM needs raw DN"),
         (np.zeros(7, int), ConfigError, r"frames of shape \(7,\): give an array \(frame, y, x\)$"),
         ([], ConfigError, "input.files is empty"),
-    ],
-)
-def test_what_is_no_frame_of_the_run_is_refused(run, frames, error, words):
-    with pytest.raises(error, match=words):
-        run.apply(frames)
+    ):
+        with pytest.raises(error, match=words):
+            run.apply(wrong)
 
 
 def test_all_that_a_run_returns_is_pickled(run):
@@ -201,17 +191,7 @@ def test_all_that_a_run_returns_is_pickled(run):
         assert copy(run.figure(name))._repr_png_() == run.figure(name)._repr_png_()
 
 
-def test_they_are_told_in_few_words(run):
-    first, answers, medians = repr(run).split("\n")
-    assert first == "<Run run.zarr: 20 x 28 pixels, 1,200 frames; complete>"
-    assert answers.startswith("Is the sensor within limits? ")
-    told = run.group("maps").attrs["summary"]["read_noise_e"]["median"]
-    assert f"median read noise {told:.4f} ± " in medians
-    assert len(repr(run.figures)) < 100 * len(run.figures)
-    assert repr(run.figures["ensemble"]) == "<Figure ensemble: Ensemble histogram and its prediction>"
-
-
-def test_what_is_missing_is_said(run, finished, tmp_path, monkeypatch):
+def test_what_is_missing_or_damaged_is_said(run, finished, tmp_path, monkeypatch):
     with pytest.raises(StoreError, match="has no truth yet; for the state of the run: pchem status"):
         _ = run.truth
     with pytest.raises(StoreError, match="does not exist"):
@@ -219,12 +199,6 @@ def test_what_is_missing_is_said(run, finished, tmp_path, monkeypatch):
     with pytest.raises(StoreError, match=r"not searched for yet; run: pchem discrepancy .*run\.yaml"):
         _ = run.verdict
     assert run.status()["report"] == "complete"
-    monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(MissingDependencyError, match="pip install 'xarray>="):
-        pchem_pipeline.open_run(finished)
-
-
-def test_files_of_another_kind_are_damage(finished, tmp_path):
     path = shutil.copytree(finished, tmp_path / "a.zarr")
     (path / "report.json").write_text("[1]")
     shutil.copy(path / "fit/correlation/zarr.json", path / "fit/bias/zarr.json")
@@ -233,9 +207,12 @@ def test_files_of_another_kind_are_damage(finished, tmp_path):
         damaged._repr_html_()
     with pytest.raises(StoreError, match=r"fit is damaged \(.*\); run it again: pchem fit .* --force"):
         _ = damaged.fit
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(MissingDependencyError, match="pip install 'xarray>="):
+        pchem_pipeline.open_run(finished)
 
 
-def test_the_tutorial_runs(finished, tmp_path):
+def test_the_tutorial_runs(finished, store, tmp_path):
     (tmp_path / "pchem-demo").mkdir()
     shutil.copytree(finished, tmp_path / "pchem-demo" / "demo.zarr")
     shutil.copy(TUTORIAL, tmp_path)
@@ -249,9 +226,7 @@ def test_the_tutorial_runs(finished, tmp_path):
     cells = json.loads((tmp_path / "tutorial.ipynb").read_text())["cells"]
     outputs = [output for cell in cells for output in cell.get("outputs", [])]
     text = "".join("".join(output.get("text", [])) for output in outputs)
-    median = np.median(
-        RunStore.open(finished).read("maps/bias")[RunStore.open(finished).read("maps/quality") == 0]
-    )
+    median = np.median(store.read("maps/bias")[store.read("maps/quality") == 0])
     assert f"bias             {median:9.4f} DN" in text
     kinds = [kind for output in outputs for kind in output.get("data", {})]
     assert kinds.count("image/png") == 4  # nothing is shown twice

@@ -97,14 +97,10 @@ def test_frames_are_read_from_s3_and_fetched_once(cloud, server, camera, finishe
     assert cloud.states("run.yaml")["ingest"] == "stale - the input has changed"
 
 
-@pytest.mark.parametrize(
-    ("url", "words"), [("s3://lab/none/*.tif", "no such file"), ("s3://elsewhere/a.tif", "no such file")]
-)
-def test_what_is_not_there_is_one_line(cloud, url, words):
+@pytest.mark.parametrize("url", ["s3://lab/none/*.tif", "s3://elsewhere/a.tif"])
+def test_what_is_not_there_is_one_line(cloud, url):
     (cloud.folder / "run.yaml").write_text(RUN.replace("frames/*.tif", f'"{url}"'))
-    said = cloud.refused(4, "ingest", "run.yaml")
-    assert said.startswith("pchem: ")
-    assert words in said
+    assert re.match("pchem: .*no such file", cloud.refused(4, "ingest", "run.yaml"))
 
 
 STORED = (
@@ -124,8 +120,7 @@ def test_a_server_that_does_not_answer_is_one_line(shell, keys, frames, text):
     (shell.folder / "run.yaml").write_text(text)
     result = shell.alone(**keys)("ingest", "run.yaml")
     assert result.code == 4
-    assert result.last.startswith("pchem: s3://lab/")
-    assert "check address, keys and network" in result.last
+    assert re.match("pchem: s3://lab/.*check address, keys and network", result.last)
     assert "Traceback" not in result.stderr
     assert SECRET not in result.stderr
 

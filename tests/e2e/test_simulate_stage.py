@@ -46,10 +46,7 @@ def simulated(target, **options):
 
 
 def frames_of(target):
-    reader = open_frames(target.config.input, target.base_dir)
-    frames = np.empty(reader.shape, reader.dtype)
-    reader.read_into(frames, 0, reader.shape[0])
-    return frames
+    return open_frames(target.config.input, target.base_dir).read()
 
 
 def expected(target):
@@ -58,49 +55,38 @@ def expected(target):
 
 
 @pytest.mark.parametrize(
-    ("format", "frames_per_file"),
-    [("tiff", None), *((each, 5) for each in ("tiff", "fits", "hdf5", "npy", "raw", "zarr"))],
+    ("format", "n_files", "backend", "limits", "options"),
+    [
+        ("tiff", 1, "threads", {}, {}),
+        *((each, 5, "threads", {}, {}) for each in ("tiff", "fits", "hdf5", "npy", "raw", "zarr")),
+        ("raw", 2, "processes", {}, {}),
+        ("raw", 1, "threads", {"_BUDGET": 1, "_CHUNK": 3 * 4 * 9 * 11}, {}),  # small blocks
+        ("raw", 23, "serial", {"_MOST_UNITS": 4}, {}),  # many files share few units
+        ("raw", 1, "serial", {}, {"roi": (0, 1, 0, 1)}),  # a region leaves no frames out
+    ],
 )
-def test_every_format_holds_the_frames_and_the_store_the_truth(tmp_path, format, frames_per_file):
-    target = prepare(tmp_path, backend="threads", format=format, frames_per_file=frames_per_file)
-    assert simulated(target) == "complete"
+def test_formats_blocks_units_and_processes_hold_the_same_frames_and_the_store_the_truth(
+    tmp_path, monkeypatch, format, n_files, backend, limits, options
+):
+    for name, value in limits.items():
+        monkeypatch.setattr(stage, name, value)
+    per_file = None if n_files == 1 else -(-23 // n_files)
+    target = prepare(tmp_path, backend=backend, format=format, frames_per_file=per_file)
+    assert simulated(target, **options) == "complete"
     dn, electrons = expected(target)
     np.testing.assert_array_equal(frames_of(target), dn)
     store = RunStore.open(target.store)
     np.testing.assert_array_equal(store.read("truth/electron_number"), electrons[:10])
     maps = draw_truth(target.config.simulate).arrays()
     with np.load(tmp_path / "frames" / "truth.npz", allow_pickle=False) as beside:
-        assert len(beside["files"]) == (1 if frames_per_file is None else 5)
+        assert len(beside["files"]) == n_files
         for name, values in maps.items():
             np.testing.assert_array_equal(store.read(f"truth/{name}"), values)
             np.testing.assert_array_equal(beside[name], values)
-
-
-def test_integration_time_and_bit_depth_travel_with_the_files(tmp_path):
-    target = prepare(tmp_path, format="tiff")
-    simulated(target)
-    bare = target.changed("input", integration_time=None, bit_depth=None)
-    reader = open_frames(bare.config.input, target.base_dir)
-    assert (reader.integration_time, reader.bit_depth) == (2.5, 12)
-
-
-@pytest.mark.parametrize(
-    ("backend", "limits", "n_files"),
-    [
-        ("processes", {}, 2),
-        ("threads", {"_BUDGET": 1, "_CHUNK": 3 * 4 * 9 * 11}, 1),  # small blocks
-        ("serial", {"_MOST_UNITS": 4}, 23),  # many files share few units
-    ],
-)
-def test_blocks_units_and_processes_give_the_same_frames(tmp_path, monkeypatch, backend, limits, n_files):
-    for name, value in limits.items():
-        monkeypatch.setattr(stage, name, value)
-    target = prepare(tmp_path, backend=backend, frames_per_file=-(-23 // n_files))
-    assert simulated(target) == "complete"
-    dn, electrons = expected(target)
-    np.testing.assert_array_equal(frames_of(target), dn)
-    np.testing.assert_array_equal(RunStore.open(target.store).read("truth/electron_number"), electrons[:10])
-    assert len(list((tmp_path / "frames").glob("*.raw"))) == n_files
+    if format == "tiff":  # integration time and bit depth travel with the files
+        bare = target.changed("input", integration_time=None, bit_depth=None)
+        reader = open_frames(bare.config.input, target.base_dir)
+        assert (reader.integration_time, reader.bit_depth) == (2.5, 12)
 
 
 def test_a_failed_run_goes_on_where_it_was(tmp_path, monkeypatch):
@@ -123,12 +109,6 @@ def test_a_failed_run_goes_on_where_it_was(tmp_path, monkeypatch):
     np.testing.assert_array_equal(frames_of(target), expected(target)[0])
     assert simulated(target) == "complete"
     assert len(written) == 6
-
-
-def test_regions_do_not_leave_frames_out(tmp_path):
-    target = prepare(tmp_path)
-    assert simulated(target, roi=(0, 1, 0, 1)) == "complete"
-    np.testing.assert_array_equal(frames_of(target), expected(target)[0])
 
 
 def test_a_changed_setting_replaces_the_old_files_and_nothing_else(tmp_path):
@@ -160,15 +140,12 @@ def test_a_folder_of_other_files_is_left_alone(tmp_path, name, content):
     assert (tmp_path / "frames" / name).read_bytes() == content
 
 
-def test_a_disk_too_small_is_noticed_before_the_work(tmp_path):
+def test_a_missing_section_and_a_disk_too_small_are_noticed_before_the_work(tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("input: {files: [nothing.tif]}\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match="no section simulate"):
+        simulated(find_run(path))
     target = prepare(tmp_path, n_frames=10**12, truth_frames=0)
     with pytest.raises(StoreError, match="GB are free"):
         simulated(target)
     assert not list((tmp_path / "frames").iterdir())
-
-
-def test_a_run_without_the_section_says_so(tmp_path):
-    path = tmp_path / "config.yaml"
-    path.write_text("input: {files: [nothing.tif]}\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match="no section simulate"):
-        run_stages(find_run(path), ["simulate"], Command(quiet=True))

@@ -4,7 +4,6 @@ import shutil
 import subprocess
 import sys
 
-import pytest
 from helpers.commands import imported_by
 
 #: what takes a tenth of a second or more to import, or draws such things in
@@ -16,24 +15,20 @@ HEAVY = {
 MIDDLING = {"numpy", "zarr", "pydantic", "yaml"}
 
 
-@pytest.fixture
-def store(finished, tmp_path):
-    return shutil.copytree(finished, tmp_path / "run.zarr")
-
-
 def test_help_imports_next_to_nothing():
     assert not imported_by("--help") & (HEAVY | MIDDLING)
     # the command line library loads pydantic by itself where it is installed
     assert not imported_by("run", "--help") & (HEAVY | MIDDLING - {"pydantic", "numpy"})
 
 
-def test_status_imports_nothing_that_computes(store):
-    found = imported_by("status", store)
+def test_status_imports_nothing_that_computes(finished):
+    found = imported_by("status", finished)
     assert not found & HEAVY
     assert found >= MIDDLING  # the list of imports is read right
 
 
-def test_fit_imports_its_kernels_and_not_those_who_draw_or_read_cameras(store):
+def test_fit_imports_its_kernels_and_not_those_who_draw_or_read_cameras(finished, tmp_path):
+    store = shutil.copytree(finished, tmp_path / "run.zarr")
     found = imported_by("fit", store, "--force", "--quiet", "--backend", "serial")
     assert "numba" in found
     assert not found & (HEAVY - {"numba", "scipy"})

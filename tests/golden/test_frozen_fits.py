@@ -41,8 +41,6 @@ SETTINGS = {
 }
 SAMPLES = (1.0, 3.0, 8.0, 0.0)  # exposures of a joint fit, relative; the last holds no electrons
 
-HISTOGRAM = ("counts", "origin")
-
 
 def fitted(kind, histograms):
     """Fit the frozen histograms through the package's interface; arrays by name, the pixel first."""
@@ -55,11 +53,10 @@ def fitted(kind, histograms):
         found = {each.name: getattr(fit, each.name) for each in fields(fit) if each.name != "intervals"}
         variances = np.diagonal(fit.covariance, axis1=1, axis2=2)
         errors = [variances[:, : len(SAMPLES)], *variances[:, len(SAMPLES) :].T]
-        return found | {
-            f"{name}_stderr": np.sqrt(each) for name, each in zip(PARAMETERS, errors, strict=True)
-        }
+        named = zip(PARAMETERS, errors, strict=True)
+        return found | {f"{name}_stderr": np.sqrt(each) for name, each in named}
     sample = "coarse" if kind in ("exact", "auto") else "fine"
-    counts, origin = (histograms[f"{sample}_{name}"] for name in HISTOGRAM)
+    counts, origin = histograms[f"{sample}_counts"], histograms[f"{sample}_origin"]
     nothing = np.zeros((counts.shape[0], 1), np.uint32)
     tile = {"counts": counts[:, None], "origin": origin[:, None], "under": nothing, "over": nothing}
     effects = [effect_class(each["tag"])(**each) for each in EFFECTS] if kind == "effects" else []
@@ -112,10 +109,8 @@ def differences(old, new):
         left, right = old[name], new[name]
         with np.errstate(invalid="ignore"):
             same = (np.abs(right - left) <= allowed) | (left == right) | (np.isnan(left) & np.isnan(right))
-        off = np.argwhere(~(same | ~np.broadcast_to(chosen, same.shape)))
-        wrong.extend(
-            f"{name}{place}: {left[tuple(place)]} -> {right[tuple(place)]}" for place in off.tolist()
-        )
+        off = np.argwhere(~same & chosen)
+        wrong.extend(f"{name}{at}: {left[tuple(at)]} -> {right[tuple(at)]}" for at in off.tolist())
 
     within("fit_status", 0)
     good = (old["fit_status"] & int(FAILED)) == 0

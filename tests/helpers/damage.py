@@ -22,11 +22,9 @@ def damaged(content, rng):
 def _place(content, rng, size=1):
     """Draw a place for ``size`` bytes, often near the ends, where headers and tables are."""
     last = max(0, len(content) - size)
-    reach = min(last, 400)
     where = rng.integers(3)
-    if where == 0:
-        return int(rng.integers(last + 1))
-    return int(rng.integers(reach + 1)) if where == 1 else last - int(rng.integers(reach + 1))
+    away = int(rng.integers((last if where == 0 else min(last, 400)) + 1))
+    return last - away if where == 2 else away
 
 
 def flip_bits(content, rng):
@@ -34,16 +32,21 @@ def flip_bits(content, rng):
         content[_place(content, rng)] ^= 1 << int(rng.integers(8))
 
 
-def change_bytes(content, rng):
-    size = int(rng.integers(1, 33))
+def _part(content, rng, end):
+    """Draw a part of fewer than so many bytes; return it with its length."""
+    size = int(rng.integers(1, end))
     place = _place(content, rng, size)
-    content[place : place + size] = rng.bytes(min(size, len(content) - place))
+    return slice(place, place + size), min(size, len(content) - place)
+
+
+def change_bytes(content, rng):
+    part, size = _part(content, rng, 33)
+    content[part] = rng.bytes(size)
 
 
 def zero_block(content, rng):
-    size = int(rng.integers(1, max(2, len(content) // 3)))
-    place = _place(content, rng, size)
-    content[place : place + size] = bytes(min(size, len(content) - place))
+    part, size = _part(content, rng, max(2, len(content) // 3))
+    content[part] = bytes(size)
 
 
 def cut(content, rng):
@@ -51,9 +54,7 @@ def cut(content, rng):
 
 
 def remove(content, rng):
-    size = int(rng.integers(1, 65))
-    place = _place(content, rng, size)
-    del content[place : place + size]
+    del content[_part(content, rng, 65)[0]]
 
 
 def insert(content, rng):

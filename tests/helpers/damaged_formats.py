@@ -7,6 +7,7 @@ process and prints a line of JSON after each: the next one is that to which a cr
 import contextlib
 import faulthandler
 import json
+import re
 import resource
 import shutil
 import signal
@@ -79,15 +80,13 @@ def _ser(path, dtype="uint16", times=True):
 
 def _raw_yaml(path):
     (path / "a.raw").write_bytes(bytes(16) + frames().tobytes())
-    (path / "a.raw.yaml").write_text(
-        "shape: [6, 8, 9]\ndtype: uint16\nheader_bytes: 16\nintegration_time: 2.5\n"
-    )
+    words = "shape: [6, 8, 9]\ndtype: uint16\nheader_bytes: 16\nintegration_time: 2.5\n"
+    (path / "a.raw.yaml").write_text(words)
 
 
 def _csv(path, mark=","):
-    (path / "a.csv").write_text(
-        f"dn{mark}a{mark}b\n" + "".join(f"{d}{mark}{9 * d}{mark}7\n" for d in range(90, 130))
-    )
+    rows = [("dn", "a", "b"), *((d, 9 * d, 7) for d in range(90, 130))]
+    (path / "a.csv").write_text("".join(mark.join(map(str, row)) + "\n" for row in rows))
 
 
 def _npz(path):
@@ -111,14 +110,6 @@ SEEDS = {layout: lambda p, layout=layout: write(p, layout, frames()) for layout 
     "histogram, semicolons": lambda p: _csv(p, ";"),
     "histogram, npz": _npz,
 }
-
-
-def write_seeds(folder):
-    """Write the undamaged files, each layout into a folder of its own."""
-    for number, written in enumerate(SEEDS.values()):
-        place = folder / str(number)
-        place.mkdir(parents=True)
-        written(place)
 
 
 # -- a case ------------------------------------------------------------------------------------------------
@@ -161,9 +152,8 @@ def layout_of(number):
 def make_case(seeds, number, place):
     """Write the damaged files of a case to a folder; return it."""
     rng = np.random.default_rng([14, number])
-    source = seeds / str(number % len(SEEDS))
     shutil.rmtree(place, ignore_errors=True)
-    shutil.copytree(source, place)
+    shutil.copytree(seeds / str(number % len(SEEDS)), place)
     files = sorted(path for path in place.rglob("*") if path.is_file())
     victim = files[int(rng.integers(len(files)))]
     victim.write_bytes(damaged(victim.read_bytes(), rng))
@@ -203,10 +193,7 @@ def read_all(place):
 
 
 def peak_memory():
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) << 10
-    return 0
+    return int(re.search(r"VmHWM:\s*(\d+)", Path("/proc/self/status").read_text())[1]) << 10
 
 
 def forget_peak():
@@ -269,8 +256,7 @@ def main(folder, first, end):
     seeds = Path(folder) / "seeds"
     expected = {name: read_all(seeds / str(i)) for i, name in enumerate(SEEDS)}
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    limit = size + 3 * MEMORY
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_AS, 2 * (size + 3 * MEMORY,))
     print("ready", flush=True)
     for number in range(int(first), int(end)):
         # a hang below Python, where no alarm is heard, ends the process
@@ -284,8 +270,10 @@ def main(folder, first, end):
 def run_cases(folder, first, end):
     """Yield the `Case` of each number ``first`` to ``end``; a process that dies is replaced by another."""
     seeds = folder / "seeds"
-    if not seeds.exists():
-        write_seeds(seeds)
+    if not seeds.exists():  # each layout into a folder of its own
+        for number, written in enumerate(SEEDS.values()):
+            (seeds / str(number)).mkdir(parents=True)
+            written(seeds / str(number))
     while first < end:
         command = [sys.executable, "-m", "helpers.damaged_formats", str(folder), str(first), str(end)]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}

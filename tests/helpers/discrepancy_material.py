@@ -74,10 +74,12 @@ def time_series(
     sd_k = np.sqrt(np.nansum(charge_std**2)) / h_sum
     sd_r = np.sqrt(np.nansum(readout_std**2)) / n_good
     position = kept / kept[-1] - 0.5
-    row_sd = np.sqrt(np.nansum(readout_std**2, axis=1)) / usable.sum(axis=1)
-    column_sd = np.sqrt(np.nansum(readout_std**2, axis=0)) / usable.sum(axis=0)
-    row_k = np.sqrt(np.nansum(charge_std**2, axis=1)) / usable.sum(axis=1)
-    column_k = np.sqrt(np.nansum(charge_std**2, axis=0)) / usable.sum(axis=0)
+    row_sd, column_sd, row_k, column_k = (
+        np.sqrt(np.nansum(values**2, axis=axis)) / usable.sum(axis=axis)
+        for values in (readout_std, charge_std)
+        for axis in (1, 0)
+    )
+    pairs = [f"{axis}.{pair}" for axis in "xy" for pair in ("kk", "rr", "rk")]
     pickup = 1.6 * np.sin(2 * np.pi * (0.17 * np.arange(ny)[None, :] + 0.031 * np.arange(n)[:, None]))
     blocks = (starts.size, ny, nx)
     return TimeSeries(
@@ -100,15 +102,11 @@ def time_series(
         lag_readout=(rng.standard_normal((3, ny, nx)) / np.sqrt(n)).astype(np.float32),
         lag_readout_charge=(rng.standard_normal(shape) / np.sqrt(n)).astype(np.float32),
         n_pairs=n,
-        neighbours={f"{axis}.{pair}": 0.0 for axis in "xy" for pair in ("kk", "rr", "rk")},
+        neighbours=dict.fromkeys(pairs, 0.0),
         repeated=np.empty(0, np.int64),
         repeated_rows=0,
         hits=np.empty((0, 4), np.int64),
-        neighbour_maps={
-            f"{axis}.{pair}": rng.standard_normal(shape).astype(np.float32)
-            for axis in "xy"
-            for pair in ("kk", "rr", "rk")
-        },
+        neighbour_maps={pair: rng.standard_normal(shape).astype(np.float32) for pair in pairs},
     )
 
 
@@ -119,26 +117,26 @@ def _candidates(*scored: tuple[str, float, float, float]) -> list[dict[str, Any]
     ]
 
 
+PULLS = {
+    "space.row.readout.variance": (84.0, 1.1),
+    "frame.readout.trend": (-31.2, -0.4),
+    "code.alternating": (22.5, 2.2),
+    "frame.readout.slow": (14.1, -1.3),
+    "space.row.readout.lag1": (-9.8, 0.2),
+    "shape.He4.cnt": (8.0, 0.9),
+    "code.top": (6.1, -1.7),
+    "shape.goodness.mean": (-5.2, 0.1),
+    "space.x.rr": (4.9, 1.2),
+    "frame.readout.variance": (4.4, -0.8),
+    "shape.C2.mean": (-4.3, 2.6),
+    "tail.low.count": (3.1, 0.5),
+}
+
+
 def _pulls(extended: bool) -> list[dict[str, Any]]:
-    befores = (84.0, -31.2, 22.5, 14.1, -9.8, 8.0, 6.1, -5.2, 4.9, 4.4, -4.3, 3.1)
-    afters = (1.1, -0.4, 2.2, -1.3, 0.2, 0.9, -1.7, 0.1, 1.2, -0.8, 2.6, 0.5)
-    names = [
-        "space.row.readout.variance",
-        "frame.readout.trend",
-        "code.alternating",
-        "frame.readout.slow",
-        "space.row.readout.lag1",
-        "shape.He4.cnt",
-        "code.top",
-        "shape.goodness.mean",
-        "space.x.rr",
-        "frame.readout.variance",
-        "shape.C2.mean",
-        "tail.low.count",
-    ]
     return [
         {"statistic": n, "sentence": STATISTICS[n].sentence, "before": b, "after": a if extended else None}
-        for n, b, a in zip(names, befores, afters, strict=True)
+        for n, (b, a) in PULLS.items()
     ]
 
 
@@ -268,10 +266,10 @@ def verdict_of(verdict: str, **changes: Any) -> Verdict:
 def discrepancy_data(verdict: str = "named", **changes: Any) -> DiscrepancyData:
     """What the page is drawn from."""
     seen = evidence()
-    pulls = [] if verdict == "consistent" else _pulls(extended=True)
-    before = seen.z | {pull["statistic"]: pull["before"] for pull in pulls}
+    pulls = {} if verdict == "consistent" else PULLS
+    before = seen.z | {name: pull[0] for name, pull in pulls.items()}
     after = {name: float(np.tanh(z)) for name, z in seen.z.items()}
-    after |= {pull["statistic"]: pull["after"] for pull in pulls}
+    after |= {name: pull[1] for name, pull in pulls.items()}
     arrays = evidence_arrays(seen, before, after=after if verdict in ("named", "named_in_part") else None)
     if verdict == "named":
         position = arrays["frame_number"] / arrays["frame_number"][-1] - 0.5

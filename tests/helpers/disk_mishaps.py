@@ -102,13 +102,12 @@ class ForgetfulDisk:
 
     def _kept(self, log):
         """Return the numbers of changes of names in folders that were synced later."""
-        kept = set()
-        for i, (name, *arguments) in enumerate(log):
-            if name in ("replace", "remove", "remove_tree"):
-                folder = arguments[-1].parent
-                if ("sync_folder", folder) in log[i:]:
-                    kept.add(i)
-        return kept
+        return {
+            i
+            for i, (name, *arguments) in enumerate(log)
+            if name in ("replace", "remove", "remove_tree")
+            and ("sync_folder", arguments[-1].parent) in log[i:]
+        }
 
 
 def _is_synced(log):

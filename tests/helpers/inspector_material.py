@@ -55,12 +55,6 @@ def inspector_of(
     return inspector_data(store.path.name, shape, entries, sample)
 
 
-def inspected(store: RunStore, data: ReportData) -> ReportData:
-    """Return the same report with its inspector."""
-    inspector = inspector_of(store, data.maps, data.fit, [(0, 0)])
-    return replace(data, inspector=lambda: inspector, pixels=data.pixels[:1])
-
-
 def make_run(
     folder: Path,
     shape: tuple[int, int] = (70, 90),
@@ -72,7 +66,9 @@ def make_run(
     """Write a run of a simulated sensor with its report."""
     data = replace(report_data(shape, failed=failed), **changes)  # type: ignore[arg-type]
     store = write_run(folder, data, n_frames=n_frames)
-    store.write_file("report.html", page_without_pictures(inspected(store, data)).encode())
+    inspector = inspector_of(store, data.maps, data.fit, [(0, 0)])
+    page = page_without_pictures(replace(data, inspector=lambda: inspector, pixels=data.pixels[:1]))
+    store.write_file("report.html", page.encode())
     for stage in ("histogram", "fit", "maps", "ensemble", "report"):
         store.records.write(StageRecord(stage, 1, "made", {}, finished=True))
     return store

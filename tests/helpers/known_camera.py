@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm, poisson
+from helpers.plain_law import joint_mass
 
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.use.calibration import Calibration
@@ -57,15 +57,13 @@ class KnownCamera:
         """Return the least probability of a wrong electron number of each pixel (Bayes), by plain sums."""
         out = np.empty(self.bias.shape)
         for place in np.ndindex(*out.shape):
-            h, g, mu, s = (
-                float(np.broadcast_to(v, out.shape)[place])
-                for v in (exposure, self.gain, self.bias, self.read_noise_e)
-            )
-            k = np.arange(int(h + 12 * np.sqrt(h + 1) + 12))[:, None]
-            dn = np.arange(int(mu - 8 * s / g - 3), int(mu + (k[-1, 0] + 8 * s) / g + 3))
-            edges = (np.append(dn - 0.5, dn[-1] + 0.5) - mu - k / g) / (s / g)
-            joint = poisson.pmf(k, h) * np.diff(norm.cdf(edges), axis=1)
-            out[place] = 1.0 - joint.max(axis=0).sum()
+            theta = [
+                np.broadcast_to(v, out.shape)[place] for v in (exposure, self.gain, self.bias, self.sigma)
+            ]
+            h, g, mu, sigma = theta
+            n_k = int(h + 12 * np.sqrt(h + 1) + 12)
+            dn = np.arange(int(mu - 8 * sigma - 3), int(mu + n_k / g + 8 * sigma + 3))
+            out[place] = 1.0 - joint_mass(dn, *theta, n_k).max(axis=0).sum()
         return out
 
 

@@ -22,14 +22,6 @@ class Theta(NamedTuple):
     sigma: float
 
 
-class Sums(NamedTuple):
-    """A_t, B_t and C_t of eq. update_matrices."""
-
-    a: float
-    b: float
-    c: float
-
-
 def log_joint(x: Array, theta: Theta) -> Array:
     """Logarithm of each term of eq. X_density, shape (N, k)."""
     last = int(
@@ -46,27 +38,16 @@ def log_likelihood(x: Array, theta: Theta) -> float:
     return float(logsumexp(log_joint(x, theta), axis=1).sum())
 
 
-def memberships(x: Array, theta: Theta) -> Array:
-    """gamma_nk, eq. gamma_nk, shape (N, k)."""
+def em_step(x: Array, theta: Theta) -> Theta:
+    """Eqs. gamma_nk, update_matrices and update_eqns."""
     joint = log_joint(x, theta)
-    return np.exp(joint - logsumexp(joint, axis=1, keepdims=True))
-
-
-def e_step(x: Array, theta: Theta) -> Sums:
-    """Eq. update_matrices."""
-    gamma = memberships(x, theta)
+    gamma = np.exp(joint - logsumexp(joint, axis=1, keepdims=True))
     k = np.arange(gamma.shape[1])
     mean_k = gamma @ k
-    return Sums(float(mean_k.mean()), float((gamma @ k**2).mean()), float((x * mean_k).mean()))
-
-
-def em_step(x: Array, theta: Theta) -> Theta:
-    """Eq. update_eqns."""
-    a, b, c = e_step(x, theta)
+    a, b, c = float(mean_k.mean()), float((gamma @ k**2).mean()), float((x * mean_k).mean())
     gain = (b - a**2) / (c - x.mean() * a)
-    bias = x.mean() - a / gain
     variance = (x**2).mean() - x.mean() ** 2 - (b - a**2) / gain**2
-    return Theta(a, gain, bias, float(np.sqrt(variance)))
+    return Theta(a, gain, x.mean() - a / gain, float(np.sqrt(variance)))
 
 
 def em(x: Array, theta: Theta, n_iterations: int) -> list[Theta]:

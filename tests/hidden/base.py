@@ -28,9 +28,11 @@ class Hidden:
     warmup: ClassVar[int] = 0
     order: ClassVar[int] = 0
 
-    def __init_subclass__(cls) -> None:
-        """Name the effect."""
+    def __init_subclass__(cls, **attributes: Any) -> None:
+        """Name the effect, and set what is said of it beside its base."""
         cls.tag = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+        for name, value in attributes.items():
+            setattr(cls, name, value)
 
     def __init__(self, rng: np.random.Generator, sensor: Sensor, level: float):
         """Draw the sub-parameters of the effect for a sensor."""

@@ -44,22 +44,13 @@ class Hiding:
 
     def key(self) -> dict[str, Any]:
         """What to seal."""
-        return {
-            "seed": self.seed,
-            "shape": list(self.sensor.shape),
-            "n_frames": self.sensor.n_frames,
-            "bits": self.sensor.bits,
-            "effects": [
-                {
-                    "tag": effect.tag,
-                    "level": effect.level,
-                    "strength": effect.strength,
-                    "parameters": effect.parameters,
-                    "affected_pixels": int(effect.affected.sum()),
-                }
-                for effect in self.effects
-            ],
-        }
+        names = ("tag", "level", "strength", "parameters")
+        effects = [
+            {name: getattr(effect, name) for name in names} | {"affected_pixels": int(effect.affected.sum())}
+            for effect in self.effects
+        ]
+        facts = {"n_frames": self.sensor.n_frames, "bits": self.sensor.bits, "effects": effects}
+        return {"seed": self.seed, "shape": list(self.sensor.shape), **facts}
 
     def seal(self, path: Path) -> None:
         """Write the key, and the maps beside it (.npz)."""
@@ -114,24 +105,18 @@ def hide(
 def _one_frame(
     t: int, sensor: Sensor, effects: tuple[Hidden, ...], light: np.random.Generator, dark: np.random.Generator
 ) -> np.ndarray:
-    h = sensor.exposure
-    for effect in effects:
-        h = effect.exposure(t, h)
-    k = light.poisson(h)
-    for effect in effects:
-        k = effect.electrons(t, k)
-    v = k.astype(float)
-    for effect in effects:
-        v = effect.signal(t, v)
-    n = sensor.noise * dark.standard_normal(sensor.shape)
-    for effect in effects:
-        n = effect.noise(t, n, k)
+    def through(hook: str, value: np.ndarray, *more: np.ndarray) -> np.ndarray:
+        for effect in effects:
+            value = getattr(effect, hook)(t, value, *more)
+        return value
+
+    k = through("electrons", light.poisson(through("exposure", sensor.exposure)))
+    v = through("signal", k.astype(float))
+    n = through("noise", sensor.noise * dark.standard_normal(sensor.shape), k)
     step = sensor.step
     for effect in effects:
         step = step * effect.gain(t)
-    dn = sensor.bias + step * (v + n)
-    for effect in effects:
-        dn = effect.voltage(t, dn)
+    dn = through("voltage", sensor.bias + step * (v + n))
     most = 2**sensor.bits - 1
     code = np.clip(np.floor(dn + 0.5).astype(np.int64), 0, most)
     for effect in effects:

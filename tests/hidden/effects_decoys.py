@@ -8,14 +8,10 @@ import numpy as np
 from hidden.base import Hidden
 
 
-class TemporalFilter(Hidden):
+class TemporalFilter(Hidden, s95=5e-3, most=1.0):
     """Samples averaged with the delivered one before, where those are alike; strength: their share."""
 
-    s95 = 5e-3
-    most = 1.0
-
-    def draw(self):
-        self.before = None
+    before = None
 
     def convert(self, t, dn, code):
         found = code
@@ -27,22 +23,15 @@ class TemporalFilter(Hidden):
         return found
 
 
-class RowDroop(Hidden):
+class RowDroop(Hidden, s95=0.03, scaling=(0.25, 0.25, 0.25), most=0.9):
     """The level of a row falls with the charge that the row holds (supply); strength: part of its mean."""
-
-    s95 = 0.03
-    scaling = (0.25, 0.25, 0.25)
-    most = 0.9
 
     def signal(self, t, v):
         return v - self.strength * v.mean(axis=1, keepdims=True)
 
 
-class DistantCrosstalk(Hidden):
+class DistantCrosstalk(Hidden, s95=1e-3, most=0.2):
     """A sample gets a part of the one read some columns before (a pipeline); strength: that part."""
-
-    s95 = 1e-3
-    most = 0.2
 
     def draw(self):
         self.columns = self.pick("columns", 4, 8)
@@ -53,12 +42,8 @@ class DistantCrosstalk(Hidden):
         return found
 
 
-class NoisyFrames(Hidden):
+class NoisyFrames(Hidden, s95=0.03, scaling=(0.5, 0.5, 0.25), most=1.5):
     """Read noise that is larger in one frame of thirty, by chance; strength: relative."""
-
-    s95 = 0.03
-    scaling = (0.5, 0.5, 0.25)
-    most = 1.5
 
     def draw(self):
         self.loud = self.rng.random(self.sensor.n_frames) < 1 / 30
@@ -67,11 +52,8 @@ class NoisyFrames(Hidden):
         return n * (1 + self.strength * self.loud[max(t, 0)])
 
 
-class SettlingRows(Hidden):
+class SettlingRows(Hidden, s95=0.02, scaling=(0.25, 0.25, 0.25)):
     """Rows whose first pixels settle from the level of the row before; strength: part of it that is left."""
-
-    s95 = 0.02
-    scaling = (0.25, 0.25, 0.25)
 
     def voltage(self, t, dn):
         last = (dn[:, -1] - self.sensor.bias[:, -1])[:-1, None]
@@ -80,11 +62,8 @@ class SettlingRows(Hidden):
         return found
 
 
-class TapGain(Hidden):
+class TapGain(Hidden, s95=0.01, scaling=(0.25, 0.25, 0.25)):
     """The gain of one readout tap, a quarter of the columns, moves frame by frame; strength: relative."""
-
-    s95 = 0.01
-    scaling = (0.25, 0.25, 0.25)
 
     def signal(self, t, v):
         v = v.copy()
@@ -93,24 +72,17 @@ class TapGain(Hidden):
         return v
 
 
-class DeadTime(Hidden):
+class DeadTime(Hidden, s95=2e-3, most=0.1):
     """Electrons that come soon after another are lost; strength: part lost per electron already there."""
-
-    s95 = 2e-3
-    most = 0.1
 
     def electrons(self, t, k):
         return k - self.rng.binomial(k, np.clip(self.strength * np.maximum(k - 1, 0), 0, 0.9))
 
 
-class Hysteresis(Hidden):
+class Hysteresis(Hidden, s95=0.05):
     """A sample is drawn towards the one delivered before, whatever its size; strength: DN."""
 
-    s95 = 0.05
-    scaling = (0.5, 0.5, 0.5)
-
-    def draw(self):
-        self.before = None
+    before = None
 
     def convert(self, t, dn, code):
         found = code
@@ -120,65 +92,46 @@ class Hysteresis(Hidden):
         return found
 
 
-class BlockMean(Hidden):
+class BlockMean(Hidden, s95=2e-3, most=1.0):
     """Blocks of 2 x 2 pixels that come as their mean (lossy compression); strength: their share."""
-
-    s95 = 2e-3
-    most = 1.0
 
     def convert(self, t, dn, code):
         ny, nx = (size // 2 for size in code.shape)
-        blocks = code[: 2 * ny, : 2 * nx].reshape(ny, 2, nx, 2)
+        found = code.copy()
+        blocks = found[: 2 * ny, : 2 * nx].reshape(ny, 2, nx, 2)
         lost = self.rng.random((ny, 1, nx, 1)) < self.strength
         mean = blocks.sum(axis=(1, 3), keepdims=True) // 4
-        found = code.copy()
         found[: 2 * ny, : 2 * nx] = np.where(lost, mean, blocks).reshape(2 * ny, 2 * nx)
         return found
 
 
-class RowGain(Hidden):
+class RowGain(Hidden, s95=0.01, scaling=(0.25, 0.5, 0.25)):
     """The gain of each row is drawn anew in every frame; strength: relative, rms."""
-
-    s95 = 0.01
-    scaling = (0.25, 0.5, 0.25)
 
     def signal(self, t, v):
         return v * (1 + self.strength * self.rng.standard_normal((v.shape[0], 1)))
 
 
-class Afterpulses(Hidden):
+class Afterpulses(Hidden, s95=2e-3, most=0.5, warmup=20):
     """Each electron brings others into the next frame of its pixel; strength: their mean number."""
 
-    s95 = 2e-3
-    most = 0.5
-    warmup = 20
-
-    def draw(self):
-        self.before = np.zeros(self.sensor.shape, np.int64)
+    before = 0
 
     def electrons(self, t, k):
-        self.before = k + self.rng.poisson(self.strength * self.before)
+        self.before = k + self.rng.poisson(self.strength * self.before, k.shape)
         return self.before
 
 
-class RepelledCharge(Hidden):
+class RepelledCharge(Hidden, s95=1.5e-3, most=0.1):
     """Electrons that come to others go to the pixel on the right; strength: part per electron there."""
-
-    s95 = 1.5e-3
-    most = 0.1
 
     def electrons(self, t, k):
         gone = self.rng.binomial(k, np.clip(self.strength * np.maximum(k - 1, 0), 0, 0.9))
-        arrived = np.zeros_like(k)
-        arrived[:, 1:] = gone[:, :-1]
-        return k - gone + arrived
+        return k - gone + np.pad(gone[:, :-1], ((0, 0), (1, 0)))
 
 
-class MainsGain(Hidden):
+class MainsGain(Hidden, s95=0.01, scaling=(0.5, 0.5, 0.25)):
     """A gain that swings with the mains while rows are read; strength: relative amplitude."""
-
-    s95 = 0.01
-    scaling = (0.5, 0.5, 0.25)
 
     def draw(self):
         rows = np.arange(self.sensor.shape[0])[:, None]
@@ -189,22 +142,16 @@ class MainsGain(Hidden):
         return v * (1 + self.strength * np.sin(self.place + 2 * np.pi * self.per_frame * t))
 
 
-class BlendedFrames(Hidden):
+class BlendedFrames(Hidden, s95=2e-3, most=0.5):
     """Frames that are the mean of themselves and the one before; strength: share of the frames."""
-
-    s95 = 2e-3
-    most = 0.5
 
     def record(self, t, frames):
         if t > 0 and self.rng.random() < self.strength:
             frames[t] = (frames[t].astype(np.int64) + frames[t - 1]) // 2
 
 
-class BurstingBlock(Hidden):
+class BurstingBlock(Hidden, s95=0.5, scaling=(0.25, 0.25, 0.25)):
     """A block of pixels whose offset jumps together in one frame of twenty; strength: DN."""
-
-    s95 = 0.5
-    scaling = (0.25, 0.25, 0.25)
 
     def draw(self):
         (ny, nx), side = self.sensor.shape, max(self.sensor.shape[0] // 6, 2)
@@ -216,21 +163,16 @@ class BurstingBlock(Hidden):
         return dn + self.strength * self.affected * (self.rng.random() < 0.05)
 
 
-class RowTilt(Hidden):
+class RowTilt(Hidden, s95=0.15, scaling=(0.25, 0.5, 0.25)):
     """A slope along each row, drawn anew; strength: DN rms at its ends."""
-
-    s95 = 0.15
-    scaling = (0.25, 0.5, 0.25)
 
     def voltage(self, t, dn):
         along = np.linspace(-1, 1, dn.shape[1])
         return dn + self.strength * self.rng.standard_normal((dn.shape[0], 1)) * along
 
 
-class NoisyTime(Hidden):
+class NoisyTime(Hidden, s95=0.05):
     """Read noise that is larger in a fifth of the run; strength: relative."""
-
-    s95 = 0.05
 
     def draw(self):
         self.begin = self.between("begin", 0.1, 0.7) * self.sensor.n_frames
@@ -239,21 +181,15 @@ class NoisyTime(Hidden):
         return n * (1 + self.strength * (self.begin <= t < self.begin + self.sensor.n_frames / 5))
 
 
-class EmptySamples(Hidden):
+class EmptySamples(Hidden, s95=1e-3, most=0.2):
     """Samples that are read without their electrons; strength: their share."""
-
-    s95 = 1e-3
-    most = 0.2
 
     def electrons(self, t, k):
         return np.where(self.rng.random(k.shape) < self.strength, 0, k)
 
 
-class LoudColumn(Hidden):
+class LoudColumn(Hidden, s95=0.25, scaling=(0.5, 0.25, 0.25)):
     """Columns whose pixels share a deviation from frame to frame, one in twelve; strength: DN rms."""
-
-    s95 = 0.25
-    scaling = (0.5, 0.25, 0.25)
 
     def draw(self):
         self.loud = self.rng.random(self.sensor.shape[1]) < 1 / 12
@@ -263,16 +199,11 @@ class LoudColumn(Hidden):
         return dn + self.strength * self.loud * self.rng.standard_normal(dn.shape[1])
 
 
-class NegativeGhost(Hidden):
+class NegativeGhost(Hidden, s95=0.3, warmup=1):
     """Large samples leave the next frame of their pixel lower; strength: DN per electron above four."""
 
-    s95 = 0.3
-    warmup = 1
-
-    def draw(self):
-        self.before = np.zeros(self.sensor.shape)
+    before = 0.0
 
     def signal(self, t, v):
-        shifted = v - self.strength / np.median(self.sensor.step) * np.maximum(self.before - 4, 0)
-        self.before = v
-        return shifted
+        before, self.before = self.before, v
+        return v - self.strength / np.median(self.sensor.step) * np.maximum(before - 4, 0)

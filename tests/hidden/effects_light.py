@@ -5,10 +5,8 @@ import numpy as np
 from hidden.base import Course, Hidden, telegraph
 
 
-class ExposureDrift(Hidden):
+class ExposureDrift(Hidden, s95=0.004):
     """The exposure of all pixels drifts; strength: relative, end to end."""
-
-    s95 = 0.004
 
     def draw(self):
         self.course = Course(self)
@@ -17,14 +15,12 @@ class ExposureDrift(Hidden):
         return h * (1 + self.strength * self.course(t))
 
 
-class Persistence(Hidden):
+class Persistence(Hidden, s95=0.1):
     """The image of an earlier exposure fades; strength: e- per frame at its brightest, first frame.
 
     The study has no s95 for it. A tenth of the pixels at 0.1 e- shifts the trend of the frame means by about
     six standard errors.
     """
-
-    s95 = 0.1
 
     def draw(self):
         ny, nx = self.sensor.shape
@@ -52,12 +48,8 @@ class Persistence(Hidden):
         return h + self.strength * left * self.image
 
 
-class DarkCurrentRts(Hidden):
+class DarkCurrentRts(Hidden, s95=0.0027, scaling=(0.75, 0.75, 0.5), most=0.3):
     """The dark current of some pixels blinks; strength: fraction of pixels."""
-
-    s95 = 0.0027
-    scaling = (0.75, 0.75, 0.5)
-    most = 0.3
 
     def draw(self):
         self.where = self.some_pixels(self.strength)
@@ -77,12 +69,8 @@ class DarkCurrentRts(Hidden):
         return h
 
 
-class ExposureFlicker(Hidden):
+class ExposureFlicker(Hidden, s95=0.005, scaling=(0.5, 0.5, 0.25), most=0.3):
     """The exposure of all pixels varies from frame to frame; strength: relative, rms."""
-
-    s95 = 0.005
-    scaling = (0.5, 0.5, 0.25)
-    most = 0.3
 
     def draw(self):
         law = self.pick("law", "normal", "uniform", "two_level")
@@ -99,10 +87,8 @@ class ExposureFlicker(Hidden):
         return h * self.factor[max(t, 0)]
 
 
-class OverdispersedCounts(Hidden):
+class OverdispersedCounts(Hidden, s95=0.0016):
     """The exposure varies from sample to sample: Var K = H + a H^2; strength: a."""
-
-    s95 = 0.0016
 
     def draw(self):
         self.law = self.pick("law", "gamma", "lognormal", p=(0.6, 0.4))
@@ -114,11 +100,8 @@ class OverdispersedCounts(Hidden):
         return h * np.exp(width * self.rng.standard_normal(h.shape) - width**2 / 2)
 
 
-class BranchingCounts(Hidden):
+class BranchingCounts(Hidden, s95=0.0013, most=0.5):
     """Each electron sets free Poisson(l) more in the same pixel, and those again; strength: l."""
-
-    s95 = 0.0013
-    most = 0.5
 
     def electrons(self, t, k):
         total, young = k.copy(), k
@@ -128,30 +111,21 @@ class BranchingCounts(Hidden):
         return total
 
 
-class OpticalCrosstalk(Hidden):
+class OpticalCrosstalk(Hidden, s95=0.0028, most=0.5):
     """Each electron sets one free in one of the four neighbours with probability p; strength: p."""
-
-    s95 = 0.0028
-    most = 0.5
 
     def electrons(self, t, k):
         emitted = self.rng.binomial(k, self.strength)
-        y, x = np.nonzero(emitted)
-        times = emitted[y, x]
-        y, x = np.repeat(y, times), np.repeat(x, times)
-        step = np.array([(0, 1), (0, -1), (1, 0), (-1, 0)])[self.rng.integers(0, 4, y.size)]
-        y, x = y + step[:, 0], x + step[:, 1]
-        inside = (y >= 0) & (y < k.shape[0]) & (x >= 0) & (x < k.shape[1])
+        places = np.repeat(np.argwhere(emitted), emitted[emitted > 0], axis=0)
+        places += np.array([(0, 1), (0, -1), (1, 0), (-1, 0)])[self.rng.integers(0, 4, len(places))]
+        inside = ((places >= 0) & (places < k.shape)).all(axis=1)
         k = k.copy()
-        np.add.at(k, (y[inside], x[inside]), 1)
+        np.add.at(k, tuple(places[inside].T), 1)
         return k
 
 
-class CosmicRays(Hidden):
+class CosmicRays(Hidden, s95=0.003, scaling=(0.0, 0.0, 1.0)):
     """Particles cross some frames; strength: tracks per frame."""
-
-    s95 = 0.003
-    scaling = (0.0, 0.0, 1.0)
 
     def draw(self):
         self.alpha = self.between("alpha_share", 0.0, 0.4)
@@ -184,11 +158,8 @@ class CosmicRays(Hidden):
         return k
 
 
-class Glow(Hidden):
+class Glow(Hidden, s95=0.25, scaling=(0.5, 0.5, 0.25)):
     """Light from a corner or an edge, in one frame of fifty or growing; strength: e- there."""
-
-    s95 = 0.25
-    scaling = (0.5, 0.5, 0.25)
 
     def draw(self):
         (ny, nx), n = self.sensor.shape, self.sensor.n_frames
@@ -197,10 +168,8 @@ class Glow(Hidden):
         cy = 0.0 if corner == "corner" else self.between("row", 0.2, 0.8) * ny
         away = np.hypot(y - cy, x)
         reach = max(ny, nx) / 5
-        if self.pick("falloff", "exponential", "gaussian", p=(0.7, 0.3)) == "exponential":
-            self.shape = np.exp(-away / reach)
-        else:
-            self.shape = np.exp(-0.5 * (away / reach) ** 2)
+        power = 1 if self.pick("falloff", "exponential", "gaussian", p=(0.7, 0.3)) == "exponential" else 2
+        self.shape = np.exp(-((away / reach) ** power) / power)
         self.affected = self.shape > 0.1
         if self.pick("course", "bursts", "grows", p=(0.7, 0.3)) == "bursts":
             self.size = self.rng.random(n) < 0.02
@@ -212,15 +181,11 @@ class Glow(Hidden):
         return h + self.strength * self.shape * self.size[max(t, 0)]
 
 
-class Trapping(Hidden):
+class Trapping(Hidden, s95=0.005, most=0.9, warmup=60):
     """A trap that holds one electron at most; strength: chance that an empty one catches one of a sample.
 
     Of traps in some pixels only, each catches the oftener.
     """
-
-    s95 = 0.005
-    most = 0.9
-    warmup = 60
 
     def draw(self):
         self.release = self.between("release", 0.1, 0.6)

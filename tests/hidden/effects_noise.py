@@ -5,16 +5,12 @@ import numpy as np
 from hidden.base import Course, Hidden, telegraph
 
 
-class RtsNoise(Hidden):
+class RtsNoise(Hidden, s95=0.0035, scaling=(0.75, 0.75, 0.5), most=0.5):
     """One trap in the source follower of some pixels; strength: fraction of pixels.
 
     The trap is sampled when the reset and the signal are: once each (difference: three levels), N times each
     and averaged, or the signal alone, frame after frame (two levels, slow).
     """
-
-    s95 = 0.0035
-    scaling = (0.75, 0.75, 0.5)
-    most = 0.5
 
     def draw(self):
         self.where = self.some_pixels(self.strength)
@@ -43,13 +39,11 @@ class RtsNoise(Hidden):
     def _trap(self, n_reads: int) -> np.ndarray:
         """States at successive reads, (read, pixel); a fresh start in every frame."""
         n = self.occupied.size
-        state = self.rng.random(n) < self.occupied
-        states = []
+        states = [self.rng.random(n) < self.occupied]
         for _ in range(n_reads):
-            states.append(state)
             fresh = self.rng.random(n) < self.occupied
-            state = np.where(self.rng.random(n) < self.kept, state, fresh)
-        return np.array(states, float)
+            states.append(np.where(self.rng.random(n) < self.kept, states[-1], fresh))
+        return np.array(states[:-1], float)
 
     def noise(self, t, n, k):
         if self.reads:
@@ -62,11 +56,8 @@ class RtsNoise(Hidden):
         return n
 
 
-class FlickerNoise(Hidden):
+class FlickerNoise(Hidden, s95=0.0009, most=0.9):
     """A part of each pixel's noise power is correlated in time; strength: that part."""
-
-    s95 = 0.0009
-    most = 0.9
 
     def draw(self):
         if self.pick("spectrum", "one_time_constant", "one_over_f", p=(0.6, 0.4)) == "one_over_f":
@@ -82,11 +73,8 @@ class FlickerNoise(Hidden):
         return np.sqrt(1 - self.strength) * n + np.sqrt(self.strength) * self.sensor.noise * slow
 
 
-class HeavyTailedNoise(Hidden):
+class HeavyTailedNoise(Hidden, s95=6e-5, most=0.2):
     """Some samples of every pixel are noisier; strength: part of the samples at three times the noise."""
-
-    s95 = 6e-5
-    most = 0.2
 
     def draw(self):
         self.law = self.pick("law", "mixture", "student", p=(0.7, 0.3))
@@ -103,12 +91,8 @@ class HeavyTailedNoise(Hidden):
         return np.where(self.rng.random(n.shape) < self.strength, self.width * n, n)
 
 
-class NoiseSkew(Hidden):
+class NoiseSkew(Hidden, s95=0.16, scaling=(1 / 6, 1 / 6, 1 / 6), most=0.95):
     """A part of the noise is exponential; strength: its time constant over the whole standard deviation."""
-
-    s95 = 0.16
-    scaling = (1 / 6, 1 / 6, 1 / 6)
-    most = 0.95
 
     def draw(self):
         self.side = self.sign()
@@ -118,11 +102,8 @@ class NoiseSkew(Hidden):
         return np.sqrt(1 - self.strength**2) * n + self.side * self.strength * self.sensor.noise * tail
 
 
-class SignalDependentNoise(Hidden):
+class SignalDependentNoise(Hidden, s95=0.015, scaling=(0.25, 0.25, 0.25)):
     """Noise that grows with the electrons: variance s^2 k, or c k^2; strength: s, e- per root electron."""
-
-    s95 = 0.015
-    scaling = (0.25, 0.25, 0.25)
 
     def draw(self):
         self.power = 0.5 if self.pick("grows_with", "root", "number", p=(0.7, 0.3)) == "root" else 1.0
@@ -134,11 +115,8 @@ class SignalDependentNoise(Hidden):
         return n + self.each * k**self.power * self.rng.standard_normal(n.shape)
 
 
-class Nonlinearity(Hidden):
+class Nonlinearity(Hidden, s95=0.0012, most=0.2):
     """The response bends; strength: relative change of the gain over 5 e-."""
-
-    s95 = 0.0012
-    most = 0.2
 
     def draw(self):
         self.bend = self.sign(negative=0.7) * self.strength
@@ -147,11 +125,8 @@ class Nonlinearity(Hidden):
         return v * (1 + self.bend * v / 5)
 
 
-class InterpixelCapacitance(Hidden):
+class InterpixelCapacitance(Hidden, s95=0.0004, most=0.1):
     """A part of the signal shows in the neighbours; strength: part per neighbour."""
-
-    s95 = 0.0004
-    most = 0.1
 
     def draw(self):
         skew = 0.0
@@ -169,12 +144,8 @@ class InterpixelCapacitance(Hidden):
         return v
 
 
-class AnalogMemory(Hidden):
+class AnalogMemory(Hidden, s95=0.0006, most=0.3, warmup=2):
     """A part of the signal of the frame before remains; strength: that part, the mean over the pixels."""
-
-    s95 = 0.0006
-    most = 0.3
-    warmup = 2
 
     def draw(self):
         self.before = np.zeros(self.sensor.shape)
@@ -188,10 +159,8 @@ class AnalogMemory(Hidden):
         return v + self.memory * before
 
 
-class GainDrift(Hidden):
+class GainDrift(Hidden, s95=0.0015):
     """The gain of all pixels drifts; strength: relative, end to end."""
-
-    s95 = 0.0015
 
     def draw(self):
         self.course = Course(self)

@@ -5,13 +5,8 @@ import numpy as np
 from hidden.base import Hidden
 
 
-class ChargeLag(Hidden):
+class ChargeLag(Hidden, s95=0.05, scaling=(0.0, 0.0, 0.0), most=0.4, warmup=40):
     """Each electron stays behind for a frame with probability q, and again; strength: q. Invisible."""
-
-    s95 = 0.05
-    scaling = (0.0, 0.0, 0.0)
-    most = 0.4
-    warmup = 40
 
     def draw(self):
         self.left = np.zeros(self.sensor.shape, np.int64)
@@ -22,12 +17,8 @@ class ChargeLag(Hidden):
         return there - self.left
 
 
-class ChargeDiffusion(Hidden):
+class ChargeDiffusion(Hidden, s95=0.05, scaling=(0.0, 0.0, 0.0), most=0.6):
     """Each electron moves to one of the four neighbours with probability q; strength: q. Invisible."""
-
-    s95 = 0.05
-    scaling = (0.0, 0.0, 0.0)
-    most = 0.6
 
     def electrons(self, t, k):
         stay = k.copy()
@@ -39,38 +30,28 @@ class ChargeDiffusion(Hidden):
             stay -= moved
             shifted = np.roll(moved, way, axis)
             # what leaves the sensor does not come back on the other side
-            edge = (slice(None),) * axis + (0 if way == 1 else -1,)
-            shifted[edge] = 0
+            shifted[(slice(None),) * axis + (0 if way == 1 else -1,)] = 0
             arrived += shifted
         return stay + arrived
 
 
-class SpuriousCharge(Hidden):
+class SpuriousCharge(Hidden, s95=0.075, scaling=(0.0, 0.0, 0.0)):
     """Electrons that no light and no dark current made; strength: e- per sample. Invisible."""
-
-    s95 = 0.075
-    scaling = (0.0, 0.0, 0.0)
 
     def electrons(self, t, k):
         return k + self.rng.poisson(self.strength, k.shape)
 
 
-class SelfTriggerCut(Hidden):
+class SelfTriggerCut(Hidden, s95=0.01, most=0.9):
     """Samples without an electron are partly not taken, but awaited anew; strength: that part."""
-
-    s95 = 0.01
-    most = 0.9
 
     def electrons(self, t, k):
         again = (k == 0) & (self.rng.random(k.shape) < self.strength)
         return np.where(again, self.rng.poisson(self.sensor.exposure), k)
 
 
-class OutputCrosstalk(Hidden):
+class OutputCrosstalk(Hidden, s95=0.01, most=0.2):
     """The right half sees a part of what the left half's output reads at the same time; strength: part."""
-
-    s95 = 0.01
-    most = 0.2
 
     def draw(self):
         nx = self.sensor.shape[1]
@@ -82,11 +63,8 @@ class OutputCrosstalk(Hidden):
         return v
 
 
-class CheckerboardOffset(Hidden):
+class CheckerboardOffset(Hidden, s95=0.15, scaling=(0.25, 0.25, 0.25)):
     """Two colours of pixels, like a chessboard, swap the sign of an offset from frame to frame; DN."""
-
-    s95 = 0.15
-    scaling = (0.25, 0.25, 0.25)
 
     def draw(self):
         y, x = np.indices(self.sensor.shape)
@@ -96,13 +74,11 @@ class CheckerboardOffset(Hidden):
         return dn + (self.strength if t % 2 == 0 else -self.strength) * self.colour
 
 
-class HerringBone(Hidden):
+class HerringBone(Hidden, s95=0.05):
     """A sine picked up sample by sample, by one converter for all of them; strength: amplitude, DN.
 
     Its phase runs on from frame to frame, or is new in each. To be told as periodic pickup.
     """
-
-    s95 = 0.05
 
     def draw(self):
         per_column = self.between("cycles_per_column", 0.03, 0.47)

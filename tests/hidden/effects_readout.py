@@ -5,10 +5,8 @@ import numpy as np
 from hidden.base import Course, Hidden, telegraph
 
 
-class BiasDrift(Hidden):
+class BiasDrift(Hidden, s95=0.022):
     """The bias of all pixels drifts; strength: DN, end to end."""
-
-    s95 = 0.022
 
     def draw(self):
         self.course = Course(self)
@@ -17,10 +15,8 @@ class BiasDrift(Hidden):
         return dn + self.strength * self.course(t)
 
 
-class BiasJumps(Hidden):
+class BiasJumps(Hidden, s95=0.021):
     """The bias of parts of the sensor jumps, each part at its own times; strength: height, DN."""
-
-    s95 = 0.021
 
     def draw(self):
         (ny, nx), nt = self.sensor.shape, self.sensor.n_frames
@@ -47,40 +43,29 @@ class BiasJumps(Hidden):
         return dn + self.course[max(t, 0)][self.part]
 
 
-class FrameNoise(Hidden):
+class FrameNoise(Hidden, s95=0.031, scaling=(0.5, 0.5, 0.25)):
     """All pixels of a frame share a deviation; strength: DN rms."""
-
-    s95 = 0.031
-    scaling = (0.5, 0.5, 0.25)
 
     def voltage(self, t, dn):
         return dn + self.strength * self.rng.standard_normal()
 
 
-class RowNoise(Hidden):
+class RowNoise(Hidden, s95=0.093, scaling=(0.25, 0.5, 0.25)):
     """All pixels of a row of a frame share a deviation; strength: DN rms."""
-
-    s95 = 0.093
-    scaling = (0.25, 0.5, 0.25)
 
     def voltage(self, t, dn):
         return dn + self.strength * self.rng.standard_normal((dn.shape[0], 1))
 
 
-class ColumnNoise(Hidden):
+class ColumnNoise(Hidden, s95=0.079, scaling=(0.5, 0.25, 0.25)):
     """All pixels of a column of a frame share a deviation; strength: DN rms."""
-
-    s95 = 0.079
-    scaling = (0.5, 0.25, 0.25)
 
     def voltage(self, t, dn):
         return dn + self.strength * self.rng.standard_normal((1, dn.shape[1]))
 
 
-class PeriodicPickup(Hidden):
+class PeriodicPickup(Hidden, s95=0.023):
     """A sine picked up while rows are read; strength: amplitude, DN."""
-
-    s95 = 0.023
 
     def draw(self):
         along = self.pick("along", "rows", "columns", "frames", p=(0.7, 0.15, 0.15))
@@ -95,10 +80,8 @@ class PeriodicPickup(Hidden):
         return dn + self.strength * np.sin(self.place + 2 * np.pi * self.per_frame * t)
 
 
-class ReadoutAlternation(Hidden):
+class ReadoutAlternation(Hidden, s95=0.006):
     """Even and odd frames differ, as with two banks of converters; strength: half the difference, DN."""
-
-    s95 = 0.006
 
     def draw(self):
         self.half = self.sign() * self.strength
@@ -107,16 +90,12 @@ class ReadoutAlternation(Hidden):
         return dn + (self.half if t % 2 == 0 else -self.half)
 
 
-class AdcDnl(Hidden):
+class AdcDnl(Hidden, order=2, s95=0.0015, most=0.9):
     """Codes of uneven width; strength: deviation of the width, LSB.
 
     A pattern that fewer codes carry, or an irregular one, is made stronger so that it is as visible as the
     alternation of all codes.
     """
-
-    order = 2
-    s95 = 0.0015
-    most = 0.9
 
     def draw(self):
         kind = self.pick("kind", "bit", "random", "one_code", "missing", p=(0.6, 0.25, 0.075, 0.075))
@@ -126,9 +105,8 @@ class AdcDnl(Hidden):
             error = min(self.strength * np.sqrt(2.0**bit), 0.45)
             edges = self.sign() * error * ((codes >> bit) & 1)
         elif kind == "random":
-            edges = np.clip(
-                2.5 / np.sqrt(2) * self.strength * self.rng.standard_normal(codes.size), -0.4, 0.4
-            )
+            random = self.rng.standard_normal(codes.size)
+            edges = np.clip(2.5 / np.sqrt(2) * self.strength * random, -0.4, 0.4)
         elif kind == "missing":
             period = int(self.pick("period", 11, 13, 19))
             edges = min(self.strength * np.sqrt(2 * period), 1.0) * (codes % period == 5)
@@ -136,9 +114,8 @@ class AdcDnl(Hidden):
             low, high = self.sensor.code_range
             code = int(self.rng.uniform(low + 0.1 * (high - low), high - 0.3 * (high - low)))
             wider = min(8 * self.strength, 0.45)
-            edges = np.where(codes > code, wider / 2, np.where(codes == code, -wider / 2, 0.0))
-            # the next ones make up for it
-            edges[code + 2 :] = 0.0
+            edges = np.zeros(codes.size)
+            edges[code : code + 2] = -wider / 2, wider / 2  # the next ones make up for it
             self.parameters["code"] = code
         self.edges = edges
 
@@ -147,11 +124,8 @@ class AdcDnl(Hidden):
         return code - (dn < lower) + (dn >= upper)
 
 
-class AdcInl(Hidden):
+class AdcInl(Hidden, order=2, s95=0.016):
     """The converter's curve bends smoothly; strength: amplitude, LSB."""
-
-    order = 2
-    s95 = 0.016
 
     def draw(self):
         self.low, self.high = self.sensor.code_range
@@ -170,12 +144,8 @@ class AdcInl(Hidden):
         return dn + self.side * self.strength * (4 * w**3 - 3 * w)
 
 
-class Clipping(Hidden):
+class Clipping(Hidden, s95=7e-6, scaling=(1.0, 1.0, 1.0), most=0.05):
     """Nothing below, or nothing above, one code; strength: part of the samples that it catches."""
-
-    s95 = 7e-6
-    scaling = (1.0, 1.0, 1.0)
-    most = 0.05
 
     def draw(self):
         self.side = self.pick("side", "low", "high")
@@ -184,9 +154,8 @@ class Clipping(Hidden):
         caught = self.strength * (6 / 7 if self.side == "low" else 8 / 7) * frames.size
         counts = np.bincount(frames.ravel(), minlength=2**self.sensor.bits)
         # beyond[c]: samples that a limit at code c would catch; the limit that comes nearest to what is asked
-        total = np.cumsum(counts if self.side == "low" else counts[::-1])
-        beyond = np.concatenate([[0], total[:-1]])
-        beyond = beyond if self.side == "low" else beyond[::-1]
+        way = 1 if self.side == "low" else -1
+        beyond = np.concatenate([[0], np.cumsum(counts[::way])[:-1]])[::way]
         limit = int(np.argmin(np.abs(np.log(np.maximum(beyond, 0.01) / caught))))
         touched = frames < limit if self.side == "low" else frames > limit
         frames[touched] = limit
@@ -194,11 +163,8 @@ class Clipping(Hidden):
         self.parameters |= {"limit_dn": limit, "samples": int(touched.sum())}
 
 
-class RepeatedFrames(Hidden):
+class RepeatedFrames(Hidden, s95=1.0, scaling=(0.0, 0.0, 0.0)):
     """Frames, or rows of frames, come twice; strength: number of frames."""
-
-    s95 = 1.0
-    scaling = (0.0, 0.0, 0.0)
 
     def draw(self):
         n = max(1, round(self.strength))
@@ -215,15 +181,11 @@ class RepeatedFrames(Hidden):
             frames[t, self.rows] = frames[t - 1, self.rows]
 
 
-class PixelCorrection(Hidden):
+class PixelCorrection(Hidden, order=5, s95=0.05, most=1.0):
     """A sample far above its eight neighbours becomes their median; strength: share of those replaced.
 
     Far is so many standard deviations of the samples' own scatter.
     """
-
-    order = 5
-    s95 = 0.05
-    most = 1.0
 
     def draw(self):
         scatter = np.sqrt(np.median(self.sensor.exposure)) * np.median(self.sensor.step)
@@ -240,12 +202,8 @@ class PixelCorrection(Hidden):
         return np.where(replaced, median, code)
 
 
-class BitErrors(Hidden):
+class BitErrors(Hidden, order=4, s95=1e-3, most=1.0):
     """A bit of the converter reads 0, or its opposite, in some of the samples; strength: their share."""
-
-    order = 4
-    s95 = 1e-3
-    most = 1.0
 
     def draw(self):
         self.bit = int(self.pick("bit", 2, 3, 4))
@@ -258,12 +216,8 @@ class BitErrors(Hidden):
         return np.where(self.rng.random(code.shape) < self.strength, wrong, code)
 
 
-class BinaryOffset(Hidden):
+class BinaryOffset(Hidden, order=3, s95=0.1, scaling=(0.25, 0.25, 0.25)):
     """An offset that follows one bit of the sample read before in the row; strength: DN."""
-
-    order = 3
-    s95 = 0.1
-    scaling = (0.25, 0.25, 0.25)
 
     def draw(self):
         self.bit = int(self.pick("bit", 0, 1, 2, 3))
@@ -278,13 +232,8 @@ class BinaryOffset(Hidden):
         return found
 
 
-class RepeatedLines(Hidden):
+class RepeatedLines(Hidden, order=6, s95=1e-4, scaling=(1.0, 0.0, 1.0), most=0.2):
     """Rows or columns that repeat the one before; strength: share of them."""
-
-    order = 6
-    s95 = 1e-4
-    scaling = (1.0, 0.0, 1.0)
-    most = 0.2
 
     def draw(self):
         self.axis = 0 if self.pick("lines", "rows", "columns") == "rows" else 1
@@ -297,12 +246,8 @@ class RepeatedLines(Hidden):
         return np.moveaxis(found, 0, self.axis)
 
 
-class MisplacedLines(Hidden):
+class MisplacedLines(Hidden, order=6, s95=5e-3, most=0.3):
     """Rows or columns that hold the samples of other pixels; strength: share of them, or of the frames."""
-
-    order = 6
-    s95 = 5e-3
-    most = 0.3
 
     def draw(self):
         self.axis = 0 if self.pick("lines", "rows", "columns") == "rows" else 1
@@ -330,15 +275,11 @@ class MisplacedLines(Hidden):
         return np.moveaxis(found, 0, self.axis)
 
 
-class GainStitch(Hidden):
+class GainStitch(Hidden, order=2, s95=3e-3, most=0.4):
     """Above a code the gain is another; strength: relative change.
 
     Both gains agree at that code, or at the black level: then there is a step.
     """
-
-    order = 2
-    s95 = 3e-3
-    most = 0.4
 
     def draw(self):
         low, high = self.sensor.code_range
@@ -353,16 +294,11 @@ class GainStitch(Hidden):
         return np.where(dn > self.code, dn + self.change * (dn - self.origin), dn)
 
 
-class BlackClamp(Hidden):
+class BlackClamp(Hidden, order=1, s95=0.018, scaling=(0.0, 0.0, 0.5), most=1.0):
     """The black level of a frame is taken from some of its pixels; strength: part of their mean taken off.
 
     They are the left eighth of the columns, the upper eighth of the rows, or all.
     """
-
-    order = 1
-    s95 = 0.018
-    scaling = (0.0, 0.0, 0.5)
-    most = 1.0
 
     def draw(self):
         (ny, nx), s = self.sensor.shape, self.sensor
@@ -375,14 +311,11 @@ class BlackClamp(Hidden):
         return dn - self.strength * (dn[self.part].mean() - self.usual)
 
 
-class ReadOrderNoise(Hidden):
+class ReadOrderNoise(Hidden, s95=0.07, scaling=(0.25, 0.5, 0.25)):
     """Noise of 1/f in the order of reading, of one tap or of four blocks of columns; strength: DN rms.
 
     Without what changes more slowly than once a frame, which an amplifier's clamp takes away.
     """
-
-    s95 = 0.07
-    scaling = (0.25, 0.5, 0.25)
 
     def draw(self):
         ny, nx = self.sensor.shape

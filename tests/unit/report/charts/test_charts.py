@@ -10,9 +10,9 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from helpers.discrepancy_material import discrepancy_data
-from helpers.quick_stacks import stack, sums_of
-from helpers.report_material import report_data
+from helpers.report_material import with_stability
 
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.base.wording import symbol, without_formulas
 from pchem_pipeline.report.charts.chart import (
     COLUMN_MM,
@@ -41,7 +41,6 @@ from pchem_pipeline.report.charts.on_page import page_chart, rounded
 from pchem_pipeline.report.charts.on_paper import Look, draw_chart, drawing_bytes
 from pchem_pipeline.report.figures.catalogue import run_figures
 from pchem_pipeline.report.figures.figure import Figure
-from pchem_pipeline.report.figures.stability import stability_figures
 from pchem_pipeline.report.inspector import json_for_html
 from pchem_pipeline.report.pages.page import draw_figure
 from pchem_pipeline.report.style.palette import DIVERGING, LIGHT, MAP_COLOURS, shades
@@ -51,12 +50,7 @@ HOSTILE = "</script><script>alert(1)</script><!-- & $\\mu$"
 
 @pytest.fixture(scope="module")
 def charts() -> dict[str, Figure]:
-    frames = stack(np.random.default_rng(2), (300, 12, 16))
-    data = replace(
-        report_data((12, 16)),
-        stability=stability_figures(sums_of(frames)),
-        discrepancy=discrepancy_data("named"),
-    )
+    data = with_stability((12, 16), discrepancy=discrepancy_data("named"))
     return {each.name: each for each in run_figures(data)}
 
 
@@ -130,6 +124,12 @@ def test_every_mark_is_drawn_everywhere() -> None:
     assert len(axes.lines) + len(axes.patches) + len(axes.collections) + len(axes.texts) >= 11
     kinds = [mark["kind"] for mark in page_chart(chart)["stacks"][0]["panels"][0]["marks"]]
     assert set(kinds) == {"span", "band", "steps", "bars", "sticks", "line", "points", "level", "words"}
+    y = np.array([1.0, 2.0, np.nan, 3.0, 4.0])
+    gap = Chart((Stack((Panel(Axis("y"), (Line(np.arange(5.0), y),)),), Axis("x")),))
+    assert page_chart(gap)["stacks"][0]["panels"][0]["marks"][0]["y"] == [1.0, 2.0, None, 3.0, 4.0]
+    # numbers have the digits of a screen
+    assert rounded(np.array([123.4567891, np.nan, -0.0]), (123.0, 124.0)) == [123.45679, None, 0.0]
+    assert rounded(np.array([1.23456789e-7, np.inf]), (1e-9, 1.0), log=True) == [1.2346e-7, None]
 
 
 def map_chart(values: np.ndarray, *, square: bool = True, **more: object) -> Chart:
@@ -154,6 +154,9 @@ def test_a_map_has_the_colours_of_its_scale() -> None:
         known = np.isfinite(values)
         assert np.abs(drawn[known] - expected[known]).max() <= 3
         assert np.ptp(drawn, axis=(0, 1)).min() > 60  # the test can fail
+    # and those of the page are matplotlib's
+    expected = 255.0 * mpl.colormaps[MAP_COLOURS](np.arange(256))[:, :3]
+    assert np.abs(shades() - expected).max() < 2.6
 
 
 def test_a_map_lies_where_its_axes_say() -> None:
@@ -171,17 +174,6 @@ def test_a_map_lies_where_its_axes_say() -> None:
     assert axes.images[0].get_extent() == [0.0, 3.0, 5.0, 0.0]
 
 
-def test_the_colours_of_maps_are_those_of_matplotlib() -> None:
-    expected = 255.0 * mpl.colormaps[MAP_COLOURS](np.arange(256))[:, :3]
-    assert np.abs(shades() - expected).max() < 2.6
-
-
-def test_a_gap_is_a_gap() -> None:
-    y = np.array([1.0, 2.0, np.nan, 3.0, 4.0])
-    chart = Chart((Stack((Panel(Axis("y"), (Line(np.arange(5.0), y),)),), Axis("x")),))
-    assert page_chart(chart)["stacks"][0]["panels"][0]["marks"][0]["y"] == [1.0, 2.0, None, 3.0, 4.0]
-
-
 def test_hostile_words_stay_words() -> None:
     chart = every_mark(HOSTILE)
     text = str(json_for_html(page_chart(chart)))
@@ -193,17 +185,8 @@ def test_hostile_words_stay_words() -> None:
     root = ElementTree.fromstring(unquote(source.partition(",")[2]))
     assert "</script><script>alert(1)" in "".join(root.itertext())
     assert all("script" not in each.tag for each in root.iter())
-
-
-def test_no_formula_is_left() -> None:
-    for name in (
-        "quanta_exposure",
-        "bias",
-        "read_noise_dn",
-        "read_noise_e",
-        "dark_current",
-        "spurious_charge",
-    ):
+    # and no formula is left
+    for name in (*PARAMETERS, "read_noise_e", "dark_current", "spurious_charge"):
         assert not set(without_formulas(symbol(name)[0])) & set("$\\{}_^")
     assert without_formulas(r"$\sigma^2 + (x - \mu)/g$") == "σ² + (x − μ)/g"
     assert without_formulas(r"costs 3 \$ and 4 \$") == "costs 3 $ and 4 $"
@@ -230,11 +213,6 @@ def test_long_curves_keep_their_extremes_and_gaps() -> None:
     edges, steps = fewer_steps(np.append(x, 100_000.0), np.abs(y), 3000)
     assert edges.size == steps.size + 1 <= 3001
     assert (edges[0], edges[-1], np.nanmax(steps)) == (0.0, 100_000.0, 50.0)
-
-
-def test_numbers_have_the_digits_of_a_screen() -> None:
-    assert rounded(np.array([123.4567891, np.nan, -0.0]), (123.0, 124.0)) == [123.45679, None, 0.0]
-    assert rounded(np.array([1.23456789e-7, np.inf]), (1e-9, 1.0), log=True) == [1.2346e-7, None]
 
 
 def test_a_title_wider_than_its_place_is_broken_and_the_panels_beside_it_stay_level() -> None:

@@ -1,8 +1,8 @@
 """Every figure, on data as they should be and on data as they are; spectra show what is planted."""
 
 import io
-from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -67,20 +67,15 @@ EMPTY_PIXEL = replace(NAN_PIXEL, counts=np.zeros(4, dtype=np.uint16))
 def test_pixel_fits_show_parameters_with_errors_and_the_status(pixel: PixelFit, width: float) -> None:
     figure = draw_chart(Look(width), pixels_chart([pixel, NAN_PIXEL, EMPTY_PIXEL]))
     words = texts(figure)
-    assert "± 0.012 e⁻" in words
-    assert "fewer than 3 occupied bins" in words
-    assert "no fit" in words
-    assert "no frames" in words
+    for each in ("± 0.012 e⁻", "fewer than 3 occupied bins", "no fit", "no frames"):
+        assert each in words
     assert figure.get_size_inches()[0] * 25.4 == pytest.approx(width)
     drawn(figure)
 
 
-def test_residuals_beyond_the_strip_are_marked(pixel: PixelFit) -> None:
+def test_residuals_beyond_the_strip_are_marked_and_a_bin_far_out_does_not_stretch_it(pixel: PixelFit) -> None:
     wrong = replace(pixel, parameters={**pixel.parameters, "bias": pixel.parameters["bias"] + 5.0})
     assert "beyond 12 σ" in texts(draw_chart(LOOK, pixels_chart([wrong])))
-
-
-def test_a_bin_far_out_does_not_stretch_the_axis(pixel: PixelFit) -> None:
     counts = np.zeros(5000, dtype=np.int64)
     counts[: pixel.counts.size] = pixel.counts
     counts[4999] = 1
@@ -90,37 +85,33 @@ def test_a_bin_far_out_does_not_stretch_the_axis(pixel: PixelFit) -> None:
     drawn(figure)
 
 
-def _map(kind: str) -> np.ndarray:
-    rng = np.random.default_rng(5)
-    values = rng.normal(2.0, 0.2, (24, 32))
-    match kind:
-        case "hot":
-            values[3, 4] = 1e4
-        case "holes":
-            values[rng.random(values.shape) < 0.3] = np.nan
-        case "empty":
-            values[:] = np.nan
-        case "constant":
-            values[:] = 2.0
-        case "one value":
-            values[:] = np.nan
-            values[2, 3] = 1.0
-        case "decades":
-            values = np.exp(3 * rng.standard_normal(values.shape))
-        case "tiny":
-            values = values[:8, :8]
-        case "wide":
-            values = values.ravel()[None, :600]
-        case "column":
-            values = values.ravel()[:40, None]
-        case "long":
-            values = values.reshape(4, -1)
-        case "channels":
-            values = values.ravel()[None, :6].copy()
-            values[0, 2] = np.nan
-        case "one pixel":
-            values = values[:1, :1]
+def put(values: np.ndarray, *changes: tuple[Any, float]) -> np.ndarray:
+    """Return a copy with other values at places."""
+    values = values.copy()
+    for place, value in changes:
+        values[place] = value
     return values
+
+
+PLAIN = np.random.default_rng(5).normal(2.0, 0.2, (24, 32))
+HOLES = np.where(np.random.default_rng(6).random(PLAIN.shape) < 0.3, np.nan, PLAIN)
+NOTHING = np.full(PLAIN.shape, np.nan)
+MAPS = {
+    "plain": PLAIN,
+    "hot": put(PLAIN, ((3, 4), 1e4)),
+    "holes": HOLES,
+    "empty": NOTHING,
+    "one value": put(NOTHING, ((2, 3), 1.0)),
+    "constant": np.full(PLAIN.shape, -7.5),
+    "zero": np.zeros(PLAIN.shape),
+    "decades": np.exp(3 * np.random.default_rng(7).standard_normal(PLAIN.shape)),
+    "tiny": PLAIN[:8, :8],
+    "wide": PLAIN.reshape(1, -1)[:, :600],
+    "column": PLAIN.reshape(-1, 1)[:40],
+    "long": PLAIN.reshape(4, -1),
+    "channels": put(PLAIN[:1, :6], ((0, 2), np.nan)),
+    "one pixel": PLAIN[:1, :1],
+}
 
 
 def chart_of(values: np.ndarray, name: str = "bias", stderr: np.ndarray | None = None) -> Chart:
@@ -128,17 +119,9 @@ def chart_of(values: np.ndarray, name: str = "bias", stderr: np.ndarray | None =
     return map_chart(map_tables(values, name, stderr, known), name, known)
 
 
-KINDS = (
-    *["plain", "hot", "holes", "empty", "constant", "decades", "tiny", "wide", "column", "long", "channels"],
-    "one value",
-    "one pixel",
-)
-
-
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", MAPS)
 def test_maps_of_all_kinds(kind: str) -> None:
-    values = _map(kind)
-    figure = draw_chart(LOOK, chart_of(values, "dark_current", np.abs(values) / 100))
+    figure = draw_chart(LOOK, chart_of(MAPS[kind], "dark_current", np.abs(MAPS[kind]) / 100))
     assert "(e⁻/px/s)" in texts(figure)
     drawn(figure)
 
@@ -170,19 +153,16 @@ def test_fit_status_map_has_a_legend_of_words(shape: tuple[int, int]) -> None:
     drawn(figure)
 
 
-def test_pixels_that_no_fit_has_reached_are_not_called_good() -> None:
+def test_pixels_that_no_fit_has_reached_are_not_called_good_and_every_status_is_counted() -> None:
     status, missing = np.zeros((6, 8), dtype=np.uint16), np.zeros((6, 8), dtype=bool)
     missing[:2] = True
     words = texts(draw_chart(LOOK, status_chart(status, reasons_in(status), missing))).replace("\xa0", " ")
     assert "not fitted yet: 16 (33 %)" in words
     assert "good fit: 32 (67 %)" in words
-
-
-def test_every_status_at_once() -> None:
-    status = (1 << np.arange(16, dtype=np.uint16)).reshape(2, 8)
-    rows = reasons_in(status)
+    every = (1 << np.arange(16, dtype=np.uint16)).reshape(2, 8)
+    rows = reasons_in(every)
     assert sum(n for _, _, n in rows) == 16
-    drawn(draw_chart(LOOK, status_chart(status, rows)))
+    drawn(draw_chart(LOOK, status_chart(every, rows)))
 
 
 @pytest.fixture(scope="module")
@@ -197,33 +177,24 @@ RMSE = {"epcd_exact": 1.3e-4, "noise_floor": 1.2e-4, "nuced_exact": 2e-4}
 def test_ensemble_shows_both_halves_with_rmse(arrays: dict[str, np.ndarray], width: float) -> None:
     figure = draw_chart(Look(width), ensemble_chart(ensemble_tables(arrays), RMSE, 250))
     words = texts(figure)
-    assert "exact mean over pixels, RMSE 1.3×10⁻⁴" in words
-    assert "sampling noise alone, RMSE 1.2×10⁻⁴" in words
+    for each in ("exact mean over pixels, RMSE 1.3×10⁻⁴", "sampling noise alone, RMSE 1.2×10⁻⁴"):
+        assert each in words
     assert "raw data, 250 frames" in words
     drawn(figure)
 
 
-def _half(arrays: dict[str, np.ndarray], *names: str) -> dict[str, np.ndarray]:
-    return {name: arrays[name] for name in names}
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda a: _half(a, "dn", "counts", "density"),
-        lambda a: _half(a, "electrons", "nuced_counts", "nuced_density", "nuced_exact"),
-        lambda a: {"dn": np.array([100]), "counts": np.array([7]), "density": np.array([1.0])},
-    ],
-)
-def test_ensemble_with_parts_missing(
-    arrays: dict[str, np.ndarray], change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]
-) -> None:
-    drawn(draw_chart(LOOK, ensemble_chart(ensemble_tables(change(arrays)), {})))
-
-
-def test_without_samples_there_is_no_ensemble(arrays: dict[str, np.ndarray]) -> None:
-    half = _half(arrays, "dn", "counts", "density", "epcd_exact")
-    assert ensemble_tables({}) == ensemble_tables({**half, "counts": np.zeros_like(half["counts"])}) == ()
+def test_ensemble_with_parts_missing(arrays: dict[str, np.ndarray]) -> None:
+    raw, nuced = (
+        {name: arrays[name] for name in names}
+        for names in (
+            ("dn", "counts", "density"), ("electrons", "nuced_counts", "nuced_density", "nuced_exact")
+        )
+    )  # fmt: skip
+    one = {"dn": np.array([100]), "counts": np.array([7]), "density": np.array([1.0])}
+    for some in (raw, nuced, one):
+        drawn(draw_chart(LOOK, ensemble_chart(ensemble_tables(some), {})))
+    no_samples = {**raw, "epcd_exact": arrays["epcd_exact"], "counts": np.zeros_like(raw["counts"])}
+    assert ensemble_tables({}) == ensemble_tables(no_samples) == ()
 
 
 def test_electron_numbers(arrays: dict[str, np.ndarray]) -> None:
@@ -257,7 +228,7 @@ def test_drawing_leaves_the_users_settings_alone(pixel: PixelFit) -> None:
 
 
 def test_a_palette_does_not_change_a_map_visibly() -> None:
-    full = drawing_bytes(draw_chart(LOOK, chart_of(_map("holes"))), "png", dpi=150)
+    full = drawing_bytes(draw_chart(LOOK, chart_of(HOLES)), "png", dpi=150)
     few = small_png(full)
     assert len(few) < len(full)
     before, after = (
@@ -296,15 +267,10 @@ def test_independent_pixels_give_the_power_of_chance(clean: StackSums) -> None:
 @pytest.mark.parametrize(("line", "cycles"), [("row", 5), ("column", 6)])
 def test_a_planted_wave_has_its_power_at_its_frequency(line: str, cycles: int) -> None:
     amplitude, length, across = 2.0, *((NY, NX) if line == "row" else (NX, NY))
-    rng = np.random.default_rng(5)
-    phase = rng.uniform(0.0, 2.0 * np.pi, (N, 1, 1))
+    phase = np.random.default_rng(5).uniform(0.0, 2.0 * np.pi, (N, 1, 1))
     place = np.arange(length) * 2.0 * np.pi * cycles / length
-
-    def moved(dn: np.ndarray) -> np.ndarray:
-        wave = amplitude * np.sin((place[:, None] if line == "row" else place) + phase)
-        return dn + wave
-
-    sums = simulated(12, moved)
+    wave = amplitude * np.sin((place[:, None] if line == "row" else place) + phase)
+    sums = simulated(12, lambda dn: dn + wave)
     table = next(each for each in line_spectra(sums) if each.part == f"noise_{line}")
     expected = 1.0 + across * length * amplitude**2 / 4.0 / float(np.mean(sums.variance))
     assert np.argmax(table["power"]) == cycles - 1
@@ -316,11 +282,9 @@ def test_a_planted_wave_has_its_power_at_its_frequency(line: str, cycles: int) -
 
 
 def test_what_moves_in_time_and_what_repeats_in_space_is_seen() -> None:
-    def moved(dn: np.ndarray) -> np.ndarray:
-        time = np.arange(N)[:, None, None]
-        return dn + 0.5 * np.sin(2.0 * np.pi * 0.2 * time) + 5.0 * (np.arange(NX) % 8 == 0)
-
-    sums = simulated(13, moved)
+    time = np.arange(N)[:, None, None]
+    added = 0.5 * np.sin(2.0 * np.pi * 0.2 * time) + 5.0 * (np.arange(NX) % 8 == 0)
+    sums = simulated(13, lambda dn: dn + added)
     spectrum = power_table(sums)
     assert spectrum["frequency"][np.argmax(spectrum["largest"])] == pytest.approx(0.2, rel=0.05)
     assert spectrum["largest"].max() > 100.0
@@ -330,15 +294,12 @@ def test_what_moves_in_time_and_what_repeats_in_space_is_seen() -> None:
     assert outside.sum() < 12
     pattern = next(each for each in pattern_spectra(sums) if each.part == "pattern_column")
     assert pattern["power"][NX // 8 - 1] > 20.0
-
-
-def test_hot_pixels_leave_the_pattern_as_it_is() -> None:
+    # and a hot pixel leaves the pattern as it is
     spoiled = simulated(11, lambda dn: dn + 900.0 * ((np.arange(NY)[:, None] == 7) & (np.arange(NX) == 9)))
     assert max(table["power"].max() for table in pattern_spectra(spoiled)) < 20.0
 
 
 def test_long_runs_are_averaged_and_figures_come_with_their_tables(clean: StackSums) -> None:
-
     long = replace(clean, numbers=np.arange(10 * N), all_means=np.tile(clean.all_means, 10))
     assert frame_table(long)["mean"].size == 1000
     assert frame_table(long)["mean"].mean() == pytest.approx(clean.frame_mean.mean())
@@ -349,10 +310,6 @@ def test_long_runs_are_averaged_and_figures_come_with_their_tables(clean: StackS
         assert all(csv_text(table).count("\n") > 5 for table in figure.tables)
         assert any(sign.isdigit() for sign in figure.alt)
     assert stability_figures(None) == []
-
-
-def test_a_line_of_channels_has_what_it_can(clean: StackSums) -> None:
-    line = sums_of(stack(np.random.default_rng(3), (200, 1, 30)))
-
-    for figure in stability_figures(line):
+    # a line of channels has what it can
+    for figure in stability_figures(sums_of(stack(np.random.default_rng(3), (200, 1, 30)))):
         assert drawing_bytes(figure.draw(Look()), "png", dpi=50)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from helpers.report_material import defects_of
 
+from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.report.data import Sample, Samples
 from pchem_pipeline.report.pages.emva import COLUMNS, emva_rows
@@ -11,64 +12,51 @@ from pchem_pipeline.report.pages.emva import COLUMNS, emva_rows
 SHAPE = (60, 80)
 
 
-class Maps:
-    """Maps as a store has them."""
-
-    def __init__(self):
-        rng = np.random.default_rng(3)
-        self.true = {
-            "quanta_exposure": 2.0 + 0.1 * rng.standard_normal(SHAPE),
-            "conversion_gain": 0.1 * (1 + 0.02 * rng.standard_normal(SHAPE)),
-            "bias": 100 + 3 * rng.standard_normal(SHAPE),
-            "read_noise_dn": 3 + 0.1 * rng.standard_normal(SHAPE),
-            "read_noise_e": 0.3 + 0.01 * rng.standard_normal(SHAPE),
-        }
-        self.true["quanta_exposure"][0, :24] = 30.0  # half a per cent is hot
-        self.arrays = {"fit/fit_status": np.zeros(SHAPE, np.uint16)}
-        for name, values in self.true.items():
-            error = 0.02 * np.median(values)
-            self.arrays[f"maps/{name}"] = values + error * rng.standard_normal(SHAPE)
-            self.arrays[f"maps/{name}_stderr"] = np.full(SHAPE, error)
-        self.arrays["fit/fit_status"][1] = int(FitStatus.BIAS_AMBIGUOUS)
-        self.arrays["maps/bias"][1] += 500
-        self.arrays["fit/fit_status"][2] = int(FitStatus.NO_DATA)
-        self.arrays["maps/dark_current"] = self.arrays["maps/quanta_exposure"] / 4
-        for name in [name for name in self.arrays if name.startswith("maps")]:
-            self.arrays[name][2] = np.nan
-
-    def rows(self, kind):
-        maps = {name.removeprefix("maps/"): values.copy() for name, values in self.arrays.items()}
-        status = maps.pop("fit/fit_status")
-        return emva_rows(maps, status, kind, defects_of(maps, status))
+def drawn():
+    """Maps with their errors, the words of the pixels, and the true maps; some pixels are hot."""
+    rng = np.random.default_rng(3)
+    true = {
+        "quanta_exposure": 2.0 + 0.1 * rng.standard_normal(SHAPE),
+        "conversion_gain": 0.1 * (1 + 0.02 * rng.standard_normal(SHAPE)),
+        "bias": 100 + 3 * rng.standard_normal(SHAPE),
+        "read_noise_dn": 3 + 0.1 * rng.standard_normal(SHAPE),
+        "read_noise_e": 0.3 + 0.01 * rng.standard_normal(SHAPE),
+    }
+    true["quanta_exposure"][0, :24] = 30.0  # half a per cent is hot
+    maps, status = {}, np.zeros(SHAPE, np.uint16)
+    for name, values in true.items():
+        error = 0.02 * np.median(values)
+        maps |= {name: values + error * rng.standard_normal(SHAPE), f"{name}_stderr": np.full(SHAPE, error)}
+    status[1], status[2] = int(FitStatus.BIAS_AMBIGUOUS), int(FitStatus.NO_DATA)
+    maps["bias"][1] += 500
+    maps["dark_current"] = maps["quanta_exposure"] / 4
+    for values in maps.values():
+        values[2] = np.nan
+    return maps, status, true
 
 
-@pytest.fixture(scope="module")
-def store():
-    return Maps()
+def table(maps, status, kind, *more):
+    rows = emva_rows(maps, status, kind, defects_of(maps, status), *more)
+    return {row.symbol or row.quantity: row for row in rows}
 
 
-def table(store, kind):
-    return {row.symbol or row.quantity: row for row in store.rows(kind)}
-
-
-def test_spreads_are_those_of_the_sensor_not_of_its_errors(store):
-    found = table(store, "light")
+def test_spreads_are_those_of_the_sensor_not_of_its_errors():
+    maps, status, true_maps = drawn()
+    found = table(maps, status, "light")
     kept = np.ones(SHAPE, bool)
     kept[1:3] = False
-    n = kept.sum()
     for row, true in (
-        (found["DSNU_1288"], 0.1 * store.true["bias"][kept].std()),
+        (found["DSNU_1288"], 0.1 * true_maps["bias"][kept].std()),
         (found["non-uniformity of the gain"], 2.0),
-        (found["K"], np.mean(1 / store.true["conversion_gain"][kept])),
+        (found["K"], np.mean(1 / true_maps["conversion_gain"][kept])),
         (found["sigma_d"], 0.3),
     ):
         assert abs(row.value - true) < 5 * row.standard_error + 0.001 * true, row
         assert 0 < row.standard_error < 0.1 * true
     # it can fail: with the errors of the pixels in it the spread of the gain is 2.8 %
-    gain = store.arrays["maps/conversion_gain"][kept]
+    gain = maps["conversion_gain"][kept]
     assert 100 * gain.std() / gain.mean() - 2.0 > 5 * found["non-uniformity of the gain"].standard_error
     assert found["hot pixels"].value == pytest.approx(100 * 24 / (60 * 80 - 80), rel=0.01)
-    assert n == 58 * 80
 
 
 def ladder(bend):
@@ -78,18 +66,12 @@ def ladder(bend):
     line = levels[:, None, None] * rate
     left = bend * (line - line.mean(axis=0)) ** 2 + error * rng.standard_normal((4, *SHAPE))
     read = {"read_noise_e": np.full(SHAPE, 0.3), "charge_per_level": rate + 0.01 * rng.standard_normal(SHAPE)}
-    maps = {
-        name: np.full(SHAPE, 1.0) for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
-    }
-    maps |= read
+    maps = {name: np.full(SHAPE, 1.0) for name in PARAMETERS} | read
     maps |= {f"{name}_stderr": np.full(SHAPE, 0.01) for name in maps}
     exposures = tuple(Sample(str(x), "exposed", x, 1000) for x in levels.tolist())
     arrays = {"quanta_exposure": line + left, "linearity_residual": left}
-    status = np.zeros(SHAPE, np.uint16)
-    found = emva_rows(
-        maps, status, "light", defects_of(maps, status), 6.0, Samples(exposures, "light_level", arrays)
-    )
-    rows = {row.symbol: row for row in found}
+    samples = Samples(exposures, "light_level", arrays)
+    rows = table(maps, np.zeros(SHAPE, np.uint16), "light", 6.0, samples)
     brightest = 8.0 * rate.mean() + left[3].mean()
     true = {
         "PRNU_1288": 3.0,
@@ -111,18 +93,17 @@ def test_exposures_at_several_light_levels_determine_linearity_and_prnu():
 
 
 @pytest.mark.parametrize("kind", ["dark", "light", "unknown"])
-def test_what_needs_dark_or_light_is_empty_without(store, kind):
-    found = table(store, kind)
+def test_what_needs_dark_or_light_is_empty_without(kind):
+    maps, status, _ = drawn()
+    found = table(maps, status, kind)
     assert (found["mu_I.mean"].value is not None) == (kind == "dark")
     assert (found["PRNU_1288 (similar)"].value is not None) == (kind == "light")
     assert found["eta"].cells()[2:4] == ["", ""]
     assert all(len(row.cells()) == len(COLUMNS) for row in found.values())
     assert all(row.definition_here and row.where_it_differs for row in found.values())
     assert ("the bias alone" in found["DSNU_1288"].where_it_differs) == (kind != "dark")
-
-
-def test_a_sensor_without_a_value_has_an_empty_table(store):
-    lost = Maps()
-    lost.arrays["fit/fit_status"][:] = int(FitStatus.NO_DATA)
+    # a sensor without a value has an empty table
+    status[:] = int(FitStatus.NO_DATA)
     with np.errstate(all="raise"):
-        assert all(row.cells()[2] == "" for row in lost.rows("dark") if row.quantity != "hot pixels")
+        lost = table(maps, status, kind)
+    assert all(row.cells()[2] == "" for row in lost.values() if row.quantity != "hot pixels")

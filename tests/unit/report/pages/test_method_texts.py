@@ -17,15 +17,8 @@ from pchem_pipeline.report.pages.tables import method_rows, method_tables, metho
 
 
 def errors(rmse):
-    gain = {
-        "n": 9,
-        "bias": 0.001,
-        "bias_stderr": 0.0,
-        "rmse": rmse,
-        "median": 0.0,
-        "robust_sd": rmse,
-        "bound": 0.01,
-    }
+    gain = {"n": 9, "bias": 0.001, "bias_stderr": 0.0, "median": 0.0, "bound": 0.01}
+    gain |= {"rmse": rmse, "robust_sd": rmse}
     return dict.fromkeys(("quanta_exposure", "conversion_gain", "bias", "read_noise_e"), gain)
 
 
@@ -47,13 +40,10 @@ def method(name, rmse, answered=10, missing=""):
 
 
 def study_point(noise, ours, transfer):
+    bounds = {"one sample": 0.9 * ours, "a dark and a bright sample": 0.9 * transfer}
     return {
         "read_noise_e": noise,
-        "bounds": {
-            "one sample": 0.9 * ours,
-            "a dark and a bright sample": 0.9 * transfer,
-            "photon_transfer": transfer,
-        },
+        "bounds": bounds | {"photon_transfer": transfer},
         "methods": {
             "pchem_em": method("pchem_em", ours),
             "photon_transfer": method("photon_transfer", transfer),
@@ -94,9 +84,7 @@ def test_the_text_has_a_row_for_every_method():
     assert "needs a dark and a bright sample" in text
     row = next(line for line in text.splitlines() if line.startswith("pchem em"))
     assert row.split()[2:] == ["10", "0.0909", "0.1", "1.1", "1.1", "1", "1.10", "1.1", "1.1", "100"]
-
-
-def test_against_a_fit_there_is_no_multiple_of_the_bound():
+    # against a fit there is no multiple of the bound
     result = {**RESULT, "reference": "fit", "methods": [method("pchem_em", None), method("cumulants", 0.2)]}
     ours, other = method_rows(result)
     assert "reference" in ours
