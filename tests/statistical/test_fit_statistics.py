@@ -6,7 +6,6 @@ from helpers.drawn_pixels import draw
 from helpers.em_trace import em_trace
 
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd
 
 
@@ -76,15 +75,3 @@ def test_a_large_expected_gap_is_that_to_the_polished_neighbour_but_for_some(cas
     assert result.n_iterations[0] < 8  # the neighbours were not visited
     assert gap > 80
     assert result.likelihood_gap[0] == pytest.approx(gap, rel=0.4)
-
-
-def test_starting_points_are_near_where_they_should_be():
-    regression, side_lobe = range(2)
-    few = drawn_in_range(42, 200, (0.15, 0.6), (0.2, 0.35))
-    many = drawn_in_range(43, 200, (1.5, 8), (0.2, 0.35))
-    for pixels, methods in ((few, (regression,)), (many, (regression, side_lobe))):
-        starts = starting_points(pixels.counts, pixels.origin)
-        for method in methods:
-            off = np.abs(starts[:, method, 1] / pixels.truth[:, 1] - 1)
-            assert np.median(off) < 0.15
-    assert np.isnan(starting_points(np.zeros((1, 9), np.uint32), np.array([0]))).all()

@@ -95,8 +95,9 @@ def test_likelihood_with_a_dark_sample_beats_photon_transfer_and_no_bound(exposu
         assert errors.std(ddof=1) < 0.5 * transfer
 
 
-def test_plain_em_ends_at_the_maximum():
-    given, truth = pixels((2.0,), 0.25, 200)
+@pytest.mark.parametrize("exposure", [0.4, 2.0])
+def test_plain_em_ends_at_the_maximum(exposure):
+    given, truth = pixels((exposure,), 0.25, 200)
     plain, _ = log_errors("plain_em", given, truth, MethodsSettings(em_tolerance=1e-9))
     full, _ = log_errors("pchem_em", given, truth)
     np.testing.assert_allclose(plain, full, atol=1e-5)
@@ -135,7 +136,6 @@ def cumulant_sd(exposure, noise, n_frames):
     """Asymptotic sd of ln(k3/k4) by its influence function, from the exact mass."""
     x = np.arange(-200.0, 400.0)
     mass = pcd_mass(x, exposure, GAIN, 0.3, np.sqrt(noise**2 - GAIN**2 / 12))
-    centred = x - mass @ x
 
     def ratio(weights):
         weights = weights / weights.sum()
@@ -144,7 +144,6 @@ def cumulant_sd(exposure, noise, n_frames):
         return np.log(m3 / (m4 - 3 * m2**2))
 
     assert mass.sum() == pytest.approx(1)
-    assert np.abs(centred).max() > 100
     # influence function by a small mass at each code
     step = 1e-7
     moved = [ratio((1 - step) * mass + step * unit) for unit in np.eye(x.size)]
