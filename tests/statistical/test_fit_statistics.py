@@ -6,6 +6,7 @@ from helpers.drawn_pixels import draw
 from helpers.em_trace import em_trace
 
 from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd
 
 
@@ -75,3 +76,11 @@ def test_a_large_expected_gap_is_that_to_the_polished_neighbour_but_for_some(cas
     assert result.n_iterations[0] < 8  # the neighbours were not visited
     assert gap > 80
     assert result.likelihood_gap[0] == pytest.approx(gap, rel=0.4)
+
+
+@pytest.mark.parametrize(("exposure", "methods"), [((0.15, 0.6), 1), ((1.5, 8), 2)])
+def test_starting_points_are_near_where_they_should_be(exposure, methods):
+    """By the regression, and of more electrons by the side lobe too."""
+    pixels = drawn_in_range(42, 200, exposure, (0.2, 0.35))
+    gain = starting_points(pixels.counts, pixels.origin)[:, :methods, 1]
+    assert (np.median(np.abs(gain / pixels.truth[:, 1:2] - 1), axis=0) < 0.15).all()

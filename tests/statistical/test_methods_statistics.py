@@ -95,9 +95,8 @@ def test_likelihood_with_a_dark_sample_beats_photon_transfer_and_no_bound(exposu
         assert errors.std(ddof=1) < 0.5 * transfer
 
 
-@pytest.mark.parametrize("exposure", [0.4, 2.0])
-def test_plain_em_ends_at_the_maximum(exposure):
-    given, truth = pixels((exposure,), 0.25, 200)
+def test_plain_em_ends_at_the_maximum():
+    given, truth = pixels((2.0,), 0.25, 200)
     plain, _ = log_errors("plain_em", given, truth, MethodsSettings(em_tolerance=1e-9))
     full, _ = log_errors("pchem_em", given, truth)
     np.testing.assert_allclose(plain, full, atol=1e-5)
