@@ -18,6 +18,7 @@ simulate:
 RUN = """
 run: {{store: {store}, tile: {tile}}}
 input: {{files: [frames/*.tif], integration_time: {seconds}}}
+histogram: {{block_frames: 32}}  # appended frames go into blocks as long as the first
 fit: {{gap_threshold: {gap}}}
 model: {{effects: [{effects}]}}
 """

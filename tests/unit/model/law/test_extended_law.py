@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.em_trace import evaluated
+from helpers.em_trace import evaluated, one_sample
 from helpers.extended_reference import EVERYTHING, LAWS, reference_mass
 from helpers.plain_law import pcd_mass
 from scipy.stats import binom, norm, poisson
@@ -99,18 +99,14 @@ def test_outliers_are_spread_evenly_and_weigh_nothing_else():
 @pytest.mark.parametrize("aside", [False, True])
 def test_score_and_information_are_the_derivatives(law, satellite, aside):
     model = EVERYTHING.with_counts(law, 0.06).with_clip(92, 158).with_outliers(1e-3, 4096)
-    counts = np.zeros(90, np.uint32)
-    counts[2:69] = np.arange(67) % 7 * 9 + 1
+    counts = np.pad(np.arange(67) % 7 * 9 + 1, (2, 21))
     packed = pack([model.with_free_satellites((1.3,))], 1)
     n_peaks = packed.peaks.shape[3] * (1 + packed.pattern.shape[0])
     n_exposures = max(packed.exposures.shape[2], packed.added.shape[3])
-    pixel = pixel_numba.make_pixel(np.array([False]), 90, n_peaks, n_exposures)
-    scratch = pixel_numba.make_scratch(1, 90, True)
-    mask = np.zeros(90, np.uint8)
-    if aside:
-        mask[10:31] = pixel_numba.SET_ASIDE
-    centre = 90 + pixel_numba.load(counts, mask, pixel.bins[0], pixel.facts[0])
-    pixel = pixel._replace(centre=int(centre))
+    mask = np.where((np.arange(90) >= 10) & (np.arange(90) < 31) & aside, pixel_numba.SET_ASIDE, 0)
+    pixel, scratch, centre = one_sample(counts, mask, n_peaks, n_exposures)
+    centre += 90
+    pixel = pixel._replace(centre=centre)
     cells_numba.resolve(packed, 0, satellite, pixel)
     at = scratch.evaluations[pixel_numba.AT]
 
@@ -123,9 +119,7 @@ def test_score_and_information_are_the_derivatives(law, satellite, aside):
     value, score, information = evaluate(here)
     alone = evaluated(pixel, here, pixel_numba.LOGLIK_ALONE, cells_likelihood(), scratch)
     assert alone == pytest.approx(value, rel=1e-12)
-    for i in range(5 if satellite else 4):
-        step = np.zeros(5)
-        step[i] = (1e-5, 1e-4, 1e-4, 1e-5, 1e-5)[i]
+    for i, step in enumerate(np.diag([1e-5, 1e-4, 1e-4, 1e-5, 1e-5])[: 5 if satellite else 4]):
         (above, score_above, _), (below, score_below, _) = evaluate(here + step), evaluate(here - step)
         assert score[i] == pytest.approx((above - below) / 2 / step[i], rel=1e-6, abs=1e-6 * abs(score).max())
         slope = (score_below - score_above) / 2 / step[i]
