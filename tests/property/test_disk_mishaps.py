@@ -5,7 +5,6 @@ import functools
 import re
 import threading
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,8 +20,7 @@ from pchem_pipeline.run.signals import StopRequest
 from pchem_pipeline.run.stage import WHOLE, Command, StageContext, open_store
 from pchem_pipeline.runner import execute as runner
 from pchem_pipeline.runner.execute import execute
-from pchem_pipeline.store import disk
-from pchem_pipeline.store.files import write_atomic, write_json
+from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.run_store import RunStore
 
 SENSOR = SensorInfo("frames", 10, 8, 16, "uint16", 14, 4.87, "copy", {})
@@ -162,16 +160,6 @@ def test_a_power_cut_at_any_moment(tmp_path, monkeypatch, before, step):
         assert_same(found, expected)
         lost += refused
     assert lost > 0 or step > 1  # chunks are not synced: their loss is found by whoever reads them
-
-
-def test_a_power_cut_knows_files_by_their_whole_paths(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with monkeypatch.context() as patch:
-        forgetful = ForgetfulDisk(patch)
-        write_atomic(Path("out.zarr/a"), b"x")
-        disk.sync_folder(tmp_path)
-    left = forgetful.after_power_cut(len(forgetful.log), np.random.default_rng(1))
-    assert left == {tmp_path / "out.zarr" / "a": b"x"}
 
 
 def test_readers_while_a_writer_works(tmp_path):

@@ -37,8 +37,8 @@ def drawn(model, truth, seed=3):
     return counts.astype(np.uint32)
 
 
-def origins(n):
-    return np.full(n, FIRST)
+def fitted(counts, first=FIRST, **how):
+    return fit_histograms(counts, np.full(len(counts), first), **how)
 
 
 def stderr(fit):
@@ -70,8 +70,8 @@ def test_fit_is_where_the_gradient_vanishes(name):
     if name == "clip":
         model = SampleLaw().with_clip(97, 180)
     counts = drawn(model, TRUTH)
-    plain = fit_histograms(counts, origins(5))
-    extended = fit_histograms(counts, origins(5), law=model, start=plain)
+    plain = fitted(counts)
+    extended = fitted(counts, law=model, start=plain)
     for pixel in (1, 3):
         offset = maximum(counts[pixel], model, extended.columns[pixel], stderr(extended)[pixel])
         assert abs(offset).max() < 1e-5, offset
@@ -82,12 +82,12 @@ def test_pixels_do_not_influence_each_other():
     model = LAWS["variance"].with_free_satellites([1.0, 2.0])
     truth = [np.repeat(column, 2) for column in TRUTH]
     counts = drawn(model, truth)
-    plain = fit_histograms(counts, origins(10))
-    together = fit_histograms(counts, origins(10), law=model, start=plain)
+    plain = fitted(counts)
+    together = fitted(counts, law=model, start=plain)
     for pixel in (0, 7):
         part = slice(pixel, pixel + 1)
-        alone = fit_histograms(counts[part], origins(1))
-        single = fit_histograms(counts[part, 10:], origins(1) + 10, law=model, start=alone)
+        alone = fitted(counts[part])
+        single = fitted(counts[part, 10:], FIRST + 10, law=model, start=alone)
         for name in {field.name for field in dataclasses.fields(FitResult)} - {"intervals"}:
             np.testing.assert_array_equal(getattr(single, name)[0], getattr(together, name)[pixel])
 
@@ -97,8 +97,8 @@ def test_a_pixel_without_plain_values_stays_without():
     counts[1] = 0
     counts[2] = 0
     counts[2, 60] = FRAMES
-    plain = fit_histograms(counts, origins(5))
-    extended = fit_histograms(counts, origins(5), law=LAWS["variance"], start=plain)
+    plain = fitted(counts)
+    extended = fitted(counts, law=LAWS["variance"], start=plain)
     assert extended.fit_status[1] == FitStatus.NO_DATA
     assert extended.fit_status[2] == FitStatus.TOO_FEW_BINS
     assert np.isnan(extended.columns[1:3]).all()
@@ -107,34 +107,34 @@ def test_a_pixel_without_plain_values_stays_without():
     # a start that is not there says it
     start = plain.columns.copy()
     start[3] = np.nan
-    found = fit_histograms(counts, origins(5), law=LAWS["variance"], start=start)
+    found = fitted(counts, law=LAWS["variance"], start=start)
     assert found.fit_status[3] == FitStatus.NOT_CONVERGED
 
 
 def test_bits_about_the_data_are_kept_and_those_about_the_plain_fit_are_not():
     model = SampleLaw().with_variance(per_electron=0.03)
     counts = drawn(model, TRUTH)
-    plain = fit_histograms(counts, origins(5), over=np.array([0, 0, 0, 2, 0]), adc_limits=(0, 4000))
+    plain = fitted(counts, over=np.array([0, 0, 0, 2, 0]), adc_limits=(0, 4000))
     marked = plain.fit_status | np.uint16(FitStatus.POOR_FIT | FitStatus.COARSE_STEPS)
     start = dataclasses.replace(plain, fit_status=marked)
-    extended = fit_histograms(counts, origins(5), law=model, start=start)
+    extended = fitted(counts, law=model, start=start)
     assert extended.fit_status.tolist() == [0, 0, 0, FitStatus.OUTSIDE_WINDOW, 0]
 
 
 def test_neighbour_is_taken_where_it_is_likelier():
     counts = drawn(SampleLaw(), TRUTH)
-    right = fit_histograms(counts, origins(5))
+    right = fitted(counts)
     wrong = dataclasses.replace(
         right,
         quanta_exposure=right.quanta_exposure + 1,
         bias=right.bias - 1 / right.conversion_gain,
         likelihood_gap=np.zeros(5),
     )
-    found = fit_histograms(counts, origins(5), law=SampleLaw(), start=wrong)
+    found = fitted(counts, law=SampleLaw(), start=wrong)
     np.testing.assert_allclose(found.bias, right.bias, atol=0.01)
     assert (found.likelihood_gap > 0).all()
     # a warm start is believed
-    stays = fit_histograms(counts, origins(5), law=SampleLaw(), start=wrong.columns)
+    stays = fitted(counts, law=SampleLaw(), start=wrong.columns)
     assert (abs(stays.bias - right.bias)[1:] > 5).all()
 
 
@@ -146,13 +146,13 @@ def test_exposure_that_is_added_leaves_h_as_it_is_without():
     truth = [np.tile(column, 20) for column in TRUTH]
     every = np.tile(np.arange(5), 20)
     counts = drawn(model.of(every), truth, seed=11)
-    plain = fit_histograms(counts, origins(100))
-    extended = fit_histograms(counts, origins(100), law=model.of(every), start=plain)
+    plain = fitted(counts)
+    extended = fitted(counts, law=model.of(every), start=plain)
     pull = (extended.columns - np.stack(truth, axis=1)) / stderr(extended)
     # the mean of twenty pulls, four standard errors
     assert abs(pull.reshape(20, 5, 4).mean(axis=0)).max() < 4 / np.sqrt(20)
     assert ((plain.quanta_exposure - truth[0]) / stderr(extended)[:, 0])[every < 4].mean() > 10
-    same = fit_histograms(counts, origins(100), law=SampleLaw(), start=plain)
+    same = fitted(counts, law=SampleLaw(), start=plain)
     np.testing.assert_array_equal(extended.columns[every == 4], same.columns[every == 4])
     mean = nearest_pcd(extended.columns.T.tolist(), model.of(every))[0]
     np.testing.assert_allclose(mean, extended.columns[:, 0] + (np.array(added) * weights).sum(axis=1)[every])
@@ -167,8 +167,8 @@ def test_free_satellites_are_found_where_they_are_and_nowhere_else():
     shares = np.stack([0.5 * weight, 1 - weight, 0.5 * weight], axis=1)
     shifts = np.stack([-amplitude, 0 * amplitude, amplitude], axis=1)
     counts = drawn(SampleLaw().with_noise(shares, shift_e=shifts), truth)
-    plain = fit_histograms(counts, origins(40))
-    extended = fit_histograms(counts, origins(40), law=law, start=plain)
+    plain = fitted(counts)
+    extended = fitted(counts, law=law, start=plain)
     found = extended.satellite_weight > 0
     np.testing.assert_array_equal(found, weight > 0)
     right = found & (abs(extended.satellite_amplitude_e - amplitude) < 0.1)

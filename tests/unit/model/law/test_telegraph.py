@@ -29,9 +29,10 @@ def drawn(rng, exposure):
     return np.rint(dn).astype(np.uint16)
 
 
-def pixel_with_mean(samples):
-    """The pixel with the exposure that a plain fit finds, the mean one."""
-    return np.array([(samples.mean() - PIXEL[2]) * PIXEL[1], *PIXEL[1:]])
+def looked_at(samples, frames):
+    """Return what is found, and the exposure of a plain fit, the mean one, with which it begins."""
+    mean = (samples.mean() - PIXEL[2]) * PIXEL[1]
+    return find_telegraph(samples, frames, np.array([mean, *PIXEL[1:]])), mean
 
 
 @pytest.mark.parametrize("n_processes", [1, 2])
@@ -79,9 +80,9 @@ def test_blinking_pixels_are_found_with_their_lower_exposure(gap):
         rng = np.random.default_rng(seed)
         up = course(rng, frames, SHARE, TAU)
         samples = drawn(rng, PIXEL[0] + STEP * up)
-        found = find_telegraph(samples, frames, pixel_with_mean(samples))
+        found, mean = looked_at(samples, frames)
         assert found.weight.sum() == pytest.approx(1.0)
-        steady = pixel_with_mean(samples)[0] - found.added @ found.weight
+        steady = mean - found.added @ found.weight
         # of a pixel whose states are known: the mean of its frames with the lower exposure
         noise = np.sqrt((PIXEL[0] + (PIXEL[1] * PIXEL[3]) ** 2) / (~up).sum())
         pulls.append((steady - PIXEL[0]) / noise)
@@ -94,10 +95,9 @@ def test_blinking_pixels_are_found_with_their_lower_exposure(gap):
 def test_two_defects_of_one_pixel_are_told_apart():
     rng = np.random.default_rng(2)
     frames = np.arange(4000)
-    low = course(rng, frames, 0.5, 80.0)
-    high = course(rng, frames, 0.3, 40.0)
+    low, high = course(rng, frames, 0.5, 80.0), course(rng, frames, 0.3, 40.0)
     samples = drawn(rng, PIXEL[0] + 0.8 * low + 1.7 * high)
-    found = find_telegraph(samples, frames, pixel_with_mean(samples))
+    found, _ = looked_at(samples, frames)
     assert found.step.size == 2
     np.testing.assert_allclose(np.sort(found.step), [0.8, 1.7], atol=0.25)
     np.testing.assert_allclose(found.added, added_of(found.step))
@@ -106,7 +106,7 @@ def test_two_defects_of_one_pixel_are_told_apart():
 
 def test_hardly_a_steady_pixel_is_said_to_blink():
     steady = [drawn(np.random.default_rng([7, seed]), np.full(2000, PIXEL[0])) for seed in range(200)]
-    found = [find_telegraph(each, np.arange(2000), pixel_with_mean(each)) for each in steady]
+    found = [looked_at(each, np.arange(2000))[0] for each in steady]
     # one in 300 is expected: more than four of 200 would come once in 1500 times
     assert sum(each is not None for each in found) <= 4
 
