@@ -87,13 +87,11 @@ def asked(action, *given, **options):
 
 @pytest.fixture
 def copy(finished, tmp_path):
-    """A copy of the finished run, to be damaged."""
     shutil.copytree(finished, tmp_path / "run")
     return tmp_path / "run"
 
 
 def cured(folder, words):
-    """Do what a line says."""
     forced = re.search(r"pchem (\w+) \S+ --force", words)
     removed = re.search(r"(?:delete (/\S+)|(/\S+) (?:is damaged|is missing).*; delete it)", words)
     if removed:

@@ -51,7 +51,6 @@ def a_sample(seed, *, hidden="", sigma_e=0.25, strength=0.0):
 
 
 def counted(x, **sample):
-    """Samples in DN (pixel, sample) as histograms."""
     x = np.rint(x).astype(np.int64)
     origin = x.min(axis=1)
     return SampleHistograms(histograms(x - origin[:, None])[0], origin, **sample)

@@ -23,7 +23,6 @@ FACTORS = (1.0, 2.5)
 
 
 def truth(rng):
-    """(H, g, mu, sigma) of the pixels."""
     return rng.uniform((1.0, 1 / 13, 98.0, 2.6), (2.5, 1 / 9, 102.0, 3.4), (N, 4))
 
 

@@ -21,7 +21,6 @@ GAIN, N = 1 / 11, 4000
 
 
 def pixels(exposures, noise, n_pixels, n_frames=N, seed=1, gain=GAIN):
-    """The same pixels under several exposures."""
     rng = np.random.default_rng([seed, round(1000 * noise), *(round(100 * h) for h in exposures)])
     bias = 100 + rng.random(n_pixels)
     drawn = [draw_histograms(rng, h, gain, bias, noise, n_frames) for h in exposures]

@@ -49,7 +49,6 @@ def test_blocks_add_up():
 
 
 def compared(one, other, good=GOOD, *, same_data=False, limit=None):
-    """The difference of one map."""
     return compare_maps([("bias", one, other)], good, same_data=same_data, limits={"bias": limit})["bias"]
 
 

@@ -31,7 +31,6 @@ def known(*columns):
 
 
 def converted(frames, pixels):
-    """Electron numbers of frames (frame, y, x) under their fitted exposure."""
     ends = frames.min(axis=0), frames.max(axis=0)
     return number_tables(*ends, pixels.exposure, pixels).convert(frames).number
 

@@ -9,12 +9,10 @@ from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of
 
 
 def fitted(dn, **options):
-    """Return the fit of samples of shape (pixel, frame)."""
     return fit_histograms(*histograms(dn), **options)
 
 
 def good(found):
-    """Return which pixels have values that are neither missing nor flagged."""
     return (found.fit_status & int(FAILED | FLAGGED)) == 0
 
 

@@ -50,7 +50,6 @@ class Sample(NamedTuple):
 
     @property
     def at(self):
-        """The evaluation."""
         return self.scratch.evaluations[AT, 0]
 
     @property

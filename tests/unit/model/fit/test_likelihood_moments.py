@@ -70,7 +70,6 @@ def test_they_are_those_of_the_curvature_where_the_peaks_are_clear():
 
 
 def log_likelihood(theta, codes, counts):
-    """Return that of parameters (m, 4) by plain sums."""
     exposure, gain, bias, sigma = theta.T[:, :, None]
     peaks = (poisson.pmf(k, exposure) * norm.pdf(codes, bias + k / gain, sigma) for k in range(16))
     return np.log(sum(peaks)) @ counts

@@ -13,7 +13,6 @@ STEP, SHARE, TAU = 0.9, 0.4, 60.0
 
 
 def course(rng, frames, share, tau):
-    """A telegraph signal, frame by frame."""
     up = np.empty(frames.size, bool)
     state = rng.random() < share
     for i, gap in enumerate(np.diff(frames, prepend=frames[0])):

@@ -20,7 +20,6 @@ def ordinary(n, rng, spread=0.02):
 
 
 def moments_of(pixels, samples, top=4095):
-    """Return the moments of samples (frame, pixel)."""
     return Moments(
         np.asarray(pixels, np.int64),
         np.full(len(pixels), len(samples)),
