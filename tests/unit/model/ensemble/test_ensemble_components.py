@@ -44,8 +44,8 @@ def test_every_case_is_that_of_maps_held_constant():
 
 
 def test_widths_survive_hot_pixels_many_electrons_and_none():
-    columns = [0.0, 2.0, 900.0], [0.1, 0.2, 0.1], [90.0, 100.0, 110.0], [1.0, 1.0, 1.0]
-    result = component_widths(UsablePixels(*np.array(columns)), 1500)
+    columns = np.array([[0.0, 2.0, 900.0], [0.1, 0.2, 0.1], [90.0, 100.0, 110.0], [1.0, 1.0, 1.0]])
+    result = component_widths(UsablePixels(*columns), 1500)
     assert np.isfinite(result.variance).all()
     assert result.mean[0] == pytest.approx((90 + np.exp(-2) * 100) / (1 + np.exp(-2)))
     assert result.mean[1400] == pytest.approx(110 + 1400 / 0.1)

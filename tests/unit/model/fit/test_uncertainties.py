@@ -24,15 +24,12 @@ CASES = [(2.0, 11.0, 0.3), (0.15, 9.0, 0.2), (1.5, 12.0, 0.46)]
 N = 3000
 
 
-def fitted(case, seed=3):
-    pixel = draw(np.random.default_rng(seed), *case, n_frames=N)
-    fit = fit_histograms(pixel.counts, pixel.origin, settings=FitSettings(tolerance=1e-12))
-    return pixel, fit.columns[0]
-
-
-def intervals(pixel, level):
-    settings = FitSettings(intervals="profile", interval_level=level)
-    return fit_histograms(pixel.counts, pixel.origin, settings=settings).intervals
+def fitted(case, level):
+    """Return a pixel, its fit and the ends of its profile intervals."""
+    pixel = draw(np.random.default_rng(3), *case, n_frames=N)
+    settings = FitSettings(tolerance=1e-12, intervals="profile", interval_level=level)
+    fit = fit_histograms(pixel.counts, pixel.origin, settings=settings)
+    return pixel, fit.columns[0], fit.intervals[0]
 
 
 def minuit(pixel, start, plain):
@@ -47,9 +44,8 @@ def minuit(pixel, start, plain):
 
 @pytest.mark.parametrize("case", CASES)
 def test_intervals_are_those_of_minuit(case):
-    pixel, at = fitted(case)
+    pixel, at, ends = fitted(case, 0.6827)
     found = minuit(pixel, at, lambda *theta: theta).minos(cl=0.6827)
-    ends = intervals(pixel, 0.6827)[0]
     for place, name in enumerate(("h", "g", "mu", "s")):
         other = found.merrors[name]
         width = ends[place, 1] - ends[place, 0]
@@ -57,12 +53,12 @@ def test_intervals_are_those_of_minuit(case):
 
 
 def test_the_interval_of_the_noise_in_electrons_is_a_profile_too():
-    pixel, at = fitted(CASES[2])
-    start = *at[:3], at[1] * at[3]
-    found = minuit(pixel, start, lambda h, g, mu, noise: (h, g, mu, noise / g)).minos("s", cl=0.95)
-    ends = intervals(pixel, 0.95)[0, INTERVAL_NAMES.index("read_noise_e")]
-    other = found.merrors["s"]
-    np.testing.assert_allclose(ends - at[1] * at[3], (other.lower, other.upper), rtol=0.02)
+    pixel, at, ends = fitted(CASES[2], 0.95)
+    noise_e = at[1] * at[3]
+    found = minuit(pixel, (*at[:3], noise_e), lambda h, g, mu, noise: (h, g, mu, noise / g))
+    other = found.minos("s", cl=0.95).merrors["s"]
+    ends = ends[INTERVAL_NAMES.index("read_noise_e")]
+    np.testing.assert_allclose(ends - noise_e, (other.lower, other.upper), rtol=0.02)
     # and it is far from symmetric here: standard errors would not do
     assert (other.upper + other.lower) / (other.upper - other.lower) > 0.02
 
