@@ -80,22 +80,6 @@ def test_anisotropy_is_found_where_it_is():
     assert plain.anisotropy == 0.0
 
 
-def test_a_path_of_the_gain_is_found():
-    effect = GainDrift(drift=0.06, shape="path", path=(-0.5, 0.5, -0.5))
-    found = GainDrift.estimate(evidence_of(effect))
-    assert found[0].shape == "path"
-    position = np.linspace(0, 1, 50)
-    assert np.corrcoef(found[0].drift * found[0].profile(position), effect.profile(position))[0, 1] > 0.95
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_gain_that_settles_is_found_as_such(sign):
-    effect = GainDrift(drift=0.06 * sign, shape="settling", settling_fraction=0.1)
-    [first] = [e for e in GainDrift.estimate(evidence_of(effect)) if e.shape == "settling"]
-    assert 0.05 <= first.settling_fraction <= 0.2
-    assert first.drift * sign > 0
-
-
 @pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)
 def test_the_opposite_direction_counts_for_nothing(effect):
     plain = evidence_of(seed=10)
