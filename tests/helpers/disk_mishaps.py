@@ -13,9 +13,9 @@ SYNCS = ("sync_file", "sync_folder")
 class FailingDisk:
     """Lets the n-th operation fail once, with an error of the operating system; counts all."""
 
-    def __init__(self, monkeypatch, operations=(*CHANGES, *SYNCS)):
+    def __init__(self, monkeypatch):
         self.count, self.at, self.number = 0, None, 0
-        for name in operations:
+        for name in (*CHANGES, *SYNCS):
             monkeypatch.setattr(disk, name, self._failing(name, getattr(disk, name)))
 
     def fail(self, at, number):
@@ -35,7 +35,7 @@ class FailingDisk:
 
 
 class ForgetfulDisk:
-    """Writes down what changes and what is synced, to build the disk as a power cut leaves it."""
+    """Writes down what changes and what is synced, by whole paths: the disk as a power cut leaves it."""
 
     def __init__(self, monkeypatch):
         self.log = []
@@ -44,8 +44,7 @@ class ForgetfulDisk:
             monkeypatch.setattr(disk, name, self._noted(name, getattr(disk, name)))
 
     def _noted(self, name, operation):
-        def call(*given):
-            arguments = [each.absolute() if isinstance(each, Path) else each for each in given]
+        def call(*arguments):
             entry = (name, *arguments)
             if name == "make_folder":
                 above = [arguments[0], *arguments[0].parents]
@@ -63,17 +62,14 @@ class ForgetfulDisk:
 
         return call
 
-    def after_power_cut(self, end, rng, before=None):
+    def after_power_cut(self, end, rng):
         """Return the files (path -> content) where the power is cut behind ``end`` operations.
-
-        ``before`` are those that were on the disk already.
 
         Each change of names in a folder that was not synced later is there or not, in any order; so is what
         lies in a new folder whose own name was not. A content that was not synced is whole, cut, or empty.
         """
         log = self.log[:end]
-        files, kept = dict(before or {}), self._kept(log)
-        lost = []
+        files, kept, lost = {}, self._kept(log), []
         for i, (name, *arguments) in enumerate(log):
             path = arguments[0]
             if name not in CHANGES or (

@@ -33,13 +33,14 @@ class EmTrace(NamedTuple):
     parameters: Array
 
 
-def one_sample(counts: NDArray[np.integer]) -> tuple[Pixel, Scratch, int]:
+def one_sample(
+    counts: NDArray[np.integer], mask: ArrayLike = 0, n_peaks: int = 0, n_exposures: int = 0
+) -> tuple[Pixel, Scratch, int]:
     """Return one histogram as the loops take it, room to work in, and its centre in bins after the first."""
-    pixel = make_pixel(FREE, counts.size, 0, 0)
-    scratch = make_scratch(1, counts.size, False)
-    centre = load(
-        np.asarray(counts, np.uint32), np.zeros(counts.size, np.uint8), pixel.bins[0], pixel.facts[0]
-    )
+    pixel = make_pixel(FREE, counts.size, n_peaks, n_exposures)
+    scratch = make_scratch(1, counts.size, n_peaks > 0)
+    whole = np.full(counts.size, mask, np.uint8)
+    centre = load(np.asarray(counts, np.uint32), whole, pixel.bins[0], pixel.facts[0])
     return pixel, scratch, int(centre)
 
 

@@ -18,10 +18,17 @@ simulate:
 RUN = """
 run: {{store: {store}, tile: {tile}}}
 input: {{files: [frames/*.tif], integration_time: {seconds}}}
+histogram: {{block_frames: 32}}  # appended frames go into blocks as long as the first
 fit: {{gap_threshold: {gap}}}
 model: {{effects: [{effects}]}}
 """
 STAGES = ("ingest", "histogram", "fit", "maps", "ensemble")
+CHANGES = (
+    ("seconds", 2.0),
+    ("gap", 6.0),
+    ("effects", "{tag: nonlinearity, step_change: 0.004}"),
+    ("effects", ""),
+)
 
 
 class Commands(RuleBasedStateMachine):
@@ -33,10 +40,9 @@ class Commands(RuleBasedStateMachine):
         self.shell = Shell(self.folder)
         (self.folder / "camera.yaml").write_text(CAMERA)
         self.shell.ok("simulate", "camera.yaml", "--quiet")
-        files = sorted((self.folder / "frames").iterdir())
         self.later = self.folder / "later"
         self.later.mkdir()
-        for file in files[1:]:
+        for file in sorted((self.folder / "frames").iterdir())[1:]:
             file.rename(self.later / file.name)
         self.settings = {"tile": 8, "seconds": 1.0, "gap": 5.0, "effects": ""}
         self.write("run.zarr")
@@ -56,16 +62,7 @@ class Commands(RuleBasedStateMachine):
             except subprocess.TimeoutExpired:
                 process.kill()
 
-    @rule(
-        change=sampled_from(
-            [
-                ("seconds", 2.0),
-                ("gap", 6.0),
-                ("effects", "{tag: nonlinearity, step_change: 0.004}"),
-                ("effects", ""),
-            ]
-        )
-    )
+    @rule(change=sampled_from(CHANGES))
     def change(self, change):
         self.settings |= [change]
         self.write("run.zarr")

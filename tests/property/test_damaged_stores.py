@@ -76,17 +76,22 @@ def damaged(path, kind, rng):
         path.write_bytes(content)
 
 
-def asked(action):
+def asked(action, *given, **options):
     """Do something with a run; return the line that refuses it, or nothing."""
     try:
-        action()
+        action(*given, **options)
     except PchEmError as error:
         return str(error)
     return ""
 
 
+@pytest.fixture
+def copy(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "run")
+    return tmp_path / "run"
+
+
 def cured(folder, words):
-    """Do what a line says."""
     forced = re.search(r"pchem (\w+) \S+ --force", words)
     removed = re.search(r"(?:delete (/\S+)|(/\S+) (?:is damaged|is missing).*; delete it)", words)
     if removed:
@@ -101,26 +106,19 @@ def cured(folder, words):
 
 def check(folder, victim, expected, forced):
     """Ask status, notebook, run and a stage; follow each line; the numbers are the same in the end."""
-    place = folder / "run.yaml"
-
-    def forced_stage():
-        run(place, [forced], force=True)
-
-    for action in (
-        lambda: run_status(find_run(folder / "run.zarr")),
-        lambda: same(numbers(folder / "run.zarr"), expected, victim),
-        forced_stage,
-        lambda: run(place),
+    place, store = folder / "run.yaml", folder / "run.zarr"
+    for words in (
+        asked(lambda: run_status(find_run(store))),
+        asked(lambda: same(numbers(store), expected, victim)),
+        asked(run, place, [forced], force=True),
+        asked(run, place),
     ):
-        words = asked(action)
         assert not words or (str(folder) in words and "; " in words and "\n" not in words), words
     for _ in range(8):
-        words = asked(lambda: run(place)) or asked(
-            lambda: same(numbers(folder / "run.zarr"), expected, victim)
-        )
+        words = asked(run, place) or asked(lambda: same(numbers(store), expected, victim))
         if not words:
             break
-        asked(lambda words=words: cured(folder, words))
+        asked(cured, folder, words)
     assert not words, f"{victim}: {words}"
     assert {state.state for state in run_status(find_run(place))} == {"complete"}, victim
 
@@ -168,26 +166,21 @@ def test_chunks_that_are_exchanged_or_cut_are_found(finished, tmp_path, array, r
         states = {each.stage: each for each in run_status(find_run(folder / "run.yaml"))}
         words = f"{array} is missing or has changed"
         assert (states[group].state, states[group].why) == ("stale", words)
-        refused = asked(lambda place=folder: run(place / "run.yaml", [reader], force=True))
-        assert f"{words}; " in refused
+        assert f"{words}; " in asked(run, folder / "run.yaml", [reader], force=True)
         run(folder / "run.yaml")
         same(numbers(folder / "run.zarr"), expected)
 
 
-def test_without_the_model_of_the_fit_nothing_is_expected_of_a_pixel(finished, tmp_path):
+def test_without_the_model_of_the_fit_nothing_is_expected_of_a_pixel(finished, copy):
     """It was expected of the plain PCD, without a word."""
-    folder = tmp_path / "run"
-    shutil.copytree(finished, folder)
-    (folder / "run.zarr/model/0001.json").unlink()
+    (copy / "run.zarr/model/0001.json").unlink()
     with pytest.raises(StoreError, match="the model used by fit is missing; run again"):
-        open_run(folder / "run.zarr").pixel(3, 5)
-    run(folder / "run.yaml")
-    same(numbers(folder / "run.zarr"), numbers(finished / "run.zarr"))
+        open_run(copy / "run.zarr").pixel(3, 5)
+    run(copy / "run.yaml")
+    same(numbers(copy / "run.zarr"), numbers(finished / "run.zarr"))
 
 
-def test_pixels_of_a_tile_that_failed_have_no_value(finished, tmp_path, monkeypatch):
-    folder = tmp_path / "run"
-    shutil.copytree(finished, folder)
+def test_pixels_of_a_tile_that_failed_have_no_value(copy, monkeypatch):
     do_tile = maps._do_tile
 
     def failing(tile, store, **more):
@@ -196,30 +189,27 @@ def test_pixels_of_a_tile_that_failed_have_no_value(finished, tmp_path, monkeypa
         return do_tile(tile, store, **more)
 
     monkeypatch.setattr(maps, "_do_tile", failing)
-    assert "maps: 1 of 2 units failed" in asked(lambda: run(folder / "run.yaml", ["maps"], force=True))
-    found = open_run(folder / "run.zarr")
+    assert "maps: 1 of 2 units failed" in asked(run, copy / "run.yaml", ["maps"], force=True)
+    found = open_run(copy / "run.zarr")
     assert found.maps.quality.values[:, 8:].tolist() == [[NO_VALUE] * 8] * 8
     assert not found.usable[:, 8:].any()
     assert found.good[:, :8].sum() > 32
     assert np.isnan(found.maps.bias[:, 8:]).all()
 
 
-def test_chunks_that_0_2_left_out_are_read(finished, tmp_path):
+def test_chunks_that_0_2_left_out_are_read(copy):
     """There a chunk of the fill value alone was not written, and descriptions have no digest."""
-    folder = tmp_path / "run"
-    shutil.copytree(finished, folder)
-    expected = numbers(folder / "run.zarr")
-    for place in (folder / "run.zarr").rglob("*.json"):
-        if place.name == "report.json":
-            continue
+    store = copy / "run.zarr"
+    expected = numbers(store)
+    for place in {*store.rglob("*.json")} - {store / "report.json"}:
         content = json.loads(place.read_text())
-        content.pop("digest_of_content", None)
-        content.get("attributes", {}).pop("digest_of_content", None)
+        for part in (content, content.get("attributes", {})):
+            part.pop("digest_of_content", None)
         content.pop("files", None)
         place.write_text(json.dumps(content))
-    place = folder / "run.zarr/.pchem/config.yaml"
+    place = store / ".pchem/config.yaml"
     place.write_text(place.read_text().partition("\n")[2])
     assert not np.any(expected["histogram/under"])
-    shutil.rmtree(folder / "run.zarr/histogram/under/c")
-    same(numbers(folder / "run.zarr"), expected)
-    assert {state.state for state in run_status(find_run(folder / "run.yaml"))} == {"complete"}
+    shutil.rmtree(store / "histogram/under/c")
+    same(numbers(store), expected)
+    assert {state.state for state in run_status(find_run(copy / "run.yaml"))} == {"complete"}

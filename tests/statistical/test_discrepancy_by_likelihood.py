@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.drawn_pixels import histograms
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.by_likelihood.explainer import find_in_histograms
@@ -41,41 +42,32 @@ def signal(rng, h, hidden, strength, sigma_e):
     return k + noise
 
 
-def histograms(seed, *, hidden="", sigma_e=0.25, strength=0.0):
-    """Histograms of sensors with every sample drawn."""
+def a_sample(seed, *, hidden="", sigma_e=0.25, strength=0.0):
+    """Histograms of pixels with every sample drawn, and their DN per electron and bias."""
     rng = np.random.default_rng(seed)
-    exposure = rng.uniform(0.6, 4.0, PIXELS)
-    step, bias = rng.uniform(13.0, 15.0, (PIXELS, 1)), rng.uniform(80.0, 120.0, (PIXELS, 1))
-    h = np.broadcast_to(exposure[:, None], (PIXELS, SAMPLES))
-    return counted(bias + step * signal(rng, h, hidden, strength, sigma_e))
+    h, step, bias = (rng.uniform(*each, (PIXELS, 1)) for each in ((0.6, 4.0), (13.0, 15.0), (80.0, 120.0)))
+    h = np.broadcast_to(h, (PIXELS, SAMPLES))
+    return counted(bias + step * signal(rng, h, hidden, strength, sigma_e)), step.ravel(), bias.ravel()
 
 
 def counted(x, **sample):
-    """Samples in DN (pixel, sample) as histograms."""
     x = np.rint(x).astype(np.int64)
     origin = x.min(axis=1)
-    width = int((x.max(axis=1) - origin).max()) + 1
-    counts = [np.bincount(row - first, minlength=width) for row, first in zip(x, origin, strict=True)]
-    return SampleHistograms(np.array(counts, np.uint32), origin, **sample)
+    return SampleHistograms(histograms(x - origin[:, None])[0], origin, **sample)
 
 
 def test_a_peak_that_is_taken_for_that_of_no_electron_is_put_right_with_the_effect():
     """The plain fit of some bright pixels is an electron off; with the effect from there, too, it misfits."""
-    rng = np.random.default_rng(101)
-    h, step, bias = (rng.uniform(*limits, PIXELS) for limits in ((0.6, 4.0), (13.0, 15.0), (80.0, 120.0)))
-    k = branching_numbers(rng, np.broadcast_to(h[:, None], (PIXELS, SAMPLES)), 0.1, (PIXELS, SAMPLES))
-    electrons = k + 0.2 * rng.normal(size=k.shape)
-    found = find_in_histograms([counted(bias[:, None] + step[:, None] * electrons)], SETTINGS)
+    sample, step, bias = a_sample(101, hidden="branching_counts", sigma_e=0.2, strength=0.1)
+    found = find_in_histograms([sample], SETTINGS)
     assert found.verdict.verdict == "named"
     assert found.verdict.effects == ("branching_counts",)
     assert abs((found.maps.bias.ravel() - bias) / step).max() < 0.2
 
 
 def test_nothing_hidden_is_consistent():
-    found = find_in_histograms([histograms(1)], SETTINGS).verdict
-    assert found.verdict == "consistent"
-    assert found.model_effects == ()
-    assert found.effects == ()
+    found = find_in_histograms([a_sample(1)[0]], SETTINGS).verdict
+    assert (found.verdict, found.model_effects, found.effects) == ("consistent", (), ())
     assert found.gap.before < 3 * found.gap.floor
     assert "row_noise" in found.untestable
     assert "no frame order and no neighbours" in found.untestable["row_noise"]
@@ -86,13 +78,11 @@ def test_nothing_hidden_is_consistent():
     [("branching_counts", 0.08, "branching"), ("signal_dependent_noise", 0.11, "noise_e")],
 )
 def test_what_is_hidden_is_named(hidden, strength, name):
-    found = find_in_histograms([histograms(7, hidden=hidden, strength=strength)], SETTINGS).verdict
+    found = find_in_histograms([a_sample(7, hidden=hidden, strength=strength)[0]], SETTINGS).verdict
     assert found.verdict == "named", found.sentence
     assert found.effects == (hidden,)
     [step] = found.steps
-    fitted = step.parameters[name]
-    assert abs(fitted.value - strength) < 5 * fitted.stderr
-    assert 0 < fitted.stderr < 0.2 * strength
+    assert_strength(step, name, strength)
     # the gap falls to what chance leaves, and a wrong effect in its place does not bring it there
     assert step.gap_before > 3 * step.gap_floor
     assert step.gap_after < 2 * step.gap_floor
@@ -102,10 +92,9 @@ def test_what_is_hidden_is_named(hidden, strength, name):
 
 def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tried():
     short = SETTINGS.model_copy(update={"effort": 1e-5})
-    sample = histograms(7, hidden="branching_counts", strength=0.08)
+    sample, _, _ = a_sample(7, hidden="branching_counts", strength=0.08)
     found = find_in_histograms([sample], short).verdict
-    assert found.verdict == "unexplained"
-    assert found.effects == ()
+    assert (found.verdict, found.effects) == ("unexplained", ())
     assert "used its budget" in found.limit
     assert "branching_counts" in found.limit
     assert find_in_histograms([sample], short).verdict == found
@@ -113,16 +102,15 @@ def test_a_search_that_ends_at_its_limit_names_nothing_and_says_what_was_not_tri
 
 def test_an_effect_of_the_model_is_not_added_again_and_the_rest_is_consistent():
     present = effect_class("branching_counts")(branching=0.08)
-    found = find_in_histograms(
-        [histograms(7, hidden="branching_counts", strength=0.08)], SETTINGS, model=(present,)
-    )
+    sample, _, _ = a_sample(7, hidden="branching_counts", strength=0.08)
+    found = find_in_histograms([sample], SETTINGS, model=(present,))
     assert found.verdict.gap.before < 2 * found.verdict.gap.floor
     assert found.verdict.effects == ()
     assert found.model == (present,)
 
 
 def test_a_peak_that_was_cut_is_set_aside_and_bends_nothing():
-    sample = histograms(11, hidden="branching_counts", strength=0.2, sigma_e=0.12)
+    sample, _, _ = a_sample(11, hidden="branching_counts", strength=0.2, sigma_e=0.12)
     # a trigger that drops nine of ten samples without electrons
     rng = np.random.default_rng(2)
     for row in sample.counts:
@@ -139,12 +127,14 @@ def test_a_peak_that_was_cut_is_set_aside_and_bends_nothing():
     assert found.gap.after < found.gap.before
 
 
-def test_too_few_samples_are_refused_in_one_line():
+def test_too_few_samples_and_samples_of_other_pixels_are_refused_in_one_line():
+    def sample(pixels, count):
+        return SampleHistograms(np.full((pixels, 50), count, np.uint32), np.zeros(pixels, np.int64))
+
     with pytest.raises(InputError, match="900 needed"):
-        find_in_histograms([SampleHistograms(np.ones((4, 50), np.uint32), np.zeros(4, np.int64))], SETTINGS)
-
-
-# -- several exposures of the same pixels, all pixels alike ---------------------------------------------
+        find_in_histograms([sample(4, 1)], SETTINGS)
+    with pytest.raises(InputError, match="different numbers of pixels"):
+        find_in_histograms([sample(4, 99), sample(5, 99)], SETTINGS)
 
 
 def exposures(seed, levels, *, hidden="", strength=0.0, sigma_e=0.25, times=(None, None, None)):
@@ -161,10 +151,10 @@ def exposures(seed, levels, *, hidden="", strength=0.0, sigma_e=0.25, times=(Non
     return samples
 
 
-def strength_of(step, name):
+def assert_strength(step, name, expected):
     fitted = step.parameters[name]
     assert 0 < fitted.stderr < 0.2 * fitted.value
-    return fitted.value, fitted.stderr
+    assert abs(fitted.value - expected) < 5 * fitted.stderr
 
 
 @pytest.mark.parametrize(
@@ -180,8 +170,7 @@ def test_several_exposures_tell_branching_from_overdispersion(hidden, strength, 
     joint = find_in_histograms(samples, SETTINGS).verdict
     assert joint.verdict == "named", joint.sentence
     assert joint.effects == (hidden,)
-    value, stderr = strength_of(joint.steps[0], name)
-    assert abs(value - strength) < 5 * stderr
+    assert_strength(joint.steps[0], name, strength)
     assert joint.gap.after < joint.gap.before / 5
 
 
@@ -194,8 +183,7 @@ def test_several_exposures_tell_signal_dependent_noise_from_a_gain_error():
     assert np.nanstd(1.0 / single.maps.conversion_gain) / 14.0 > 2 * 0.15**2
     joint = find_in_histograms(samples, SETTINGS)
     assert joint.verdict.effects == ("signal_dependent_noise",), joint.verdict.sentence
-    value, stderr = strength_of(joint.verdict.steps[0], "noise_e")
-    assert abs(value - 0.15) < 5 * stderr
+    assert_strength(joint.verdict.steps[0], "noise_e", 0.15)
     steps = 1.0 / joint.maps.conversion_gain[:, 0]
     assert abs(np.median(steps) / 14.0 - 1.0) < 0.15**2 / 4
 
@@ -206,8 +194,7 @@ def test_integration_times_tell_spurious_charge_from_dark_current():
     hidden = {"hidden": "spurious_charge", "strength": 0.1}
     found = find_in_histograms(exposures(1, levels, times=times, **hidden), settings).verdict
     assert found.effects == ("spurious_charge",), found.sentence
-    value, stderr = strength_of(found.steps[0], "mean_e")
-    assert abs(value - 0.1) < 5 * stderr
+    assert_strength(found.steps[0], "mean_e", 0.1)
     assert "spurious_charge" not in found.untestable
     # dark current alone, exposures that are no matter of time, and the same charge without times
     alone = find_in_histograms(exposures(1, levels, times=times), settings).verdict
@@ -216,12 +203,6 @@ def test_integration_times_tell_spurious_charge_from_dark_current():
     for verdict in (alone, other, timeless):
         assert verdict.verdict == "consistent", verdict.sentence
     assert "spurious_charge" in timeless.untestable
-
-
-def test_samples_of_other_pixels_are_refused():
-    first, second = histograms(1), histograms(2)
-    with pytest.raises(InputError, match="different numbers of pixels"):
-        find_in_histograms([first, SampleHistograms(second.counts[:5], second.origin[:5])], SETTINGS)
 
 
 def test_places_are_those_of_the_sensor():
@@ -233,6 +214,5 @@ def test_places_are_those_of_the_sensor():
         row[::2] = 200
     one = SETTINGS.model_copy(update={"candidates": ("branching_counts",)})
     found = find_in_histograms(samples, one, width=6).verdict
-    assert found.examined.rows == (0, 4)
-    assert found.examined.columns == (0, 6)
+    assert (found.examined.rows, found.examined.columns) == ((0, 4), (0, 6))
     assert all(y < 4 and x < 6 for place in found.where for y, x in place.pixels)

@@ -58,21 +58,18 @@ def evidence_of(*effects, seed=1):
     ids=lambda v: v.tag,
 )
 def test_the_strength_is_found_to_a_factor_of_five(effect):
-    kinds = ("growth", "noise", "sampling")
-    guesses = [
-        guess
-        for guess in type(effect).estimate(evidence_of(effect))
-        if all(getattr(guess, kind, None) == getattr(effect, kind, None) for kind in kinds)
-    ]
-    truth = getattr(effect, effect.strength)
-    assert any(0.2 < getattr(guess, effect.strength) / truth < 5 for guess in guesses)
-    assert all(getattr(guess, effect.strength) * truth > 0 for guess in guesses)
+    guesses = type(effect).estimate(evidence_of(effect))
+    for kind in ("growth", "noise", "sampling"):
+        guesses = [g for g in guesses if getattr(g, kind, None) == getattr(effect, kind, None)]
+    ratio = np.array([getattr(g, effect.strength) for g in guesses]) / getattr(effect, effect.strength)
+    assert ((ratio > 0.2) & (ratio < 5)).any()
+    assert (ratio > 0).all()
 
 
 @pytest.mark.parametrize(("share", "tau"), [(0.03, 3.0), (0.02, 40.0)])
 def test_the_correlation_time_is_among_the_guesses(share, tau):
-    effect = FlickerNoise(share=share, correlation_frames=tau)
-    assert any(0.3 < g.correlation_frames / tau < 3.5 for g in FlickerNoise.estimate(evidence_of(effect)))
+    guesses = FlickerNoise.estimate(evidence_of(FlickerNoise(share=share, correlation_frames=tau)))
+    assert any(0.3 < g.correlation_frames / tau < 3.5 for g in guesses)
 
 
 def test_anisotropy_is_found_where_it_is():
@@ -81,22 +78,6 @@ def test_anisotropy_is_found_where_it_is():
     assert first.anisotropy == pytest.approx(0.7, abs=0.2)
     [plain] = InterpixelCapacitance.estimate(evidence_of(InterpixelCapacitance(coupling=0.005)))
     assert plain.anisotropy == 0.0
-
-
-def test_a_path_of_the_gain_is_found():
-    effect = GainDrift(drift=0.06, shape="path", path=(-0.5, 0.5, -0.5))
-    found = GainDrift.estimate(evidence_of(effect))
-    assert found[0].shape == "path"
-    position = np.linspace(0, 1, 50)
-    assert np.corrcoef(found[0].drift * found[0].profile(position), effect.profile(position))[0, 1] > 0.95
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_gain_that_settles_is_found_as_such(sign):
-    effect = GainDrift(drift=0.06 * sign, shape="settling", settling_fraction=0.1)
-    [first] = [e for e in GainDrift.estimate(evidence_of(effect)) if e.shape == "settling"]
-    assert 0.05 <= first.settling_fraction <= 0.2
-    assert first.drift * sign > 0
 
 
 @pytest.mark.parametrize("effect", CLASSES, ids=lambda c: c.__name__)

@@ -66,21 +66,16 @@ def test_a_drift_of_any_profile_is_followed():
 def test_flicker_of_two_levels(levels, shares):
     evidence = seen(ExposureFlicker(rms=0.06, levels=levels, shares=shares))
     found, plain = ExposureFlicker.estimate(evidence)
+    assert 1 / 3 < found.rms / 0.06 < 3
     assert not plain.levels
     assert len(found.levels) == 2
     assert abs(found.shares[1] - shares[1]) < 5 * np.sqrt(shares[0] * shares[1] / evidence.n_frames)
 
 
-def test_flicker_with_a_memory():
-    evidence = seen(ExposureFlicker(rms=0.05, correlation_frames=4.0))
-    found = ExposureFlicker.estimate(evidence)[0]
-    # as many independent values as fit into the frames
-    assert abs(found.correlation_frames / 4.0 - 1) < 5 * np.sqrt(2 * 4.0 / evidence.n_frames)
-
-
 def test_flicker_on_a_line():
     evidence = seen(ExposureFlicker(rms=0.02, period_frames=7.3, phase_cycles=0.3))
     found = ExposureFlicker.estimate(evidence)[0]
+    assert 1 / 3 < found.rms / 0.02 < 3
     noise = 1.0 / np.sum(evidence.charge_std[evidence.maps.usable] ** 2)  # of a frame's relative exposure
     # Rife and Boorstyn 1974: variance of a frequency
     frequency = np.sqrt(6 * noise / evidence.n_frames) / (0.02 * np.sqrt(2) * np.pi * N)
@@ -93,8 +88,6 @@ def test_flicker_on_a_line():
     [
         ExposureFlicker(rms=0.04),
         ExposureFlicker(rms=0.05, correlation_frames=4.0),
-        ExposureFlicker(rms=0.02, period_frames=7.3),
-        ExposureFlicker(rms=0.06, levels=(0.0, 1.0), shares=(0.95, 0.05)),
         OverdispersedCounts(relative_variance=0.03),
         BranchingCounts(branching=0.03),
         OpticalCrosstalk(probability=0.04),
@@ -105,9 +98,16 @@ def test_flicker_on_a_line():
     ids=lambda effect: effect.tag,
 )
 def test_the_strength_is_found_to_a_factor_of_three(truth):
-    found = type(truth).estimate(seen(truth))
+    evidence = seen(truth)
+    found = type(truth).estimate(evidence)
     assert 1 / 3 < getattr(found[0], truth.strength) / getattr(truth, truth.strength) < 3
     assert getattr(truth, "dwell_low_frames", None) in [getattr(o, "dwell_low_frames", None) for o in found]
+    if tau := getattr(truth, "correlation_frames", None):
+        # as many independent values as fit into the frames
+        assert abs(found[0].correlation_frames / tau - 1) < 5 * np.sqrt(2 * tau / evidence.n_frames)
+    if isinstance(truth, CosmicRays):
+        assert 0.5 < found[0].length_um / truth.length_um < 2.0
+        assert 0.5 < found[0].electrons_per_um / truth.electrons_per_um < 2.0
 
 
 def test_what_would_begin_brighter_than_any_scene_is_no_afterglow(monkeypatch):
@@ -135,16 +135,9 @@ def test_persistence():
     assert np.sum((found - wanted) ** 2) < 0.15 * np.sum(wanted**2)
     # the grid of radii has steps of 1.4, so the peak is known to half that
     assert abs(spot.peak_e - 0.5) < 0.5 * 0.5
-    assert abs(spot.centre_y - 0.3) < 0.07
-    assert abs(spot.centre_x - 0.6) < 0.07
+    assert (spot.centre_y, spot.centre_x) == pytest.approx((0.3, 0.6), abs=0.07)
     assert 0.09 <= spot.radius <= 0.19
     assert abs(np.log(spot.decay_frames / 600)) < np.log(2.0)
-
-
-def test_tracks_have_their_length_and_charge():
-    (found,) = CosmicRays.estimate(seen(CosmicRays(tracks_per_frame=0.05)))
-    assert 0.5 < found.length_um / 15.0 < 2.0
-    assert 0.5 < found.electrons_per_um / 80.0 < 2.0
 
 
 def test_a_strong_afterglow_has_the_image_that_it_has_however_wrong_the_fits_are():

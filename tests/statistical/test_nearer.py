@@ -16,12 +16,9 @@ def drawn(seed, exposure, noise, step):
     return np.floor(100.5 + step * signal).astype(np.uint16)
 
 
-def statistic(frames, exposure, noise, step):
-    """Return how much nearer samples are than by chance."""
-    maps = PixelMaps.known(
-        (np.full(SHAPE, v) for v in (exposure, 1 / step, 100.0, noise * step)), np.ones(SHAPE, bool)
-    )
-    return nearer_statistics(frames, EDGES, maps)["time.nearer"]
+def maps_of(exposure, noise, step):
+    columns = (np.full(SHAPE, v) for v in (exposure, 1 / step, 100.0, noise * step))
+    return PixelMaps.known(columns, np.ones(SHAPE, bool))
 
 
 def test_samples_averaged_with_those_before_them_are_nearer():
@@ -30,10 +27,10 @@ def test_samples_averaged_with_those_before_them_are_nearer():
     chosen = np.random.default_rng(2).random(frames[1:].shape) < 0.4
     alike = abs(frames[1:].astype(int) - frames[:-1]) < 5
     frames[1:][chosen & alike] = ((frames[1:] + frames[:-1]) // 2)[chosen & alike]
-    assert statistic(frames, *law) > 8.0
+    assert nearer_statistics(frames, EDGES, maps_of(*law))["time.nearer"] > 8.0
 
 
 def test_frames_too_few_or_samples_that_always_agree_give_none():
-    maps = PixelMaps.known((np.full(SHAPE, v) for v in (1.0, 0.1, 100.0, 3.0)), np.ones(SHAPE, bool))
+    maps = maps_of(1.0, 0.3, 10.0)
     assert nearer_statistics(drawn(1, 1.0, 0.3, 10.0)[:5], np.array([0, 5]), maps) == {}
     assert nearer_statistics(np.full((FRAMES, *SHAPE), 7, np.uint16), EDGES, maps) == {}

@@ -12,14 +12,18 @@ SHAPE, N_FRAMES, BLOCK, SEED = (32, 32), 1600, 50, 17
 NUMBERS = np.arange(N_FRAMES)
 
 
-def _vector(*effects):
-    frames = small_stack(SHAPE, N_FRAMES, SEED, effects)
+def _seen(frames):
     return observe(frames, NUMBERS, n_run=N_FRAMES, block_frames=BLOCK).z
 
 
 @pytest.fixture(scope="module")
-def plain():
-    return _vector()
+def frames():
+    return small_stack(SHAPE, N_FRAMES, SEED)
+
+
+@pytest.fixture(scope="module")
+def plain(frames):
+    return _seen(frames)
 
 
 CASES: list[tuple[dict[str, Any], dict[str, float]]] = [
@@ -33,7 +37,7 @@ CASES: list[tuple[dict[str, Any], dict[str, float]]] = [
 
 @pytest.mark.parametrize(("effect", "moved"), CASES, ids=lambda case: "-".join(map(str, case.values())))
 def test_an_effect_moves_its_statistics(effect, moved, plain):
-    z = _vector(effect)
+    z = _seen(small_stack(SHAPE, N_FRAMES, SEED, [effect]))
     for name, least in moved.items():
         difference = z[name] - plain[name]
         assert difference * np.sign(least) > abs(least), (name, difference)
@@ -42,13 +46,8 @@ def test_an_effect_moves_its_statistics(effect, moved, plain):
     assert largest in moved or "clip" in effect["tag"], largest
 
 
-def _seen(frames):
-    return observe(frames, NUMBERS, n_run=N_FRAMES, block_frames=BLOCK).z
-
-
-def test_changes_of_the_codes_move_theirs(plain):
+def test_changes_of_the_codes_move_theirs(frames, plain):
     rng = np.random.default_rng(3)
-    frames = small_stack(SHAPE, N_FRAMES, SEED)
     # some even frames one DN higher
     shifted = frames.copy()
     shifted[::20] += 1
@@ -68,12 +67,10 @@ def test_changes_of_the_codes_move_theirs(plain):
     twice[101] = twice[100]
     twice[301, 5] = twice[300, 5]
     z = _seen(twice)
-    assert z["frame.repeated"] == 10
-    assert z["frame.repeated_rows"] == 10
+    assert (z["frame.repeated"], z["frame.repeated_rows"]) == (10, 10)
 
 
-def test_a_share_of_the_neighbour_moves_the_pairs(plain):
-    frames = small_stack(SHAPE, N_FRAMES, SEED)
+def test_a_share_of_the_neighbour_moves_the_pairs(frames, plain):
     rng = np.random.default_rng(4)
     # 1 % of the right neighbour's signal, as whole DN at random
     share = 0.01 * (frames[:, :, 1:].astype(float) - frames[:, :, 1:].mean(axis=0))

@@ -17,14 +17,12 @@ from pchem_pipeline.model.fit.status import FitStatus
 
 def judge_together(fit):
     """Return the fit of a sensor's pixels with the word of those that are weakly identified."""
-    of_gain, of_sigma = np.sqrt(fit.covariance[:, 1, 1]), np.sqrt(fit.covariance[:, 3, 3])
+    of_gain, of_sigma = errors(fit)[:, [1, 3]].T
     together = fit.covariance[:, 1, 3] / (of_gain * of_sigma)
     noise, stderr = noise_of(fit.conversion_gain, fit.read_noise_dn, of_gain, of_sigma, together)
     pixels = Judged(noise, stderr, fit.likelihood_gap)
-    pool = NoisePool.of(pixels)
-    if pool is None:
-        return fit
-    word = np.where(np.logical_or(*pool.reasons(pixels, FitSettings())), int(FitStatus.WEAKLY_IDENTIFIED), 0)
+    weak = np.logical_or(*NoisePool.of(pixels).reasons(pixels, FitSettings()))
+    word = np.where(weak, int(FitStatus.WEAKLY_IDENTIFIED), 0)
     return replace(fit, fit_status=fit.fit_status | word.astype(np.uint16))
 
 

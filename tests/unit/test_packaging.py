@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 import yaml
@@ -35,6 +36,7 @@ def test_a_system_without_the_module_resource_is_no_reason_to_fail(monkeypatch):
     assert environment.available_workers() >= 1
 
 
-def test_no_folder_has_more_than_twenty_files():
-    folders = {path.parent for path in (ROOT / "pchem_pipeline").rglob("*.py")}
-    assert not [str(each) for each in folders if len(list(each.glob("*.py"))) > 20]
+def test_no_folder_has_more_than_twenty_files_and_no_module_more_than_800_lines():
+    modules = [*(ROOT / "pchem_pipeline").rglob("*.py")]
+    assert not [path for path in modules if len(path.read_text(encoding="utf-8").splitlines()) > 800]
+    assert not [path for path, n in Counter(path.parent for path in modules).items() if n > 20]

@@ -1,5 +1,6 @@
 """The study of numbers that are called good: its judge is right, and finds what is wrong."""
 
+import json
 import sys
 
 import numpy as np
@@ -18,11 +19,12 @@ ALL = np.ones(4, bool)
 
 
 def pixel(clipped=""):
-    rng = np.random.default_rng(7)
-    bias = 1.5 if clipped else TRUTH[2]
-    samples = np.rint(10 * (rng.poisson(TRUTH[0], 1500) + 0.15 * rng.normal(size=1500)) + bias).astype(int)
-    truth = TRUTH.copy()
-    truth[2] = bias
+    rng, truth = np.random.default_rng(7), TRUTH.copy()
+    if clipped:
+        truth[2] = 1.5
+    samples = np.rint(10 * (rng.poisson(truth[0], 1500) + 0.15 * rng.normal(size=1500)) + truth[2]).astype(
+        int
+    )
     return trust_pixels.Pixel(0, samples.clip(0) if clipped else samples, truth, clipped)
 
 
@@ -30,12 +32,10 @@ def pixel(clipped=""):
 def test_the_judges_likelihood_is_the_mass_of_the_codes(clipped):
     one = pixel(clipped)
     h, g, mu, sigma = one.truth * [1.1, 0.9, 1.0, 1.2]
-    k = np.arange(30)
-    s = np.sqrt(sigma**2 - 1 / 12)
+    k, s = np.arange(30), np.sqrt(sigma**2 - 1 / 12)
     low = np.where(one.samples == 0, -np.inf, one.samples - 0.5) if clipped else one.samples - 0.5
-    cells = norm.cdf((one.samples[:, None] + 0.5 - mu - k / g) / s) - norm.cdf(
-        (low[:, None] - mu - k / g) / s
-    )
+    high = one.samples + 0.5
+    cells = np.subtract(*(norm.cdf((each[:, None] - mu - k / g) / s) for each in (high, low)))
     expected = np.log(cells @ poisson.pmf(k, h)).sum()
     judge, theta = trust_pixels.Judge(one), trust_pixels._theta(np.array([h, g, mu, sigma]))
     height, scores = judge.scores(theta[None])
@@ -71,14 +71,15 @@ def test_pixels_are_drawn_again_by_their_number_and_counted_in_tables():
     assert trust_study.interval(0, 1000) == "0 (0 to 0.37)"
 
 
-def test_runs_are_compared_with_what_was_simulated(tmp_path, monkeypatch, undrawn):
-    good = trust_runs.study_run(0, tmp_path / "good", "none")
+def test_runs_are_compared_with_what_was_simulated(tmp_path, undrawn):
+    good = trust_runs.study_run(0, tmp_path, "none")
     assert good["wrong"] == []
     assert not good["traceback"]
     assert good["pixels"] > 0
-    brighter = ("nothing", lambda case: case.truth["quanta_exposure"].__imul__(1.2))
-    monkeypatch.setitem(trust_runs.MISHAPS, "none", brighter)
-    bad = trust_runs.study_run(0, tmp_path / "bad", "none")
+    brighter = trust_runs.sensor(0, tmp_path)
+    brighter.truth["quanta_exposure"] *= 1.2
+    report = json.loads((tmp_path / "run.zarr" / "report.json").read_text())
+    bad = good | trust_runs.check(brighter, tmp_path / "run.zarr", report)
     assert [each.split()[0] for each in bad["wrong"]] == ["quanta_exposure"]
     assert "| nothing | 2 | 0 | 0 | 1 |" in trust_study.run_table([good, bad])
     assert "| 0 | none | 0 |" in trust_study.odd_runs([good, bad])

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from pchem_pipeline.base.variables import VARIABLES
+from pchem_pipeline.base.variables import PARAMETERS, VARIABLES
 from pchem_pipeline.base.wording import (
     count,
     fitted_or_chosen,
@@ -83,20 +83,9 @@ def test_numbers_in_words(words: Callable[..., str], given: tuple[object, ...], 
     assert words(*given) == text
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "quanta_exposure",
-        "conversion_gain",
-        "bias",
-        "read_noise_dn",
-        "read_noise_e",
-        "charge_rate",
-        "dark_current",
-    ],
-)
-def test_the_units_of_maps_are_those_of_the_store(name: str) -> None:
-    assert symbol(name)[2] == unit_text(VARIABLES[f"maps/{name}"].unit)
+def test_the_units_of_maps_are_those_of_the_store() -> None:
+    for name in (*PARAMETERS, "read_noise_e", "charge_rate", "dark_current"):
+        assert symbol(name)[2] == unit_text(VARIABLES[f"maps/{name}"].unit), name
 
 
 def test_plain_sentences_get_the_signs_of_a_page() -> None:

@@ -6,8 +6,6 @@ import pytest
 from pchem_pipeline.model.checks.shrinkage import LOOSEST, Judged, NoisePool, noise_of
 from pchem_pipeline.model.fit.settings import FitSettings
 
-SETTINGS = FitSettings()
-
 
 def pixels(noise, spread, error, gap, n=4000, seed=1):
     """Pixels whose read noises differ by ``spread``, estimated to ``error``; a quiet one has a larger gap."""
@@ -18,7 +16,7 @@ def pixels(noise, spread, error, gap, n=4000, seed=1):
 
 
 def weak(sensor):
-    return np.logical_or(*NoisePool.of(sensor).reasons(sensor, SETTINGS))
+    return np.logical_or(*NoisePool.of(sensor).reasons(sensor, FitSettings()))
 
 
 ROUGH = LOOSEST / (8 * np.pi**2 * 0.4)
@@ -59,19 +57,12 @@ def test_pixels_without_a_value_have_no_part_in_it():
     expected = weak(sensor)
     hole = np.array([np.nan])
     more = Judged.join([Judged(hole, hole, hole), sensor, Judged(np.array([0.3]), hole, np.array([50.0]))])
-    found = weak(more)
-    np.testing.assert_array_equal(found[1:-1], expected)
-    assert not found[0]
-    assert not found[-1]
-
-
-def test_few_pixels_make_no_pool():
-    assert NoisePool.of(pixels(0.46, 0.0, 0.02, gap=3.0, n=29)) is None
-    assert NoisePool.of(pixels(0.46, 0.0, 0.02, gap=3.0, n=30)) is not None
+    np.testing.assert_array_equal(weak(more), [False, *expected, False])
+    pools = [NoisePool.of(pixels(0.46, 0.0, 0.02, gap=3.0, n=n)) for n in (29, 30)]
+    assert [pool is None for pool in pools] == [True, False]
 
 
 def test_noise_in_electrons_by_the_delta_method():
-    values = (0.1, 3.0, 2e-3, 0.1, -0.5)
-    noise, error = noise_of(*(np.array([value]) for value in values))
+    noise, error = noise_of(*np.array([[0.1], [3.0], [2e-3], [0.1], [-0.5]]))
     assert noise[0] == pytest.approx(0.3)
     assert error[0] == pytest.approx(np.sqrt(9 * 4e-6 + 0.01 * 0.01 - 2 * 0.3 * 1e-4))

@@ -26,19 +26,11 @@ CASES = [
 ]
 
 
-def membership_argmax(x, h, g, mu, sigma):
-    """Largest membership by trying all k, eq. gamma_nk, of the density."""
-    k = np.arange(400)
-    log_weight = poisson.logpmf(k, h) + norm.logpdf(x[:, None], mu + k / g, sigma)
-    return np.asarray(log_weight.argmax(axis=1))
-
-
 def known(*columns):
     return KnownPixels(columns, SampleLaw())
 
 
 def converted(frames, pixels):
-    """Electron numbers of frames (frame, y, x) under their fitted exposure."""
     ends = frames.min(axis=0), frames.max(axis=0)
     return number_tables(*ends, pixels.exposure, pixels).convert(frames).number
 
@@ -46,10 +38,11 @@ def converted(frames, pixels):
 @pytest.mark.parametrize("case", CASES)
 def test_thresholds_are_where_the_largest_membership_changes(case):
     h, g, mu, sigma = case
-    x = np.linspace(mu - 4 / g, mu + 60 / g, 4001)
+    x, k = np.linspace(mu - 4 / g, mu + 60 / g, 4001), np.arange(400)
     table = thresholds(h, g, mu, sigma, 399)
     assert np.all(np.diff(table) > 0)
-    np.testing.assert_array_equal(np.searchsorted(table, x), membership_argmax(x, *case))
+    membership = poisson.logpmf(k, h) + norm.logpdf(x[:, None], mu + k / g, sigma)  # eq. gamma_nk
+    np.testing.assert_array_equal(np.searchsorted(table, x), membership.argmax(axis=1))
 
 
 @pytest.mark.parametrize(
@@ -95,30 +88,23 @@ def test_histograms_and_frames_give_the_same_numbers():
     assert beyond == everything[12:].sum()
 
 
-def test_errors_are_those_of_all_integers():
+def test_errors_and_what_tables_expect_are_those_of_all_integers():
     truth = np.array(CASES).T.copy()
     other = truth * np.array([1.1, 1.02, 1.0, 0.9])[:, None] + np.array([0, 0, 0.7, 0])[:, None]
-    for used in (truth, other):
-        errors = []
-        for true, guess in zip(truth.T, used.T, strict=True):
-            x = np.arange(int(true[2]) - 150, int(true[2]) + 1500)
-            joint = joint_mass(x, *true, n_k=200)
-            number = joint_mass(x, *guess, n_k=200).argmax(axis=0)
-            errors.append(1.0 - joint[number, np.arange(x.size)].sum())
+    errors, total = np.empty((2, len(CASES))), np.zeros(60)
+    for i, (true, guess) in enumerate(zip(truth.T, other.T, strict=True)):
+        x = np.arange(int(true[2]) - 150, int(true[2]) + 1500)
+        joint = joint_mass(x, *true, n_k=200)
+        best, number = joint.argmax(axis=0), joint_mass(x, *guess, n_k=200).argmax(axis=0)
+        errors[:, i] = [1.0 - joint[each, np.arange(x.size)].sum() for each in (best, number)]
+        total += np.bincount(best, weights=joint.sum(axis=0), minlength=60)[:60]
+    for used, expected in zip((truth, other), errors, strict=True):
         found = errors_of_numbers(UsablePixels(*used), UsablePixels(*truth))
-        np.testing.assert_allclose(found, errors, atol=1e-11)
-
-
-def test_tables_expect_what_all_integers_show():
-    data, total, errors = known(*np.array(CASES).T), np.zeros(60), []
-    for case in CASES:
-        joint = joint_mass(np.arange(int(case[2]) - 150, int(case[2]) + 1500), *case, n_k=200)
-        number = joint.argmax(axis=0)
-        total += np.bincount(number, weights=joint.sum(axis=0), minlength=60)[:60]
-        errors.append(1.0 - joint.max(axis=0).sum())
-    found = number_tables(*data.codes(), data.exposure, data, detailed=True).outcomes(60)
-    np.testing.assert_allclose(found.estimated, total, atol=1e-11)
-    np.testing.assert_allclose(found.error, errors, atol=1e-11)
+        np.testing.assert_allclose(found, expected, atol=1e-11)
+    data = known(*truth)
+    outcomes = number_tables(*data.codes(), data.exposure, data, detailed=True).outcomes(60)
+    np.testing.assert_allclose(outcomes.estimated, total, atol=1e-11)
+    np.testing.assert_allclose(outcomes.error, errors[0], atol=1e-11)
 
 
 def test_numbers_are_decided_with_the_effects_of_the_law():

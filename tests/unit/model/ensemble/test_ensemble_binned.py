@@ -42,6 +42,8 @@ def test_cells_are_those_of_numpy_with_the_means_of_their_pixels():
     counts = np.histogramdd(np.stack(columns, axis=1), bins=[edges_of(each, 5) for each in columns])[0]
     np.testing.assert_allclose(np.sort(cells.share), np.sort(counts[counts > 0]) / 400, rtol=1e-12)
     np.testing.assert_allclose(cells.values @ cells.share, np.mean(columns, axis=1), rtol=1e-12)
+    constant = joint_cells((np.full(9, 2.5),), 4)
+    np.testing.assert_allclose([*constant.values[0], *constant.share], [2.5, 1.0])
 
 
 def test_hot_pixels_do_not_widen_the_bins():
@@ -52,30 +54,21 @@ def test_hot_pixels_do_not_widen_the_bins():
     assert cells.values.max() == pytest.approx(5000.0)
 
 
-def test_a_constant_map_is_one_cell():
-    cells = joint_cells((np.full(9, 2.5),), 4)
-    np.testing.assert_allclose(cells.values, [[2.5]])
-    np.testing.assert_allclose(cells.share, [1.0])
+def products(columns, bins):
+    """Return the share and the values of each combination of the bins of maps."""
+    marginals = [joint_cells((column,), bins) for column in columns]
+    for parts in itertools.product(*(zip(m.share, m.values[0], strict=True) for m in marginals)):
+        shares, values = zip(*parts, strict=True)
+        yield np.prod(shares), values
 
 
-def test_dependent_is_the_sum_over_cells():
-    pixels, dn = unlike_pixels(60), DnAxis(50, 250)
-    bins = 3
-    h, g, mu, sigma = pixels.maps
-    cells = joint_cells((h, g, mu, sigma**2), bins)
+def test_curves_are_sums_over_cells_and_over_all_products():
+    pixels, dn, bins = unlike_pixels(60), DnAxis(50, 250), 3
+    columns = (*pixels.maps[:3], pixels.read_noise_dn**2)
+    cells = joint_cells(columns, bins)
     expected = sum(w * pcd(dn.dn, *v) for w, v in zip(cells.share, cells.values.T, strict=True))
     np.testing.assert_allclose(epcd_dependent(pixels, dn, bins), expected, rtol=1e-10, atol=1e-13)
-
-
-def test_independent_is_the_sum_over_all_products():
-    pixels, dn = unlike_pixels(60), DnAxis(50, 250)
-    bins = 3
-    h, g, mu, sigma = pixels.maps
-    marginals = [joint_cells((column,), bins) for column in (h, g, mu, sigma**2)]
-    expected = np.zeros(dn.size)
-    for places in itertools.product(*(range(m.share.size) for m in marginals)):
-        share = np.prod([m.share[i] for m, i in zip(marginals, places, strict=True)])
-        expected += share * pcd(dn.dn, *(m.values[0, i] for m, i in zip(marginals, places, strict=True)))
+    expected = sum(w * pcd(dn.dn, *v) for w, v in products(columns, bins))
     np.testing.assert_allclose(epcd_independent(pixels, dn, bins), expected, rtol=1e-9, atol=2e-15)
 
 
@@ -89,16 +82,12 @@ def test_independent_integrates_narrow_noise_over_the_cell():
 
 def test_independent_on_a_short_axis_is_a_cut_of_the_long_one():
     pixels = unlike_pixels(60)
-    long, short = DnAxis(0, 500), DnAxis(110, 20)
-    bins = 8
-    np.testing.assert_allclose(
-        epcd_independent(pixels, short, bins), epcd_independent(pixels, long, bins)[110:130], atol=1e-15
-    )
+    short, long = (epcd_independent(pixels, axis, 8) for axis in (DnAxis(110, 20), DnAxis(0, 500)))
+    np.testing.assert_allclose(short, long[110:130], atol=1e-15)
 
 
 def test_nuced_is_the_sum_of_bin_means():
-    pixels, axis = unlike_pixels(60), NucedAxis(0.25, -8, 60)
-    bins = 3
+    pixels, axis, bins = unlike_pixels(60), NucedAxis(0.25, -8, 60), 3
     low, high = (np.arange(60) - 8.5) * 0.25, (np.arange(60) - 7.5) * 0.25
 
     def bin_mean(h, variance):
@@ -106,16 +95,11 @@ def test_nuced_is_the_sum_of_bin_means():
         cells = norm.cdf(high, K[:, None], sd) - norm.cdf(low, K[:, None], sd)
         return np.asarray(poisson.pmf(K, h) @ cells / 0.25)
 
-    h, variance = pixels.quanta_exposure, pixels.read_noise_e**2
-    joint = joint_cells((h, variance), bins)
+    columns = pixels.quanta_exposure, pixels.read_noise_e**2
+    joint = joint_cells(columns, bins)
     expected = sum(w * bin_mean(*v) for w, v in zip(joint.share, joint.values.T, strict=True))
     np.testing.assert_allclose(nuced_dependent(pixels, axis, bins), expected, rtol=1e-9, atol=1e-13)
-    one, two = joint_cells((h,), bins), joint_cells((variance,), bins)
-    expected = sum(
-        a * b * bin_mean(u, v)
-        for a, u in zip(one.share, one.values[0], strict=True)
-        for b, v in zip(two.share, two.values[0], strict=True)
-    )
+    expected = sum(w * bin_mean(*v) for w, v in products(columns, bins))
     np.testing.assert_allclose(nuced_independent(pixels, axis, bins), expected, rtol=1e-9, atol=1e-13)
 
 
@@ -134,15 +118,13 @@ def test_exposures_far_from_each_other_are_inverted_apart():
     exposure[0] = 300.0
     pixels = UsablePixels(exposure, gain, rng.uniform(99.0, 101.0, n), rng.uniform(1.2, 1.6, n))
     dn, bins = DnAxis(80, 2000), 3
-    h, g, mu, s2 = (joint_cells((each,), bins) for each in (*pixels.maps[:3], pixels.read_noise_dn**2))
-    k, expected = np.arange(500), np.zeros(dn.size)
+    h, k, expected = joint_cells((exposure,), bins), np.arange(500), np.zeros(dn.size)
     mass = poisson.pmf(k[:, None], h.values[0]) @ h.share
-    for (gain_cell, a), (bias, b), (v, c) in itertools.product(
-        *(zip(x.values[0], x.share, strict=True) for x in (g, mu, s2))
-    ):
-        centre = bias + k / gain_cell
-        low, high = (norm.cdf(dn.dn[:, None] + side, centre, np.sqrt(v - 1 / 12)) for side in (-0.5, 0.5))
-        expected += a * b * c * ((high - low) @ mass)
+    for share, (g, mu, s2) in products((*pixels.maps[1:3], pixels.read_noise_dn**2), bins):
+        low, high = (
+            norm.cdf(dn.dn[:, None] + side, mu + k / g, np.sqrt(s2 - 1 / 12)) for side in (-0.5, 0.5)
+        )
+        expected += share * ((high - low) @ mass)
     np.testing.assert_allclose(epcd_independent(pixels, dn, bins), expected, atol=1e-13)
 
 

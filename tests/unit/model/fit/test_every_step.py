@@ -9,12 +9,10 @@ from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of
 
 
 def fitted(dn, **options):
-    """Return the fit of samples of shape (pixel, frame)."""
     return fit_histograms(*histograms(dn), **options)
 
 
 def good(found):
-    """Return which pixels have values that are neither missing nor flagged."""
     return (found.fit_status & int(FAILED | FLAGGED)) == 0
 
 
@@ -29,14 +27,13 @@ def good(found):
     ],
 )
 def test_dark_and_clean_pixels_have_the_right_gain(exposure, noise, frames, step):
-    """A comb of half the step has no sample at each second peak: its gain, H and read noise are twice too
-    large."""
+    """A comb of half the step has no sample at each second peak: g, H and read noise are twice too large."""
     found = fitted(codes(np.random.default_rng(5), (150, frames), exposure, step, noise))
     ratio = found.conversion_gain[good(found)] * step
     assert good(found).mean() > 0.9
     # n electrons give the step to s / sqrt(n); a share exp(-N H) of few of them is no fault
     few = 0.2 + 5.0 * noise / np.sqrt(exposure * frames)
-    assert (np.abs(ratio - 1.0) > min(few, 0.6)).sum() == 0
+    assert np.abs(ratio - 1.0).max() <= min(few, 0.6)
 
 
 @pytest.mark.parametrize(
@@ -77,12 +74,11 @@ def test_samples_at_a_limit_are_censored(exposure, bias):
     found = fitted(dn, adc_limits=(0, 4095))
     used = good(found)
     assert used.mean() > 0.9
-    errors = np.sqrt(np.stack([found.covariance[used, i, i] for i in range(4)]))
-    values = found.columns[used].T
-    truth = np.array([exposure, 1 / 14.0, bias, np.hypot(0.3 * 14.0, 12**-0.5)])
-    pulls = (values - truth[:, None]) / errors
+    errors = np.sqrt(np.diagonal(found.covariance[used], axis1=1, axis2=2))
+    truth = exposure, 1 / 14.0, bias, np.hypot(0.3 * 14.0, 12**-0.5)
+    pulls = (found.columns[used] - truth) / errors
     assert (np.abs(pulls) < 5.0).all()
-    assert (np.abs(pulls.mean(axis=1)) < 5.0 / np.sqrt(used.sum())).all()
+    assert (np.abs(pulls.mean(axis=0)) < 5.0 / np.sqrt(used.sum())).all()
 
 
 @pytest.mark.parametrize(
@@ -99,8 +95,7 @@ def test_two_combs_with_the_same_codes_are_flagged(exposure, step, noise, frames
 
 
 def test_a_comb_seen_by_chance_is_flagged():
-    """1,000 samples with 0.43 e- of read noise have peaks of 1.6 % contrast: chance makes as much at other
-    steps."""
+    """1,000 samples with 0.43 e- have peaks of 1.6 % contrast: chance makes as much at other steps."""
     found = fitted(codes(np.random.default_rng(8), (100, 1000), 8.0, 9.3, 0.43))
     assert good(found).mean() < 0.1
     assert (found.fit_status & int(FitStatus.GAIN_AMBIGUOUS) != 0).mean() > 0.8
@@ -121,10 +116,8 @@ def _draw(number):
     samples = [step * (rng.poisson(h, shape) + noise * rng.normal(size=shape)) for h in exposures]
     clipped = rng.choice(["", "", "low", "high"])
     if clipped:
-        low, high = (
-            rng.uniform(0, 3) * np.hypot(noise * step, 0.3),
-            np.quantile(samples[-1], rng.uniform(0.7, 1)),
-        )
+        low = rng.uniform(0, 3) * np.hypot(noise * step, 0.3)
+        high = np.quantile(samples[-1], rng.uniform(0.7, 1))
         bias += (low if clipped == "low" else _LIMITS[1] - high) - bias.mean()
     samples = [np.rint(sample + bias[:, None]).astype(np.int64) for sample in samples]
     samples = [sample.clip(*_LIMITS) if clipped else sample for sample in samples]
@@ -138,14 +131,11 @@ def _good_and_wrong(number):
     limits = _LIMITS if clipped else None
     found = fit_histograms(counts, origins, dark=[h == 0 for h in exposures], adc_limits=limits)
     names = [*["quanta_exposure"] * len(exposures), "conversion_gain", "bias", "read_noise_dn"]
-    estimates = np.column_stack(
-        [found.quanta_exposure, found.conversion_gain, found.bias, found.read_noise_dn]
-    )
     truth = np.stack(np.broadcast_arrays(*exposures, 1 / step, bias, sigma), axis=1)
     floor = np.array([*(0.005 * h for h in exposures), 0.005 / step, 0.01 * step, 0.005 * sigma])
     errors = np.nan_to_num(np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)), nan=np.inf)
     good = np.stack([(found.fit_status & int(FAILED | flags_of(name))) == 0 for name in names], axis=1)
-    wrong = good & (np.abs(estimates - truth) > 6 * errors + floor)
+    wrong = good & (np.abs(found.columns - truth) > 6 * errors + floor)
     return np.array([good.any(axis=1).sum(), wrong.any(axis=1).sum()])
 
 

@@ -16,7 +16,6 @@ from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.mass import sample_mass
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-NAMES = ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn")
 FIRST, N_CODES, FRAMES = 40, 330, 4000
 TRUTH = [
     np.array([0.6, 1.5, 2.5, 4.5, 3.0]),
@@ -26,10 +25,9 @@ TRUTH = [
 ]
 
 
-def log_likelihood(counts, origin, parameters, law, satellites=None):
-    """Return ``sum_i c_i log P(x_i)`` of every pixel, nats; NaN without parameters."""
-    codes = np.asarray(origin)[:, None] + np.arange(counts.shape[1])
-    mass = sample_mass(law, parameters, codes, satellites=satellites)
+def log_likelihood(counts, parameters, law):
+    """Return ``sum_i c_i log P(x_i)`` of every pixel, nats."""
+    mass = sample_mass(law, parameters, np.arange(FIRST, FIRST + N_CODES))
     return (counts * np.log(np.where(counts > 0, np.maximum(mass, 1e-300), 1.0))).sum(axis=1)
 
 
@@ -39,12 +37,8 @@ def drawn(model, truth, seed=3):
     return counts.astype(np.uint32)
 
 
-def origins(n):
-    return np.full(n, FIRST)
-
-
-def columns(fit):
-    return np.stack([getattr(fit, name) for name in NAMES], axis=1)
+def fitted(counts, first=FIRST, **how):
+    return fit_histograms(counts, np.full(len(counts), first), **how)
 
 
 def stderr(fit):
@@ -56,18 +50,12 @@ def maximum(counts, model, start, scale):
 
     def value(offset):
         here = [np.array([v]) for v in start + offset * scale]
-        return float(log_likelihood(counts[None], origins(1), here, model)[0])
+        return float(log_likelihood(counts[None], here, model)[0])
 
     def gradient(offset):
         # fourth-order differences
-        out = np.empty(4)
-        for i in range(4):
-            e = np.zeros(4)
-            e[i] = 0.02
-            out[i] = (
-                8 * (value(offset + e) - value(offset - e)) - value(offset + 2 * e) + value(offset - 2 * e)
-            ) / 0.24
-        return out
+        far = [[value(offset + n * e) - value(offset - n * e) for n in (1, 2)] for e in 0.02 * np.eye(4)]
+        return np.array(far) @ [8, -1] / 0.24
 
     found = root(gradient, np.full(4, 0.02), jac=lambda x: -np.eye(4), method="hybr", options={"xtol": 1e-10})
     assert abs(gradient(found.x)).max() < 1e-6
@@ -82,32 +70,26 @@ def test_fit_is_where_the_gradient_vanishes(name):
     if name == "clip":
         model = SampleLaw().with_clip(97, 180)
     counts = drawn(model, TRUTH)
-    plain = fit_histograms(counts, origins(5))
-    extended = fit_histograms(counts, origins(5), law=model, start=plain)
+    plain = fitted(counts)
+    extended = fitted(counts, law=model, start=plain)
     for pixel in (1, 3):
-        offset = maximum(counts[pixel], model, columns(extended)[pixel], stderr(extended)[pixel])
+        offset = maximum(counts[pixel], model, extended.columns[pixel], stderr(extended)[pixel])
         assert abs(offset).max() < 1e-5, offset
-    np.testing.assert_allclose(
-        extended.log_likelihood, log_likelihood(counts, origins(5), extended, model), rtol=1e-13
-    )
+    np.testing.assert_allclose(extended.log_likelihood, log_likelihood(counts, extended, model), rtol=1e-13)
 
 
 def test_pixels_do_not_influence_each_other():
     model = LAWS["variance"].with_free_satellites([1.0, 2.0])
     truth = [np.repeat(column, 2) for column in TRUTH]
     counts = drawn(model, truth)
-    plain = fit_histograms(counts, origins(10))
-    together = fit_histograms(counts, origins(10), law=model, start=plain)
+    plain = fitted(counts)
+    together = fitted(counts, law=model, start=plain)
     for pixel in (0, 7):
         part = slice(pixel, pixel + 1)
-        alone = fit_histograms(counts[part], origins(1))
-        single = fit_histograms(counts[part, 10:], origins(1) + 10, law=model, start=alone)
-        for field in dataclasses.fields(FitResult):
-            if field.name == "intervals":
-                continue
-            np.testing.assert_array_equal(
-                getattr(single, field.name)[0], getattr(together, field.name)[pixel]
-            )
+        alone = fitted(counts[part])
+        single = fitted(counts[part, 10:], FIRST + 10, law=model, start=alone)
+        for name in {field.name for field in dataclasses.fields(FitResult)} - {"intervals"}:
+            np.testing.assert_array_equal(getattr(single, name)[0], getattr(together, name)[pixel])
 
 
 def test_a_pixel_without_plain_values_stays_without():
@@ -115,45 +97,44 @@ def test_a_pixel_without_plain_values_stays_without():
     counts[1] = 0
     counts[2] = 0
     counts[2, 60] = FRAMES
-    plain = fit_histograms(counts, origins(5))
-    extended = fit_histograms(counts, origins(5), law=LAWS["variance"], start=plain)
+    plain = fitted(counts)
+    extended = fitted(counts, law=LAWS["variance"], start=plain)
     assert extended.fit_status[1] == FitStatus.NO_DATA
     assert extended.fit_status[2] == FitStatus.TOO_FEW_BINS
-    assert np.isnan(columns(extended)[1:3]).all()
+    assert np.isnan(extended.columns[1:3]).all()
     assert np.isnan(extended.covariance[1:3]).all()
-    assert np.isfinite(columns(extended)[[0, 3, 4]]).all()
+    assert np.isfinite(extended.columns[[0, 3, 4]]).all()
     # a start that is not there says it
-    start = columns(plain)
+    start = plain.columns.copy()
     start[3] = np.nan
-    found = fit_histograms(counts, origins(5), law=LAWS["variance"], start=start)
+    found = fitted(counts, law=LAWS["variance"], start=start)
     assert found.fit_status[3] == FitStatus.NOT_CONVERGED
 
 
 def test_bits_about_the_data_are_kept_and_those_about_the_plain_fit_are_not():
     model = SampleLaw().with_variance(per_electron=0.03)
     counts = drawn(model, TRUTH)
-    plain = fit_histograms(counts, origins(5), over=np.array([0, 0, 0, 2, 0]), adc_limits=(0, 4000))
+    plain = fitted(counts, over=np.array([0, 0, 0, 2, 0]), adc_limits=(0, 4000))
     marked = plain.fit_status | np.uint16(FitStatus.POOR_FIT | FitStatus.COARSE_STEPS)
-    extended = fit_histograms(
-        counts, origins(5), law=model, start=dataclasses.replace(plain, fit_status=marked)
-    )
+    start = dataclasses.replace(plain, fit_status=marked)
+    extended = fitted(counts, law=model, start=start)
     assert extended.fit_status.tolist() == [0, 0, 0, FitStatus.OUTSIDE_WINDOW, 0]
 
 
 def test_neighbour_is_taken_where_it_is_likelier():
     counts = drawn(SampleLaw(), TRUTH)
-    right = fit_histograms(counts, origins(5))
+    right = fitted(counts)
     wrong = dataclasses.replace(
         right,
         quanta_exposure=right.quanta_exposure + 1,
         bias=right.bias - 1 / right.conversion_gain,
         likelihood_gap=np.zeros(5),
     )
-    found = fit_histograms(counts, origins(5), law=SampleLaw(), start=wrong)
+    found = fitted(counts, law=SampleLaw(), start=wrong)
     np.testing.assert_allclose(found.bias, right.bias, atol=0.01)
     assert (found.likelihood_gap > 0).all()
     # a warm start is believed
-    stays = fit_histograms(counts, origins(5), law=SampleLaw(), start=columns(wrong))
+    stays = fitted(counts, law=SampleLaw(), start=wrong.columns)
     assert (abs(stays.bias - right.bias)[1:] > 5).all()
 
 
@@ -165,17 +146,16 @@ def test_exposure_that_is_added_leaves_h_as_it_is_without():
     truth = [np.tile(column, 20) for column in TRUTH]
     every = np.tile(np.arange(5), 20)
     counts = drawn(model.of(every), truth, seed=11)
-    plain = fit_histograms(counts, origins(100))
-    extended = fit_histograms(counts, origins(100), law=model.of(every), start=plain)
-    pull = (columns(extended) - np.stack(truth, axis=1)) / stderr(extended)
-    for i in range(5):
-        # the mean of twenty pulls, four standard errors
-        assert abs(pull[i::5].mean(axis=0)).max() < 4 / np.sqrt(20)
+    plain = fitted(counts)
+    extended = fitted(counts, law=model.of(every), start=plain)
+    pull = (extended.columns - np.stack(truth, axis=1)) / stderr(extended)
+    # the mean of twenty pulls, four standard errors
+    assert abs(pull.reshape(20, 5, 4).mean(axis=0)).max() < 4 / np.sqrt(20)
     assert ((plain.quanta_exposure - truth[0]) / stderr(extended)[:, 0])[every < 4].mean() > 10
-    same = fit_histograms(counts, origins(100), law=SampleLaw(), start=plain)
-    np.testing.assert_array_equal(columns(extended)[every == 4], columns(same)[every == 4])
-    mean = nearest_pcd(columns(extended).T.tolist(), model.of(every))[0]
-    np.testing.assert_allclose(mean, columns(extended)[:, 0] + (np.array(added) * weights).sum(axis=1)[every])
+    same = fitted(counts, law=SampleLaw(), start=plain)
+    np.testing.assert_array_equal(extended.columns[every == 4], same.columns[every == 4])
+    mean = nearest_pcd(extended.columns.T.tolist(), model.of(every))[0]
+    np.testing.assert_allclose(mean, extended.columns[:, 0] + (np.array(added) * weights).sum(axis=1)[every])
 
 
 def test_free_satellites_are_found_where_they_are_and_nowhere_else():
@@ -187,25 +167,20 @@ def test_free_satellites_are_found_where_they_are_and_nowhere_else():
     shares = np.stack([0.5 * weight, 1 - weight, 0.5 * weight], axis=1)
     shifts = np.stack([-amplitude, 0 * amplitude, amplitude], axis=1)
     counts = drawn(SampleLaw().with_noise(shares, shift_e=shifts), truth)
-    plain = fit_histograms(counts, origins(40))
-    extended = fit_histograms(counts, origins(40), law=law, start=plain)
+    plain = fitted(counts)
+    extended = fitted(counts, law=law, start=plain)
     found = extended.satellite_weight > 0
-    assert found[5:20].all()
-    assert not found[20:].any()
-    assert not found[:5].any()
+    np.testing.assert_array_equal(found, weight > 0)
     right = found & (abs(extended.satellite_amplitude_e - amplitude) < 0.1)
     assert right.sum() >= 14
     error = abs(extended.satellite_weight - weight)[right] / np.sqrt(weight * (1 - weight) / FRAMES)[right]
     assert (error < 8).all()
     # the parameters come right: the plain fit was led astray by electrons, this one is within its errors
-    pulls = (columns(extended) - np.stack(truth, axis=1)) / stderr(extended)
-    astray = (columns(plain) - np.stack(truth, axis=1)) / stderr(plain)
+    pulls, astray = ((each.columns - np.stack(truth, axis=1)) / stderr(each) for each in (extended, plain))
     assert (abs(pulls[right]) < 5).all()
     assert (abs(astray[5:20]).max(axis=1) > 10).sum() > 8
     # their log-likelihood holds the satellites
-    np.testing.assert_allclose(
-        extended.log_likelihood, log_likelihood(counts, origins(40), extended, law), rtol=1e-12
-    )
+    np.testing.assert_allclose(extended.log_likelihood, log_likelihood(counts, extended, law), rtol=1e-12)
     mass = sample_mass(law, extended, np.arange(FIRST, FIRST + N_CODES))
     np.testing.assert_allclose(mass.sum(axis=1), 1.0, atol=1e-6)
 

@@ -22,7 +22,6 @@ from pchem_pipeline.model.law.pixel_numba import (
     SCORE,
     Pixel,
     Scratch,
-    histogram_of,
 )
 
 # (H, 1/g, s_e) from needles to unresolved peaks, a hot pixel, and steps of which few bins go at a time
@@ -51,12 +50,7 @@ class Sample(NamedTuple):
 
     @property
     def at(self):
-        """The evaluation."""
         return self.scratch.evaluations[AT, 0]
-
-    @property
-    def histogram(self):
-        return histogram_of.py_func(self.pixel, 0)
 
     @property
     def information(self):
@@ -101,14 +95,11 @@ def test_score_is_the_gradient_and_information_minus_its_jacobian(case):
         return histogram.at[SCORE, :4].copy()
 
     for i, h in enumerate(np.eye(4, 5) * step[:, None]):
-        slope = (
-            8 * (loglik(point + h) - loglik(point - h)) - loglik(point + 2 * h) + loglik(point - 2 * h)
-        ) / 12
-        assert score[i] / size[i] == pytest.approx(slope / step[i] / size[i], rel=1e-6, abs=2e-5)
-        change = score_at(point + h) - score_at(point - h)
-        np.testing.assert_allclose(
-            information[i] / size / size[i], -change / (2 * step[i]) / size / size[i], atol=2e-6
-        )
+        near, far = (loglik(point + n * h) - loglik(point - n * h) for n in (1, 2))
+        slope = (8 * near - far) / 12 / step[i]
+        assert score[i] / size[i] == pytest.approx(slope / size[i], rel=1e-6, abs=2e-5)
+        change = (score_at(point - h) - score_at(point + h)) / (2 * step[i])
+        np.testing.assert_allclose(information[i] / size / size[i], change / size / size[i], atol=2e-6)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -121,31 +112,32 @@ def test_em_iterates_follow_the_paper(case):
     assert not np.allclose(trace.parameters[1], trace.parameters[0], rtol=1e-4)
 
 
-def test_large_electron_numbers_and_a_comb_finer_than_any():
-    pixel, scratch, centre = one_sample(np.array([0, 3, 40, 180, 300, 180, 40, 3, 0], np.uint32))
-    x = np.repeat(np.arange(-centre, 9.0 - centre), [0, 3, 40, 180, 300, 180, 40, 3, 0])
-    for h in (40.0, 5000.0):  # with a table of factorials, and beyond it
-        theta = Theta(h, 1 / 0.6, -0.6 * h, 0.7)
-        loglik = evaluated(pixel, internal(theta, 0.0), DERIVATIVES, likelihood(False), scratch)
-        k = np.arange(int(h) - 60, int(h) + 60)
-        log_weight = poisson.logpmf(k, h)
-        terms = log_weight + norm.logpdf(x[:, None], theta.bias + 0.6 * k, theta.sigma)
-        assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)
-    finest = Theta(2.0, 1 / 0.01, 0.0, 0.3)
-    assert evaluated(pixel, internal(finest, 0.0), DERIVATIVES, likelihood(False), scratch) == -np.inf
+BELL = np.array([0, 3, 40, 180, 300, 180, 40, 3, 0])
+FAR = np.bincount(np.repeat([0, 200, 211, 222, 399], [1, 300, 400, 200, 1]))
 
 
-def test_far_values_have_the_density_of_the_nearest_component():
-    counts = np.zeros(400, np.uint32)
-    counts[[0, 200, 211, 222, 399]] = 1, 300, 400, 200, 1
+@pytest.mark.parametrize(
+    ("counts", "theta"),
+    [
+        # large electron numbers: with a table of factorials, and beyond it
+        *((BELL, Theta(h, 1 / 0.6, 4.0 - 0.6 * h, 0.7)) for h in (40.0, 5000.0)),
+        # values far from all components; e-: 0.055 and 0.27
+        *((FAR, Theta(1.0, 1 / 11.0, 200.3, sigma)) for sigma in (0.6, 3.0)),
+    ],
+)
+def test_many_electrons_and_far_values_have_the_density_of_all_components(counts, theta):
     pixel, scratch, centre = one_sample(counts)
-    x = np.repeat(np.arange(400.0) - centre, counts)
-    for sigma in (0.6, 3.0):  # e-: 0.055 and 0.27
-        theta = Theta(1.0, 1 / 11.0, 200.3 - centre, sigma)
-        loglik = evaluated(pixel, internal(theta, 0.0), DERIVATIVES, likelihood(False), scratch)
-        k = np.arange(60)
-        terms = poisson.logpmf(k, 1.0) + norm.logpdf(x[:, None], theta.bias + 11.0 * k, sigma)
-        assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)
+    loglik = evaluated(pixel, internal(theta, centre), DERIVATIVES, likelihood(False), scratch)
+    k = np.arange(max(0, int(theta.exposure) - 60), int(theta.exposure) + 60)
+    x = np.repeat(np.arange(counts.size), counts)[:, None]
+    terms = poisson.logpmf(k, theta.exposure) + norm.logpdf(x, theta.bias + k / theta.gain, theta.sigma)
+    assert loglik == pytest.approx(logsumexp(terms, axis=1).sum(), rel=1e-10)
+
+
+def test_a_comb_finer_than_any_has_no_likelihood():
+    pixel, scratch, _ = one_sample(BELL)
+    finest = internal(Theta(2.0, 1 / 0.01, 0.0, 0.3), 0.0)
+    assert evaluated(pixel, finest, DERIVATIVES, likelihood(False), scratch) == -np.inf
 
 
 def test_a_tied_step_leaves_the_noise_in_electrons():

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers.known_camera import KnownCamera
-from scipy.special import gammaln
+from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.fit.api import fit_histograms, likelihood_moments
 from pchem_pipeline.model.histogram.count import histogram_frames
@@ -32,20 +32,23 @@ def noisy():
     return fitted(np.random.default_rng(71), (0.45, 0.45))
 
 
-def pulls(made, covariance):
+def errors_of(found):
+    return np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+
+
+def pulls(made, errors):
     """Return pulls of (H, g, mu, sigma) of pixels whose bias is right and far from ambiguous."""
-    error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     off = made.fit.columns - made.truth
     right = (abs(off[:, 2] * made.truth[:, 1]) < 0.5) & (made.fit.likelihood_gap > 5.0)
-    return (off / error)[right]
+    return (off / errors)[right]
 
 
 def test_errors_are_right_where_those_of_the_curvature_are_too_small(noisy):
-    z = pulls(noisy, noisy.moments.covariance)
+    z = pulls(noisy, errors_of(noisy.moments))
     limit = 5 / np.sqrt(2 * len(z))
     assert (abs(z.std(axis=0)[:2] - 1) < limit).all()
     assert (z.std(axis=0) < 1 + limit).all()
-    assert (pulls(noisy, noisy.fit.covariance).std(axis=0)[:2] > 1 + limit).all()
+    assert (pulls(noisy, errors_of(noisy.fit)).std(axis=0)[:2] > 1 + limit).all()
 
 
 def test_a_bias_that_is_an_electron_off_is_no_surprise(noisy):
@@ -61,27 +64,21 @@ def test_a_bias_that_is_an_electron_off_is_no_surprise(noisy):
 
 def test_they_are_those_of_the_curvature_where_the_peaks_are_clear():
     clear = fitted(np.random.default_rng(72), (0.2, 0.25))
-    ratio = np.diagonal(clear.moments.covariance, axis1=1, axis2=2)
-    ratio = ratio / np.diagonal(clear.fit.covariance, axis1=1, axis2=2)
-    assert (abs(np.sqrt(np.median(ratio, axis=0)) - 1) < 0.01).all()
+    ratio = errors_of(clear.moments) / errors_of(clear.fit)
+    assert (abs(np.median(ratio, axis=0) - 1) < 0.01).all()
     assert clear.moments.rival_weight.max() < 1e-3
 
 
 def log_likelihood(theta, codes, counts):
-    """Return that of parameters (m, 4) by plain sums."""
     exposure, gain, bias, sigma = theta.T[:, :, None]
-    density = 0.0
-    for k in range(16):
-        log_mass = k * np.log(exposure) - exposure - gammaln(k + 1)
-        density = density + np.exp(log_mass - 0.5 * ((codes - bias - k / gain) / sigma) ** 2) / sigma
-    return np.log(density) @ counts
+    peaks = (poisson.pmf(k, exposure) * norm.pdf(codes, bias + k / gain, sigma) for k in range(16))
+    return np.log(sum(peaks)) @ counts
 
 
 def test_moments_are_those_of_plain_sampling(noisy):
     """Importance sampling (Student's t of 5 degrees of freedom) of the likelihood of single pixels."""
     rng = np.random.default_rng(73)
-    found = np.sqrt(np.diagonal(noisy.moments.covariance, axis1=1, axis2=2))
-    curvature = np.sqrt(np.diagonal(noisy.fit.covariance, axis1=1, axis2=2))
+    found, curvature = errors_of(noisy.moments), errors_of(noisy.fit)
     clear = np.flatnonzero(noisy.fit.likelihood_gap > 12)[:8]
     plain = []
     for pixel in clear:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.drawn_pixels import draw
 from iminuit import Minuit
-from numpy.typing import NDArray
+from scipy.stats import false_discovery_control
 
 from pchem_pipeline.base.variables import INTERVALS, interval_names
 from pchem_pipeline.effects.operators.offsets import RowNoise
@@ -19,20 +19,16 @@ from pchem_pipeline.model.law.pcd import log_pcd, pcd_posterior
 from pchem_pipeline.model.law.sample_law import SampleLaw
 from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
 
-Array = NDArray[np.float64]
 CASES = [(2.0, 11.0, 0.3), (0.15, 9.0, 0.2), (1.5, 12.0, 0.46)]
 N = 3000
 
 
-def fitted(case, seed=3):
-    pixel = draw(np.random.default_rng(seed), *case, n_frames=N)
-    fit = fit_histograms(pixel.counts, pixel.origin, settings=FitSettings(tolerance=1e-12))
-    return pixel, fit.columns[0]
-
-
-def intervals(pixel, level):
-    settings = FitSettings(intervals="profile", interval_level=level)
-    return fit_histograms(pixel.counts, pixel.origin, settings=settings).intervals
+def fitted(case, level):
+    """Return a pixel, its fit and the ends of its profile intervals."""
+    pixel = draw(np.random.default_rng(3), *case, n_frames=N)
+    settings = FitSettings(tolerance=1e-12, intervals="profile", interval_level=level)
+    fit = fit_histograms(pixel.counts, pixel.origin, settings=settings)
+    return pixel, fit.columns[0], fit.intervals[0]
 
 
 def minuit(pixel, start, plain):
@@ -47,9 +43,8 @@ def minuit(pixel, start, plain):
 
 @pytest.mark.parametrize("case", CASES)
 def test_intervals_are_those_of_minuit(case):
-    pixel, at = fitted(case)
+    pixel, at, ends = fitted(case, 0.6827)
     found = minuit(pixel, at, lambda *theta: theta).minos(cl=0.6827)
-    ends = intervals(pixel, 0.6827)[0]
     for place, name in enumerate(("h", "g", "mu", "s")):
         other = found.merrors[name]
         width = ends[place, 1] - ends[place, 0]
@@ -57,12 +52,11 @@ def test_intervals_are_those_of_minuit(case):
 
 
 def test_the_interval_of_the_noise_in_electrons_is_a_profile_too():
-    pixel, at = fitted(CASES[2])
-    start = *at[:3], at[1] * at[3]
-    found = minuit(pixel, start, lambda h, g, mu, noise: (h, g, mu, noise / g)).minos("s", cl=0.95)
-    ends = intervals(pixel, 0.95)[0, -1]
-    other = found.merrors["s"]
-    np.testing.assert_allclose(ends - at[1] * at[3], (other.lower, other.upper), rtol=0.02)
+    pixel, at, ends = fitted(CASES[2], 0.95)
+    noise_e = at[1] * at[3]
+    found = minuit(pixel, (*at[:3], noise_e), lambda h, g, mu, noise: (h, g, mu, noise / g))
+    other = found.minos("s", cl=0.95).merrors["s"]
+    np.testing.assert_allclose(ends[-1] - noise_e, (other.lower, other.upper), rtol=0.02)
     # and it is far from symmetric here: standard errors would not do
     assert (other.upper + other.lower) / (other.upper - other.lower) > 0.02
 
@@ -78,13 +72,9 @@ def test_variance_of_a_curve_follows_from_its_slopes(law):
     found = curve_errors(law, UsablePixels(*np.ascontiguousarray(pixels.T)), covariance, dn, nuced)
     expected = np.zeros(60), np.zeros(40)
     for at, known in zip(pixels, np.nan_to_num(covariance), strict=True):
-        slopes = np.empty((4, 60))
-        for i in range(4):
-            up, down = at.copy(), at.copy()
-            up[i] *= 1 + 1e-6
-            down[i] *= 1 - 1e-6
-            masses = [sample_mass(law, each[:, None], dn.dn)[0] for each in (up, down)]
-            slopes[i] = (masses[0] - masses[1]) / (2e-6 * at[i])
+        near = at + 1e-6 * np.stack([np.diag(at), -np.diag(at)])  # up and down, (2, step, parameter)
+        up, down = (sample_mass(law, each.T, dn.dn) for each in near)
+        slopes = (up - down) / (2e-6 * at[:, None])
         place = np.floor((dn.dn - at[2]) * at[1] / nuced.width + 0.5).astype(int) + 3
         inside = (place >= 0) & (place < 40)
         in_bins = [np.bincount(place[inside], each[inside], 40) for each in slopes]
@@ -105,8 +95,6 @@ def test_covariance_is_six_correlations_and_four_errors():
 
 
 def test_false_discoveries_are_those_of_scipy():
-    from scipy.stats import false_discovery_control
-
     p = np.random.default_rng(5).random((6, 7)) ** 3
     np.testing.assert_allclose(false_discovery(p), false_discovery_control(p, axis=None).reshape(6, 7))
     p[2, 3] = np.nan
@@ -124,14 +112,10 @@ def test_the_poorest_come_first_even_where_p_is_zero():
     assert abs(misfit(np.array([49.33]), np.array([50.0]))[0]) < 0.01
 
 
-def tile(n=4):
-    pixels = draw(np.random.default_rng(9), np.full(n, 1.5), 11.0, 0.3, n_frames=N)
-    flat = {name: np.zeros((1, n), np.uint32) for name in ("under", "over")}
-    return pixels, {"counts": pixels.counts[None], "origin": pixels.origin[None].astype(np.int32), **flat}
-
-
 def test_settings_bring_intervals_and_sandwich_errors_into_the_store():
-    pixels, histogram = tile()
+    pixels = draw(np.random.default_rng(9), np.full(4, 1.5), 11.0, 0.3, n_frames=N)
+    histogram = {"counts": pixels.counts[None], "origin": pixels.origin[None].astype(np.int32)}
+    histogram |= {name: np.zeros((1, 4), np.uint32) for name in ("under", "over")}
     plain = fit_tile([histogram], TileFit())["fit"]
     settings = FitSettings(intervals="profile", errors="sandwich", interval_level=0.95)
     full = fit_tile([histogram], TileFit(settings))["fit"]
@@ -141,10 +125,8 @@ def test_settings_bring_intervals_and_sandwich_errors_into_the_store():
         assert (low < middle).all()
         assert (middle < high).all()
         assert f"{name}_low" not in plain
-    fit = fit_histograms(pixels.counts, pixels.origin)
-    middle = np.zeros((4, 4, 4))
-    for i in range(4):
-        h, g, mu, sigma = fit.columns[i]
+    fit, middle = fit_histograms(pixels.counts, pixels.origin), np.zeros((4, 4, 4))
+    for i, (h, g, mu, sigma) in enumerate(fit.columns):
         codes = np.flatnonzero(pixels.counts[i])
         given = pcd_posterior(pixels.origin[i] + codes, h, g, mu, sigma)
         charge, shift = given.k / h - 1, -given.ke / (g * sigma) ** 2

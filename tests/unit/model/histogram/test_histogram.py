@@ -37,9 +37,7 @@ def test_a_late_glitch_is_counted_as_over_and_moves_nothing():
     assert (result.under[0, 1], result.over[0, 1]) == (1, 1)
     assert result.counts[0, 1].sum() == 598
     assert (result.minimum[0, 1], result.maximum[0, 1]) == (1, 4000)
-    others = np.ones((2, 2), bool)
-    others[0, 1] = False
-    np.testing.assert_array_equal(result.counts[others], clean.counts[others])
+    np.testing.assert_array_equal(result.counts[[0, 1, 1], [0, 0, 1]], clean.counts[[0, 1, 1], [0, 0, 1]])
 
 
 def test_an_early_glitch_does_not_take_the_window_with_it():
@@ -58,61 +56,45 @@ def test_more_than_24_bits_are_refused():
 
 
 def test_counts_are_wide_enough():
-    assert counts_dtype(65535) == np.uint16
-    assert counts_dtype(65536) == np.uint32
-    frames = np.zeros((70_000, 1, 1), np.uint8)
-    result = histogram_frames(frames, bins=32)
-    assert result.counts.max() == 70_000
+    assert (counts_dtype(65535), counts_dtype(65536)) == (np.uint16, np.uint32)
+    assert histogram_frames(np.zeros((70_000, 1, 1), np.uint8), bins=32).counts.max() == 70_000
 
 
-class TestChoiceOfBins:
-    @staticmethod
-    def pixels(ranges, max_bins=1024):
-        out = np.zeros(max_bins + 2, np.int64)
-        for width, number in ranges.items():
-            out[min(width, max_bins + 1)] += number
-        return out
+@pytest.mark.parametrize(
+    ("ranges", "most", "expected"),
+    [
+        ({1: 100}, 1024, 32),
+        ({60: 100}, 1024, 144),
+        ({60: 100, 200: 1}, 1024, 416),  # a hot pixel gets its window
+        ({60: 100, 290: 1}, 1024, 144),  # its need of 608 is above 4 * 144 and 512: wild
+        ({100: 100, 290: 1}, 1024, 608),
+        ({60: 100, 1025: 3}, 1024, 144),  # hopeless pixels do not decide
+        ({1025: 100, 60: 3}, 1024, 1024),
+        ({700: 100}, 1024, 1024),
+        ({65: 5}, 64, 64),
+    ],
+)
+def test_bins_are_as_many_as_nearly_all_pixels_need(ranges, most, expected):
+    pixels = np.zeros(most + 2, np.int64)
+    pixels[list(ranges)] = list(ranges.values())
+    assert choose_bins(pixels, most) == expected
 
-    @pytest.mark.parametrize(
-        ("ranges", "expected"),
-        [
-            ({1: 100}, 32),
-            ({60: 100}, 144),
-            ({60: 100, 200: 1}, 416),  # a hot pixel gets its window
-            ({60: 100, 290: 1}, 144),  # its need of 608 is above 4 * 144 and 512: wild
-            ({100: 100, 290: 1}, 608),
-            ({60: 100, 5000: 3}, 144),  # hopeless pixels do not decide
-            ({5000: 100, 60: 3}, 1024),
-            ({700: 100}, 1024),
-        ],
-    )
-    def test_cases(self, ranges, expected):
-        assert choose_bins(self.pixels(ranges), 1024) == expected
 
-    def test_never_above_the_limit(self):
-        assert choose_bins(self.pixels({300: 5}, 64), 64) == 64
+def test_single_glitches_are_left_out_of_the_range_but_hot_pixels_are_not():
+    frames = pcd_like(7, (256, 4, 4))
+    ordered = np.sort(frames.astype(int), axis=0)
+    expected = np.bincount((ordered[-4] - ordered[3] + 1).ravel(), minlength=1026)
+    np.testing.assert_array_equal(pixels_by_range(frames, 1024), expected)
+    plain = choose_bins(pixels_by_range(frames, 1024), 1024)
+    frames[3, 1, 1], frames[90, 1, 1], frames[100, 2, 2] = 4000, 0, 65535
+    assert choose_bins(pixels_by_range(frames, 1024), 1024) == plain
+    frames[::20, 3, 3] += 60
+    assert choose_bins(pixels_by_range(frames, 1024), 1024) > plain
+    assert choose_bins(pixels_by_range(np.full((1, 2, 2), 9, np.uint16), 1024), 1024) == 32
 
-    def test_single_glitches_are_left_out_but_hot_pixels_are_not(self):
-        frames = pcd_like(7, (256, 4, 4))
-        plain = choose_bins(pixels_by_range(frames, 1024), 1024)
-        frames[3, 1, 1], frames[90, 1, 1], frames[100, 2, 2] = 4000, 0, 65535
-        assert choose_bins(pixels_by_range(frames, 1024), 1024) == plain
-        frames[::20, 3, 3] += 60
-        assert choose_bins(pixels_by_range(frames, 1024), 1024) > plain
 
-    def test_trimmed_range_is_that_of_the_sorted_samples(self):
-        frames = pcd_like(8, (256, 3, 5))
-        ordered = np.sort(frames.astype(int), axis=0)
-        expected = np.bincount((ordered[-4] - ordered[3] + 1).ravel(), minlength=1026)
-        np.testing.assert_array_equal(pixels_by_range(frames, 1024), expected)
-
-    def test_one_frame(self):
-        one = np.full((1, 2, 2), 9, np.uint16)
-        assert choose_bins(pixels_by_range(one, 1024), 1024) == 32
-
-    def test_typical_window_leaves_room_for_a_hundred_times_more_frames(self):
-        frames = pcd_like(9, (25_600, 3, 3))
-        result = histogram_frames(frames)
-        assert not result.over.any()
-        assert not result.under.any()
-        assert result.counts.shape[2] <= 256
+def test_typical_window_leaves_room_for_a_hundred_times_more_frames():
+    result = histogram_frames(pcd_like(9, (25_600, 3, 3)))
+    assert not result.over.any()
+    assert not result.under.any()
+    assert result.counts.shape[2] <= 256

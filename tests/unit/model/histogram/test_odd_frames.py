@@ -27,13 +27,9 @@ def test_odd_frames_are_found_and_chance_makes_none():
     level[700:850], variance[700:850], digest[700:850] = 0.0, 0.0, -1
     digest[300] = 17
     found = odd(level, variance, digest)
-    assert {kind: frames.tolist() for kind, frames in found.items()} == {
-        "empty": list(range(700, 850)),
-        "copied": [300],
-        "far": [0, 1, 2, 3, 4, 600],
-        "moved_x": [],
-        "moved_y": [],
-    }
+    expected = {"empty": [*range(700, 850)], "copied": [300], "far": [0, 1, 2, 3, 4, 600]}
+    expected |= {"moved_x": [], "moved_y": []}
+    assert {kind: frames.tolist() for kind, frames in found.items()} == expected
     assert odd_words(found, level, variance) == (
         "frames 700 to 849 are empty; frame 300 is equal to an earlier frame; "
         "frames 0 to 4 are 30 DN above the others; frame 600 is 60 DN below the others"

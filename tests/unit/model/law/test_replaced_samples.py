@@ -1,7 +1,6 @@
 """The law of samples of which some are replaced: against drawn samples, and against itself."""
 
 import numpy as np
-import pytest
 
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas
 from pchem_pipeline.model.law.replaced_samples import ReplacedSamples
@@ -31,8 +30,7 @@ def mass_of(law):
 
 
 def test_codes_are_as_frequent_as_in_drawn_samples():
-    rng = np.random.default_rng(1)
-    n = 400_000
+    rng, n = np.random.default_rng(1), 400_000
     law = law_by(drawn(rng, n)[0])
     _, out, gone = drawn(rng, n)
     assert (gone.mean(axis=0) > 0.03).all()
@@ -57,25 +55,21 @@ def test_what_stands_in_may_lie_outside_of_the_codes():
     assert not above.comes.any()
 
 
-@pytest.mark.parametrize("parameter", range(4))
-def test_the_score_is_the_slope_of_the_likelihood_and_zero_on_average(parameter):
+def test_the_score_is_the_slope_of_the_likelihood_and_zero_on_average():
     rng = np.random.default_rng(2)
     law = law_by(drawn(rng, 3000)[0])
     counts = rng.multinomial(5000, mass_of(law)).astype(np.uint32)
     theta = np.stack([np.log(EXPOSURE), STEP, BIAS, 2.0 * np.log(NOISE * STEP)])
 
-    def parabolas(shift):
-        at = theta.copy()
-        at[parameter] += shift
+    def parabolas(at):
         maps = np.exp(at[0]), 1.0 / at[1], at[2], np.sqrt(np.exp(at[3]) + 1.0 / 12.0)
         return sample_parabolas(SampleLaw(), maps, counts, FIRST, law)
 
-    small = 1e-4
-    slope = (parabolas(small)[0] - parabolas(-small)[0]) / (2.0 * small)
-    _, score, information = parabolas(0.0)
-    np.testing.assert_allclose(score[:, parameter], slope, rtol=1e-5, atol=1e-3)
-    spread = np.sqrt(information[:, parameter, parameter])
-    assert (np.abs(score[:, parameter]) < 5.0 * spread).all()
+    _, score, information = parabolas(theta)
+    for parameter, small in enumerate(1e-4 * np.eye(4)[:, :, None]):
+        slope = (parabolas(theta + small)[0] - parabolas(theta - small)[0]) / 2e-4
+        np.testing.assert_allclose(score[:, parameter], slope, rtol=1e-5, atol=1e-3)
+    assert (np.abs(score) < 5.0 * np.sqrt(np.diagonal(information, axis1=1, axis2=2))).all()
     np.testing.assert_allclose(information, information.swapaxes(1, 2))
 
 
@@ -84,14 +78,12 @@ def test_nothing_is_replaced_at_no_share_and_pixels_keep_their_own():
     values = drawn(rng, 500)[0]
     counts = rng.multinomial(5000, mass_of(law_by(values))).astype(np.uint32)
     none = ReplacedSamples.by(values, EXCESS, 0.0 * SHARE, FIRST, N_CODES)
-    for found, plain in zip(
-        sample_parabolas(SampleLaw(), MAPS, counts, FIRST, none),
-        sample_parabolas(SampleLaw(), MAPS, counts, FIRST),
-        strict=True,
-    ):
-        np.testing.assert_allclose(found, plain, rtol=1e-6, atol=1e-6)
+    replaced, plain, both = (
+        sample_parabolas(SampleLaw(), MAPS, counts, FIRST, *law) for law in ([none], [], [law_by(values)])
+    )
+    for found, expected in zip(replaced, plain, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
     one = law_by(values).of(np.array([1]))
     alone = sample_parabolas(SampleLaw(), [m[1:] for m in MAPS], counts[1:], FIRST[1:], one)
-    both = sample_parabolas(SampleLaw(), MAPS, counts, FIRST, law_by(values))
     for found, expected in zip(alone, both, strict=True):
         np.testing.assert_allclose(found[0], expected[1], rtol=1e-9)
