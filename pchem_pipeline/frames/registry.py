@@ -124,7 +124,7 @@ def detect_format(path: Path) -> str:
 
 
 def check_unpacked(path: Path, head: bytes) -> None:
-    """Refuse a packed file: libraries may unpack it, but its bytes are not where they say."""
+    """Raise InputError for a packed file: libraries may unpack it, but its bytes are not where they say."""
     for magic, program in _PACKED.items():
         if head.startswith(magic):
             raise InputError(f"{path}: compressed with {program}; unpack it first")

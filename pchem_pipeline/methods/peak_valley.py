@@ -60,7 +60,8 @@ def comb(counts: NDArray[np.integer], spacing: float, width: float) -> tuple[flo
     """Return distance and first place of the peaks, bins, H, and the height of a valley over its peaks.
 
     A peak counts where it is above the valley beside it by three times the scatter of the smoothed counts.
-    The first guess of the distance, and the standard deviation of the smoothing, are in bins.
+    The histogram has shape (B,); the first guess of the distance, and the standard deviation of the
+    smoothing, are in bins.
     """
     values = gaussian_filter1d(counts.astype(np.float64), width, mode="constant")
     tops, facts = find_peaks(values, prominence=0.0, distance=max(1.0, 0.6 * spacing))

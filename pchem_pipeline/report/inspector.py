@@ -116,7 +116,7 @@ def some_of(values: NDArray[Any], enough: int = 65_537) -> NDArray[Any]:
 
 
 def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
-    """Return a map in few bytes; values are kept to half a step, those outside the range to 1e-7."""
+    """Return a map (y, x) in few bytes; values are kept to half a step, those outside the range to 1e-7."""
     flat = np.asarray(values).ravel()
     place = _places(flat, scale)
     bars = None if flat.dtype.kind in "iub" else _bars(place)

@@ -32,7 +32,7 @@ class Multiple(NamedTuple):
 
 
 def multiple_of(pattern: FloatArray, seen: FloatArray, weight: FloatArray | float = 1.0) -> Multiple:
-    """Return how many times a pattern is in what is seen, which has the inverse variance ``weight``."""
+    """Return how many times a pattern is in data of its shape and of inverse variance ``weight``."""
     information = float((weight * pattern**2).sum())
     if not (np.isfinite(information) and information > 0):
         return Multiple(0.0, np.inf)

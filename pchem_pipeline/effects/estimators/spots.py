@@ -50,7 +50,8 @@ def spot_to_window(
 ) -> dict[str, float]:
     """Return a spot as it is on some rows and columns that are taken for a sensor of their own.
 
-    By ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect; ranges as in `to_window`.
+    By ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect on a sensor of ``shape`` (rows,
+    columns); ranges as in `to_window`.
     """
     centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
     # the brightest of these pixels is the one nearest to the centre

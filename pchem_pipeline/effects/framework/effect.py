@@ -390,7 +390,7 @@ class Effect(Section):
         return self.title or self.tag
 
     def by_law(self, shape: tuple[int, int]) -> Sequence[Effect]:
-        """Return effects of one law each for all of their pixels that together are this one on a sensor."""
+        """Return effects that together are this one on a sensor of ``shape``, each of one law."""
         return (self,)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:

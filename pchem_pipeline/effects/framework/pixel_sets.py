@@ -24,7 +24,11 @@ _MOST_RUNS = 20_000
 
 
 def region_mask(region: Region, shape: tuple[int, ...], rows: IntArray | None = None) -> BoolArray:
-    """Return which pixels of a sensor lie in a region, see :meth:`.region.Region.mask`."""
+    """Return which pixels (y, x) of a sensor lie in a region, see :meth:`.region.Region.mask`.
+
+    Raises:
+        ConfigError: it reaches beyond the sensor.
+    """
     _check(region, shape)
     y = np.arange(shape[0]) if rows is None else np.asarray(rows)
     x = np.arange(shape[1])
@@ -87,7 +91,11 @@ def overlap(one: BoolArray, other: BoolArray) -> float:
 
 
 def simplest_region(mask: BoolArray) -> dict[str, Any]:
-    """Return the fields of the region of a map of pixels, see :meth:`.region.Region.of_mask`."""
+    """Return the fields of the region of a map of pixels, see :meth:`.region.Region.of_mask`.
+
+    Raises:
+        ConfigError: it holds no pixel, or too many runs.
+    """
     rows, columns = np.asarray(mask.any(axis=1)), np.asarray(mask.any(axis=0))
     if not rows.any():
         raise ConfigError("a region without a pixel; leave it out")

@@ -535,7 +535,7 @@ class ResponseTerm(Section):
 
 
 def excess_moments(exposure: FloatArray, above: float) -> tuple[FloatArray, FloatArray]:
-    """Return the mean and the variance of what Poisson counts of some means have above a number, e-, e-^2."""
+    """Return mean (e-) and variance (e-^2) of what Poisson counts have above a number; means of any shape."""
     if above == 0.0:
         return exposure, exposure
     largest = float(np.max(np.nan_to_num(exposure), initial=0.0))

@@ -106,7 +106,7 @@ def _truncated(path: Path, n_frames: int, needed: int, size: int, whole: int) ->
 
 
 class OpenedFile:
-    """A file open for one call; refused if it vanished, or became shorter since it was inspected."""
+    """A file open for one call; InputError if it vanished, or became shorter since it was inspected."""
 
     def __init__(self, path: Path, size: int) -> None:
         self._path = path
@@ -167,7 +167,7 @@ class ContiguousReader(FrameReader):
         raise NotImplementedError
 
     def set_layout(self, path: Path, layout: Layout, size: int) -> None:
-        """Take the layout; refuse a file whose ``size`` is less than the layout says."""
+        """Take the layout; InputError: the file's ``size`` is less than the layout says."""
         if layout.end > size:
             whole = int(np.count_nonzero(layout.offsets + layout.frame_bytes <= size))
             raise _truncated(path, layout.offsets.size, layout.end, size, whole)
@@ -185,7 +185,7 @@ class ContiguousReader(FrameReader):
         settings: InputSettings | None,
         what: str,
     ) -> None:
-        """Set the stack's shape and type from those of the stored array; refuse what cannot be frames.
+        """Set the stack's shape and type from those of the stored array; InputError: these are no frames.
 
         Without settings, the file says itself what its signed samples mean. Messages call the array ``what``.
         """

@@ -42,7 +42,7 @@ def external_links(path: Path, file: Any) -> dict[str, str]:
 
 
 def check_links(path: Path, links: dict[str, str], wanted: str | None) -> None:
-    """Refuse a wanted dataset that lies in another file (a Dectris master file, say); None: any link."""
+    """Raise InputError if the wanted dataset (None: any) is in another file, as in a Dectris master file."""
     asked = {name: links[name] for name in links if wanted is None or name == wanted.strip("/")}
     if asked:
         shown = ", ".join(f"{name} in {file}" for name, file in list(asked.items())[:4])
@@ -218,7 +218,7 @@ def _fits(part: Any, source: Any) -> bool:
 
 
 def check_filters(path: Path, dataset: Any) -> None:
-    """Refuse a dataset that is coded by a filter which is not installed."""
+    """Raise InputError if a dataset is coded by a filter that is not installed."""
     from h5py import h5z
 
     record = dataset.id.get_create_plist()

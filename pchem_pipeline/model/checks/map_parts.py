@@ -39,8 +39,8 @@ def map_parts(values: FloatArray) -> list[Parts]:
     """Find steps of a map along its columns and rows; without any, two modes of its values.
 
     A step is a jump of the medians of lines against a common slope, by at least the robust standard deviation
-    of the pixels within the parts. The map, NaN where it has no value, is divided at the most significant
-    one, and each part likewise.
+    of the pixels within the parts. The map (y, x), NaN where it has no value, is divided at the most
+    significant one, and each part likewise.
     """
     # of each line, all of it and both halves are looked at
     boxes = _divided(values, (0, values.shape[0], 0, values.shape[1]), _ALARM / (3.0 * sum(values.shape)))

@@ -29,7 +29,7 @@ class ChiSquare:
 
 
 def central_window(counts: NDArray[np.integer[Any]]) -> slice:
-    """Return the bins that hold the central 99.9 % of the samples, which are not all zero.
+    """Return the bins that hold the central 99.9 % of the samples, shape (n,), not all zero.
 
     A few hot pixels stretch the axis over thousands of empty bins; an RMSE over all of them would shrink with
     the length of the axis.
@@ -42,12 +42,12 @@ def central_window(counts: NDArray[np.integer[Any]]) -> slice:
 
 
 def rmse(data: FloatArray, model: FloatArray, window: slice = slice(None)) -> float:
-    """Return the root mean square difference between two densities on the same bins, in their unit."""
+    """Return the root mean square difference between two densities, (n,), in their unit."""
     return math.sqrt(float(np.mean((data[window] - model[window]) ** 2)))
 
 
 def noise_floor(variance: FloatArray, window: slice = slice(None)) -> float:
-    """Return the RMSE that counting alone causes, from the variance of the density of each bin."""
+    """Return the RMSE that counting alone causes, from the variance of the density of each bin, (n,)."""
     return math.sqrt(float(np.mean(variance[window])))
 
 
@@ -62,8 +62,8 @@ def chi_square(
 ) -> ChiSquare:
     """Return Pearson's chi-square of an ensemble histogram with the binomial variance of its pixels.
 
-    Over the bins with at least 10 samples. The bins of one pixel are slightly anticorrelated, so the sum is
-    not exactly chi-square; with many bins the difference is small.
+    Over those of the n bins with at least 10 samples. The bins of one pixel are slightly anticorrelated, so
+    the sum is not exactly chi-square; with many bins the difference is small.
     """
     use = (counts >= 10) & (variance > 0)
     value, dof = float(np.sum((data[use] - model[use]) ** 2 / variance[use])), int(use.sum())

@@ -245,7 +245,7 @@ def number_tables(
 def compare_electron_numbers(
     estimated: NDArray[np.uint16], true: NDArray[np.uint16], n_sizes: int = 8
 ) -> ErrorTally:
-    """Compare estimated with true electron numbers, by so many sizes of error, where there is an estimate."""
+    """Compare estimated with true electron numbers of any shape, by sizes of error, where estimated."""
     known = estimated != NO_NUMBER
     off = estimated[known].astype(np.int64) - true[known]
     sizes = np.bincount(np.minimum(np.abs(off), n_sizes - 1), minlength=n_sizes)

@@ -51,7 +51,7 @@ class Cells:
 
 
 def joint_cells(columns: Sequence[FloatArray], bins: int) -> Cells:
-    """Histogram d parameters of n pixels, so many bins each, and keep the occupied cells only."""
+    """Histogram d parameters of n pixels, each (n,), so many bins each, and keep the occupied cells only."""
     index: IntArray = np.zeros(columns[0].size, dtype=np.int64)
     edges = [_edges(column, bins) for column in columns]
     for column, edge in zip(columns, edges, strict=True):
@@ -201,7 +201,7 @@ def nuced_dependent(pixels: UsablePixels, axis: NucedAxis, bins: int) -> FloatAr
 
 
 def nuced_independent(pixels: UsablePixels, axis: NucedAxis, bins: int) -> FloatArray:
-    """Return the NUCed ensemble PCD, 1/e-, with the joint density as the product of two histograms.
+    """Return the NUCed ensemble PCD, 1/e-, (n_bins,), with the density as the product of two histograms.
 
     Hendrickson et al. 2023, eq. partial_ensemble_dist, independent parameters, averaged over each bin.
     """
@@ -223,7 +223,7 @@ def _in_bins(
 
 
 def electron_pmf_binned(quanta_exposure: FloatArray, n_k: int, bins: int) -> FloatArray:
-    """Return the mass of the ensemble electron number, with the density of H from a histogram, for k < n_k.
+    """Return the mass of the ensemble electron number, (n_k,), with the density of H, (n,), from a histogram.
 
     Hendrickson et al. 2023, eq. K_ensemble_pmf with the integral replaced by a sum.
     """

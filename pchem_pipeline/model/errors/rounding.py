@@ -51,7 +51,7 @@ def rounding_may_matter(variance: FloatArray, n_frames: NDArray[np.generic]) -> 
 def biased_by_rounding(parameters: Sequence[FloatArray], n_frames: NDArray[np.generic]) -> BoolArray:
     """Return in which pixels rounding biases the density's estimates by more than :data:`LARGEST_BIAS`.
 
-    Arguments as of :func:`rounding_bias`; a pixel without parameters is not biased.
+    Arguments as of :func:`rounding_bias`, shape (n,); a pixel without parameters is not biased.
     """
     sigma, frames = np.asarray(parameters[3], np.float64), np.asarray(n_frames, np.float64)
     suspects = np.flatnonzero(np.isfinite(sigma) & rounding_may_matter(sigma**2, frames))

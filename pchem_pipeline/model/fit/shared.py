@@ -153,7 +153,11 @@ class SharedProblem:
         return np.where(self.kept, np.log(np.maximum(mass, LEAST_SEEN) / inside), 0.0)
 
     def slopes(self, theta: FloatArray, shared: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the log masses, (n, B), and their derivatives, own four parameters first, (n, 4 + d, B)."""
+        """Return the log masses, (n, B), and their derivatives, own four parameters first, (n, 4 + d, B).
+
+        Raises:
+            ValueError: fields of the law do not go together.
+        """
         base, own = self.log_masses(theta, shared), to_parameters(self.samples.rows(theta))
         n, width = base.shape
         slopes = np.zeros((n, 4 + shared.size, width))

@@ -129,7 +129,7 @@ def quality_map(fit_status: NDArray[np.integer[Any]], conversion_gain: FloatArra
 
 
 def status_counts(fit_status: NDArray[np.integer[Any]]) -> dict[str, int]:
-    """Count the pixels with each reason, by its name in lower case, ``"ok"`` first; some have several."""
+    """Count the pixels with each reason, by its name in lower case, ``"ok"`` first; words of any shape."""
     counts = {words_of(bit): int(np.count_nonzero(fit_status & int(bit))) for bit in FitStatus if bit}
     return {"ok": int(np.count_nonzero(fit_status == 0))} | counts
 

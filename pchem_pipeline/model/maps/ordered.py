@@ -28,7 +28,7 @@ class Ordered:
 
     @classmethod
     def of(cls, values: NDArray[Any] | Ordered, left_out: BoolArray | None = None) -> Ordered:
-        """Sort a map, NaN where it has no value, without some pixels; what is sorted stays as it is."""
+        """Sort a map of any shape, NaN where it has no value, without some pixels, a mask of that shape."""
         if isinstance(values, Ordered):
             return values
         ordered = np.array(values, np.float64, order="C").ravel()
@@ -114,7 +114,7 @@ class Ordered:
 
 
 def median_of(values: NDArray[Any], left_out: BoolArray | None = None) -> float:
-    """Return :attr:`Ordered.median` of a map in a third of the time."""
+    """Return :attr:`Ordered.median` of a map of any shape in a third of the time."""
     some = np.array(values, np.float64, order="C").ravel()
     if left_out is not None:
         some[left_out.ravel()] = np.nan

@@ -321,7 +321,7 @@ def points_of(mark: Mark) -> tuple[Values, Values]:
 def window(axis: Axis, values: Iterator[Values], base: float | None = None) -> tuple[float, float]:
     """Return the ends of an axis that shows these values: those given, else the values' with a margin.
 
-    The axis ends at ``base`` if no value is beyond it.
+    Values have any shapes; the axis ends at ``base`` if none is beyond it.
     """
     parts = [np.asarray(each, dtype=np.float64).ravel() for each in values]
     known = np.concatenate(parts) if parts else np.empty(0)

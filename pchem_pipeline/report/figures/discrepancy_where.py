@@ -503,7 +503,7 @@ def _codes_chart(table: DataTable, marked: Sequence[Place]) -> Chart:
 def trends(number: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return mean frame number, mean value and number of frames of each stretch of the run.
 
-    No stretch spans a gap between frames, whose numbers increase.
+    No stretch spans a gap between the n frames, whose numbers increase.
     """
     starts = np.concatenate([[0], np.flatnonzero(np.diff(number) > 1) + 1, [number.size]])
     wanted = max(number.size // _STRETCHES, 4)

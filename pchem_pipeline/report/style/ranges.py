@@ -84,7 +84,7 @@ def _widened(low: float, high: float) -> tuple[float, float]:
 
 
 def histogram_edges(values: NDArray[Any] | Ordered, shown: DisplayRange, most: int) -> FloatArray:
-    """Return the edges of 6 to ``most`` bins over the drawn range, by the rule of Freedman and Diaconis."""
+    """Return the edges of 6 to ``most`` bins of values of any shape, by the rule of Freedman and Diaconis."""
     known = Ordered.of(values).within(shown.low, shown.high)
     low, high = shown.low, shown.high
     if shown.logarithmic:

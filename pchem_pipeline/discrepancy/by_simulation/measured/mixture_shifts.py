@@ -392,7 +392,7 @@ def _of_groups(ratio: FloatArray, place: IntArray, together: Together, shape: tu
 
 
 def share_of(ratio: FloatArray, first: float = _FIRST_SHARE) -> tuple[float, float]:
-    """Return the share of groups that are moved, by EM from their log likelihood ratios, and the gain."""
+    """Return the share of moved groups, by EM from their log likelihood ratios, (n,), and the gain, nats."""
     ratio, share = ratio[np.isfinite(ratio)], first
     for _ in range(_STEPS if ratio.size else 0):
         share = float(special.expit(ratio + special.logit(share)).mean())

@@ -308,7 +308,7 @@ def running_waves(samples: PartSamples) -> Waves:
 
 
 def measured_wave(data: Waves, model: Waves, evidence: Evidence, inside: BoolArray) -> Measurement | None:
-    """Return the wave of steady phase in the pixels ``inside`` beyond a model's; None: there is none."""
+    """Return the wave of steady phase in the pixels ``inside``, (y, x), beyond a model's, or None."""
     wave, made = data.steady, model.steady
     if wave is None or (made is not None and made.amplitude > MADE * wave.amplitude):
         return None
