@@ -133,7 +133,7 @@ def texts_of(values: Mapping[str, Any], names: Iterable[str]) -> dict[str, str]:
 def celsius(value: Any, unit: Any = "C") -> float | None:
     """Return a temperature in degrees Celsius; None where it is no number, or no temperature of a sensor.
 
-    The unit is kelvin (``K``), degrees Celsius, or one that is not known, which also gives None.
+    The unit is kelvin (``K``) or degrees Celsius, which are meant without one; any other also gives None.
     """
     try:
         number = float(value)

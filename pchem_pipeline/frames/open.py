@@ -24,7 +24,8 @@ def open_frames(
 ) -> FrameSequence:
     """Open all camera files as one stack, with bit shift, region of interest and frame range applied.
 
-    With ``check_duplicates``, also look for files with the same content, and at some samples.
+    With ``check_duplicates``, also look for files with the same content, and at some samples. Threads can
+    share the stack, and it can be pickled; its ``report`` says what was found and left out.
 
     Raises:
         InputError: bad files (all in one message), too few frames, or a region outside of the frames.

@@ -18,7 +18,10 @@ WRITERS = ("tiff", "fits", "hdf5", "npy", "raw", "zarr", "ser")
 
 
 class StackFacts(NamedTuple):
-    """What a writer has to know of a stack: (frames, rows, columns), type, integration time in s, bits."""
+    """What a writer has to know of a stack: (frames, rows, columns), type, integration time in s, ADC bits.
+
+    None of the last two: not known.
+    """
 
     shape: tuple[int, int, int]
     dtype: np.dtype[Any]

@@ -24,7 +24,10 @@ from pchem_pipeline.store.run_store import RunStore
 
 @dataclass(frozen=True)
 class OpenSample:
-    """The run of a sample, with the fingerprint of its histograms; messages call it ``where``."""
+    """The run of a sample, with the fingerprint of its histograms; messages call it ``where``.
+
+    ``sensor`` has the bit depth and integration time of the configuration of the sample's run.
+    """
 
     where: str
     target: Target

@@ -107,8 +107,8 @@ class StackCounter:
     def count(self, blocks: Iterable[Block], check: Callable[[], None] = lambda: None) -> None:
         """Count all blocks, in the order of time, and write what they give into the run.
 
-        The first of a stack decides the windows, so let it always have the same number of frames. ``check``
-        is called before each block; it raises where the work shall end.
+        The first block of a stack decides the windows, so let it always have the same number of frames.
+        ``check`` is called before each block; it raises where the work shall end.
 
         Raises:
             InputError: DN of more than 24 bits, or the frames cannot be read.
