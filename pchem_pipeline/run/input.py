@@ -36,7 +36,8 @@ def known_identity(context: StageContext) -> dict[str, Any]:
         InputError: files are missing or bad, and nothing is known of them from before.
     """
     settings = context.config.input
-    known, held = dict[str, Any](), dict[str, Any]()
+    known: dict[str, Any] = {}
+    held: dict[str, Any] = {}
     with suppress(StoreError):  # one that is damaged is as good as none: the files are hashed again
         known = read_record(context.store.path / _KNOWN) or {}
         held = ingested_identity(context) or {}

@@ -82,7 +82,8 @@ def tile_shape(size: TileSize, sensor: tuple[int, int]) -> tuple[int, int]:
 
 def tile_grid(shape: tuple[int, int], size: TileSize) -> list[Tile]:
     """Return the tiles of a sensor of ``shape`` (y, x), row by row; edge tiles may be smaller."""
-    rows, columns = (equal_rows(*each) for each in zip(shape, tile_shape(size, shape), strict=True))
+    height, width = tile_shape(size, shape)
+    rows, columns = equal_rows(shape[0], height), equal_rows(shape[1], width)
     return [Tile(iy, ix, *y, *x) for iy, y in enumerate(rows) for ix, x in enumerate(columns)]
 
 

@@ -122,7 +122,8 @@ class Hdf5Reader(ContiguousReader):
             check_coded(path, self.shape, dataset.chunks, self.dtype.itemsize, size)
             _check_chunks(path, dataset)
         missing = _missing_chunks(path, dataset)
-        self.notes, self.unwritten = self.notes + missing, bool(missing)
+        self.notes += missing
+        self.unwritten = bool(missing)
         offsets = _plain_offsets(path, file, dataset, self.shape)
         if offsets is not None:
             self.set_layout(path, Layout(offsets, *self.shape[1:], dataset.dtype, self._offset), size)
@@ -151,7 +152,7 @@ def _chunks_of(dataset: Any) -> list[Any]:
 
 
 def _missing_chunks(path: Path, dataset: Any) -> tuple[str, ...]:
-    """Say how many chunks of a dataset were never written; refuse one without any."""
+    """Say how many chunks were never written, and read as the fill value; refuse a dataset without any."""
     if dataset.chunks is None:
         plain = not (dataset.is_virtual or dataset.external) and dataset.id.get_storage_size() == 0
         return unwritten_notes(path, int(plain and dataset.size > 0), 1, "datasets")

@@ -89,7 +89,8 @@ class ZarrReader(ContiguousReader):
         self.take_facts(facts_from_names(attributes))
         self.notes = _channel_notes(path, _axes(node), self._full)
         missing = _check_chunks(path, path / self._name, array, parts)
-        self.notes, self.unwritten = self.notes + missing, bool(missing)
+        self.notes += missing
+        self.unwritten = bool(missing)
 
     def _decode_into(self, buffer: NDArray[Any], t0: int, t1: int, y0: int, y1: int) -> None:
         import zarr

@@ -249,7 +249,8 @@ def _sum_tile(
     else:  # only the number of the samples matters
         outside = np.full(origin.shape, job.sensor.n_frames, np.uint32)
         counted = PixelHistograms(np.zeros((*origin.shape, 1), np.uint16), origin, outside)
-    errors, numbers = _errors(fit, tile, job.sensor.shape), np.arange(origin.size).reshape(origin.shape)
+    errors = _errors(fit, tile, job.sensor.shape)
+    numbers = np.arange(origin.size).reshape(origin.shape)  # of the pixels, in C order
     rows = []
     for part in parts_told(tile.parts(store.array("histogram/counts").shape[2])):
         everything = counted.of(part).cut(low[part], high[part])

@@ -132,8 +132,8 @@ def _write_frame_statistics(context: StageContext) -> None:
     # parts of about the same length: a frame is ranked among those of its part
     ends = np.linspace(0, n_frames, -(-n_frames // row_frames(ny)) + 1).astype(int).tolist()
     for part in (slice(*each) for each in pairwise(ends)):
-        rows = part, slice(None)
-        sums, squares = (context.store.read(f"summary/row_sum{of}", rows) for of in ("", "_square"))
+        sums = context.store.read("summary/row_sum", (part, slice(None)))
+        squares = context.store.read("summary/row_sum_square", (part, slice(None)))
         mean[part], variance[part] = frame_statistics(sums, squares, nx)
         if usual is None:
             usual, chance = np.median(sums, axis=0), chance_of_copies(sums.var(axis=0), n_frames)
