@@ -116,8 +116,9 @@ def _read(path: Path) -> list[_Channel]:
     suffix = path.suffix.lower()
     if suffix not in HISTOGRAM_SUFFIXES:
         raise InputError(f"{path}: give histograms as .csv, .txt, .npy or .npz")
+    read = _read_numpy if suffix in (".npy", ".npz") else _read_text
     try:
-        dn, columns, names = (_read_numpy if suffix in (".npy", ".npz") else _read_text)(path)
+        dn, columns, names = read(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from error
     except csv.Error as error:
@@ -207,7 +208,7 @@ def _read_text(path: Path) -> tuple[NDArray[Any], list[NDArray[Any]], list[str]]
             raise InputError(
                 f"{path}: row {number} ({mark.join(row)[:40]}) is not {width} numbers; correct it"
             )
-    table = np.array([[float(cell) for cell in row] for row in rows]).reshape(-1, width)
+    table = np.fromiter((float(cell) for row in rows for cell in row), np.float64).reshape(-1, width)
     names = [name or str(i) for i, name in enumerate((header or [""] * width)[1:])]
     return table[:, 0], list(table[:, 1:].T), names
 
