@@ -130,7 +130,7 @@ def power_of_ten(exponent: int) -> str:
 
 
 def measured(value: float, error: float, unit: str = "") -> str:
-    """Return ``value ± error unit``, rounded to two digits of the error; NaN or 0 leaves the error out."""
+    """Return ``value ± error unit``, rounded to two digits of the error; one of NaN or 0 is left out."""
     tail = f" {unit}" if unit else ""
     if not math.isfinite(value):
         return "not known"

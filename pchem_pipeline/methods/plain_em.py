@@ -49,7 +49,9 @@ def closed_form_start(sample: Sample) -> FloatArray:
 def run_em(
     sample: Sample, start: FloatArray, only_light: bool, settings: MethodsSettings
 ) -> tuple[FloatArray, IntArray]:
-    """Run EM from (H, g, mu, sigma), shape (n, 4), NaN where there is no start; ``only_light``: for H and g.
+    """Run EM from (H, g, mu, sigma), shape (n, 4), NaN where there is no start.
+
+    ``only_light``: bias and read noise are known, H and g are looked for.
 
     Returns:
         (H, g, mu, sigma), NaN without a result, and the steps taken (negative: out of range; 0: no start).

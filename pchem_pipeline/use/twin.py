@@ -148,6 +148,7 @@ def _patterns(values: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatA
     of_columns = np.nan_to_num(np.nanmean(values, axis=0) - centre)
     rest = values - centre - of_rows[:, None] - of_columns[None]
     own = float(np.nanvar(rest))
+    # a mean of a line scatters by its pixels, too: that part stays with the rest
     of_rows, of_columns = (
         pattern * np.sqrt(max(0.0, 1.0 - own / length / max(float(pattern.var()), 1e-300)))
         for pattern, length in ((of_rows, values.shape[1]), (of_columns, values.shape[0]))

@@ -39,8 +39,8 @@ def map_parts(values: FloatArray) -> list[Parts]:
     """Find steps of a map along its columns and rows; without any, two modes of its values.
 
     A step is a jump of the medians of lines against a common slope, by at least the robust standard deviation
-    of the pixels within the parts. The map (y, x), NaN where it has no value, is divided at the most
-    significant one, and each part likewise.
+    of the pixels within the parts: a smaller one hardly matters to a median over the sensor. The map (y, x),
+    NaN where it has no value, is divided at the most significant one, and each part likewise.
     """
     # of each line, all of it and both halves are looked at
     boxes = _divided(values, (0, values.shape[0], 0, values.shape[1]), _ALARM / (3.0 * sum(values.shape)))
@@ -70,7 +70,7 @@ def _median(values: FloatArray) -> float:
 
 def _step(values: FloatArray) -> tuple[float, int]:
     """Return p-value and place of the most significant step along the columns, whole or in halves."""
-    middle = len(values) // 2
+    middle = len(values) // 2  # where steps cross, those of the halves may cancel in the whole
     return min(_step_of(part) for part in (values, values[:middle], values[middle:]))
 
 

@@ -29,7 +29,7 @@ class ChiSquare:
 
 
 def central_window(counts: NDArray[np.integer[Any]]) -> slice:
-    """Return the bins that hold the central 99.9 % of the samples, shape (n,), not all zero.
+    """Return the bins that hold the central 99.9 % of the counts, shape (n,), which are not all zero.
 
     A few hot pixels stretch the axis over thousands of empty bins; an RMSE over all of them would shrink with
     the length of the axis.

@@ -178,7 +178,8 @@ def compare_maps(
 
 
 def _q_values(likely: Sequence[FloatArray], tested: int) -> list[FloatArray]:
-    """Return the q-values of the smallest p-values, map by map, out of all that were tested."""
+    """Return the q-values of the smallest p-values of each map, out of all that were tested."""
+    # map by map: where one has changed throughout, no pixel of another is let through in its company
     return [false_discovery(few * (tested / max(few.size, 1))) for few in likely]
 
 

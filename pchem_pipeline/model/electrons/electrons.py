@@ -215,7 +215,7 @@ def number_tables(
     parts: int = 1,
     detailed: bool = False,
 ) -> NumberTables:
-    """Return the electron number of each code that pixels have shown.
+    """Return the most probable electron number of each code that pixels have shown.
 
     That it is right has the probability of its share in the sum over all k.
 

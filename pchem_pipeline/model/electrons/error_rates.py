@@ -22,8 +22,9 @@ _AT_ONCE = 4096  # pixels
 def error_rates(totals: EnsembleTotals, pixels: UsablePixels, true: UsablePixels | None) -> dict[str, Any]:
     """Return how often the electron numbers are wrong, where the true ones are known.
 
-    The expected rate is that of data of the true parameters decided with the fitted ones; the least possible
-    one that of numbers decided with the true ones. Frames that the fit has seen err slightly less.
+    ``expected_error_rate_from_truth`` is that of data of the true parameters decided with the fitted ones;
+    ``least_error_rate`` that of numbers decided with the true ones. Frames that the fit has seen err slightly
+    less than new ones.
 
     Args:
         totals: the sums over all tiles.

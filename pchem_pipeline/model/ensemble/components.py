@@ -122,7 +122,7 @@ def moment_errors(pixels: UsablePixels, n_frames: int | NDArray[np.integer[Any]]
     About the ensemble mean, from which the pixel lies off by d, ``Var((X - m)^2) = 3 v^2 + H/g^4 - v^2 +
     4 d H/g^3 + 4 d^2 v``. Frames are independent, so both add over samples.
 
-    Each pixel counts the same, whatever its frames. Those of ``mean`` (DN), ``variance`` (DN^2),
+    Each pixel counts the same, whatever its frames. Errors of ``mean`` (DN), ``variance`` (DN^2),
     ``nuced_mean`` (e-) and ``nuced_variance`` (e-^2).
     """
     exposure, gain, bias, sigma = pixels.maps

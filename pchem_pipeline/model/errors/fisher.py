@@ -49,13 +49,15 @@ def correlations(covariance: FloatArray) -> FloatArray:
 
     NaN where a parameter has no standard error.
     """
-    variances, (i, j) = np.diagonal(covariance, axis1=-2, axis2=-1), np.transpose(CORRELATION_PAIRS)
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
+    i, j = np.transpose(CORRELATION_PAIRS)
     return np.ascontiguousarray(covariance[..., i, j] / np.sqrt(variances[..., i] * variances[..., j]))
 
 
 def covariance_from(stderr: FloatArray, correlation: FloatArray) -> FloatArray:
     """Return the covariance, (..., 4, 4), from standard errors, (..., 4), and correlations, (..., 6)."""
-    covariance, (i, j) = stderr[..., :, None] * stderr[..., None, :], np.transpose(CORRELATION_PAIRS)
+    covariance = stderr[..., :, None] * stderr[..., None, :]
+    i, j = np.transpose(CORRELATION_PAIRS)
     covariance[..., i, j] *= correlation
     covariance[..., j, i] *= correlation
     return covariance

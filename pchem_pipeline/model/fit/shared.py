@@ -409,6 +409,7 @@ def _damped(information: FloatArray, damping: FloatArray) -> FloatArray:
 
 def _limits(theta: FloatArray, n_exposures: int) -> tuple[FloatArray, FloatArray]:
     """Return how far the own parameters may go from a start: not to another electron number, (n, P) each."""
+    # beyond, the law would need ever more electron numbers, and each step ever more time
     m = n_exposures
     step = np.exp(theta[:, m])
     reach = np.full((step.size, m + 2), _REACH_EXPOSURE)

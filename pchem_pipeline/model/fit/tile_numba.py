@@ -236,7 +236,7 @@ def _tile_kernel(plain: bool) -> Callable[..., None]:
         parameters: FloatArray,
         covariance: FloatArray,
     ) -> bool:
-        """Fill parameters and covariance at a maximum; return whether the information is regular."""
+        """Fill parameters and covariance at a maximum; False unless the information is positive definite."""
         n, at, fixed = pixel.facts.shape[0], scratch.evaluations[AT_BEST], scratch.flags[FIXED]
         held = fixed.copy()
         floor = min_log_variance(theta[n + STEP], limits.cells)

@@ -95,7 +95,10 @@ class HistogramAccumulator:
         return self
 
     def add(self, frames: _Frames) -> None:
-        """Count a block of frames, (frame, y, x); the first one places the windows of pixels that do not fit.
+        """Count a block of frames, (frame, y, x).
+
+        The first block of a stack places the windows of pixels that do not fit: let it always have the same
+        number of frames.
 
         Raises:
             InputError: a DN has more than 24 bits.
@@ -109,8 +112,8 @@ class HistogramAccumulator:
                 f"the frames have DN of {int(high.max())}, more than 24 bits; correct input.dtype, "
                 "input.byte_order or input.bit_shift"
             )
-        seen = low, high, self._minimum, self._maximum
-        place_windows(frames, *seen, self._counts, self._origin, self._fixed, self._first)
+        ranges = low, high, self._minimum, self._maximum  # of these frames, and of all before
+        place_windows(frames, *ranges, self._counts, self._origin, self._fixed, self._first)
         self._first = False
         count_frames(frames, self._origin, self._counts, self._under, self._over)
 

@@ -99,7 +99,7 @@ def block_starts(n_frames: int, block_frames: int) -> IntArray:
 def frame_statistics(
     row_sum: IntArray, row_sum_square: IntArray, columns: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean, DN, and variance, DN^2, over the pixels of each frame, (frame,) each.
+    """Return mean, DN, and variance, DN^2, over all n pixels of each frame (divisor n), (frame,) each.
 
     The sums along all rows of the sensor, of so many columns, are of shape (frame, y).
     """

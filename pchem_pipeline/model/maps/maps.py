@@ -156,12 +156,14 @@ def summarise(
         The summary; NaN throughout where no pixel has a value.
     """
     ordered = Ordered.of(values, left_out)
-    n, missing, without, nan = ordered.size, ordered.n_missing, ordered.n_left_out, float("nan")
+    n, missing, without = ordered.size, ordered.n_missing, ordered.n_left_out
+    nan = float("nan")
     if n == 0:
         return MapSummary(0, missing, without, nan, nan, nan, dict.fromkeys(percentiles, nan), nan, nan, 0, 0)
     median, robust_sd = ordered.median, ordered.robust_sd
     middle, half = 0.5 * (n - 1), 0.5 * np.sqrt(n)
-    limit, found = outlier_sigmas * robust_sd, ordered.quantiles(np.asarray(percentiles) / 100.0)
+    limit = outlier_sigmas * robust_sd
+    found = ordered.quantiles(np.asarray(percentiles) / 100.0)
     error = 0.5 * (ordered.at_rank(middle + half) - ordered.at_rank(middle - half))
     return MapSummary(
         n_valid=n,

@@ -28,7 +28,10 @@ class Ordered:
 
     @classmethod
     def of(cls, values: NDArray[Any] | Ordered, left_out: BoolArray | None = None) -> Ordered:
-        """Sort a map of any shape, NaN where it has no value, without some pixels, a mask of that shape."""
+        """Sort a map of any shape, NaN where it has no value, without some pixels, a mask of that shape.
+
+        What is sorted already is returned as it is.
+        """
         if isinstance(values, Ordered):
             return values
         ordered = np.array(values, np.float64, order="C").ravel()
