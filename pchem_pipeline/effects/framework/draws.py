@@ -93,7 +93,8 @@ def regrouped(
         electrons: Poisson numbers, e-, any shape.
         u: a uniform number for each.
         bound: upper limit of both probabilities of ``law``, broadcasts against ``electrons``.
-        law: from flat indices of samples to the probabilities, per electron, to be lost or else a cluster.
+        law: from flat indices of samples to the probabilities, per electron, to be left out and, of the rest,
+            to become a cluster.
         extra: from uniform numbers and flat indices to the electrons of a cluster beyond one, >= 1.
     """
     result = np.array(electrons)

@@ -180,7 +180,8 @@ class Simulations:
         """
         text = "|".join(e.model_dump_json() for e in model)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-        taken, tasks = self.frames.acquisition(as_data=True), list[Replicate]()
+        taken = self.frames.acquisition(as_data=True)
+        tasks: list[Replicate] = []
         for i in range(begin // 2, (begin + count + 1) // 2):
             seed = self.seed_of(prefix, i)
             tasks.append(Replicate(f"{prefix}-null-{digest}-{i}", sensor.draw(seed), model, seed, taken))
