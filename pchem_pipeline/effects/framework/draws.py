@@ -2,7 +2,8 @@
 
 An effect on single electrons changes few samples. One keyed uniform number per sample says which; what
 happens there is worked out for those samples alone. Every function grows with its probability from the same
-end of the number, so the samples that change at a small strength also change at a large one.
+end of the number, so the samples that change at a small strength also change at a large one, and none
+changes at none.
 
 A stationary Markov process at a frame between two known ones depends on those two alone. So from a coarse
 grid of frames, so far apart that they are independent, midpoints are filled in level by level, down to the

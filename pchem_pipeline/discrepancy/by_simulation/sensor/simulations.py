@@ -144,8 +144,9 @@ class Simulations:
     ) -> Sensor:
         """Return the sensor learnt from the seen frames and their fit under a model; see `learn_sensor`."""
         self.effort.learn(self.plain.maps.usable.size, fit.components)
-        own = self.own_samples(model), self.frames.seen_numbers, fit, self.frames.effects(model)
-        return learn_sensor(*own, self.plain.ambiguous, lost, before)
+        frames, numbers = self.own_samples(model), self.frames.seen_numbers
+        effects = self.frames.effects(model)
+        return learn_sensor(frames, numbers, fit, effects, self.plain.ambiguous, lost, before)
 
     def drawn(self, model: tuple[Effect, ...], count: int) -> list[Mapping[str, float]]:
         """Return the statistics of so many replicates of a model, drawn where they are new.
