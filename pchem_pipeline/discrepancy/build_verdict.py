@@ -129,12 +129,16 @@ class Addition:
 
     def _separate(self) -> dict[str, str]:
         """Return, by effect, the measurement that would distinguish it from this one."""
-        known, tag, classes = dict(type(self.effect).separate), self.effect.tag, effect_classes()
+        known, tag = dict(type(self.effect).separate), self.effect.tag
         if self.named or self.alone:
             return known if self.named else {}
-        others = [each for each in self.candidates if each.effect != tag]
-        back = {c.effect: classes[c.effect].separate.get(tag) for c in others if c.effect in classes}
-        return {c.effect: known.get(c.effect) or back.get(c.effect) or _more_samples(c) for c in others}
+        found = {}
+        for each in self.candidates:
+            if each.effect != tag:
+                other = effect_classes().get(each.effect)
+                back = None if other is None else other.separate.get(tag)
+                found[each.effect] = known.get(each.effect) or back or _more_samples(each)
+        return found
 
 
 @dataclass(frozen=True)

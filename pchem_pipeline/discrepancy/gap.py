@@ -77,7 +77,7 @@ class Gap:
         return self.value <= self.floor and not self.standing_out
 
     def too_wide(self, closed: float) -> bool:
-        """Test whether the rest (few samples measure it poorly) is too large to name what closed so much."""
+        """Test whether the lower end of the rest is too large to name an effect that closed so much."""
         return max(self.interval[0], 0.0) >= _REST_OF_NAMED * closed
 
 

@@ -29,7 +29,10 @@ from pchem_pipeline.effects.framework.evidence import Evidence
 
 @dataclass
 class AddedSets:
-    """Fits what the search found on ``whole`` train and test parts, and measures gaps on the final part."""
+    """Fits what the search found to train and test part together, and measures gaps on the final part.
+
+    ``whole`` does so with all codes.
+    """
 
     found: Explanation
     whole: SetComparison
@@ -40,7 +43,7 @@ class AddedSets:
         return replace(self.whole, kept=self.found.kept)
 
     def gap(self, fitted: FittedSet) -> Gap:
-        """Return the gap of a fit; codes that are set aside have the masses of the plain law."""
+        """Return the gap of a fit; codes set aside keep the plain law, and nothing of theirs is closed."""
         masses = on_all_codes(fitted.log_masses, self.found.kept, self.whole.plain.log_masses)
         return self.whole.gap(replace(fitted, log_masses=masses))
 

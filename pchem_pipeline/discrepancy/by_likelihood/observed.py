@@ -136,7 +136,7 @@ def _split(counts: NDArray[np.integer], parts: int, rng: np.random.Generator) ->
     found = []
     for remaining in range(parts, 1, -1):
         totals = (left.sum(axis=1) // remaining).tolist()
-        drawn = [rng.multivariate_hypergeometric(*each) for each in zip(left, totals, strict=True)]
+        drawn = [rng.multivariate_hypergeometric(row, n) for row, n in zip(left, totals, strict=True)]
         found.append(np.stack(drawn).astype(np.int64))
         left = left - found[-1]
     return (*found, left)

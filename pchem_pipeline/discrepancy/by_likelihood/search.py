@@ -90,7 +90,7 @@ def _rest(sets: SetComparison, best: FittedSet) -> float:
 
 
 def combs_coincide(parameters: FloatArray) -> bool:
-    """Return whether the peaks of pixels with parameters (n, 4) lie at the same DN, as codes do."""
+    """Return whether peaks of pixels (n, 4) lie at the same DN: codes cannot be told from electrons then."""
     gain, bias = np.median(parameters[:, 1]), parameters[:, 2]
     return bool(np.ptp(np.quantile(bias, [0.1, 0.9])) * gain < _COINCIDE)
 

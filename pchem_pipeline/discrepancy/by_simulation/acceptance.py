@@ -60,8 +60,9 @@ class Acceptance:
         """Return the effects that are significant in the data, and in the final frames alone.
 
         Those had no part in finding them: a true effect of 4.5 standard errors in two thirds of the frames
-        misses them once in seventy times; a chance passes once in six. What has no name or is overwhelming,
-        though its strength be known badly, needs 3 standard errors; a strength by few events counts by these.
+        misses them once in seventy times; a chance passes once in six. What has no name needs 3 standard
+        errors in either; what is beyond doubt, though its strength is known badly (the variance of a noise in
+        n frames to sqrt(2 / n)), 3 in the data. Of few events the probability by chance counts instead.
         """
         first, n, model_error = self.first, len(added.vectors), self.settings.model_error
         certain = counted(added.parts, self.z.both - first.mean, noise_of_splits(first, 2, model_error))

@@ -277,6 +277,8 @@ def without_company(additions: Sequence[Addition]) -> list[Addition]:
 def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, null: NullModel) -> str:
     """Say what a model leaves in the families of an effect's signature, in its place, or of what it moves.
 
+    Empty if that is nothing.
+
     Args:
         effect: an effect.
         part: by how much it moves the statistics, shape (m,).

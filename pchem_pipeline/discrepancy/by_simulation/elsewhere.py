@@ -1,4 +1,4 @@
-"""Test of the final model in another window of the sensor: there what is larger than one looks different."""
+"""Test of the final model in another window: what is larger than a window may look like something else."""
 
 from __future__ import annotations
 

@@ -155,8 +155,17 @@ class FrameExplainer(Explainer[Screened]):
         effort.begin()
         untestable = {tag: c.untestable for tag, c in effect_classes().items() if c.untestable}
         z = Measured(*as_matrix(names, own))
-        data = observed.parts[0], observed.examined(), first, z, effort
-        prepared = Prepared(settings, "frames", *data, untestable, observed.doubt())
+        prepared = Prepared(
+            settings,
+            "frames",
+            observed.parts[0],
+            observed.examined(),
+            first,
+            z,
+            effort,
+            untestable,
+            observed.doubt(),
+        )
         screening = Screening(observed, work, z, classes, model, settings.model_error, prepared.defects)
         accept = Acceptance(first, z, StatisticsGap(first, observed.final_samples), settings)
         return cls(prepared, observed, work, screening, accept, model)
@@ -276,9 +285,10 @@ class FrameExplainer(Explainer[Screened]):
         if key not in self._likelihoods:
             if len(self._likelihoods) >= _LIKELIHOODS:
                 del self._likelihoods[next(iter(self._likelihoods))]
-            own = self.work.own_samples((*present, *effects)), self.observed.plain.maps, present
-            how = self.work.effort, pixels, self.prepared.defects
-            self._likelihoods[key] = PixelLikelihood(*own, *how)
+            samples = self.work.own_samples((*present, *effects))
+            self._likelihoods[key] = PixelLikelihood(
+                samples, self.observed.plain.maps, present, self.work.effort, pixels, self.prepared.defects
+            )
         return self._likelihoods[key]
 
     def tolerance(self) -> FloatArray | float:

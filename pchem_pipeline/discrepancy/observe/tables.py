@@ -133,8 +133,15 @@ def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: BoolArray)
     while n_codes > coarse * _MOST_BINS:
         coarse *= 2
     n_bins = n_codes // coarse + 1
-    sizes = (4, n_codes), (FOLD,), (FOLD, FOLD), (3, n_bins), (n_bins, n_bins)
-    codes = CodeSums(axis, coarse, *(np.zeros(size) for size in sizes))
+    codes = CodeSums(
+        first=axis,
+        coarse=coarse,
+        single=np.zeros((4, n_codes)),
+        fold=np.zeros(FOLD),
+        fold_covariance=np.zeros((FOLD, FOLD)),
+        bins=np.zeros((3, n_bins)),
+        bin_covariance=np.zeros((n_bins, n_bins)),
+    )
     moments, support = np.zeros(n, MOMENTS), np.tile(np.array([0, 1, 0]), (n, 1))
     tables = np.zeros((1 + int(length[good].sum()), 2), np.float32)
     factors, sums = np.zeros((n, N_NUISANCE, N_COLUMNS)), np.zeros((n, N_TESTS, N_TESTS + 3))

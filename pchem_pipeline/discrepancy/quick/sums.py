@@ -62,7 +62,7 @@ class Lines:
         return np.stack([each.sum(axis=0, dtype=np.int64) / len(each) for each in blocks])
 
     def centred(self, frames: slice = slice(None), lines: slice = slice(None)) -> FloatArray:
-        """Return sums less their mean over each block, (frame, line), DN: some, as all take much memory."""
+        """Return sums of some frames or lines (all take much memory) less their mean over each block, DN."""
         values = self.sums[frames, lines].astype(np.float64)
         first = frames.indices(self.sums.shape[0])[0]
         block = np.searchsorted(self.starts, np.arange(first, first + len(values)), side="right") - 1

@@ -310,24 +310,25 @@ def _response(pixels: PixelMaps, codes: IntArray) -> FloatArray:
     sigma = np.sqrt(np.maximum(noise**2 - QUANTISATION_VARIANCE, 0.01))
     first = np.floor(bias - 5.0 * sigma).astype(np.int64)
     n_cells = int(np.ceil((10.0 * sigma + (exposure + 5.0 * np.sqrt(exposure) + 2.0) / gain).max()))
-    mass, slopes = sample_slopes(SampleLaw(), pixels, first, n_cells)
+    masses, slopes = sample_slopes(SampleLaw(), pixels, first, n_cells)
     # a larger bias takes from each code what lies at its upper edge, and gives what lies at its lower one
-    density = np.pad(-np.cumsum(slopes[:, 2], axis=1), ((0, 0), (1, 0)))
-    mass = np.maximum(mass, 1e-12)
-    root = np.sqrt(mass)[:, :, None]
+    densities = np.pad(-np.cumsum(slopes[:, 2], axis=1), ((0, 0), (1, 0)))
+    masses = np.maximum(masses, 1e-12)
+    root = np.sqrt(masses)[:, :, None]
     # changes of the masses with H, mu, sigma, g, orthonormal under 1 / mass, (n, 4, cells)
     tangents = (np.linalg.qr(slopes.transpose(0, 2, 1) / root)[0] * root).transpose(0, 2, 1)
     total = np.zeros((codes.size + 2 * n_cells, codes.size + 2 * n_cells + 1))
     cells = np.arange(n_cells)
-    for begin, edge, weight, along in zip(first - codes[0] + n_cells, density, mass, tangents, strict=True):
+    begins = first - codes[0] + n_cells
+    for begin, density, mass, tangent in zip(begins, densities, masses, tangents, strict=True):
         if not 0 <= begin <= total.shape[0] - n_cells:
             continue
         # a deviation at an edge moves the samples there into the upper cell
-        taken = np.zeros((len(along), n_cells + 1))
-        taken[:, :-1] = along / weight * edge[:-1]
-        taken[:, 1:] -= along / weight * edge[1:]
+        taken = np.zeros((len(tangent), n_cells + 1))
+        taken[:, :-1] = tangent / mass * density[:-1]
+        taken[:, 1:] -= tangent / mass * density[1:]
         change = total[begin : begin + n_cells, begin : begin + n_cells + 1]
-        change -= along.T @ taken
-        change[cells, cells] += edge[:-1]
-        change[cells, cells + 1] -= edge[1:]
+        change -= tangent.T @ taken
+        change[cells, cells] += density[:-1]
+        change[cells, cells + 1] -= density[1:]
     return total[n_cells:-n_cells, n_cells:-n_cells]

@@ -353,7 +353,7 @@ def _fitted(seen: FloatArray, variance: float, k: int) -> Levels:
         number = np.maximum(belongs.sum(axis=1), 1e-9)
         levels = Levels(belongs @ seen / number, number / number.sum())
     order = np.argsort(levels.values)
-    return Levels(*(each[order] for each in levels))
+    return Levels(levels.values[order], levels.shares[order])
 
 
 def _log_density(levels: Levels, seen: FloatArray, variance: float) -> tuple[FloatArray, FloatArray]:

@@ -2,7 +2,8 @@
 
 An effect on single electrons changes few samples. One keyed uniform number per sample says which; what
 happens there is worked out for those samples alone. Every function grows with its probability from the same
-end of the number, so the samples that change at a small strength also change at a large one.
+end of the number, so the samples that change at a small strength also change at a large one, and none
+changes at none.
 
 A stationary Markov process at a frame between two known ones depends on those two alone. So from a coarse
 grid of frames, so far apart that they are independent, midpoints are filled in level by level, down to the
@@ -93,7 +94,8 @@ def regrouped(
         electrons: Poisson numbers, e-, any shape.
         u: a uniform number for each.
         bound: upper limit of both probabilities of ``law``, broadcasts against ``electrons``.
-        law: from flat indices of samples to the probabilities, per electron, to be lost or else a cluster.
+        law: from flat indices of samples to the probabilities, per electron, to be left out and, of the rest,
+            to become a cluster.
         extra: from uniform numbers and flat indices to the electrons of a cluster beyond one, >= 1.
     """
     result = np.array(electrons)

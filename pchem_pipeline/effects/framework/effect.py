@@ -357,7 +357,9 @@ class Effect(Section):
     def limited(cls, name: str, value: float) -> float:
         """Return a value cut to the limits that its field states."""
         for limit in cls.model_fields[name].metadata:
-            value = min(max(value, getattr(limit, "ge", -math.inf)), getattr(limit, "le", math.inf))
+            low, high = getattr(limit, "ge", None), getattr(limit, "le", None)
+            value = value if low is None else max(value, low)
+            value = value if high is None else min(value, high)
         return value
 
     @classmethod
@@ -376,14 +378,14 @@ class Effect(Section):
 
     def at_limits(self) -> dict[str, float]:
         """Return parameters at a limit of their field, by name; not defaults, nor `may_be_at_bound`."""
-        return {
-            name: value
-            for name, field in type(self).model_fields.items()
-            if isinstance(value := getattr(self, name), float)
-            and value != field.default
-            and name not in self.may_be_at_bound
-            and any(value in (getattr(x, "ge", None), getattr(x, "le", None)) for x in field.metadata)
-        }
+        found = {}
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            limits = [getattr(limit, side, None) for limit in field.metadata for side in ("ge", "le")]
+            chosen = isinstance(value, float) and value != field.default
+            if chosen and name not in self.may_be_at_bound and value in limits:
+                found[name] = value
+        return found
 
     def describe(self) -> str:
         """Describe in a few words what is known of it."""

@@ -170,7 +170,7 @@ class Region(_Place):
         return cls.model_validate(simplest_region(mask))
 
     def mask(self, shape: tuple[int, ...], rows: IntArray | None = None) -> BoolArray:
-        """Return its pixels of a sensor, or of a band of rows, (y, x); ConfigError: it reaches beyond."""
+        """Return its pixels in a sensor, or in some rows of it, (y, x); ConfigError: it reaches beyond."""
         from pchem_pipeline.effects.framework.pixel_sets import region_mask
 
         return region_mask(self, shape, rows)

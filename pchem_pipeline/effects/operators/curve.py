@@ -553,8 +553,11 @@ class Clipping(Effect, tag="clipping"):
         code = evidence.code
         high = code.maximum if _piles_up(code, code.maximum, above=True) else None
         low = code.minimum if code.minimum > 0 and _piles_up(code, code.minimum, above=False) else None
-        pairs = dict.fromkeys(((low, high), (None, high), (low, None)))
-        return [cls(low=low, high=high) for low, high in pairs if (low, high) != (None, None)]
+        if high is None and low is None:
+            return ()
+        if high is None or low is None:
+            return (cls(low=low, high=high),)
+        return cls(low=low, high=high), cls(high=high), cls(low=low)
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law that counts at the limits what lies beyond them."""

@@ -142,13 +142,15 @@ class Glow(Effect, tag="glow"):
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return a spot that bursts, from rows and columns, and one that grows, from block means."""
-        growing = _growing(evidence)
-        found = (best_bursts(evidence), None if growing is None else (growing, None))
+        bursts, growing = best_bursts(evidence), _growing(evidence)
+        found: list[tuple[Spot, float | None]] = [] if bursts is None else [bursts]
+        if growing is not None:
+            found.append((growing, None))
         return [
             cls.model_validate(
                 {"peak_e": spot.peak, "falloff": spot.falloff, "burst_share": share, **spot.place}
             )
-            for spot, share in filter(None, found)
+            for spot, share in found
         ]
 
     def representative(self, frames: IntArray) -> tuple[Self, float]:

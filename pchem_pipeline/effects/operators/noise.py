@@ -315,8 +315,9 @@ class SignalDependentNoise(Effect, tag="signal_dependent_noise"):
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
         """Return the law with variance growing along the peaks."""
-        growing = "per_electron" if self.growth == "root" else "per_electron2"
-        return model.with_variance(**{growing: self.noise_e**2})
+        if self.growth == "root":
+            return model.with_variance(per_electron=self.noise_e**2)
+        return model.with_variance(per_electron2=self.noise_e**2)
 
 
 _WHERE, _SIZE, _FULL, _EMPTY = OF_PIXEL

@@ -371,7 +371,9 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
             if loose is not None and (line is None or line.amplitude < 0.7 * loose.amplitude):
                 fields = {name: loose.along, "amplitude_dn": loose.amplitude / alpha, "random_phase": True}
                 found.append((loose.excess, cls(**fields)))
-        for wave in (wave for wave in time.waves if not wave.alternates):
+        for wave in time.waves:
+            if wave.alternates:
+                continue
             pickup = cls(
                 amplitude_dn=wave.amplitude / mean_response(evidence),
                 cycles_per_row=wave.per_row,

@@ -41,10 +41,10 @@ def evidence_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of group ``discrepancy``, by their names without the group.
 
-    The statistics ``before`` (None: those of the evidence) and ``after`` effects are added, with which
-    ``code_extended`` samples are expected at each code, are standardised by replicates. The paths of effects
-    that do not depend on chance are among the arrays. What the evidence lacks (everything along time for
-    ready-made histograms) is absent.
+    ``before`` and ``after`` are the statistics standardised by replicates of the plain model (None: those of
+    the evidence) and of that with effects (None: no effects), ``code_extended`` the samples expected at each
+    code with these. Paths of effects are drawn where they do not depend on chance. What the evidence lacks
+    (everything along time for ready-made histograms) is absent.
     """
     code = evidence.code
     found: dict[str, NDArray[Any]] = {

@@ -302,8 +302,11 @@ class _Mapper:
         found: list[Mapping[str, float] | Exception] = []
         for replicate in replicates:
             reason = self.context.failed.pop(replicate.key, None)
-            self.total -= reason is not None
-            found.append(summaries[replicate.key] if reason is None else PchEmError(reason))
+            if reason is None:
+                found.append(summaries[replicate.key])
+            else:
+                self.total -= 1
+                found.append(PchEmError(reason))
         return found
 
 

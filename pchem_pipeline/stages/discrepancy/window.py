@@ -235,9 +235,11 @@ def fewer_samples(
         length = block_length(window.numbers.size, settings.block_frames)
         frames = read_window(source, window)
         if is_clear(frames, window.times, n_run=source.shape[0], block_frames=length):
-            # enough where much is wrong
-            most_of = {"replicates": 24, "extended_replicates": 12}
-            return few.model_copy(update={k: min(getattr(few, k), n) for k, n in most_of.items()})
+            lower = {  # enough where much is wrong
+                "replicates": min(settings.replicates, 24),
+                "extended_replicates": min(settings.extended_replicates, 12),
+            }
+            return few.model_copy(update=lower)
         samples *= 2
     return settings
 

@@ -160,7 +160,7 @@ class ReplicateSimulator:
         return pixels and (one.when is None or other.when is None or one.when.overlap(other.when, n_run) > 0)
 
     def fingerprints(self, effects: Sequence[Effect], repeats: int = 1) -> list[Hypothesis]:
-        """Simulate each effect so often on the random numbers of the model without; failures are defects."""
+        """Simulate each effect ``repeats`` times on the random numbers of the model; failures: defects."""
         if not effects:
             return []
         shown = [effect.representative(self.acquisition.numbers) for effect in effects]

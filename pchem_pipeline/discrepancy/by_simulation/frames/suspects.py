@@ -88,7 +88,7 @@ def with_ends(part: Part, evidence: Evidence) -> Part:
 
 
 def _apart(found: Iterable[tuple[_C, BoolArray]], grown: Callable[[BoolArray], BoolArray]) -> list[_C]:
-    """Return what stands out most and does not overlap; what is far less clear, not even grown masks."""
+    """Return what stands out most and does not overlap, if far less clear not even with grown masks."""
     ordered = sorted(found, key=lambda one: -one[0].z)
     chosen: list[_C] = []
     taken = np.zeros_like(ordered[0][1]) if ordered else np.zeros(0, np.bool_)

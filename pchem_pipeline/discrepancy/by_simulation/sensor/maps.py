@@ -87,7 +87,7 @@ def refit_maps(
     added: AddedExposure | None = None,
     numbers: IntArray | None = None,
 ) -> Refit:
-    """Fit the pixels of some frames with effects in their law; the old maps stay where they give none.
+    """Fit the pixels of some frames with effects in their law; if these give none, the old maps stay.
 
     Args:
         frames: (frame, y, x), DN.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 
@@ -126,7 +125,7 @@ class Replicate:
         """Simulate; yield the frames of each part, their numbers and their evidence."""
         taken = self.acquisition
         parts = (taken.numbers,) if taken.other is None else (taken.numbers, taken.other)
-        seen = functools.reduce(np.union1d, parts)
+        seen = taken.numbers if taken.other is None else np.union1d(taken.numbers, taken.other)
         frames = simulate_frames(self.maps, self.effects, self.seed, replace(taken, numbers=seen))
         start = self.maps if taken.other is None else fitted_maps(frames, ~self.maps.usable)
         for numbers in parts:

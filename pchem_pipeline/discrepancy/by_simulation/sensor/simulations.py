@@ -144,8 +144,9 @@ class Simulations:
     ) -> Sensor:
         """Return the sensor learnt from the seen frames and their fit under a model; see `learn_sensor`."""
         self.effort.learn(self.plain.maps.usable.size, fit.components)
-        own = self.own_samples(model), self.frames.seen_numbers, fit, self.frames.effects(model)
-        return learn_sensor(*own, self.plain.ambiguous, lost, before)
+        frames, numbers = self.own_samples(model), self.frames.seen_numbers
+        effects = self.frames.effects(model)
+        return learn_sensor(frames, numbers, fit, effects, self.plain.ambiguous, lost, before)
 
     def drawn(self, model: tuple[Effect, ...], count: int) -> list[Mapping[str, float]]:
         """Return the statistics of so many replicates of a model, drawn where they are new.
@@ -180,7 +181,8 @@ class Simulations:
         """
         text = "|".join(e.model_dump_json() for e in model)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-        taken, tasks = self.frames.acquisition(as_data=True), list[Replicate]()
+        taken = self.frames.acquisition(as_data=True)
+        tasks: list[Replicate] = []
         for i in range(begin // 2, (begin + count + 1) // 2):
             seed = self.seed_of(prefix, i)
             tasks.append(Replicate(f"{prefix}-null-{digest}-{i}", sensor.draw(seed), model, seed, taken))

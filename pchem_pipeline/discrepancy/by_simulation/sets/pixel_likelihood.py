@@ -138,7 +138,7 @@ class PixelLikelihood:
         """Return how far a set is behind another in likelihood, nats, and the standard error (Vuong 1989).
 
         Each parameter of an effect costs a nat (Akaike 1974). None where they cannot be fitted. They differ
-        in effects that are `identifiable_from_histograms`.
+        only in effects that are `identifiable_from_histograms`.
         """
         first, second = self._fit_set(one), self._fit_set(other, one)
         if first is None or second is None:
@@ -147,10 +147,11 @@ class PixelLikelihood:
         return rise - (first.fit.shared.size - second.fit.shared.size), error
 
     def _fit_set(self, effects: Sequence[Effect], like: Sequence[Effect] | None = None) -> FittedSet | None:
-        """Fit a set, what is not `identifiable_from_histograms` being as it is there or in another set."""
+        """Fit the `identifiable_from_histograms` effects of a set beside its others, or those of ``like``."""
         own = [e for e in effects if identifiable_from_histograms(e)]
         others = effects if like is None else like
         besides = tuple(e for e in others if not identifiable_from_histograms(e))
+        # other strengths of the same lead to the same fit
         asked = frozenset(e.model_dump_json(exclude={e.strength}) for e in own), besides
         if asked not in self._asked:
             if len(self._asked) >= _REMEMBERED:
@@ -182,7 +183,7 @@ class PixelLikelihood:
 
 @dataclass(frozen=True)
 class HistogramLikelihood:
-    """The `PixelLikelihood` beside some effects, of about so many pixels; None where they have no one law."""
+    """Asks ``of`` for the `PixelLikelihood` with some effects, of about so many pixels; None: no one law."""
 
     of: Callable[[Sequence[Effect], int], PixelLikelihood | None] = lambda effects, pixels: None
 

@@ -44,7 +44,7 @@ class Contender:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The best set and all, the best first, at their best fit.
+    """The chosen set and all that were tried, the best first, at their best fit.
 
     ``by_histograms`` says how far others (by tags) are behind the chosen one in the likelihood of the
     histograms, nats, with the error.
@@ -88,7 +88,7 @@ class Comparison:
 
 
 def chosen(search: Search) -> Comparison | None:
-    """Return the best set of which each effect is seen, or one as good by which histograms are likelier."""
+    """Return the best set with all effects seen, or one as good with likelier histograms; None: none."""
     best = _best_seen(search)
     if best is None:
         return None
