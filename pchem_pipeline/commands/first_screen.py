@@ -86,7 +86,7 @@ def typed(target: Target) -> str:
 
 
 def first_screen(numbers: Mapping[str, Any], run: str) -> list[str]:
-    """Return the first screen of a report, of ``report.json``, as lines; ``run``: its name in commands."""
+    """Return the first screen of a report by its ``report.json``, as lines; ``run`` names it in commands."""
     lines = [""]
     for answer in numbers["answers"]:
         lines.append(f"{answer['question']} {answer['word']}.")

@@ -144,7 +144,7 @@ def _put_in_force(store: RunStore, target: Target, version: ModelVersion) -> tup
 def adopt_verdict(target: Target) -> tuple[Target, str]:
     """Make the model of a run's verdict a version, and put it in force, in the store and for the YAML.
 
-    Returns the run with that model; what changed and how to go back, empty where the verdict changes nothing.
+    Return the run with that model, and what changed and how to go back; empty where nothing changes.
 
     Raises:
         ConfigError: the YAML is no configuration.

@@ -93,7 +93,7 @@ class RunView:
         return page
 
     def _is_current(self, stage: str, fingerprint: str | None = None) -> bool:
-        """Return whether a stage is finished, as stated, and rests on those before it as they are now."""
+        """Return whether a stage is finished (with this fingerprint), and so are those that it rests on."""
         record = self.store.records.read(stage)
         if record is None or not record.finished or fingerprint not in (None, record.fingerprint):
             return False

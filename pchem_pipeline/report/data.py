@@ -99,7 +99,7 @@ class PixelFit:
 
     def text(self, name: str) -> str:
         """Return a parameter with its standard error and unit."""
-        value, error = (numbers.get(name, np.nan) for numbers in (self.parameters, self.stderr))
+        value, error = self.parameters.get(name, np.nan), self.stderr.get(name, np.nan)
         return measured(value, error, symbol(name)[2])
 
 

@@ -37,7 +37,8 @@ def results_of_seeds(
         one: makes the record of a seed.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    yield from (records := read_results(path))
+    records = read_results(path)
+    yield from records
     done, start = {r["seed"] for r in records}, time.monotonic()
     with path.open("a") as file:
         for seed in itertools.count(first):

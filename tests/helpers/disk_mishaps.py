@@ -44,7 +44,8 @@ class ForgetfulDisk:
             monkeypatch.setattr(disk, name, self._noted(name, getattr(disk, name)))
 
     def _noted(self, name, operation):
-        def call(*arguments):
+        def call(*given):
+            arguments = [each.absolute() if isinstance(each, Path) else each for each in given]
             entry = (name, *arguments)
             if name == "make_folder":
                 above = [arguments[0], *arguments[0].parents]
@@ -62,14 +63,16 @@ class ForgetfulDisk:
 
         return call
 
-    def after_power_cut(self, end, rng):
+    def after_power_cut(self, end, rng, before=None):
         """Return the files (path -> content) where the power is cut behind ``end`` operations.
+
+        ``before`` are those that were on the disk already.
 
         Each change of names in a folder that was not synced later is there or not, in any order; so is what
         lies in a new folder whose own name was not. A content that was not synced is whole, cut, or empty.
         """
         log = self.log[:end]
-        files, kept, lost = {}, self._kept(log), []
+        files, kept, lost = dict(before or {}), self._kept(log), []
         for i, (name, *arguments) in enumerate(log):
             path = arguments[0]
             if name not in CHANGES or (

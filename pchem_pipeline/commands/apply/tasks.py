@@ -192,9 +192,8 @@ class _Tables:
 
     known: KnownPixels
     prior: Any  # expected exposure, e-, (y, x); or None
-    right_bias: (
-        Any  # probability of the right bias, (y, x): one an electron off makes nearly all numbers wrong
-    )
+    # probability that the bias is right, (y, x): one an electron off makes nearly all numbers wrong
+    right_bias: Any
     tables: NumberTables  # of the codes that occur
 
     def numbers(self, frames: NDArray[Any], codes: NDArray[Any], job: Job) -> Numbers:

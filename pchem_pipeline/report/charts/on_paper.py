@@ -262,11 +262,11 @@ def draw_panels(given: Any, chart: Chart) -> None:
             f"ax: {what}; give {len(panels)} axes of matplotlib, such as plt.subplots({len(panels)})[1]"
         )
     for axes, (stack, panel) in zip(several, panels, strict=True):
-        whole, width = (
-            25.4 * box.width / axes.figure.dpi for box in (axes.figure.bbox, axes.get_window_extent())
-        )
+        inch = axes.figure.dpi
+        width = 25.4 * axes.get_window_extent().width / inch
+        look = Look(25.4 * axes.figure.bbox.width / inch)
         with mpl.rc_context({"legend.fontsize": "small", "legend.frameon": False}):
-            handles = _draw_panel(axes, panel, stack, Look(whole), width)
+            handles = _draw_panel(axes, panel, stack, look, width)
             if keys := _keys(chart, width):
                 axes.legend([*keys.values()], [*keys], loc="upper left", bbox_to_anchor=(0.0, -0.2))
             elif any(chart.legend) and handles:

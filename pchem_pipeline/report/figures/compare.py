@@ -218,7 +218,8 @@ def history_figures(rows: Sequence[HistoryRow]) -> Iterator[Figure]:
     axis = "days since the first" if by_date else "label" if ordered else "run"
     heads = ("run", "label") if by_date else ("name", "text")
     columns: dict[str, Any] = {
-        head: [row[key] for row in rows] for head, key in zip(heads, ("run", "label"), strict=True)
+        heads[0]: [row["run"] for row in rows],
+        heads[1]: [row["label"] for row in rows],
     }
     columns[axis], units = at, {}
     for name in shown:

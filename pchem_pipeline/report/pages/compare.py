@@ -235,8 +235,9 @@ def run_table(found: Comparison) -> Table:
         "pixels": [f"{run.shape[0]} × {run.shape[1]}" for run in runs],
         "frames": ["not known" if run.n_frames is None else f"{run.n_frames:,}" for run in runs],
     }
-    for grade, counts in zip(_GRADES, zip(*(run.pixels for run in runs), strict=True), strict=True):
-        rows[grade] = [f"{n:,} ({percent(n, sum(r.pixels))})" for n, r in zip(counts, runs, strict=True)]
+    for place, grade in enumerate(_GRADES):
+        counts = [(run.pixels[place], sum(run.pixels)) for run in runs]
+        rows[grade] = [f"{n:,} ({percent(n, total)})" for n, total in counts]
     for name in dict.fromkeys(each for run in runs for each in run.summary):
         medians = [run.summary.get(name, (math.nan, math.nan))[:2] for run in runs]
         rows[f"{heading(name)}, median"] = [measured(*median, symbol(name)[2]) for median in medians]

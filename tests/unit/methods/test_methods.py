@@ -8,6 +8,7 @@ from scipy.stats import kstat
 
 from pchem_pipeline.methods.base import PixelSamples, Sample, methods, sample_moments
 from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, summarise_errors
+from pchem_pipeline.methods.peak_valley import comb, read_noise_of_valley
 from pchem_pipeline.methods.plain_em import run_em
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
@@ -107,6 +108,18 @@ def test_peaks_need_no_luck_with_their_first_distance(exposure, noise, gain):
     error = estimated("peak_valley", one)[:, 1] / gain - 1
     assert np.abs(error).max() < 0.05
     assert np.sqrt(np.mean(error**2)) < 2 * 1.4826 * np.median(np.abs(error - np.median(error)))
+
+
+def test_a_comb_is_measured():
+    x = np.arange(120.0)
+    heights = {0: 30.0, 1: 60.0, 2: 45.0, 4: 9.0}  # one peak is missing
+    counts = 1e4 * sum(h * np.exp(-0.5 * ((x - 20.3 - 12.4 * k) / 2.0) ** 2) for k, h in heights.items())
+    step, first, exposure, valley = comb(np.rint(counts).astype(np.uint32), 12.0, 1.5)
+    assert (step, first) == pytest.approx((12.4, 20.3), abs=0.02)
+    assert exposure == pytest.approx(2 * 45 / 60, rel=0.01)
+    tails = (60 + 45) * np.exp(-0.5 * 6.2**2 / (2.0**2 + 1.5**2))
+    assert valley == pytest.approx(tails / 52.5, rel=0.1)
+    assert np.isnan(read_noise_of_valley(np.array([1.0, 1.5, 0.0, -1.0]))).all()
 
 
 EMPTY = np.zeros((1, 40), np.uint32)

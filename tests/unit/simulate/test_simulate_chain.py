@@ -54,6 +54,11 @@ def test_long_tables_of_hot_pixels_are_searched_right():
         np.testing.assert_array_equal(dn, other)
 
 
+def test_without_noise_the_numbers_are_the_formula():
+    dn, electrons = simulate_block(constant_truth(gain=0.08, bias=100.3, noise=0.0), sensor(), (0, 20))
+    np.testing.assert_array_equal(dn, np.rint(electrons / 0.08 + 100.3))
+
+
 @pytest.mark.parametrize(("bits", "dtype"), [(1, np.uint8), (8, np.uint8), (9, np.uint16), (17, np.uint32)])
 @pytest.mark.parametrize("effects", [[], NOTHING])
 def test_the_adc_ends_at_zero_and_at_its_top(bits, dtype, effects):

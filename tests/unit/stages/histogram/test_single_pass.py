@@ -1,6 +1,7 @@
 """The one pass over the camera files: every byte read once, and the results of the separate stages."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
+from pchem_pipeline.stages.bands import cut_rows
 from pchem_pipeline.stages.histogram import memory, single_pass
 
 FRAMES, NY, NX = 300, 150, 40
@@ -201,3 +203,12 @@ def test_a_file_that_shrinks_meanwhile_is_said(tmp_path, frames, monkeypatch):
     with pytest.raises(InputError, match="was truncated"):
         single_pass.count_in_one_pass(context)
     assert not context.prepared
+
+
+def test_rows_are_cut_at_whole_steps():
+    assert cut_rows(20, 64, 4) == [(0, 20)]
+    bands = cut_rows(2000, 64, 2)
+    assert (bands[0][0], bands[-1][1]) == (0, 2000)
+    assert all(a[1] == b[0] for a, b in pairwise(bands))
+    assert all(y0 % 64 == 0 for y0, _ in bands)
+    assert 8 <= len(bands) <= 12
