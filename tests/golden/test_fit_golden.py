@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from helpers.drawn_pixels import draw
 from iminuit import Minuit
+from scipy.special import logsumexp
+from scipy.stats import norm, poisson
 
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
@@ -20,7 +22,13 @@ def test_maximum_and_standard_errors_match_iminuit(case):
     codes = np.flatnonzero(pixel.counts[0])
     x, n = (pixel.origin[0] + codes).astype(float), pixel.counts[0, codes]
     start = pixel.truth[0] * [1.02, 1.005, 1.001, 0.98]
-    minuit = Minuit(lambda *theta: -float(n @ log_pcd(x, *theta)), *start, name=("h", "g", "mu", "sigma"))
+
+    def cost(h, g, mu, sigma):
+        k = np.arange(60)
+        log_terms = poisson.logpmf(k, h) + norm.logpdf(x[:, None], mu + k / g, sigma)
+        return -float(n @ logsumexp(log_terms, axis=1))
+
+    minuit = Minuit(cost, *start)
     minuit.errordef = Minuit.LIKELIHOOD
     minuit.limits["h"] = minuit.limits["g"] = minuit.limits["sigma"] = (1e-3, None)
     minuit.strategy = 2
