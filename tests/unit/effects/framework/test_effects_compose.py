@@ -4,6 +4,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
+from pydantic import confloat
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.compose import along_chain, model_words, pixel_maps, sample_law
@@ -42,6 +43,17 @@ class Wide(Broken):
 def maps_of(*exposures):
     h = np.array(exposures)
     return pixel_maps([h, h * 0 + 0.1, h * 0 + 100, h * 0 + 2.5], np.ones(h.size, bool))
+
+
+class OneSided(Broken):
+    """A parameter of which pydantic keeps the limits together, one of them None."""
+
+    tag: Literal["one_sided"] = "one_sided"
+    size: confloat(ge=0.5) = 1.0
+
+
+def test_limits_may_be_on_one_side_alone():
+    assert [OneSided.limited("size", value) for value in (0.1, 2.0)] == [0.5, 2.0]
 
 
 def test_effects_add_up_in_their_order():
