@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -234,7 +235,7 @@ class Findings:
         complete = self.added.after.at_floor and all(each.fits for each in self.added.additions)
         return () if complete else self.described
 
-    @property
+    @functools.cached_property
     def pulls(self) -> tuple[FloatArray, FloatArray]:
         """Pulls of the statistics under the model before and after, shape (m,) each."""
         return self.first.pulls(self.z.both, splits=2), self.last.pulls(self.z.both, splits=2)

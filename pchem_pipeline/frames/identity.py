@@ -5,6 +5,7 @@ Names are recorded without folders, so that a run can be moved together with its
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -35,6 +36,11 @@ class FileHasher:
         self._advance = advance
         self._parts: list[Path] | None = None
         self._offset = 0
+
+    @functools.cached_property
+    def size(self) -> int:
+        """Bytes of the file when it was first asked; see `file_size`."""
+        return file_size(self.path)
 
     def read_to(self, count: int | None = None) -> None:
         """Read and hash until ``count`` bytes are hashed in all, or everything.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, unstore
-from pchem_pipeline.frames.identity import SCRATCH_BYTES, FileHasher, file_size, identity_of_hashes
+from pchem_pipeline.frames.identity import SCRATCH_BYTES, FileHasher, identity_of_hashes
 from pchem_pipeline.frames.reader import FrameReader, changed
 from pchem_pipeline.frames.sequence import FrameSequence
 
@@ -162,7 +162,7 @@ class HashedFrameStream(FrameStream):
             if self._is_plain(reader):
                 self._take(reader, hasher, (first, end), [part[offset:] for part in parts])
             else:
-                hasher.read_to(file_size(hasher.path) * end // n_frames)
+                hasher.read_to(hasher.size * end // n_frames)
                 decode.append((t0 + offset, t0 + offset + end - first))
             if end == n_frames:
                 hasher.read_to()

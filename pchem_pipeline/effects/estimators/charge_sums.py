@@ -39,7 +39,11 @@ class ExposureProfile(NamedTuple):
 
 
 def exposure_profile(evidence: Evidence) -> ExposureProfile | None:
-    """Return how the exposure common to all pixels went along, or None where time is not known."""
+    """Return how the exposure common to all pixels went along, or None where time is not known.
+
+    Frame t has ``sum(k - H) / sum(H)`` of mean ``d_t sum(Var k) / sum(H)`` and variance ``sum(Var k) /
+    sum(H)^2``, sums over the usable pixels.
+    """
     time, good = evidence.time, evidence.maps.usable
     if time is None or time.frames.size < 8 or not good.any():
         return None
