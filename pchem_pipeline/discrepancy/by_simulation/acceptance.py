@@ -13,9 +13,10 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     correction,
     counted,
+    lesser,
 )
 from pchem_pipeline.discrepancy.by_simulation.candidates.screening import noise_of_splits
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import ESTABLISHED, Refitted, lesser
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import ESTABLISHED, Refitted
 from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Measured, NullModel
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
@@ -69,8 +70,9 @@ class Acceptance:
         noise = noise_of_splits(first, 1, model_error)
         noise = replace(noise, covariance=added.covariance.times(1.0 + 1.0 / n))
         # about the set at its best fit: strong effects do not add up to what they do together
-        allowed = noise.of(lesser(added.slopes, added.parts))
-        change, stderr = correction(added.slopes, self.z.final - added.mean, allowed)
+        left = self.z.final - added.mean
+        allowed = noise.of(lesser(added.slopes, added.parts), left)
+        change, stderr = correction(added.slopes, left, allowed)
         measured = np.array([type(h.effect).empirical for h in added.hypotheses])
         sure = measured | _overwhelming(added.parts, self.z.both - first.mean, first.std)
         # few forms are tried of what is measured without a name

@@ -21,11 +21,12 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
     fit_set,
+    lesser,
     tolerance,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
 from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulations
-from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted, lesser
+from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, Contender
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import NullModel, misfits
@@ -205,7 +206,8 @@ class Extension:
                 continue
             fit = fit_set([*kept, hypothesis], shift, noise)
             mean = self.accept.first.mean + fit.parts.sum(axis=0)
-            rest = (self.accept.z.both - mean) / np.sqrt(noise.of(fit.parts).variances)
+            left = self.accept.z.both - mean
+            rest = left / np.sqrt(noise.of(fit.parts, left).variances)
             behind = fit.log_score(shift, noise) - best
             if hypothesis.tag not in found or behind > found[hypothesis.tag].behind:
                 closes = bool(fit.factors[-1] > 0.0)

@@ -292,4 +292,5 @@ def _proposal(way: DampedSteps[Hypothesis], shift: FloatArray, noise: Noise) -> 
 def _as_simulated(hypothesis: Hypothesis, shift: FloatArray, noise: Noise) -> float:
     """Return the log score of an effect at the very strength that was simulated."""
     part = hypothesis.fingerprint[None]
-    return log_density(shift - part[0], noise.of(part))
+    left = shift - part[0]
+    return log_density(left, noise.of(part, left))

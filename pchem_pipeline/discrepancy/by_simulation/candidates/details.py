@@ -166,8 +166,8 @@ def _correction(refitter: Refitter, one: Refitted, details: Sequence[_Detail]) -
     step[:n] = np.where(scaling, np.clip(step[:n], -LARGEST_STEP, LARGEST_STEP), 0.0)
     step[n:] = np.clip(step[n:], -_LARGEST_STEP, _LARGEST_STEP)
     noise = refitter.noise(one.covariance, len(one.vectors))
-    left = refitter.target - one.mean - step @ _slopes(one, details)
-    return step, log_density(left, noise.of(one.parts))
+    left = refitter.target - one.mean
+    return step, log_density(left - step @ _slopes(one, details), noise.of(one.parts, left))
 
 
 def _normal_equations(
@@ -175,9 +175,10 @@ def _normal_equations(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the information of the logarithms of factors and parameters, (e + d, e + d), and the score."""
     noise, kept = refitter.noise(one.covariance, len(one.vectors)), refitter.kept(one.hypotheses)
-    covariance = noise.among(kept).of(one.parts[:, kept])
+    residual = (refitter.target - one.mean)[kept]
+    covariance = noise.among(kept).of(one.parts[:, kept], residual)
     design = covariance.white(_slopes(one, details)[:, kept]).T
-    left = covariance.white((refitter.target - one.mean)[kept])
+    left = covariance.white(residual)
     damping = np.where(np.arange(design.shape[1]) < len(one.hypotheses), 1e-6, _USUAL_ERROR**-2.0)
     return design.T @ design + np.diag(damping), design.T @ left
 

@@ -91,10 +91,15 @@ class Noise:
         events = np.broadcast_to(self.events, kept.shape)[kept]
         return replace(self, covariance=self.covariance.among(kept), events=events)
 
-    def of(self, prediction: FloatArray) -> Covariance:
-        """Return the covariance where the prediction, (e, m), is the sum of the effects' shifts."""
-        counts = self.events * np.abs(prediction.sum(axis=0))
-        allowed = tolerance(prediction, self.model_error, self.events)
+    def of(self, parts: FloatArray, left: FloatArray) -> Covariance:
+        """Return the covariance of what the shifts of effects, (e, m), leave, (m,).
+
+        An effect counts with what is asked of it beside the others, where it does more than that: what is
+        too strong is not allowed more for it.
+        """
+        counted = lesser(parts, parts + left)
+        counts = self.events * np.abs(counted.sum(axis=0))
+        allowed = tolerance(counted, self.model_error, self.events)
         return self.covariance.plus(allowed**2 + counts)
 
 
@@ -129,7 +134,8 @@ class SetFit:
     def log_score(self, shift: FloatArray, noise: Noise) -> float:
         """Return the Gaussian log density of a shift of statistics, up to a constant, nats."""
         parts = self.parts
-        return log_density(shift - parts.sum(axis=0), noise.of(parts))
+        left = shift - parts.sum(axis=0)
+        return log_density(left, noise.of(parts, left))
 
 
 def correction(
@@ -167,6 +173,11 @@ def tolerance(parts: FloatArray, model_error: float, events: FloatArray | float)
     return np.asarray(model_error * np.sqrt(own + leaked))
 
 
+def lesser(slopes: FloatArray, parts: FloatArray) -> FloatArray:
+    """Return the lesser of slopes and shifts, (e, m), of which a share is not held against effects."""
+    return np.asarray(np.where(np.abs(slopes) < np.abs(parts), slopes, parts))
+
+
 def log_density(residual: FloatArray, covariance: Covariance) -> float:
     """Return the Gaussian log density of a residual, up to a constant, nats."""
     white = covariance.white(residual)
@@ -179,7 +190,8 @@ def fit_set(hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise) -
     factors = np.ones(len(hypotheses))
     stderr = np.full(len(hypotheses), np.inf)
     for _ in range(_REWEIGHTINGS):
-        covariance = noise.of(columns * factors[:, None])
+        parts = columns * factors[:, None]
+        covariance = noise.of(parts, shift - parts.sum(axis=0))
         design = covariance.white(columns).T
         factors, _ = optimize.nnls(design, covariance.white(shift))
         variance = np.diag(np.linalg.pinv(design.T @ design))

@@ -22,6 +22,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
     correction,
+    lesser,
     log_density,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError
@@ -288,8 +289,9 @@ class Refitter:
         if slopes is not None:
             noise = self.noise(one.covariance, len(one.vectors))
             kept = self.kept(hypotheses)
-            allowed = noise.among(kept).of(lesser(slopes, one.parts)[:, kept])
-            change, _ = correction(slopes[:, kept], (self.target - one.mean)[kept], allowed)
+            residual = (self.target - one.mean)[kept]
+            allowed = noise.among(kept).of(lesser(slopes, one.parts)[:, kept], residual)
+            change, _ = correction(slopes[:, kept], residual, allowed)
             hypotheses = _moved(hypotheses, np.log1p(np.maximum(change, -_LARGEST_SHARE))) or hypotheses
         try:
             return self.simulated(hypotheses, one, replicates, slopes)
@@ -395,12 +397,12 @@ class Refitter:
         change, stderr = correction(
             slopes[:, kept],
             residual[kept],
-            noise.among(kept).of(lesser(slopes, parts)[:, kept]),
+            noise.among(kept).of(lesser(slopes, parts)[:, kept], residual[kept]),
             scatter if replicates >= ENOUGH else None,
         )
         change = np.where(scaling, np.log1p(np.maximum(change, -_LARGEST_SHARE)), 0.0)
         found = tuple(replace(h, fingerprint=part) for h, part in zip(hypotheses, parts, strict=True))
-        allowed = noise.of(parts)
+        allowed = noise.of(parts, residual)
         promised = residual - np.expm1(change) @ slopes
         return Refitted(
             found,
@@ -501,11 +503,6 @@ def _step(before: Sequence[Effect], after: Sequence[Effect]) -> FloatArray:
         a, b = (float(getattr(e, e.strength, 1.0)) if e.strength else 1.0 for e in (old, new))
         found.append(old.power * np.log(b / a) if a * b > 0.0 else 0.0)
     return np.array(found)
-
-
-def lesser(slopes: FloatArray, parts: FloatArray) -> FloatArray:
-    """Return the lesser of slopes and shifts, (e, m), of which a share is not held against effects."""
-    return np.asarray(np.where(np.abs(slopes) < np.abs(parts), slopes, parts))
 
 
 def beyond_chance(difference: FloatArray, error: FloatArray) -> FloatArray:

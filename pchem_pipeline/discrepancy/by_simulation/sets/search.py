@@ -291,7 +291,8 @@ class Search:
         shift = self.refitter.target - self.refitter.null.mean
         noise = replace(self.refitter.noise(best.covariance, len(best.vectors)), model_error=LOOSE)
         parts = fit_set(members, shift, noise).parts
-        left = np.abs(shift - parts.sum(axis=0)) / np.sqrt(noise.of(parts).variances)
+        left = shift - parts.sum(axis=0)
+        left = np.abs(left) / np.sqrt(noise.of(parts, left).variances)
         return bool((left[np.abs(parts).max(axis=0) < _HARDLY * np.abs(shift)] > CERTAIN).any())
 
     def _started(self, members: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
