@@ -18,6 +18,7 @@ from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     fit_set,
     held_out_gain,
     likeliest_sets,
+    log_density,
     meets_itself,
     seconds,
 )
@@ -167,6 +168,20 @@ def test_an_effect_in_two_regions_is_named_in_both_beside_one_of_the_whole_senso
     assert all(not meets_itself(one.hypotheses) for one in sets)
     assert all("row_noise" in {h.tag for h in one.hypotheses} for one in sets)  # none is a second one alone
     assert len({h.effect.key for h in sets[0].hypotheses}) == 2
+
+
+def test_beside_what_another_effect_does_the_likeliest_strength_is_the_right_one() -> None:
+    """What is allowed to the details of an effect does not grow with a strength that the data do not show.
+
+    Else one that is 20 times too strong would hide in them what the other one does, and be the likeliest.
+    """
+    own, other = 50.0 * np.eye(40)[1], 200.0 * np.eye(40)[2]
+    noise, factors = Noise(UNIT, 0.2), (0.0, 0.5, 1.0, 3.0, 20.0, 100.0)
+    left = [own + other - factor * own for factor in factors]
+    allowed = [noise.of(factor * own[None], rest) for factor, rest in zip(factors, left, strict=True)]
+    scores = [log_density(rest, each) for rest, each in zip(left, allowed, strict=True)]
+    assert factors[int(np.argmax(scores))] == 1.0
+    assert allowed[2].variances[1] == pytest.approx(1.0 + (0.2 * 50.0) ** 2, rel=0.02)
 
 
 def test_nothing_predicts_held_out_samples_where_nothing_is() -> None:
