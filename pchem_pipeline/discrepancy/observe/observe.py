@@ -7,6 +7,7 @@ whatever the model of the run.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
@@ -16,13 +17,14 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.errors import InputError, PchEmError
 from pchem_pipeline.discrepancy.observe import digital, vector
+from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.follows import follow_statistics
 from pchem_pipeline.discrepancy.observe.laws import poisson
 from pchem_pipeline.discrepancy.observe.misplaced import misplaced_lines
 from pchem_pipeline.discrepancy.observe.sums import MINIMUM_BLOCKS, samples_beyond
 from pchem_pipeline.discrepancy.observe.tables import PixelHistograms, PixelLaws, pixel_laws
 from pchem_pipeline.discrepancy.observe.view import FrameView
-from pchem_pipeline.discrepancy.observe.waves import waves_across
+from pchem_pipeline.discrepancy.observe.waves import Waves, waves_across
 from pchem_pipeline.effects.framework.evidence import SCORES, CodeResiduals, Evidence, PixelMaps, TimeSeries
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
@@ -48,6 +50,7 @@ def observe(
     exclude: BoolArray | None = None,
     start: PixelMaps | None = None,
     fitted: bool = True,
+    names: Collection[str] = STATISTICS,
 ) -> Evidence:
     """Return the evidence of a split of the frames.
 
@@ -60,12 +63,17 @@ def observe(
         start: parameters near those of these frames, where they are known: saves time.
         fitted: take the parameters from a fit of these frames; False: take ``start`` as it is, for frames too
             few to be fitted.
+        names: of the statistics that are asked for; what is costly and in none of them is left out.
 
     Raises:
         InputError: the frames are fewer than four blocks, or not as described.
         PchEmError: no pixel is usable.
     """
     _check(frames, numbers, block_frames)
+
+    def asked(*families: str) -> bool:
+        return any(name.startswith(families) for name in names)
+
     shape = frames.shape[1:]
     seen = PixelHistograms.of(frames)
     wanted = np.ones(shape, np.bool_) if exclude is None else ~exclude
@@ -82,7 +90,7 @@ def observe(
     repeats = digital.Repeats.of(frames, numbers)
     predicted = digital.predicted_samples(frames, edges, maps.usable)
     bits = digital.previous_bits(frames, edges, maps)
-    waves = waves_across(frames, numbers, laws, maps)
+    waves = waves_across(frames, numbers, laws, maps) if asked("space.sample") else Waves((), {})
     misplaced_z, misplaced = misplaced_lines(frames, seen.counts, seen.origin, maps.usable)
     z = {
         **evidence.z,
@@ -94,7 +102,7 @@ def observe(
         **digital.predicted_statistics(predicted),
         **digital.bit_statistics(bits),
         **digital.nearer_statistics(frames, edges, maps),
-        **follow_statistics(frames, edges, laws, maps),
+        **(follow_statistics(frames, edges, laws, maps) if asked("space.follows", "time.follows") else {}),
         **repeats.statistics(seen, frames.shape),
         **digital.square_statistics(frames, seen, maps.usable),
         **misplaced_z,

@@ -7,7 +7,7 @@ moves these statistics as one that acts everywhere moves those of the whole, whi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,6 +144,7 @@ def part_evidence(
     block_frames: int,
     window: SensorWindow | None = None,
     fitted: bool = True,
+    names: Collection[str] = STATISTICS,
 ) -> Evidence:
     """Return the evidence of a part alone, as of a sensor that ends with it: row 0 is its first.
 
@@ -163,8 +164,9 @@ def part_evidence(
         stack, maps, inside = stack[:, y, x], maps.of((y, x)), inside[y, x]
     exclude = ~(inside & maps.usable)
     return observe(
-        stack, numbers[chosen], n_run=n_run, block_frames=length, exclude=exclude, start=maps, fitted=fitted
-    )
+        stack, numbers[chosen], n_run=n_run, block_frames=length,
+        exclude=exclude, start=maps, fitted=fitted, names=names,
+    )  # fmt: skip
 
 
 def part_statistics(
@@ -189,7 +191,7 @@ def part_statistics(
         try:
             evidence = part_evidence(
                 frames, numbers, maps, part,
-                n_run=n_run, block_frames=block_frames, window=window, fitted=False,
+                n_run=n_run, block_frames=block_frames, window=window, fitted=False, names=leading,
             )  # fmt: skip
         except (PchEmError, ConfigError):
             continue
