@@ -285,6 +285,7 @@ applied/row_offset | frame part y | float32 | DN | subtracted row offset
 applied/column_offset | frame part x | float32 | DN | subtracted column offset
 applied/wave_offset | frame wave coefficient | float32 | DN | c and s of the subtracted pattern c cos(2 pi
     (f_y y + f_x x)) + s sin(...)
+applied/readout_offset | frame y x | float32 | DN | subtracted 1/f noise along the readout
 applied/offset_part | part y x | bool | 1 | pixels of the part with common offsets
 applied/noise_before | y x | float64 | e- | standard deviation over the frames, with the offsets
 applied/noise_after | y x | float64 | e- | standard deviation over the frames, without the offsets

@@ -1,10 +1,11 @@
-"""Offsets that pixels of a frame, a row, a column or a wave share, all or those of a part of the sensor.
+"""Offsets that pixels of a frame, a row, a column, a wave or a readout share, of the sensor or a part of it.
 
 Which a model names, and what they were in some frames.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.errors import PchEmError
@@ -35,6 +37,8 @@ class CommonModes:
         left: tags of effects on many pixels alike that are not the same in other frames.
         waves: patterns ``c cos(2 pi (f_y y + f_x x)) + s sin(...)`` with their own c and s in each frame:
             f_y, f_x, the variance of c and of s (DN^2), and the number of the part, shape (wave, 4).
+        readouts: noise of spectrum 1/f along the samples of each tap: its variance (DN^2), the number of taps
+            and of the part, shape (readout, 3).
         in_noise: variance of these offsets that the read noise of the run includes, DN^2.
     """
 
@@ -44,6 +48,7 @@ class CommonModes:
     left: tuple[str, ...] = ()
     waves: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
     in_noise: float = 0.0
+    readouts: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
     def of_model(cls, effects: Sequence[Effect], shape: tuple[int, int]) -> CommonModes:
@@ -57,23 +62,26 @@ class CommonModes:
         )
         removed = dict.fromkeys(effect.tag for effect, _ in found if effect.tag not in left)
         parts: dict[bytes, tuple[BoolArray, FloatArray]] = {}
-        waves = []
+        waves, readouts = [], []
         for effect, shared in found:
             if effect.tag in left or shared.variance is None:
                 continue
             mask = np.ones(shape, np.bool_) if effect.region is None else effect.region.mask(shape)
             _, variances = parts.setdefault(mask.tobytes(), (mask, np.zeros(3)))
-            if shared.of != "wave":
+            place = float(list(parts).index(mask.tobytes()))
+            if shared.of in _AXES:
                 variances[_AXES.index(shared.of)] += shared.variance
-            elif shared.variance > 0.0:
-                place = float(list(parts).index(mask.tobytes()))
+            elif shared.variance > 0.0 and shared.of == "wave":
                 waves.append([shared.cycles_per_row, shared.cycles_per_column, shared.variance, place])
+            elif shared.variance > 0.0:
+                readouts.append([shared.variance, float(min(shared.taps, shape[1])), place])
         return cls(
             tuple(removed),
             np.array([mask for mask, _ in parts.values()], np.bool_).reshape(-1, *shape),
             np.array([variances for _, variances in parts.values()]).reshape(-1, 3),
             tuple(left),
             np.array(waves).reshape(-1, 4),
+            readouts=np.array(readouts).reshape(-1, 3),
         )
 
     @classmethod
@@ -92,7 +100,7 @@ class CommonModes:
 
 def _check(effect: Effect, shared: SharedOffset) -> None:
     """Refuse what an effect of another package may say: an unknown kind, or an impossible variance."""
-    known = shared.of in (*_AXES, "wave")
+    known = shared.of in (*_AXES, "wave", "readout") and shared.taps > 0
     if not known or (shared.variance is not None and not 0.0 <= shared.variance < np.inf):
         raise PchEmError(f"effect {effect.tag!r}: shared_offset() returned {shared}, which is not an offset")
 
@@ -105,19 +113,23 @@ class Offsets:
         rows: offset of each row, that of the frame included, DN, shape (frame, part, y).
         columns: offset of each column, DN, shape (frame, part, x).
         waves: c and s of each wave, DN, shape (frame, wave, 2).
+        readout: noise along the readouts, DN, shape (frame, y, x); empty without any.
         left: variance of a sample's offset that stays unknown, DN^2, shape (frame, part).
     """
 
     rows: NDArray[np.floating[Any]]
     columns: NDArray[np.floating[Any]]
     waves: NDArray[np.floating[Any]] = field(default_factory=lambda: np.zeros((0, 0, 2)))
+    readout: NDArray[np.floating[Any]] = field(default_factory=lambda: np.zeros((0, 0, 0)))
     left: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def of_samples(self, modes: CommonModes, rows: slice = slice(None)) -> Float32Array:
         """Return the offset of each sample of some rows, DN, shape (frame, y, x)."""
         design, n = _Design.of(modes), len(self.rows)
         waves = self.waves if len(self.waves) else np.zeros((n, 0, 2))
-        frames = [design.offsets(self.rows[t], self.columns[t], waves[t], rows) for t in range(n)]
+        readout = self.readout[:, rows] if self.readout.size else np.zeros(n)
+        lines = (design.of_lines(self.rows[t], self.columns[t], waves[t], rows) for t in range(n))
+        frames = [offset + own for offset, own in zip(lines, readout, strict=True)]
         return np.array(frames, np.float32).reshape(n, *modes.parts[0, rows].shape)
 
 
@@ -160,7 +172,8 @@ def scene_of(mean: FloatArray, calibration: Calibration) -> FloatArray:
 class _Design:
     """Offsets of samples as a linear function of standard normal numbers, z.
 
-    Of each part there is one of the frame, one of each row, one of each column; of each wave two.
+    Of each part there is one of the frame, one of each row, one of each column; of each wave two; of each
+    readout one of each sample of its taps.
     """
 
     modes: CommonModes
@@ -178,27 +191,49 @@ class _Design:
         return self.modes.waves[:, 3].astype(np.int64)
 
     @cached_property
+    def readouts(self) -> list[_Readout]:
+        """Each readout."""
+        parts = self.modes.parts
+        return [
+            _Readout(parts[int(part)], int(taps), variance) for variance, taps, part in self.modes.readouts
+        ]
+
+    @cached_property
     def _scales(self) -> FloatArray:
-        """Standard deviation of each number, DN."""
+        """Standard deviation of each number of lines and waves, DN."""
         _, ny, nx = self.modes.parts.shape
         variances = np.repeat(self.modes.variances, (1, ny, nx), axis=1).ravel()
         return np.asarray(np.sqrt(np.concatenate([variances, np.repeat(self.modes.waves[:, 2], 2)])))
 
-    def unpacked(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the offsets of rows, with that of their frame, and of columns, and c and s of waves, DN."""
+    def unpacked(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return offsets of rows with that of their frame, columns, waves (c and s) and readouts, DN."""
         n_parts, ny, nx = self.modes.parts.shape
-        values, n = self._scales * z, n_parts * (1 + ny + nx)
+        values, n = self._scales * z[: self._scales.size], n_parts * (1 + ny + nx)
         lines = values[:n].reshape(n_parts, -1)
-        return lines[:, :1] + lines[:, 1 : 1 + ny], lines[:, 1 + ny :], values[n:].reshape(-1, 2)
+        pairs = zip(self.readouts, self._of_readouts(z), strict=True)
+        readout = sum(
+            (each.offsets(own) for each, own in pairs), start=np.zeros((ny if self.readouts else 0, nx))
+        )
+        return lines[:, :1] + lines[:, 1 : 1 + ny], lines[:, 1 + ny :], values[n:].reshape(-1, 2), readout
 
-    def offsets(
+    def _of_readouts(self, z: FloatArray) -> list[FloatArray]:
+        """Return the numbers of each readout."""
+        ends = self._scales.size + np.cumsum([0, *(each.size for each in self.readouts)])
+        return [z[begin:end] for begin, end in itertools.pairwise(ends)]
+
+    def offsets(self, z: FloatArray) -> FloatArray:
+        """Return the offset of each sample of a frame, DN, shape (y, x)."""
+        rows, columns, waves, readout = self.unpacked(z)
+        return self.of_lines(rows, columns, waves) + (readout if readout.size else 0.0)
+
+    def of_lines(
         self,
         rows: NDArray[np.floating[Any]],
         columns: NDArray[np.floating[Any]],
         waves: NDArray[np.floating[Any]],
         some: slice = slice(None),
     ) -> FloatArray:
-        """Return the offset of each sample of some rows of a frame, DN, shape (y, x)."""
+        """Return what rows, columns and waves add to the samples of some rows of a frame, DN, (y, x)."""
         parts = self.modes.parts[:, some]
         found = np.zeros(parts.shape[1:])
         for mask, row, column in zip(parts, rows, columns, strict=True):
@@ -217,17 +252,26 @@ class _Design:
         for part, down, along in zip(self.parts_of_waves, self.down, self.along, strict=True):
             (cc, cs), (sc, ss) = down.T @ (self.modes.parts[part] * values) @ along
             parts.append(np.array([cc - ss, sc + cs]))
-        return np.asarray(np.concatenate([np.zeros(0), *parts]) * self._scales)
+        lines = np.concatenate([np.zeros(0), *parts]) * self._scales
+        return np.concatenate([lines, *(each.sums(values) for each in self.readouts)])
 
     def top(self, form: FloatArray, near: FloatArray) -> FloatArray:
         """Return z of largest ``sum(form[0] o - form[1] o^2 / 2) - z^2 / 2``, by conjugate gradients."""
         from scipy.sparse.linalg import LinearOperator, cg
 
         size = near.size
-        curvature = LinearOperator(
-            (size, size), lambda z: z + self.sums(form[1] * self.offsets(*self.unpacked(z))), dtype=float
+
+        def near_inverse(z: FloatArray) -> FloatArray:
+            pairs = zip(self.readouts, self._of_readouts(z), strict=True)
+            return np.concatenate(
+                [z[: self._scales.size], *(r.near_inverse(own, form[1]) for r, own in pairs)]
+            )
+
+        curvature, inverse = (
+            LinearOperator((size, size), each, dtype=float)
+            for each in (lambda z: z + self.sums(form[1] * self.offsets(z)), near_inverse)
         )
-        return np.asarray(cg(curvature, self.sums(form[0]), x0=near, rtol=1e-6)[0])
+        return np.asarray(cg(curvature, self.sums(form[0]), x0=near, rtol=1e-6, M=inverse)[0])
 
     def left(self, weight: FloatArray) -> FloatArray:
         """Return the variance of a sample's offset that stays unknown, on the median line, DN^2, (part,)."""
@@ -246,7 +290,73 @@ class _Design:
             np.nanmedian(np.where(parts.any(axis=axis), values, np.nan), axis=1)
             for axis, values in zip((2, 1), lines, strict=True)
         ]
-        return np.asarray(sum(each) + np.bincount(waves, of_waves, len(parts)))
+        readouts = [each.left(weight) for each in self.readouts]
+        of_readouts = np.bincount(self.modes.readouts[:, 2].astype(np.int64), readouts, len(parts))
+        return np.asarray(sum(each) + np.bincount(waves, of_waves, len(parts)) + of_readouts)
+
+
+@dataclass(frozen=True)
+class _Readout:
+    """Noise of spectrum 1/f along the samples of each tap as a linear function of standard normal numbers."""
+
+    inside: BoolArray  # pixels of its part, (y, x)
+    taps: int
+    variance: float  # DN^2
+
+    @property
+    def width(self) -> int:
+        """Columns of a tap."""
+        return -(-int(self.inside.shape[1]) // self.taps)
+
+    @property
+    def size(self) -> int:
+        """Numbers: one for each sample of its taps."""
+        return self.taps * int(self.inside.shape[0]) * self.width
+
+    @cached_property
+    def power(self) -> FloatArray:
+        """Variance by cycles in a frame, from one on, DN^2; its mean over all frequencies is the noise's."""
+        n = self.size // self.taps
+        cycles = np.arange(n // 2 + 1)
+        power = np.where(cycles > 0, 1.0 / np.maximum(cycles, 1), 0.0)
+        return power * self.variance / self._mean(power)
+
+    def _mean(self, power: FloatArray) -> float:
+        """Return the mean over all frequencies, of both signs."""
+        n = self.size // self.taps
+        return float(2.0 * power.sum() - power[0] - (power[-1] if n % 2 == 0 else 0.0)) / n
+
+    def _filtered(self, values: FloatArray, factors: FloatArray) -> FloatArray:
+        """Return values, any shape, multiplied by factors at each frequency, shape (tap, sample)."""
+        along = values.reshape(self.taps, -1)
+        return np.asarray(fft.irfft(factors * fft.rfft(along), along.shape[1]))
+
+    def offsets(self, z: FloatArray) -> FloatArray:
+        """Return the noise of each pixel, DN, shape (y, x)."""
+        ny, nx = self.inside.shape
+        blocks = self._filtered(z, np.sqrt(self.power)).reshape(self.taps, ny, self.width)
+        return np.asarray(blocks.transpose(1, 0, 2).reshape(ny, -1)[:, :nx] * self.inside)
+
+    def sums(self, values: FloatArray) -> FloatArray:
+        """Return the transpose of :meth:`offsets`, of values (y, x)."""
+        ny, nx = self.inside.shape
+        padded = np.pad(self.inside * values, ((0, 0), (0, self.taps * self.width - nx)))
+        blocks = padded.reshape(ny, self.taps, self.width).transpose(1, 0, 2)
+        return self._filtered(blocks, np.sqrt(self.power)).ravel()
+
+    def near_inverse(self, z: FloatArray, weight: FloatArray) -> FloatArray:
+        """Return the inverse of the curvature, as if all samples had the mean of the weights (y, x)."""
+        return self._filtered(z, 1.0 / (1.0 + self.power * (self.inside * weight).mean())).ravel()
+
+    def left(self, weight: FloatArray) -> float:
+        """Return the variance of the noise that stays unknown (Wiener 1949), DN^2, for weights (y, x).
+
+        Where little is common to several samples each has its own weight, whose harmonic mean counts.
+        """
+        known = weight[self.inside & (weight > 0.0)]
+        share = known.size / max(int(self.inside.sum()), 1)
+        each = share / (1.0 / known).mean() if known.size else 0.0
+        return self._mean(self.power / (1.0 + self.power * each))
 
 
 def estimate_offsets(
@@ -254,7 +364,7 @@ def estimate_offsets(
     reference: Reference,
     modes: CommonModes,
 ) -> Offsets:
-    """Return the most probable offsets of whole frames (frame, y, x), DN, their rows, columns and waves.
+    """Return the most probable offsets of whole frames (frame, y, x), DN: of rows, columns, waves, readouts.
 
     The posterior mode of normal offsets under the mixture of all pixels of the line (best linear prediction
     where the electron numbers are known): each pixel says of the offset what its electron number leaves open.
@@ -271,7 +381,7 @@ def estimate_offsets(
         form = np.stack([weight * np.nan_to_num(frame - bias - known * step), weight])
         z = design.top(form, np.zeros_like(design.sums(weight)))
         for _ in range(expansions):  # in the offsets
-            offset = design.offsets(*design.unpacked(z))
+            offset = design.offsets(z)
             given = pcd_posterior(frame - bias - offset, known, 1.0 / step, 0.0, sigma)
             # what is left open of the electron number takes from what a sample tells of its offset
             # but for a twentieth of what one tells whose electron number is known

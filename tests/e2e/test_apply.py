@@ -14,7 +14,7 @@ import tifffile
 import xarray as xr
 import yaml
 from helpers.commands import Shell, imported_by
-from helpers.known_camera import KnownCamera
+from helpers.known_camera import KnownCamera, pink
 from helpers.without_pictures import undrawn
 
 from pchem_pipeline.commands.apply.characterisation import read_calibration
@@ -476,6 +476,30 @@ def test_row_noise_of_the_model_is_taken_from_the_frames(striped, shell):
     assert (found.noise_after < found.noise_before).values[good].mean() > 0.9
     assert "row_offset" in found
     assert "row_offset" not in kept
+
+
+def test_noise_along_the_readout_is_taken_from_the_frames_with_what_was_subtracted(tmp_path):
+    rng = np.random.default_rng(64)
+    camera = KnownCamera.drawn(rng, (12, 30), read_noise=(0.15, 0.2))
+    for name, n, exposure in (("dark.tif", 1500, 2.0), ("night.tif", 60, 0.7)):
+        offset = 3.0 * pink(rng, (12, 30), 1, n)
+        electrons, dn = camera.frames(rng, exposure, n, offset)
+        tifffile.imwrite(tmp_path / name, dn)
+    (tmp_path / "run.yaml").write_text(
+        "run: {store: run.zarr}\ninput: {files: [dark.tif], bit_depth: 14}\n"
+        "model: {effects: [{tag: read_order_noise, noise_dn: 3.0}]}\n"
+    )
+    shell = Shell(tmp_path)
+    shell.ok("run", "run.yaml", "--until", "fit")
+    assert (
+        "subtracted read_order_noise"
+        in shell.ok("apply", "run.zarr", "night.tif", "--output", "o.zarr").stderr
+    )
+    found = opened(tmp_path / "o.zarr").load()
+    good = found.quality.values == 0
+    assert np.corrcoef(found.readout_offset.values[:, good].ravel(), offset[:, good].ravel())[0, 1] > 0.5
+    assert (found.noise_after < found.noise_before).values[good].mean() > 0.9
+    assert (found.electrons.values - electrons)[:, good].std() < 0.27
 
 
 OVERSCAN = 8  # columns, of 40; between it and the others is one of neither

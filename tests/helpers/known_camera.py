@@ -71,3 +71,14 @@ def estimated(frames, calibration):
     """Return the exposures that frames of known pixels tell."""
     histograms = histogram_frames(frames)
     return estimate_exposure(histograms.counts, histograms.origin, calibration)
+
+
+def pink(rng, shape, taps, n):
+    """Noise of spectrum 1/f of taps that are read row by row, cut from records eight times as long."""
+    width = -(-shape[1] // taps)
+    size = 8 * shape[0] * width
+    cycles = np.arange(size // 2 + 1)
+    amplitude = np.where(cycles >= 8, np.maximum(cycles, 1) ** -0.5, 0.0)
+    record = np.fft.irfft(amplitude * np.fft.rfft(rng.standard_normal((n, taps, size))), size)
+    samples = (record / record.std())[..., : size // 8].reshape(n, taps, shape[0], width)
+    return samples.transpose(0, 2, 1, 3).reshape(n, shape[0], -1)[..., : shape[1]]

@@ -362,6 +362,8 @@ def _with_offsets(context: StageContext, job: Job, calibration: Calibration) -> 
             cycles_per_column=waves[:, 1].tolist(),
             part=waves[:, 3].astype(int).tolist(),
         )
+    if len(job.modes.readouts):
+        _create(context, job, "applied/readout_offset", chunks={"x": _chunks(job.source.shape)[2]})
     context.store.write_array("applied/offset_part", parts)
     length = job.depth * max(1, -(-_SEGMENT_SAMPLES // (8 * ny * nx * job.depth)))
     pieces = [Piece("offsets", 0, ny, t0, min(t0 + length, n)) for t0 in range(0, n, length)]

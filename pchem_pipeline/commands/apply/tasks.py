@@ -37,7 +37,10 @@ def offsets_of(output: RunStore, job: Job, t0: int, t1: int, rows: slice) -> Flo
     frames = slice(t0, t1)
     names = ("row_offset", "column_offset", *(("wave_offset",) if len(job.modes.waves) else ()))
     found = Offsets(*(output.read(f"applied/{name}", (frames, _WHOLE, _WHOLE)) for name in names))
-    return found.of_samples(job.modes, rows)
+    offsets = found.of_samples(job.modes, rows)
+    if len(job.modes.readouts):
+        offsets += output.read("applied/readout_offset", (frames, rows, _WHOLE))
+    return offsets
 
 
 def _calibration(
@@ -78,6 +81,8 @@ def offsets_piece(piece: Piece, output: RunStore, *, job: Job) -> dict[str, Any]
             output.write("applied/column_offset", region, found.columns.astype(np.float32))
             if len(job.modes.waves):
                 output.write("applied/wave_offset", region, found.waves.astype(np.float32))
+            if len(job.modes.readouts):
+                output.write("applied/readout_offset", region, found.readout.astype(np.float32))
             reached[0] |= bool((frames.min(axis=0) <= ends[0])[known].any())
             reached[1] |= bool((frames.max(axis=0) >= ends[1])[known].any())
             left += found.left.sum(axis=0)

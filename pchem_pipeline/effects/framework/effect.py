@@ -120,19 +120,22 @@ class Factors(NamedTuple):
 
 
 class SharedOffset(NamedTuple):
-    """An offset of all pixels of a frame, of a row, of a column, or along a wave across the sensor.
+    """An offset that pixels of a frame share.
 
     Attributes:
-        of: what has one offset; a wave has a sine and a cosine of its own in each frame.
+        of: what has one offset: a frame, row or column; a wave across the sensor, with a sine and a cosine of
+            its own in each frame; or pixels read one after the other, by noise of spectrum 1/f along them.
         variance: of the offset, of a wave's sine and of its cosine, in any frame of the camera, DN^2; None:
             other frames have another one.
         cycles_per_row, cycles_per_column: of a wave, from row to row and from column to column.
+        taps: column blocks that are read in parallel, row by row, each with a readout's noise of its own.
     """
 
-    of: Literal["frame", "row", "column", "wave"]
+    of: Literal["frame", "row", "column", "wave", "readout"]
     variance: float | None
     cycles_per_row: float = 0.0
     cycles_per_column: float = 0.0
+    taps: int = 1
 
 
 class Replacement(NamedTuple):

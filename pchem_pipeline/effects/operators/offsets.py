@@ -480,6 +480,10 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
         noise *= self.noise_dn
         return noise
 
+    def shared_offset(self) -> SharedOffset:
+        """Return the noise of the taps."""
+        return SharedOffset("readout", self.noise_dn**2, taps=self.taps)
+
     @classmethod
     def estimate(cls, evidence: Evidence) -> Sequence[Self]:
         """Return it with few taps, as strong as adjacent rows are alike: noise of rows makes none alike."""

@@ -4,13 +4,19 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from helpers.known_camera import KnownCamera
+from helpers.known_camera import KnownCamera, pink
 
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.effects.framework.effect import SharedOffset
 from pchem_pipeline.effects.operators.drifts import BiasDrift
 from pchem_pipeline.effects.operators.noise import NoiseSkew
-from pchem_pipeline.effects.operators.offsets import ColumnNoise, FrameNoise, PeriodicPickup, RowNoise
+from pchem_pipeline.effects.operators.offsets import (
+    ColumnNoise,
+    FrameNoise,
+    PeriodicPickup,
+    ReadOrderNoise,
+    RowNoise,
+)
 from pchem_pipeline.use.common_modes import CommonModes, Reference, estimate_offsets, scene_of
 from pchem_pipeline.use.electrons import electrons
 
@@ -162,6 +168,34 @@ def test_a_wave_and_noise_of_rows_are_told_apart():
     error = ((found.of_samples(modes) - offset) ** 2).mean()
     assert 0.6 < error / found.left.mean() < 1.6
     assert error < 0.1 * (offset**2).mean()
+
+
+@pytest.mark.parametrize(("taps", "region"), [(1, None), (3, None), (2, "columns=8:32")])
+def test_noise_along_the_readout_is_taken_from_each_frame(taps, region):
+    """As far as it is common to samples that follow each other: more than is common to those of a row."""
+    rng = np.random.default_rng(57)
+    camera = KnownCamera.drawn(rng, SHAPE, read_noise=(0.15, 0.3))
+    inside = np.broadcast_to([not region or 8 <= x < 32 for x in range(SHAPE[1])], SHAPE)
+    offset = 2.0 * pink(rng, SHAPE, taps, N_FRAMES) * inside
+    true, frames = camera.frames(rng, 1.0, N_FRAMES, offset)
+    reference = seen(frames, camera.calibration())
+    along = CommonModes.of_model([ReadOrderNoise(noise_dn=2.0, taps=taps, region=region)], SHAPE)
+    assert along.removed == ("read_order_noise",)
+    found, rows = (
+        estimate_offsets(frames, reference, modes)
+        for modes in (along, CommonModes.of_model([RowNoise(row_noise_dn=2.0, region=region)], SHAPE))
+    )
+    total = found.of_samples(along)
+    np.testing.assert_allclose(found.of_samples(along, slice(5, 9)), total[:, 5:9])
+    error = ((total - offset) ** 2)[:, inside].mean()
+    of_rows = ((rows.of_samples(along) - offset) ** 2)[:, inside].mean()
+    assert error < min(0.7 * (offset**2)[:, inside].mean(), 0.9 * of_rows)
+    assert 0.8 < error / found.left.mean() < 1.25
+    before, after = (
+        (electrons(frames, camera.calibration(), each) - true)[:, inside].var() for each in (None, total)
+    )
+    assert after < 0.75 * before
+    assert not total[:, ~inside].any()
 
 
 class Stranger(RowNoise):
