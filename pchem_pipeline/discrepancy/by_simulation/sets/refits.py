@@ -181,7 +181,9 @@ class Steps(DampedSteps[Refitted]):
             change = self.now.change
             step = change * (np.linalg.norm(self.step) / max(float(np.linalg.norm(change)), 1e-12))
             return self.now, np.clip(step, -LARGEST_STEP, LARGEST_STEP)
-        return self.best, np.clip(self.best.change * self.length, -LARGEST_STEP, LARGEST_STEP)
+        # a shorter step is shorter than the one that was taken
+        self.length = min(self.length, LARGEST_STEP / max(float(np.abs(self.best.change).max()), 1e-12))
+        return self.best, self.best.change * self.length
 
     def taken(self, step: FloatArray, now: Refitted | None) -> bool:
         """Take note of where a step led (None: nowhere), and tell whether there is another one to try."""
@@ -189,7 +191,7 @@ class Steps(DampedSteps[Refitted]):
         if now is not None and not now.score > before and self._goes_on(now):
             self.now, self.further = now, self.further + 1
             return True
-        another, self.length, self.further = self.length > _SHORTEST, min(self.length, 2.0), 0
+        another, self.further = self.length > _SHORTEST, 0
         if not self.judge(now, -np.inf if now is None else now.score) or now is None:
             return another
         self.gained, self.now, self.length = self.score - before, now, _lengthened(now.change, step)

@@ -192,14 +192,25 @@ class Search:
         return None if trial.way is None else trial.way.best
 
     def at_best_fit(self, members: Sequence[Hypothesis], least: float = -np.inf) -> Refitted | None:
-        """Return some effects at their best fit, tuned if that was done; see `settle` for ``least``."""
+        """Return some effects at their best fit, tuned if that was done; see `settle` for ``least``.
+
+        Where they were left before it, they go on from the strengths given if these explain more.
+        """
         tags = {h.tag for h in members}
         known = [one for one in self.tried if one.tuned and one.tags == tags]
         if known:
             return max(known, key=PENALISED)
         self.add(members)
         trial = self._trial_of(members)
-        return None if trial is None else self.settle(trial, least)
+        if trial is None:
+            return None
+        if trial.way is not None and not trial.ended:
+            # left far from its best, it would seem worse than beside the others
+            again = Trial(tuple(members), trial.foreseen)
+            self.advance(again)
+            if again.way is not None and again.way.best.score > trial.way.best.score:
+                trial.way = again.way
+        return self.settle(trial, least)
 
     def measure(self, measured: Callable[[tuple[Hypothesis, ...]], Iterable[Refitted]]) -> None:
         """Measure what is left without effects, then beside the best set, as far as the limit allows.

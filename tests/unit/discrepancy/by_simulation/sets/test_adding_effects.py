@@ -231,6 +231,20 @@ def test_a_set_that_cannot_come_to_another_is_not_simulated_further() -> None:
     assert begun.score < whole.score < both.score
 
 
+def test_a_set_that_was_left_far_from_its_best_goes_on_from_the_strengths_beside_others() -> None:
+    """As it was left it cannot come to the others; with the strength that it has among them it can."""
+    world = world_of(row_noise=0.4)
+    search = Search(world.refitter(), HistogramLikelihood())
+    best = world.refitter().refined([hypothesis("row_noise", 0.4)])
+    left = search.at_best_fit([hypothesis("row_noise", 0.1)], best.penalised_log_likelihood + 1e4)
+    assert left.score < best.score - 10.0
+    (found,) = {
+        search.at_best_fit([hypothesis("row_noise", 0.4)], each) for each in (best.score - 3.0, best.score)
+    }
+    assert found.score > best.score - 3.0
+    assert len(search.trials) == 1
+
+
 def test_a_promising_set_does_not_wait_for_the_best_strengths_of_its_effects() -> None:
     world = world_of(row_noise=0.4, frame_noise=0.4)
     hypotheses = [hypothesis(tag) for tag in STRENGTHS]
