@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.errors import PchEmError
@@ -328,6 +327,8 @@ class _Readout:
 
     def _filtered(self, values: FloatArray, factors: FloatArray) -> FloatArray:
         """Return values, any shape, multiplied by factors at each frequency, shape (tap, sample)."""
+        from scipy import fft  # loaded where it is needed only
+
         along = values.reshape(self.taps, -1)
         return np.asarray(fft.irfft(factors * fft.rfft(along), along.shape[1]))
 
