@@ -47,6 +47,8 @@ _REFINED = 12  # hypotheses of which the strength is refined by a second simulat
 _STEPS = 2  # that refine a strength
 _STRONGER = 4.0  # times the fingerprint of a hypothesis that is too weak to be seen
 _CLOSE = 0.15  # relative: a strength known so well is not simulated again
+REPEATS = 3  # simulations of the hypotheses that sets are made of
+_CHANCE_OF_MEAN = 1.0  # standard errors of the mean of several simulations, below which it is nothing
 
 
 def serial(replicates: Sequence[Replicate]) -> list[Vector | Exception]:
@@ -157,26 +159,26 @@ class ReplicateSimulator:
         n_run = self.acquisition.n_run
         return pixels and (one.when is None or other.when is None or one.when.overlap(other.when, n_run) > 0)
 
-    def fingerprints(self, effects: Sequence[Effect]) -> list[Hypothesis]:
-        """Simulate each effect on the random numbers of the model; those that fail are defects."""
+    def fingerprints(self, effects: Sequence[Effect], repeats: int = 1) -> list[Hypothesis]:
+        """Simulate each effect ``repeats`` times on the random numbers of the model; failures: defects."""
         if not effects:
             return []
         shown = [effect.representative(self.acquisition.numbers) for effect in effects]
-        self._simulate([None, *(effect for effect, _ in shown)])
-        base = self._rows[self._replicate(None).key]
+        self._simulate([None, *(effect for effect, _ in shown)], repeats)
+        base = self._known(None, repeats)
         return [
             Hypothesis(
                 effect,
-                share * _without_chance(row - base),
+                share * _without_chance(self._known(one, repeats) - base),
                 1 + sum(effect.tag == each.tag for each in self.model),
             )
             for effect, (one, share) in zip(effects, shown, strict=True)
-            if (row := self._rows.get(self._replicate(one).key)) is not None
+            if all(self._replicate(one, j).key in self._rows for j in range(repeats))
         ]
 
-    def _simulate(self, effects: Sequence[Effect | None]) -> None:
+    def _simulate(self, effects: Sequence[Effect | None], repeats: int) -> None:
         """Simulate the model with each effect, and with none (which must succeed), unless that is known."""
-        tasks = [(effect, self._replicate(effect)) for effect in effects]
+        tasks = [(effect, self._replicate(effect, j)) for effect in effects for j in range(repeats)]
         new = {task.key: (effect, task) for effect, task in tasks if task.key not in self._rows}
         results = self.mapper([task for _, task in new.values()]) if new else []
         for (effect, task), result in zip(new.values(), results, strict=True):
@@ -186,6 +188,10 @@ class ReplicateSimulator:
                 raise result
             else:
                 note_defect(self.defects, effect.tag, result)
+
+    def _known(self, effect: Effect | None, repeats: int) -> FloatArray:
+        """Return the statistics of the model with an effect, shape (repeat, statistic)."""
+        return np.array([self._rows[self._replicate(effect, j).key] for j in range(repeats)])
 
     def refined(
         self,
@@ -217,7 +223,9 @@ class ReplicateSimulator:
         chosen = [int(i) for i in order if fits[i].factors[0] > 0.0 and promising(int(i))][:_REFINED]
         free = [i for i in chosen if not any(hypotheses[i].effect is effect for effect in told)]
         tuned = self._tuned([hypotheses[i] for i in free], shift, noise)
-        better = dict(zip(free, tuned, strict=True))
+        best_of = {i: hypotheses[i] for i in chosen} | dict(zip(free, tuned, strict=True))
+        sharp = {id(h.effect): h for h in self.fingerprints([h.effect for h in best_of.values()], REPEATS)}
+        better = {i: sharp.get(id(one.effect), one) for i, one in best_of.items()}
         return [better.get(int(i), hypotheses[i]) for i in order]
 
     def _visible(self, hypotheses: Sequence[Hypothesis], told: Sequence[Effect]) -> list[Hypothesis]:
@@ -248,18 +256,27 @@ class ReplicateSimulator:
                     way.judge(new, _as_simulated(new, shift, noise))
         return [way.best for way in ways]
 
-    def _replicate(self, effect: Effect | None) -> Replicate:
+    def _replicate(self, effect: Effect | None, repeat: int) -> Replicate:
         effects = self.model if effect is None else along_chain(self.model, (effect,))
         # of the model and its purpose, too: the same effects come with other strengths
         text = json.dumps([self.seed, *(each.model_dump(mode="json") for each in effects)], sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-        label = f"{'base' if effect is None else effect.tag}-{digest}"
-        return Replicate(label, self.maps, effects, self.seed, self.acquisition)
+        label = f"{'base' if effect is None else effect.tag}-{digest}-{repeat}"
+        return Replicate(label, self.maps, effects, self.seed + repeat, self.acquisition)
 
 
-def _without_chance(shift: FloatArray) -> FloatArray:
-    """Return a shift of the statistics without chance, which would bias strengths low."""
-    return np.asarray(shift * np.clip((np.abs(shift) - POSSIBLE) / (CERTAIN - POSSIBLE), 0.0, 1.0))
+def _without_chance(shifts: FloatArray) -> FloatArray:
+    """Return the mean of shifts (repeat, statistic) without chance, which would bias strengths low."""
+    mean, repeats = shifts.mean(axis=0), shifts.shape[0]
+    # below the one a single simulation shows nothing, above the other all of it
+    low, high, error = POSSIBLE, CERTAIN, np.ones_like(mean)
+    if repeats > 1:
+        scatter = shifts.std(axis=0, ddof=1)
+        # few simulations do not know their scatter well: never below that of most statistics
+        error = np.maximum(scatter, np.sqrt(np.mean(scatter**2))) / np.sqrt(repeats)
+        low, high = _CHANCE_OF_MEAN, POSSIBLE
+    weight = np.clip((np.abs(mean) - low * error) / np.maximum((high - low) * error, 1e-12), 0.0, 1.0)
+    return np.asarray(mean * weight)
 
 
 def _proposal(way: DampedSteps[Hypothesis], shift: FloatArray, noise: Noise) -> Effect | None:
