@@ -307,7 +307,7 @@ def test_statistics_that_are_all_off_a_little_are_no_good_fit() -> None:
     assert world.refitter().passes_goodness_of_fit(fitted)
     scatter = world.refitter().scatter(fitted.covariance, len(fitted.vectors))
     to_and_fro = np.where(np.arange(M) % 2, 1.0, -1.0)
-    off = replace(world.refitter(), target=fitted.mean + 2.6 * scatter * to_and_fro)
+    off = replace(world.refitter(), target=fitted.mean + 2.55 * scatter * to_and_fro)
     left = off.refined(guess)
     assert np.abs(left.rest).max() < 2.0
     assert not off.passes_goodness_of_fit(left)
