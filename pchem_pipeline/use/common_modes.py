@@ -270,7 +270,9 @@ class _Design:
             LinearOperator((size, size), each, dtype=float)
             for each in (lambda z: z + self.sums(form[1] * self.offsets(z)), near_inverse)
         )
-        return np.asarray(cg(curvature, self.sums(form[0]), x0=near, rtol=1e-6, M=inverse)[0])
+        return np.asarray(
+            cg(curvature, self.sums(form[0]), x0=near, rtol=1e-6, M=inverse if self.readouts else None)[0]
+        )
 
     def left(self, weight: FloatArray) -> FloatArray:
         """Return the variance of a sample's offset that stays unknown, on the median line, DN^2, (part,)."""
@@ -313,17 +315,11 @@ class _Readout:
         return self.taps * int(self.inside.shape[0]) * self.width
 
     @cached_property
-    def power(self) -> FloatArray:
-        """Variance by cycles in a frame, from one on, DN^2; its mean over all frequencies is the noise's."""
-        n = self.size // self.taps
-        cycles = np.arange(n // 2 + 1)
-        power = np.where(cycles > 0, 1.0 / np.maximum(cycles, 1), 0.0)
-        return power * self.variance / self._mean(power)
+    def amplitudes(self) -> FloatArray:
+        """Factors at each frequency that make the noise of a tap from white noise, DN."""
+        from pchem_pipeline.effects.operators.offsets import pink_amplitudes
 
-    def _mean(self, power: FloatArray) -> float:
-        """Return the mean over all frequencies, of both signs."""
-        n = self.size // self.taps
-        return float(2.0 * power.sum() - power[0] - (power[-1] if n % 2 == 0 else 0.0)) / n
+        return np.asarray(pink_amplitudes(self.size // self.taps) * np.sqrt(self.variance))
 
     def _filtered(self, values: FloatArray, factors: FloatArray) -> FloatArray:
         """Return values, any shape, multiplied by factors at each frequency, shape (tap, sample)."""
@@ -335,7 +331,7 @@ class _Readout:
     def offsets(self, z: FloatArray) -> FloatArray:
         """Return the noise of each pixel, DN, shape (y, x)."""
         ny, nx = self.inside.shape
-        blocks = self._filtered(z, np.sqrt(self.power)).reshape(self.taps, ny, self.width)
+        blocks = self._filtered(z, self.amplitudes).reshape(self.taps, ny, self.width)
         return np.asarray(blocks.transpose(1, 0, 2).reshape(ny, -1)[:, :nx] * self.inside)
 
     def sums(self, values: FloatArray) -> FloatArray:
@@ -343,21 +339,24 @@ class _Readout:
         ny, nx = self.inside.shape
         padded = np.pad(self.inside * values, ((0, 0), (0, self.taps * self.width - nx)))
         blocks = padded.reshape(ny, self.taps, self.width).transpose(1, 0, 2)
-        return self._filtered(blocks, np.sqrt(self.power)).ravel()
+        return self._filtered(blocks, self.amplitudes).ravel()
 
     def near_inverse(self, z: FloatArray, weight: FloatArray) -> FloatArray:
         """Return the inverse of the curvature, as if all samples had the mean of the weights (y, x)."""
-        return self._filtered(z, 1.0 / (1.0 + self.power * (self.inside * weight).mean())).ravel()
+        return self._filtered(z, 1.0 / (1.0 + self.amplitudes**2 * (self.inside * weight).mean())).ravel()
 
     def left(self, weight: FloatArray) -> float:
         """Return the variance of the noise that stays unknown (Wiener 1949), DN^2, for weights (y, x).
 
-        Where little is common to several samples each has its own weight, whose harmonic mean counts.
+        The mean of ``S / (1 + S w)`` over all frequencies, S the variance at each. Of weights that differ
+        between samples the harmonic mean is taken for w: little of the noise is common to many of them.
         """
         known = weight[self.inside & (weight > 0.0)]
         share = known.size / max(int(self.inside.sum()), 1)
         each = share / (1.0 / known).mean() if known.size else 0.0
-        return self._mean(self.power / (1.0 + self.power * each))
+        variance = self.amplitudes**2
+        # the first term of the inverse transform is the mean
+        return float(np.fft.irfft(variance / (1.0 + variance * each), self.size // self.taps)[0])
 
 
 def estimate_offsets(

@@ -63,7 +63,7 @@ def observe(
         start: parameters near those of these frames, where they are known: saves time.
         fitted: take the parameters from a fit of these frames; False: take ``start`` as it is, for frames too
             few to be fitted.
-        names: of the statistics that are asked for; what is costly and in none of them is left out.
+        names: statistics that are wanted; waves, and pixels that follow others, are looked for only then.
 
     Raises:
         InputError: the frames are fewer than four blocks, or not as described.

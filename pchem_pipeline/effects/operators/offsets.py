@@ -469,7 +469,7 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
         rows, columns = context.shape
         taps = min(self.taps, columns)
         width = -(-columns // taps)
-        amplitudes = _pink_amplitudes(rows * width)
+        amplitudes = pink_amplitudes(rows * width, _RECORD)
         noise = np.empty((context.frames.size, context.rows.size, columns))
         for t, frame in enumerate(context.frames):
             random = context.random.generator(frame=int(frame))
@@ -491,12 +491,15 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
         return [one for one in cls.typical_as_seen(evidence, cls.signature[0]) if columns % one.taps == 0]
 
 
-def _pink_amplitudes(n: int) -> FloatArray:
-    """Return factors of the spectrum that make white noise of a record 1/f from one cycle in n samples on."""
-    cycles = np.arange(_RECORD * n // 2 + 1)
-    amplitudes = np.where(cycles >= min(_RECORD, cycles[-1]), np.maximum(cycles, 1) ** -0.5, 0.0)
-    weight = np.where((cycles == 0) | (2 * cycles == _RECORD * n), 1.0, 2.0)
-    return np.asarray(amplitudes / np.sqrt((weight * amplitudes**2).sum() / (_RECORD * n)))
+def pink_amplitudes(n: int, record: int = 1) -> FloatArray:
+    """Return factors that make white noise 1/f from one cycle in n samples on, of variance 1.
+
+    They multiply the Fourier transform (``rfft``) of ``record`` times n samples, shape (frequency,).
+    """
+    cycles = np.arange(record * n // 2 + 1)
+    amplitudes = np.where(cycles >= min(record, cycles[-1]), np.maximum(cycles, 1) ** -0.5, 0.0)
+    weight = np.where((cycles == 0) | (2 * cycles == record * n), 1.0, 2.0)
+    return np.asarray(amplitudes / np.sqrt((weight * amplitudes**2).sum() / (record * n)))
 
 
 Path = tuple[tuple[int, float], ...]

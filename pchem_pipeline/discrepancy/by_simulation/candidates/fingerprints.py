@@ -94,12 +94,12 @@ class Noise:
     def of(self, parts: FloatArray, left: FloatArray) -> Covariance:
         """Return the covariance of what the shifts of effects, (e, m), leave, (m,).
 
-        An effect counts with what is asked of it beside the others, where it does more than that: what is
-        too strong is not allowed more for it.
+        The details of an effect may be off by a fraction of its shift, or of what the data show of it beside
+        the other effects where that is less: else the strongest effect would be the likeliest.
         """
-        counted = lesser(parts, parts + left)
-        counts = self.events * np.abs(counted.sum(axis=0))
-        allowed = tolerance(counted, self.model_error, self.events)
+        shown = lesser(parts, parts + left)
+        counts = self.events * np.abs(shown.sum(axis=0))
+        allowed = tolerance(shown, self.model_error, self.events)
         return self.covariance.plus(allowed**2 + counts)
 
 
@@ -173,9 +173,9 @@ def tolerance(parts: FloatArray, model_error: float, events: FloatArray | float)
     return np.asarray(model_error * np.sqrt(own + leaked))
 
 
-def lesser(slopes: FloatArray, parts: FloatArray) -> FloatArray:
-    """Return the lesser of slopes and shifts, (e, m), of which a share is not held against effects."""
-    return np.asarray(np.where(np.abs(slopes) < np.abs(parts), slopes, parts))
+def lesser(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the value that is nearer to 0, element by element."""
+    return np.asarray(np.where(np.abs(one) < np.abs(other), one, other))
 
 
 def log_density(residual: FloatArray, covariance: Covariance) -> float:

@@ -181,7 +181,7 @@ class Steps(DampedSteps[Refitted]):
             change = self.now.change
             step = change * (np.linalg.norm(self.step) / max(float(np.linalg.norm(change)), 1e-12))
             return self.now, np.clip(step, -LARGEST_STEP, LARGEST_STEP)
-        # a shorter step is shorter than the one that was taken
+        # cut here, so that a length that is halved is half of the step that was taken
         self.length = min(self.length, LARGEST_STEP / max(float(np.abs(self.best.change).max()), 1e-12))
         return self.best, self.best.change * self.length
 

@@ -194,7 +194,7 @@ class Search:
     def at_best_fit(self, members: Sequence[Hypothesis], least: float = -np.inf) -> Refitted | None:
         """Return some effects at their best fit, tuned if that was done; see `settle` for ``least``.
 
-        Where they were left before it, they go on from the strengths given if these explain more.
+        A set whose steps were broken off goes on from the strengths of ``members`` if these explain more.
         """
         tags = {h.tag for h in members}
         known = [one for one in self.tried if one.tuned and one.tags == tags]
@@ -205,7 +205,7 @@ class Search:
         if trial is None:
             return None
         if trial.way is not None and not trial.ended:
-            # left far from its best, it would seem worse than beside the others
+            # it was left far from its best, and would be compared as it was left
             again = Trial(tuple(members), trial.foreseen)
             self.advance(again)
             if again.way is not None and again.way.best.score > trial.way.best.score:

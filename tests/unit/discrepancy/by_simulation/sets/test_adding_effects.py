@@ -231,17 +231,19 @@ def test_a_set_that_cannot_come_to_another_is_not_simulated_further() -> None:
     assert begun.score < whole.score < both.score
 
 
-def test_a_set_that_was_left_far_from_its_best_goes_on_from_the_strengths_beside_others() -> None:
-    """As it was left it cannot come to the others; with the strength that it has among them it can."""
-    world = world_of(row_noise=0.4)
+def test_a_set_whose_steps_were_broken_off_goes_on_from_the_strength_beside_others() -> None:
+    """At a quarter of its strength the effect moves next to nothing: its slopes there promise no more."""
+
+    def steep(effects: Sequence[Effect]) -> np.ndarray:
+        return np.eye(M)[0] * 40.0 * (sum(factor(e) for e in effects) / factor(strong)) ** 4
+
+    weak, strong = effect("row_noise", 0.1), effect("row_noise", 0.4)
+    world = world_of(row_noise=0.4, mean=steep)
     search = Search(world.refitter(), HistogramLikelihood())
-    best = world.refitter().refined([hypothesis("row_noise", 0.4)])
-    left = search.at_best_fit([hypothesis("row_noise", 0.1)], best.penalised_log_likelihood + 1e4)
-    assert left.score < best.score - 10.0
-    (found,) = {
-        search.at_best_fit([hypothesis("row_noise", 0.4)], each) for each in (best.score - 3.0, best.score)
-    }
-    assert found.score > best.score - 3.0
+    left = search.at_best_fit([Hypothesis(weak, steep([weak]))], 0.0)
+    found = search.at_best_fit([Hypothesis(strong, steep([strong]))], 0.0)
+    assert found.score > left.score + 1000.0
+    assert found.effects == (strong,)
     assert len(search.trials) == 1
 
 
