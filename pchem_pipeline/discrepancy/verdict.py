@@ -526,6 +526,22 @@ class Verdict(_Part):
                 changes["verdict"] = "named_in_part"
         return self.model_copy(update=changes)
 
+    def in_hertz(self, line_time: float) -> Verdict:
+        """Return a copy with the frequency of what is periodic along rows, read ``line_time`` seconds apart."""
+
+        def timed(step: Step) -> Step:
+            cycles = step.parameters.get("cycles_per_row")
+            if cycles is None:
+                return step
+            hertz = {
+                "value": abs(cycles.value) / line_time,
+                "stderr": cycles.stderr / line_time,
+                "unit": "Hz",
+            }
+            return step.model_copy(update={"parameters": {**step.parameters, "frequency": Measured(**hertz)}})
+
+        return self.model_copy(update={"steps": tuple(map(timed, self.steps))})
+
     def on_sensor(
         self,
         shape: tuple[int, int],

@@ -161,6 +161,13 @@ class InputSettings(Section):
         le=LONGEST,
         description="integration time per frame, s; null: from the file, else unknown (no charge rate)",
     )
+    line_time: float | None = Field(
+        default=None,
+        ge=SHORTEST,
+        le=LONGEST,
+        description="time from one row to the next while a frame is read, s; pchem discrepancy then states the "
+        "frequency of periodic pickup in Hz; null: unknown",
+    )
     on_bad_file: Literal["error", "skip"] = Field(
         default="error",
         description="unreadable, truncated, duplicate or odd-shaped files: error: stop and list them; skip: "

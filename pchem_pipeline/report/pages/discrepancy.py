@@ -225,6 +225,8 @@ def _parameters(data: DiscrepancyData) -> Table:
 
 def _meaning(tag: str, name: str) -> str:
     """Return what a parameter of an effect is, in a few words."""
+    if name == "frequency":
+        return "frequency, or this plus or minus a multiple of the line rate"
     known = effect_classes().get(tag)
     return name if known is None or name not in known.model_fields else typeset(known.meaning(name))
 

@@ -130,6 +130,19 @@ def test_a_parameter_has_its_unit_and_the_standard_error_that_is_known_and_is_le
     assert of_others == "1/frame"
 
 
+def test_a_wave_along_rows_has_a_frequency_where_the_time_of_a_row_is_known() -> None:
+    pickup = effect_class("periodic_pickup").model_validate({"amplitude_dn": 1.0, "cycles_per_row": -0.17})
+    found = verdict_of("named")
+    wave = found.steps[0].model_copy(
+        update={"parameters": parameters_of(pickup, {"cycles_per_row": 0.0002, "amplitude_dn": 0.1})}
+    )
+    timed = found.model_copy(update={"steps": (*found.steps, wave)}).in_hertz(10e-6)
+    frequency = timed.steps[-1].parameters["frequency"]
+    assert (round(frequency.value), round(frequency.stderr), frequency.unit) == (17_000, 20, "Hz")
+    assert timed.steps[:-1] == found.steps
+    assert Verdict.from_json(timed.to_json()).steps[-1].parameters["frequency"] == frequency
+
+
 def test_the_form_of_an_effect_is_told_where_it_is_not_the_usual_one() -> None:
     bent = effect_class("nonlinearity").model_validate({"step_change": -0.01, "noise": "bent"})
     assert form_of(bent) == {"noise": "bent"}
