@@ -24,6 +24,7 @@ from pchem_pipeline.config.load import (
 )
 from pchem_pipeline.config.template import SCHEMA_NAME, commented_config, json_schema
 from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.frames.remote import is_remote
 from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import nothing_left_of_a_refusal
 from pchem_pipeline.stages.table import STAGES
@@ -42,12 +43,17 @@ def write_template(
 ) -> list[Path]:
     """Write the commented YAML of a new run, and the schema of its keys if wanted; return what was written.
 
+    ``files`` are relative to the working directory, those in the YAML to its own folder.
+
     Raises:
         ConfigError: the file exists, and ``force`` is not given.
     """
     if path.exists() and not force:
         raise ConfigError(f"{path} exists; choose another name, or replace it with --force")
-    given = list(files) or ([] if simulated else ["frames/*.tif"])
+    given = [
+        name if is_remote(name) or os.path.isabs(name) else os.path.relpath(name, path.parent)
+        for name in files
+    ] or ([] if simulated else ["frames/*.tif"])
     beside = path.with_name(SCHEMA_NAME) if schema else None
     text = commented_config(path.name, files=given, simulated=simulated, schema=schema)
     parse_config(text, str(path))

@@ -95,6 +95,14 @@ def test_init_writes_a_valid_file_once_whose_first_line_names_its_schema(tmp_pat
     assert load_config(tmp_path / "c.yaml").simulate is not None
 
 
+def test_init_finds_from_the_folder_of_its_file_what_was_given_from_another_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notes").mkdir()
+    given = ("night/*.fits", str(tmp_path / "x.fits"), "https://lab.org/y.fits")
+    invoke("init", "notes/c.yaml", *given)
+    assert load_config(tmp_path / "notes" / "c.yaml").input.files == ("../night/*.fits", *given[1:])
+
+
 def pchem(*arguments, **options):
     """Run the package in a process of its own."""
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
