@@ -51,7 +51,7 @@ def write_template(
     if path.exists() and not force:
         raise ConfigError(f"{path} exists; choose another name, or replace it with --force")
     given = [
-        name if is_remote(name) or os.path.isabs(name) else os.path.relpath(name, path.parent)
+        name if is_remote(name) or Path(name).is_absolute() else os.path.relpath(name, path.parent)
         for name in files
     ] or ([] if simulated else ["frames/*.tif"])
     beside = path.with_name(SCHEMA_NAME) if schema else None

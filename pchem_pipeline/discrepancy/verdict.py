@@ -527,7 +527,7 @@ class Verdict(_Part):
         return self.model_copy(update=changes)
 
     def in_hertz(self, line_time: float) -> Verdict:
-        """Return a copy with the frequency of what is periodic along rows, read ``line_time`` seconds apart."""
+        """Return a copy with the frequency of what is periodic along rows that are ``line_time`` s apart."""
 
         def timed(step: Step) -> Step:
             cycles = step.parameters.get("cycles_per_row")

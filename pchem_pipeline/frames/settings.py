@@ -165,8 +165,8 @@ class InputSettings(Section):
         default=None,
         ge=SHORTEST,
         le=LONGEST,
-        description="time from one row to the next while a frame is read, s; pchem discrepancy then states the "
-        "frequency of periodic pickup in Hz; null: unknown",
+        description="time from one row to the next while a frame is read, s; pchem discrepancy then states "
+        "the frequency of periodic pickup in Hz; null: unknown",
     )
     on_bad_file: Literal["error", "skip"] = Field(
         default="error",
