@@ -290,6 +290,7 @@ applied/offset_part | part y x | bool | 1 | pixels of the part with common offse
 applied/noise_before | y x | float64 | e- | standard deviation over the frames, with the offsets
 applied/noise_after | y x | float64 | e- | standard deviation over the frames, without the offsets
 # what is done so far, while it is being made
+applied_parts/jump_noise | y x | float64 | e- | of pixels with a trap, noise without telegraph jumps
 applied_parts/sums | segment sum y x | float64 | 1 | sums over a segment of the frames
 applied_parts/range | end y x | int64 | 1 | smallest and largest code
 applied_parts/prior | y x | float64 | e- | exposure from the mean of these frames, used for the prior

@@ -502,6 +502,35 @@ def test_noise_along_the_readout_is_taken_from_the_frames_with_what_was_subtract
     assert (found.electrons.values - electrons)[:, good].std() < 0.27
 
 
+def test_telegraph_jumps_are_taken_from_dark_frames_and_the_noise_left_is_as_stated(tmp_path):
+    rng = np.random.default_rng(65)
+    camera = KnownCamera.drawn(rng, (12, 20), read_noise=(0.18, 0.22))
+    trapped = rng.random(camera.bias.shape) < 0.3
+    for name, n, exposure in (("light.tif", 2500, 2.0), ("dark.tif", 200, 0.1)):
+        jump = trapped * rng.choice([-2.5, 0.0, 2.5], (n, *trapped.shape), p=[0.1, 0.8, 0.1])
+        electrons, dn = camera.frames(rng, exposure, n, jump / camera.gain)
+        tifffile.imwrite(tmp_path / name, dn)
+    (tmp_path / "run.yaml").write_text(
+        "run: {store: run.zarr}\ninput: {files: [light.tif], bit_depth: 14}\n"
+        "model: {effects: [{tag: rts_noise, fraction: 0.3, amplitude_e: 2.5}]}\n"
+    )
+    shell = Shell(tmp_path)
+    shell.ok("run", "run.yaml", "--until", "fit")
+    said = shell.ok("apply", "run.zarr", "dark.tif", "--output", "o.zarr", "--what", "electrons").stderr
+    assert "telegraph jumps subtracted in" in said
+    shell.ok("apply", "run.zarr", "dark.tif", "--output", "k.zarr", "--reference", "none")
+    found, kept = (opened(tmp_path / name).load() for name in ("o.zarr", "k.zarr"))
+    good = (found.quality.values == 0) & trapped
+    assert good.sum() > 40
+    left, before = ((each.electrons.values - electrons)[:, good] for each in (found, kept))
+    stated = np.sqrt(np.mean(found.electrons_stderr_read.values[good] ** 2))
+    error = (left**2).std() / np.sqrt(left.size) / (2.0 * stated)
+    assert abs(np.sqrt(np.mean(left**2)) - stated) < 5.0 * error + 0.01
+    assert stated < 0.3 < 1.0 < np.sqrt(np.mean(before**2))
+    clean = (found.quality.values == 0) & ~trapped
+    np.testing.assert_array_equal(found.electrons.values[:, clean], kept.electrons.values[:, clean])
+
+
 OVERSCAN = 8  # columns, of 40; between it and the others is one of neither
 LIGHT = np.s_[..., : 39 - OVERSCAN]
 

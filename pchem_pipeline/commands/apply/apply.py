@@ -15,6 +15,7 @@ import numpy as np
 from pchem_pipeline import __version__
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, StoreError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.base.wording import count
 from pchem_pipeline.commands.apply.characterisation import (
     check_run,
     doubtful_pixels,
@@ -168,6 +169,13 @@ def _make_job(
             f"{overlap} of {known.sum()} pixels have a read noise above {PEAKS_OVERLAP_E} e-: their most "
             "probable electron number is often wrong; use expected_number"
         )
+    trapped = int(np.count_nonzero(known.ravel() & (calibration.own_satellites > 0.0).all(axis=1)))
+    traps = trapped > 0 and "electrons" in wanted.kinds and wanted.reference != "none"
+    if traps:
+        remarks.append(
+            f"telegraph jumps subtracted in {count(trapped, 'pixel')}; a change of the light that looks like "
+            "one is subtracted, too (less of it with --prior flat; to keep all: --reference none)"
+        )
     depth, *_ = _chunks(frames.shape)
     if wanted.format != "zarr":  # files are written by blocks of whole frames
         depth = max(1, min(depth, _BLOCK_SAMPLES // (frames.shape[1] * frames.shape[2])))
@@ -180,6 +188,7 @@ def _make_job(
         modes=modes,
         overscan=overscan,
         depth=depth,
+        traps=traps,
         expected=numbers and overlap > 0,
     )
     # outputs of versions without this setting are continued
@@ -265,6 +274,8 @@ def _create_converted(context: StageContext, job: Job, n_segments: int) -> None:
     columns = {"x": _chunks(job.source.shape)[2]}
     if "electrons" in job.kinds:
         _create(context, job, "applied/electrons", chunks=columns)
+    if job.traps:
+        _create(context, job, "applied_parts/jump_noise")
     if job.limits is not None:
         _create(context, job, "applied/at_adc_limit", chunks=columns)
     if "numbers" in job.kinds:
@@ -401,7 +412,7 @@ def _counted(context: StageContext, job: Job, calibration: Calibration) -> Job:
         unit_name="band",
         unit_bytes=bytes_of_pixel * step * job.source.shape[2],
     )
-    if "numbers" not in job.kinds:
+    if not job.by_code:
         return job
     if job.learns_prior:
         from pchem_pipeline.use.exposure import ExposurePool  # loads compiled loops
@@ -420,7 +431,7 @@ def _converted(context: StageContext, job: Job) -> None:
     """Write the frames."""
     n, ny, nx = job.source.shape
     codes = 0
-    if "numbers" in job.kinds:
+    if job.by_code:
         ends = context.store.read("applied_parts/range")
         codes = int(np.ceil((ends[1] - ends[0] + 1).mean()))
     bytes_of_pixel = 24 * (job.depth + codes) + 400

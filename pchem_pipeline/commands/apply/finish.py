@@ -47,7 +47,17 @@ def finish_maps(output: RunStore, job: Job, calibration: Calibration, reporter: 
     raised = {"peaks_overlap": calibration.conversion_gain * calibration.read_noise_dn > PEAKS_OVERLAP_E}
     if "electrons" in job.kinds:
         assert sums is not None
-        _write_errors(output, calibration, sums, n)
+        noise = read_stderr(calibration)
+        if job.traps:
+            left = output.read("applied_parts/jump_noise")
+            trapped = np.isfinite(left)
+            before, after = (float(np.median(each[trapped])) for each in (noise, left))
+            reporter.info(
+                f"apply: noise of pixels with a trap, median: {before:.3f} e- with telegraph jumps, "
+                f"{after:.3f} e- without"
+            )
+            noise = np.where(trapped, left, noise)
+        _write_errors(output, calibration, noise, sums, n)
     if sums is not None:
         raised |= _flags_of_sums(calibration, sums, n, job.limits)
     if job.counts:
@@ -74,14 +84,16 @@ def _sums(output: RunStore) -> FloatArray:
     return total
 
 
-def _write_errors(output: RunStore, calibration: Calibration, sums: FloatArray, n: int) -> None:
+def _write_errors(
+    output: RunStore, calibration: Calibration, noise: FloatArray, sums: FloatArray, n: int
+) -> None:
     """Write the two parts of the standard error of electrons, and the mean signal."""
     signal = np.where(
         calibration.usable, calibration.conversion_gain * (sums[0] / n - calibration.bias), np.nan
     )
     variance = calibration_variance(calibration)
     output.write_array("applied/mean_signal", signal)
-    output.write_array("applied/electrons_stderr_read", read_stderr(calibration).astype(np.float32))
+    output.write_array("applied/electrons_stderr_read", noise.astype(np.float32))
     output.write_array("applied/calibration_variance", variance, {"power_of_signal": [0, 1, 2]})
     output.write_array("applied/electrons_stderr_calibration", stderr_at(variance, signal).astype(np.float32))
 

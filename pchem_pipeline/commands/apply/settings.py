@@ -106,6 +106,7 @@ class Job:
         bins: of the histograms.
         window: frames of a block while counting.
         depth: frames of a chunk.
+        traps: whether telegraph jumps are taken from the electrons of pixels with a trap.
         number_type: of the electron numbers.
         expected: whether E[k | x] is written.
     """
@@ -128,6 +129,7 @@ class Job:
     bins: int = 0
     window: int = 256
     depth: int = 1
+    traps: bool = False
     number_type: Any = np.uint16
     expected: bool = False
 
@@ -151,12 +153,17 @@ class Job:
     @property
     def counts(self) -> bool:
         """Whether histograms are needed."""
-        return "numbers" in self.kinds or "exposure" in self.kinds
+        return self.by_code or "exposure" in self.kinds
+
+    @property
+    def by_code(self) -> bool:
+        """Whether samples are looked up by their code."""
+        return "numbers" in self.kinds or self.traps
 
     @property
     def learns_prior(self) -> bool:
-        """Whether the prior of the electron numbers is of these frames."""
-        return "numbers" in self.kinds and self.prior == "frames"
+        """Whether the prior of electron numbers and jumps is of these frames."""
+        return self.by_code and self.prior == "frames"
 
     @property
     def estimates(self) -> bool:

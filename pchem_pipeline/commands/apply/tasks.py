@@ -23,6 +23,7 @@ from pchem_pipeline.use.electrons import add_up, electrons, read_stderr, whole_p
 if TYPE_CHECKING:
     from pchem_pipeline.model.electrons.electrons import KnownPixels, Numbers, NumberTables
     from pchem_pipeline.model.histogram.count import RowHistograms
+    from pchem_pipeline.use.telegraph import TelegraphJumps
 
 #: Sums of a pixel over frames: x, x^2, the same without offsets, smallest and largest x.
 N_SUMS = 6
@@ -166,7 +167,11 @@ def convert_piece(piece: Piece, output: RunStore, *, job: Job) -> None:
     rows = slice(piece.y0, piece.y1)
     # without offsets each sample has limits of its own
     calibration = _calibration(output, job, rows, (None, None) if job.removed else job.cut)
-    tables = _tables(output, job, calibration, rows) if "numbers" in job.kinds else None
+    tables, jumps = _lookups(output, job, calibration, rows)
+    if jumps is not None:
+        noise = np.full(calibration.bias.size, np.nan)
+        noise[jumps.pixels] = jumps.noise
+        output.write("applied_parts/jump_noise", (rows, _WHOLE), noise.reshape(calibration.shape))
     sums = np.zeros((N_SUMS, *calibration.shape))
     sums[4] = np.inf
     electron_frames = "electrons" in job.kinds
@@ -176,12 +181,16 @@ def convert_piece(piece: Piece, output: RunStore, *, job: Job) -> None:
             offsets = offsets_of(output, job, start, start + len(frames), rows)
             region = (slice(start, start + len(frames)), rows, _WHOLE)
             add_up(frames, offsets, sums)
+            codes = _codes(frames, job, offsets) if job.by_code else frames
             if electron_frames:
-                output.write("applied/electrons", region, electrons(frames, calibration, offsets, room))
+                values = electrons(frames, calibration, offsets, room)
+                if jumps is not None:
+                    jumps.subtract(values, codes, job.lift * job.parts)
+                output.write("applied/electrons", region, values)
             if job.limits is not None:
                 output.write("applied/at_adc_limit", region, at_limit(frames, job.limits).astype(np.uint8))
             if tables is not None:
-                found = tables.numbers(frames, _codes(frames, job, offsets), job)
+                found = tables.numbers(frames, codes, job)
                 output.write("applied/electron_number", region, found.number)
                 output.write("applied/number_probability", region, found.probability)
                 if job.expected:
@@ -234,9 +243,14 @@ class _Tables:
             found.probability[t].reshape(-1)[at] = one.right / one.mass * self.right_bias.ravel()[at]
 
 
-def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -> _Tables:
-    """Return the electron numbers of the codes of some rows."""
+def _lookups(
+    output: RunStore, job: Job, calibration: Calibration, rows: slice
+) -> tuple[_Tables | None, TelegraphJumps | None]:
+    """Return the electron numbers of the codes of some rows, and the telegraph jumps; None: not wanted."""
+    if not job.by_code:
+        return None, None
     from pchem_pipeline.model.electrons.electrons import number_tables
+    from pchem_pipeline.use.telegraph import TelegraphJumps
 
     ends = output.read("applied_parts/range", (_WHOLE, rows, _WHOLE)) - job.lift * job.parts
     prior, signal = None, calibration.quanta_exposure
@@ -250,9 +264,12 @@ def _tables(output: RunStore, job: Job, calibration: Calibration, rows: slice) -
         calibration = replace(calibration, law=law)
     elif job.prior == "run":
         prior = signal
+    jumps = TelegraphJumps.of(*ends, prior, calibration.known, job.parts) if job.traps else None
+    if "numbers" not in job.kinds:
+        return None, jumps
     known = with_its_errors(calibration, signal).known
     found = number_tables(
         ends[0], ends[1], prior, known, dtype=job.number_type, parts=job.parts, detailed=True
     )
     share = np.repeat(calibration.right_bias.ravel(), np.diff(found.start))
-    return _Tables(known, prior, calibration.right_bias, replace(found, right=found.right * share))
+    return _Tables(known, prior, calibration.right_bias, replace(found, right=found.right * share)), jumps
