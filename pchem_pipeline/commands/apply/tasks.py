@@ -264,7 +264,7 @@ def _lookups(
         calibration = replace(calibration, law=law)
     elif job.prior == "run":
         prior = signal
-    jumps = TelegraphJumps.of(*ends, prior, calibration.known, job.parts) if job.traps else None
+    jumps = TelegraphJumps.of(ends[0], ends[1], prior, calibration.known, job.parts) if job.traps else None
     if "numbers" not in job.kinds:
         return None, jumps
     known = with_its_errors(calibration, signal).known
