@@ -325,7 +325,8 @@ def export(
         typer.Option(
             "--format",
             help="fits, tiff, npz, csv (summary), emva (table of EMVA 1288 quantities), defects (table, DS9 "
-            "regions and mask of the pixels that are not ordinary), pyme, navigate, decode, picasso",
+            "regions and mask of the pixels that are not ordinary), pyme, navigate, decode, picasso, "
+            "smap, banzai, pyxel, getframes",
         ),
     ] = "fits,csv",
 ) -> None:

@@ -3,6 +3,7 @@
 import csv
 import re
 import shutil
+import tomllib
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ from astropy.io import fits
 from helpers import written_fit
 from helpers.pickled_tasks import PickledTasks
 from helpers.stage_runs import completed, stage_context
+from scipy.io import loadmat
 from tifffile import imread
 
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError
@@ -22,6 +24,7 @@ from pchem_pipeline.commands.export import export_run
 from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.electrons.electrons import NO_NUMBER
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.ensemble.ensemble import DnAxis
@@ -400,7 +403,7 @@ def test_export(finished, tmp_path):
         assert {row["fit_status"]: row["pixels"] for row in csv.DictReader(file)}["poor_fit"] == "1"
 
 
-def test_export_for_programs_that_localise_single_molecules(finished, tmp_path):
+def test_export_for_other_programs(finished, tmp_path):
     finished.store.write_config(dump_config(finished.config))
     written = export_run(finished.store.path, tmp_path, tuple(ADAPTERS))
     assert all(path.exists() for path in written)
@@ -419,6 +422,12 @@ def test_export_for_programs_that_localise_single_molecules(finished, tmp_path):
     assert camera["read_sigma"] == pytest.approx(np.nanmedian(noise))
     [entry] = yaml.safe_load((tmp_path / "picasso_config.yaml").read_text())["Cameras"].values()
     assert entry["Sensitivity"] == pytest.approx(np.nanmedian(gain))
+    # SMAP inverts the gain and takes its median; rows are y
+    smap = loadmat(tmp_path / "smap/camera.mat")
+    to_electrons = np.median(1 / smap["gainmap"])
+    assert to_electrons == pytest.approx(np.nanmedian(gain), rel=1e-6)
+    np.testing.assert_allclose(smap["offsetmap"][fitted], bias[fitted], rtol=1e-6)
+    np.testing.assert_allclose(smap["varmap"][fitted], ((noise / gain) ** 2)[fitted], rtol=1e-6)
     # of dark frames they expect the dark current, too
     dark = finished.config.input.model_copy(update={"kind": "dark", "integration_time": None})
     config = finished.config.model_copy(update={"input": dark})
@@ -426,8 +435,68 @@ def test_export_for_programs_that_localise_single_molecules(finished, tmp_path):
     found = Calibration.of(SimpleNamespace(config=config, sensor=lambda _: sensor), finished.store)
     np.testing.assert_allclose(found.offset[fitted], (bias + exposure / gain)[fitted], rtol=1e-12)
     np.testing.assert_allclose(found.variance[fitted], (noise**2 + exposure)[fitted], rtol=1e-12)
-    with pytest.raises(ConfigError, match=r"exposure time.*set input\.integration_time"):
-        ADAPTERS["pyme"](found, tmp_path)
+    for name in ("pyme", "banzai", "pyxel", "getframes"):
+        with pytest.raises(ConfigError, match=r"exposure time.*set input\.integration_time"):
+            ADAPTERS[name](found, tmp_path)
+    taken = CameraFacts('A "B"', temperature=-20.0, taken=1.7e9)
+    found = replace(found, integration_time=2.0, camera=taken)
+    weak = replace(found, electrons=np.full_like(found.electrons, 1e-5))
+    [path] = ADAPTERS["decode"](weak, tmp_path)
+    assert yaml.safe_load(path.read_text())["Camera"]["spur_noise"] == 1e-5
+    check_banzai(found, tmp_path)
+    check_simulators(found, tmp_path)
+
+
+def check_banzai(found, folder):
+    """A dark frame as BANZAI reduces it, with the names of its headers: nothing but noise is left."""
+    masters = {}
+    for path in ADAPTERS["banzai"](found, folder):
+        with fits.open(path) as file:
+            data, header = file[0].data, file[0].header
+        masters[header["OBSTYPE"]] = data, header
+        assert min(header["SATURATE"], header["MAXLIN"]) > 0
+        assert header["DATE-OBS"].startswith("2023-11-14T22:13:20")
+        assert (header["CCDSTEMP"], header["CCDATEMP"], header["INSTRUME"]) == (-20, -20, 'A "B"')
+    (bias, header), (dark, _) = masters["BIAS"], masters["DARK"]
+    (noise, raw), (mask, _) = masters["READNOISE"], masters["BPM"]
+    assert header["GAIN"] == 1
+    left = found.offset * raw["GAIN"] - header["BIASLVL"] - bias - dark * found.integration_time
+    np.testing.assert_allclose(left, 0, atol=1e-4)
+    np.testing.assert_allclose(
+        noise * raw["GAIN"], found.read_noise * np.median(found.gain) / found.gain, 1e-5
+    )
+    assert mask.dtype == np.uint8
+    assert mask[~found.fitted].all()
+    assert mask.sum() == (found.defects | ~found.fitted).sum() < mask.size / 2
+
+
+def check_simulators(found, folder):
+    """The mean code of a dark frame, and its noise in DN, as Pyxel and getframes make them."""
+    gain, noise, rate = (np.median(v) for v in (found.gain, found.read_noise, found.dark_rate))
+    pixel = np.median(found.bias) + found.integration_time * rate / found.gain
+    path, _ = ADAPTERS["pyxel"](found, folder)
+    content = yaml.safe_load(path.read_text())
+    detector = content["cmos_detector"]["characteristics"]
+    per_electron = np.load(path.parent / detector["charge_to_volt"]["value"])
+    low, high = detector["adc_voltage_range"]
+    codes = (2 ** detector["adc_bit_resolution"] - 1) / (high - low)
+    steps = {step["name"]: step for group in content["pipeline"].values() for step in group}
+    given = {name: step["arguments"] for name, step in steps.items()}
+    [time] = content["exposure"]["readout"]["times"]
+    volts = given["simple_dark_current"]["dark_rate"] * time * per_electron + given["dc_offset"]["offset"]
+    np.testing.assert_allclose((volts - low) * codes - 0.5, pixel)
+    deviation = given["output_node_noise"]["std_deviation"] * codes
+    assert deviation == pytest.approx(np.median(found.read_noise / found.gain))
+    assert steps["simple_adc"]["func"] == "pyxel.models.readout_electronics.simple_adc"
+    [path] = ADAPTERS["getframes"](found, folder)
+    camera = tomllib.loads(path.read_text())["camera"]
+    assert (camera["name"], camera["resolution"]) == ('A "B"', [NY, NX])
+    mean = camera["bias_offset_adu"] + time * camera["dark_current_e_per_s"] / camera["gain_e_per_adu"]
+    assert mean == pytest.approx(np.median(found.bias) + time * rate / gain)
+    spread = camera["read_noise_nonuniformity"]
+    assert camera["read_noise_e"] * np.exp(-(spread**2) / 2) == pytest.approx(noise)
+    assert camera["full_well_e"] / gain + camera["bias_offset_adu"] == pytest.approx(2**found.bits - 1)
+    assert camera["dark_current_ref_temp_c"] == -20
 
 
 def test_a_serial_number_never_leads_out_of_the_folder(finished, tmp_path):
