@@ -175,7 +175,7 @@ def step(effect: str | None, verdict: str, before: float, after: float) -> dict[
                 "effect": "periodic_pickup",
                 "gap_after": 120 * micro,
                 "behind": -16.8,
-                "why": f"it leaves a misfit of 9.1 sigma: {STATISTICS['space.row.readout.lag1'].sentence}",
+                "why": f"it leaves a deviation of 9.1 sigma: {STATISTICS['space.row.readout.lag1'].sentence}",
             },
             {"effect": "interpixel_capacitance", "gap_after": 300 * micro, "behind": -262.0, "why": ""},
         ],

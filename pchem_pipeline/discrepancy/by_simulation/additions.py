@@ -223,7 +223,7 @@ class Extension:
         elif abs(other.rest[worst]) > CERTAIN:
             left = float(other.rest[worst])
             says = STATISTICS[self.accept.first.names[worst]].says(left)
-            why = f"it leaves a misfit of {sigma_text(left)}: {says}"
+            why = f"it leaves a deviation of {sigma_text(left)}: {says}"
         elif other.error is not None:
             why = f"it fits the pixel histograms worse, by {-other.behind:.1f} ± {other.error:.1f} nats"
         else:
@@ -296,7 +296,7 @@ def unexplained_of_its_kind(effect: Effect, part: FloatArray, rest: FloatArray, 
     worst = int(np.argmax(left))
     if left[worst] <= CERTAIN:
         return ""
-    return f"it leaves a misfit: {STATISTICS[null.names[worst]].says(float(rest[worst]))}"
+    return f"it leaves a deviation: {STATISTICS[null.names[worst]].says(float(rest[worst]))}"
 
 
 def _ambiguous_set(rivals: Sequence[Contender], certainty: float) -> list[Contender]:

@@ -60,10 +60,10 @@ class Statistic:
 
 #: Of each score its channel, the meaning of a positive [or negative] value, and of either.
 _SCORES: dict[str, tuple[str, str, str]] = {
-    "C2": ("charge", "electron numbers vary [more|less] than Poisson",
-           "the variance of electron numbers is not Poisson"),
-    "C3": ("charge", "electron numbers are [more|less] skewed than Poisson",
-           "the skewness of electron numbers is not Poisson"),
+    "C2": ("charge", "electron numbers vary [more|less] than the model predicts",
+           "the variance of electron numbers deviates from the model"),
+    "C3": ("charge", "electron numbers are [more|less] skewed than the model predicts",
+           "the skewness of electron numbers deviates from the model"),
     "He3": ("readout", "readout residuals are skewed to [high|low] DN",
             "readout residuals are skewed"),
     "He4": ("readout", "readout residuals have [heavy tails|lighter tails than a Gaussian]",
@@ -79,8 +79,8 @@ _SCORES: dict[str, tuple[str, str, str]] = {
 }  # fmt: skip
 _OF_A_SCORE = """
 {channel} shape.{score}.mean map=score.{score} {says} (mean over pixels)
-{channel} shape.{score}.chi map=score.{score} {either}, differently in each pixel
-{channel} shape.{score}.cnt map=score.{score} {either} in a few pixels
+{channel} shape.{score}.chi map=score.{score} {either} (sum of squares over pixels)
+{channel} shape.{score}.cnt map=score.{score} {either}, in more pixels than by chance
 {channel} shape.{score}.slope map=score.{score} {says}, increasingly with exposure
 """
 #: All others: channel, name, map and series, and the meaning of a large positive [or negative] value. Those
@@ -89,14 +89,15 @@ _OF_A_SCORE = """
 _OTHERS = """
 digital shape.goodness.mean map=goodness histograms [deviate from the model|are closer to the model than
         sampling noise] (mean over pixels)
-digital shape.goodness.chi map=goodness histograms deviate from the model, differently in each pixel
-digital shape.goodness.cnt map=goodness histograms deviate strongly from the model in a few pixels
+digital shape.goodness.chi map=goodness histograms deviate from the model (sum of squares over pixels)
+digital shape.goodness.cnt map=goodness histograms deviate strongly from the model, in more
+        pixels than by chance
 readout shape.peaks.mean map=peaks the peaks of the histograms [deviate from the model|are closer to the
         model than sampling noise] (mean over pixels)
-readout shape.peaks.chi map=peaks the peaks of the histograms deviate from the model, differently in each
-        pixel
-readout shape.peaks.cnt map=peaks the peaks of the histograms deviate strongly from the model in a few
-        pixels
+readout shape.peaks.chi map=peaks the peaks of the histograms deviate from the model (sum of squares over
+        pixels)
+readout shape.peaks.cnt map=peaks the peaks of the histograms deviate strongly from the model, in
+        more pixels than by chance
 digital code.rough counts deviate from the model from code to code
 digital code.alternating counts of adjacent codes deviate from the model with [opposite signs|the same sign]
 digital code.smooth counts deviate from the model smoothly along DN
@@ -117,27 +118,32 @@ both    time.lag1.{c}.mean map=lag.{c} {of} of successive frames are [correlated
 both    time.lag2.{c}.mean map=lag.{c} {of} of frames two apart are [correlated|anticorrelated] (mean over
         pixels)
 both    time.lag3.{c}.mean {of} of frames three apart are [correlated|anticorrelated] (mean over pixels)
-both    time.lag1.{c}.chi map=lag.{c} {of} of successive frames are correlated, differently in each pixel
-both    time.lag1.{c}.cnt map=lag.{c} {of} of successive frames are strongly correlated in a few pixels
+both    time.lag1.{c}.chi map=lag.{c} {of} of successive frames are correlated (sum of squares over
+        pixels)
+both    time.lag1.{c}.cnt map=lag.{c} {of} of successive frames are strongly correlated, in more
+        pixels than by chance
 cross   time.cross.readout_charge map=lag.cross residuals [rise|fall] with the charge of the frame before
-cross   time.cross.readout_charge.chi map=lag.cross residuals change with the charge of the frame before,
-        differently in each pixel
+cross   time.cross.readout_charge.chi map=lag.cross residuals change with the charge of the frame before
+        (sum of squares over pixels)
 cross   time.cross.charge_readout charge [rises|falls] with the residual of the frame before
 digital time.nearer samples are [closer to|farther from] the previous sample than [to|from] others
 cross   time.follows.sample residuals change with the charge of another pixel one frame before
 cross   time.follows.line residuals change with the charge of a row, column or frame one frame before
-both    time.block.{c}.chi map=spread.{c} block means of the {of} vary, differently in each pixel
-both    time.block.{c}.cnt map=spread.{c} block means of the {of} vary strongly in a few pixels
+both    time.block.{c}.chi map=spread.{c} block means of the {of} vary (sum of squares over pixels)
+both    time.block.{c}.cnt map=spread.{c} block means of the {of} vary strongly, in more pixels than by
+        chance
 both    frame.{c}.variance map=x.{p} series=scatter.{c} frame means of the {of} scatter [more|less] than
         independent pixels
 both    frame.{c}.lag1 series=frame.{c} frame means of the {of} are [correlated|anticorrelated] with the frame
         before
 both    frame.{c}.slow map=spread.{c} series=frame.{c} frame means of the {of} drift
 both    frame.{c}.trend map=trend.{c} series=frame.{c} frame means of the {of} [rise|fall] along the run
-both    frame.{c}.line series=frame.{c} frame means of the {of} are periodic
+both    frame.{c}.line series=frame.{c} the largest power in the spectrum of the frame
+        means of the {of} exceeds the model
 both    frame.{c}.alternating series=frame.{c} frame means of the {of} are higher in [even|odd] frames
 both    frame.{c}.largest series=frame.{c} one frame mean of the {of} is an outlier
-both    frame.{c}.quadrants map=trend.{c} series=frame.{c} quadrants drift apart in the {of}
+both    frame.{c}.quadrants map=trend.{c} series=frame.{c} quadrants vary differently along the run in
+        the {of}
 cross   frame.covariance series=scatter.charge frame means of charge and residual are
         [correlated|anticorrelated]
 cross   frame.gain.slow the gain drifts
@@ -155,10 +161,11 @@ both    space.column.{c}.variance map=y.{p} series=column.{c} column means of th
         than independent pixels
 both    space.column.{c}.lag1 map=y.{p} series=column.{c} column means of the {of} are
         [correlated|anticorrelated] with the adjacent column
-readout space.row.readout.line map=x.rr series=row.readout row means of the readout residuals are periodic
-readout space.column.readout.line map=y.rr series=column.readout column means of the readout residuals are
-        periodic
-readout space.sample.readout.line readout residuals are periodic along rows, columns or frames
+readout space.row.readout.line map=x.rr series=row.readout the largest power in the
+        spectrum of the row means of the readout residuals exceeds the model
+readout space.column.readout.line map=y.rr series=column.readout the largest power in the
+        spectrum of the column means of the readout residuals exceeds the model
+readout space.sample.readout.line readout residuals have a periodic part along rows, columns or frames
 readout space.sample.readout.spectrum readout residuals of a frame are correlated at some distance
 charge  space.x.kk map=x.kk series=row.charge electron numbers of neighbours are
         [correlated|anticorrelated], along x

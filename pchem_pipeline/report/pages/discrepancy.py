@@ -347,8 +347,8 @@ PARTS = (
     Section(
         "evidence",
         "Identification of the effect",
-        "Log-likelihood of each fitted candidate on test frames, nats; larger is better. A difference below "
-        "three standard errors, where given, is not decisive.",
+        "Log-likelihood of each fitted candidate, of all statistics of training and test frames, nats; larger"
+        " is better. A difference below three standard errors, where given, is not decisive.",
         "No candidates were compared: no statistic tested disagrees with the model.",
     ),
     Section(
@@ -473,7 +473,8 @@ def _effect_facts(data: DiscrepancyData) -> list[KeyFact]:
     for step in data.found.steps:
         if (step.effect or step.verdict == "described") and step.parameters:
             (first, value), *others = _values(step).items()
-            more = [_meaning(step.likeliest, first), *(f"{name} {text}" for name, text in others[:2])]
+            more = [_meaning(step.likeliest, first)]
+            more += [f"{_meaning(step.likeliest, name)}: {text}" for name, text in others[:2]]
             more += [] if step.size is None else [step.size.words()]
             more += [f"in {step.place}"] if step.place else []
             more += [] if data.found.part_of_model(step) else ["proposed, not in the model"]
@@ -505,10 +506,10 @@ def _signed(value: float, digits: int = 3) -> str:
 def _chance_fact(found: Verdict) -> list[KeyFact]:
     if not math.isfinite(found.p_global.before):
         return []
-    more = ["of the largest disagreement of all statistics"]
-    more += [f"t-distribution, scatter of {found.replicates} simulations"] if found.replicates else []
+    more = ["that the largest deviation of all statistics is chance"]
+    more += [f"Student's t, scatter of {found.replicates} simulated stacks"] if found.replicates else []
     before, after = probability_text(found.p_global.before), probability_text(found.p_global.after)
-    value = f"{before} → {after}" if after and found.effects else before
+    value = f"{before} → {after}" if after and found.steps else before
     return [KeyFact("p-value", value, tuple(more))]
 
 

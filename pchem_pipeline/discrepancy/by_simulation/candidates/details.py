@@ -98,12 +98,16 @@ def tuned(refitter: Refitter, one: Refitted) -> Refitted:
 def standard_errors(refitter: Refitter, one: Refitted, least: FloatArray) -> list[dict[str, float]]:
     """Return the standard errors of the strength and parameters of each effect of a set, by name.
 
-    From the inverse of the information of all together; none of a parameter that the data hardly constrain.
-    ``least`` are relative errors of the factors where the parameters are known, shape (e,).
+    The root of the inverse of the information of all together, and of the square of the change that the data
+    still ask for; none of a parameter that the data hardly constrain. ``least`` are relative errors of the
+    factors where the parameters are known, shape (e,).
     """
     details = _details(refitter, one)
-    information, _ = _normal_equations(refitter, one, details)
-    relative = np.sqrt(np.diag(np.linalg.inv(information)))
+    information, score = _normal_equations(refitter, one, details)
+    variance = np.linalg.inv(information)
+    left = variance @ score
+    left[: len(least)] -= one.change  # to which the strengths are corrected
+    relative = np.hypot(np.sqrt(np.diag(variance)), left)
     found: list[dict[str, float]] = []
     for h, error in zip(one.hypotheses, np.maximum(relative[: len(least)], least), strict=True):
         strength = abs(float(getattr(h.effect, h.effect.strength))) if h.effect.strength else np.nan

@@ -96,6 +96,7 @@ def chosen(search: Search) -> Comparison | None:
     other = max(search.ranked, key=lambda one: by_histograms.get(one.tags, (0.0, 0.0))[0])
     if by_histograms.get(other.tags, (0.0, 0.0))[0] > 0.0 and _all_seen(search, other):
         best, by_histograms = other, _by_histograms(other, search.ranked, search.likelihood)
+    best = search.at_maximum(best)
     return Comparison(best, tuple(search.ranked), by_histograms)
 
 

@@ -47,7 +47,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.refits import (
 )
 from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.model.arithmetic.significance import CERTAIN
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, DECISIVE
 
 #: Relative error of a fingerprint before its refit.
 LOOSE = 0.1
@@ -244,6 +244,15 @@ class Search:
         """Test whether what a set leaves asks for other parameters, and these were not tuned yet."""
         return one.tags not in self._tuned and may_be_tuned(self.refitter, one)
 
+    def at_maximum(self, one: Refitted) -> Refitted:
+        """Return a set with its parameters tuned, after those that could stand in its place were."""
+        near = one.penalised_log_likelihood - DECISIVE
+        for other in [each for each in self.ranked if len(each.tags - one.tags) == 1 or each is one]:
+            alike = len(other.tags) == len(one.tags) and other.penalised_log_likelihood >= near
+            if alike and other.tags not in self._tuned:
+                self._tune(other)
+        return max((each for each in self.ranked if each.tags == one.tags), key=PENALISED)
+
     def _tune(self, one: Refitted) -> float:
         """Tune the parameters of a set; return the nats that it gained."""
         self._tuned.add(one.tags)
@@ -254,7 +263,9 @@ class Search:
         except Exception as error:  # of a plug-in, as above
             note_defect(self.refitter.defects, one.words, error)
             return 0.0
-        self.trials += [] if better is one else [Trial.of(better)]
+        for trial in self.trials:
+            if trial.way is not None and trial.way.best is one and better is not one:
+                trial.way, trial.ended = Steps.begin(better), True
         return better.score - one.score
 
     def eliminate(self) -> None:

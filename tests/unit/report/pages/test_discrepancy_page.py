@@ -98,7 +98,7 @@ def test_a_named_effect_has_all_its_evidence(base: ReportData) -> None:
         "477 → < 0.66",
         "sampling noise up to 0.66",
         "0.3512 ± 0.0041 DN",
-        "it leaves a misfit of 9.1 sigma: row means",
+        "it leaves a deviation of 9.1 sigma: row means",
         "−16.8 ± 3.3",
         "0.985",
         "pixels (y, x) (3, 4), (10, 20), (30, 39)",
@@ -385,7 +385,7 @@ def test_what_is_left_of_the_gap_is_a_caution_and_one_that_chance_makes_is_not_s
     data = discrepancy_data("named", steps=[weak], gap=chance, doubt="the bias of 93 % may be off")
     told = {flag.text: flag.level for flag in remarks(data)}
     assert not any("leaves a gap" in text for text in told)
-    assert any("is rejected, since it leaves a misfit" in text for text in told)
+    assert any("is rejected, since it leaves a deviation" in text for text in told)
     assert [level for text, level in told.items() if "93 %" in text] == ["caution"]
     assert not any("no size is given" in text for text in told)
     facts = {fact.label: fact for fact in key_facts(data)}

@@ -51,7 +51,11 @@ def test_lines_end_not_between_a_number_and_its_unit_and_keep_to_the_columns():
     [
         ("ambiguous", {}, "to distinguish periodic_pickup: a faster or slower row time"),
         ("ambiguous", {}, "score"),
-        ("named_in_part", {}, "pickup is rejected (log-likelihood lower by 17); it leaves a misfit of 9.1"),
+        (
+            "named_in_part",
+            {},
+            "pickup is rejected (log-likelihood lower by 17); it leaves a deviation of 9.1",
+        ),
         ("unexplained", {}, "unexplained: counts of adjacent codes deviate from the model with opposite"),
         ("unexplained", {}, "with opposite signs (22 sigma)"),
         ("named", {"doubt": "the bias of 93 % of the pixels may be off"}, "no sizes in e⁻: the bias of 93 %"),

@@ -81,6 +81,33 @@ def test_standard_errors_are_those_of_a_fit_of_all_numbers_together() -> None:
     assert blind == {"fraction": pytest.approx(taken.fraction)}
 
 
+def test_errors_away_from_the_maximum_hold_the_change_that_the_data_still_ask_for() -> None:
+    world = world_of(TRUE)
+    one = refined(world, BLINKING)
+    [found], [right] = (
+        standard_errors(world.refitter(), each, np.zeros(1)) for each in (one, refined(world, TRUE))
+    )
+    [taken] = one.effects
+    off = {n: abs(getattr(taken, n) - getattr(TRUE, n)) for n in ("step_e", "dwell_low_frames")}
+    assert all(off[name] > 3.0 * right[name] for name in off)
+    # a number that is so far off may have no error at all
+    assert all(off[name] < 2.0 * found.get(name, np.inf) for name in off)
+
+
+def test_the_chosen_set_is_at_its_maximum_though_it_leaves_nothing_at_the_guess() -> None:
+    truth = BLINKING.model_copy(update={"dwell_low_frames": 187.0})
+    world = world_of(truth)
+    begun = refined(world, BLINKING)
+    assert world.refitter().passes_goodness_of_fit(begun)
+    assert not may_be_tuned(world.refitter(), begun)
+    found = world.compare(Hypothesis(BLINKING, statistics([BLINKING])))
+    assert found is not None
+    [effect] = found.chosen.effects
+    assert found.chosen.tuned
+    assert abs(effect.dwell_low_frames - 187.0) < 6.0
+    assert [each.tags for each in found.tried] == [found.chosen.tags]
+
+
 def test_what_is_left_where_the_effect_moves_nothing_is_no_reason_to_tune() -> None:
     world = world_of(TRUE, beside=60.0 * UNIT[9])
     assert not may_be_tuned(world.refitter(), refined(world, BLINKING))

@@ -414,7 +414,7 @@ def test_effects_that_meet_in_one_part_are_one_cause_without_a_name(second: str)
 @pytest.mark.parametrize(
     ("left", "words"),
     [
-        ({"frame.covariance": 6.0}, "it leaves a misfit"),
+        ({"frame.covariance": 6.0}, "it leaves a deviation"),
         ({"frame.covariance": 3.0}, ""),
         ({"shape.He4.mean": 6.0}, ""),
     ],
@@ -434,7 +434,7 @@ def test_what_is_left_in_the_family_of_a_signature_speaks_against_a_name(
     # what stands in its place, whatever it is
     there = np.array([0.0, 0.0, 0.0, 6.0])
     assert not unexplained_of_its_kind(everywhere, part, there, null)
-    assert unexplained_of_its_kind(placed, part, there, null).startswith("it leaves a misfit")
+    assert unexplained_of_its_kind(placed, part, there, null).startswith("it leaves a deviation")
 
 
 def guesses_of(shape: tuple[int, int]) -> Callable[..., list[Effect]]:
