@@ -206,7 +206,8 @@ class BranchingCounts(Effect, tag="branching_counts"):
     strength = "branching"
     separate: ClassVar[Mapping[str, str]] = {
         "overdispersed_counts": "several exposures: excess variance grows as H, by over-dispersion as H^2",
-        "optical_crosstalk": "electron numbers of neighbours: correlated by crosstalk only",
+        "optical_crosstalk": "electron numbers of neighbours: correlated only by crosstalk (light that the "
+        "sensor emits)",
         "exposure_flicker": "pixels of one frame: correlated by flicker only",
     }
     #: at half a percent, and at the tenth of a silicon photomultiplier

@@ -102,8 +102,8 @@ def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "On the sensor",
         "Statistics of each pixel: those with a deviating region (outlined), then goodness of fit and the "
         "most deviating ones. Below each map: histogram of all pixels (gray), of the outlined region (red) "
-        "and under the model (line). A shift of the whole histogram is an effect in all pixels, long tails "
-        "an effect in few; these are ringed in the map.",
+        "and a Gaussian of standard deviation 1 (line). A shift of the whole histogram is an effect in all "
+        "pixels, long tails an effect in few; these are ringed in the map.",
         "Maps in sigma. " + "; ".join(words).replace("-", "−") + ".",
         (table,),
         _sensor_chart(maps, flagged, origin),
