@@ -38,12 +38,7 @@ def main() -> None:
     config = RunConfig.model_validate(
         {
             "run": {"title": "Simulated sensor of the paper's size"},
-            "simulate": {
-                "shape": given.shape,
-                "n_frames": given.frames,
-                "seed": given.seed,
-                "format": "raw",
-            },
+            "simulate": {"shape": given.shape, "n_frames": given.frames, "seed": given.seed, "format": "raw"},
         }
     )
     given.folder.mkdir(parents=True, exist_ok=True)

@@ -179,8 +179,7 @@ def discrepancy(
         str | None, typer.Option(help="search only in the pixels y0:y1,x0:x1 [default: all, or a window]")
     ] = None,
     effort: Annotated[
-        float | None,
-        typer.Option(help="factor on the search budget [default: discrepancy.effort]"),
+        float | None, typer.Option(help="factor on the search budget [default: discrepancy.effort]")
     ] = None,
     *,
     command: Command,
@@ -400,8 +399,7 @@ def _stage_command(name: str, summary: str) -> None:
 def ingest(
     target: Target,
     append: Annotated[
-        bool,
-        typer.Option("--append", help="add new files to a finished run; reads only these"),
+        bool, typer.Option("--append", help="add new files to a finished run; reads only these")
     ] = False,
     *,
     given: dict[str, Any],

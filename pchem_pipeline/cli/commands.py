@@ -38,8 +38,7 @@ def apply(
         ),
     ] = "frames",
     dataset: Annotated[
-        str | None,
-        typer.Option(help="dataset of an HDF5, zarr or FITS file [default: as in the run]"),
+        str | None, typer.Option(help="dataset of an HDF5, zarr or FITS file [default: as in the run]")
     ] = None,
     format: Annotated[
         Literal["zarr", "tiff", "fits"],

@@ -141,22 +141,14 @@ def _decode(found: Calibration, folder: Path) -> list[Path]:
 
 def _picasso(found: Calibration, folder: Path) -> list[Path]:
     """Write the entry of the camera in Picasso's ``config.yaml``."""
-    camera = {
-        "Sensor": "sCMOS",
-        "Baseline": _median(found.offset),
-        "Sensitivity": _median(found.gain),
-    }
+    camera = {"Sensor": "sCMOS", "Baseline": _median(found.offset), "Sensitivity": _median(found.gain)}
     return [_yaml(folder / "picasso_config.yaml", {"Cameras": {found.camera.name or "camera": camera}})]
 
 
 def _smap(found: Calibration, folder: Path) -> list[Path]:
     """Write the maps that SMAP looks for in its folder ``settings/cameras``: DN, DN^2 and DN/e-."""
     path = folder / "smap" / f"{found.serial}.mat"
-    maps = {
-        "offsetmap": found.offset,
-        "varmap": found.variance / found.gain**2,
-        "gainmap": 1 / found.gain,
-    }
+    maps = {"offsetmap": found.offset, "varmap": found.variance / found.gain**2, "gainmap": 1 / found.gain}
     with whole_file(path) as part:
         savemat(part, {name: values.astype(np.float32) for name, values in maps.items()}, appendmat=False)
     return [path]

@@ -54,10 +54,7 @@ def run_demo(
     if effect is not None:
         simulate["effects"] = [effect.model_dump(mode="json")]
     config = RunConfig.model_validate(
-        {
-            "run": {"store": "demo.zarr", "title": "Simulated demo sensor", "tile": 32},
-            "simulate": simulate,
-        }
+        {"run": {"store": "demo.zarr", "title": "Simulated demo sensor", "tile": 32}, "simulate": simulate}
     )
     write_config(path, dump_config(config))
     target, command = find_run(path), Command(quiet=quiet)

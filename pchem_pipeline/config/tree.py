@@ -35,10 +35,7 @@ class RunSettings(Section):
         "than 80 such tiles",
     )
     allowed_failed_pixels: float = Field(
-        default=0.1,
-        ge=0,
-        le=1,
-        description="exit code 3 above this fraction of pixels without a value",
+        default=0.1, ge=0, le=1, description="exit code 3 above this fraction of pixels without a value"
     )
 
 

@@ -75,7 +75,6 @@ class DiscrepancySettings(Section):
     )
     exclude: tuple[str, ...] = Field(default=(), description="effects (tags) to leave out")
     add: bool = Field(
-        default=True,
-        description="make a new version of the model with the named effects, in store and YAML",
+        default=True, description="make a new version of the model with the named effects, in store and YAML"
     )
     seed: int = Field(default=1, ge=0, lt=2**63, description="seed of the simulated stacks")

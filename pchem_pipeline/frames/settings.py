@@ -20,10 +20,7 @@ class SampleSettings(Section):
     run: str = Field(min_length=1, description="config.yaml or store of the run, relative to this file")
     bias: bool = Field(default=False, description="bias frames (H = 0): fix bias and read noise")
     integration_time: float | None = Field(
-        default=None,
-        ge=0,
-        le=LONGEST,
-        description="s; 0 is allowed; null: as in the run",
+        default=None, ge=0, le=LONGEST, description="s; 0 is allowed; null: as in the run"
     )
     light_level: float | None = Field(
         default=None, ge=0, description="exposure in any unit, for input.against: light_level"

@@ -15,10 +15,7 @@ class MethodsSettings(Section):
     """How the other characterisation methods are compared with PCH-EM."""
 
     pixels: int = Field(
-        default=1000,
-        ge=1,
-        le=100_000,
-        description="number of pixels for each method, evenly spread",
+        default=1000, ge=1, le=100_000, description="number of pixels for each method, evenly spread"
     )
     with_runs: tuple[str, ...] = Field(
         default=(),

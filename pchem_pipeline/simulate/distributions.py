@@ -53,10 +53,7 @@ class RadialPattern(PatternBase):
     amplitude: float = Field(description="value in the corners; no unit if relative")
 
 
-Pattern = Annotated[
-    ColumnPattern | RowPattern | GradientPattern | RadialPattern,
-    Field(discriminator="kind"),
-]
+Pattern = Annotated[ColumnPattern | RowPattern | GradientPattern | RadialPattern, Field(discriminator="kind")]
 
 
 class DistributionBase(Section):
@@ -147,6 +144,5 @@ class LogUniform(_Between):
 
 
 Distribution = Annotated[
-    Constant | Normal | LogNormal | Gamma | Uniform | LogUniform,
-    Field(discriminator="kind"),
+    Constant | Normal | LogNormal | Gamma | Uniform | LogUniform, Field(discriminator="kind")
 ]

@@ -79,10 +79,7 @@ def _copula(settings: SimulateSettings) -> FloatArray:
 
 
 def _with_patterns(
-    values: FloatArray,
-    name: str,
-    distribution: Distribution,
-    settings: SimulateSettings,
+    values: FloatArray, name: str, distribution: Distribution, settings: SimulateSettings
 ) -> FloatArray:
     for i, pattern in enumerate(distribution.patterns):
         streams = _streams(settings, f"{name} pattern {i}")

@@ -191,8 +191,7 @@ class SimulateSettings(Section):
         default=250, ge=0, description="number of first frames whose true electron numbers are stored"
     )
     sensor: Path | None = Field(
-        default=None,
-        description="npz file with the maps of a sensor (see pchem twin), instead of parameters",
+        default=None, description="npz file with the maps of a sensor (see pchem twin), instead of parameters"
     )
     scene: str | None = Field(
         default=None,

@@ -14,11 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
-from pchem_pipeline.simulate.streams_numba import (
-    fill_uniform,
-    normal_from_uniform,
-    poisson_from_uniform,
-)
+from pchem_pipeline.simulate.streams_numba import fill_uniform, normal_from_uniform, poisson_from_uniform
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -46,10 +46,7 @@ def _tell_time(context: StageContext) -> None:
 
 
 def maps_tile(
-    fit: Arrays,
-    integration_time: float | None,
-    rate: str = "charge_rate",
-    n_frames: int | None = None,
+    fit: Arrays, integration_time: float | None, rate: str = "charge_rate", n_frames: int | None = None
 ) -> dict[str, NDArray[Any]]:
     """Return all maps of a tile by name.
 

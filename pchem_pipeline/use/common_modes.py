@@ -360,9 +360,7 @@ class _Readout:
 
 
 def estimate_offsets(
-    frames: NDArray[np.unsignedinteger[Any]],
-    reference: Reference,
-    modes: CommonModes,
+    frames: NDArray[np.unsignedinteger[Any]], reference: Reference, modes: CommonModes
 ) -> Offsets:
     """Return the most probable offsets of whole frames (frame, y, x), DN: of rows, columns, waves, readouts.
 

@@ -24,13 +24,7 @@ from pchem_pipeline.compute.environment import prepare_environment
 prepare_environment()
 
 from pchem_pipeline.report.data import ReportData  # noqa: E402
-from pchem_pipeline.report.inspector import (  # noqa: E402
-    InspectorData,
-    MapEntry,
-    PixelSample,
-    choose_scale,
-    pack_map,
-)
+from pchem_pipeline.report.inspector import InspectorData, MapEntry, PixelSample, choose_scale, pack_map  # noqa: E402
 from pchem_pipeline.report.pages.page import Drawn  # noqa: E402
 from pchem_pipeline.report.pages.report import render_report  # noqa: E402
 

@@ -128,10 +128,7 @@ def _compared(case: Case, frames: NDArray[np.uint16], found: Any, key: Path) -> 
 
 
 def _bias(
-    frames: NDArray[np.uint16],
-    twin: NDArray[np.uint16],
-    found: Any,
-    affected: NDArray[np.bool_],
+    frames: NDArray[np.uint16], twin: NDArray[np.uint16], found: Any, affected: NDArray[np.bool_]
 ) -> dict[str, Any]:
     """Compare fits without and with the named effects to the plain fit of the twin without the effect."""
     reference, before = fit_maps(twin), fit_maps(frames)

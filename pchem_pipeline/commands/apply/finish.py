@@ -99,12 +99,7 @@ def _write_errors(
 
 
 def _write_noise(
-    output: RunStore,
-    calibration: Calibration,
-    sums: FloatArray,
-    n: int,
-    job: Job,
-    reporter: Reporter,
+    output: RunStore, calibration: Calibration, sums: FloatArray, n: int, job: Job, reporter: Reporter
 ) -> None:
     """Write what the pixels scatter by with the offsets and without, and say what that gains."""
     gain = np.where(calibration.usable, calibration.conversion_gain, np.nan)

@@ -42,20 +42,8 @@ from pchem_pipeline.model.checks.run_differences import (
 from pchem_pipeline.model.checks.settings import allowed
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD, NO_VALUE
-from pchem_pipeline.report.comparison import (
-    ArrayRow,
-    Comparison,
-    HistoryRow,
-    Pair,
-    RunFacts,
-    by_change,
-)
-from pchem_pipeline.report.pages.compare import (
-    COMPARE_JSON,
-    COMPARE_PAGE,
-    lines_of,
-    render_comparison,
-)
+from pchem_pipeline.report.comparison import ArrayRow, Comparison, HistoryRow, Pair, RunFacts, by_change
+from pchem_pipeline.report.pages.compare import COMPARE_JSON, COMPARE_PAGE, lines_of, render_comparison
 from pchem_pipeline.run.progress import ProgressMode, Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target, find_run, with_maps

@@ -187,10 +187,7 @@ def leads_in_histograms(effect: type[Effect]) -> bool:
 
 
 def find_members(
-    classes: Mapping[str, type[Effect]],
-    evidence: Evidence,
-    present: Sequence[Effect],
-    failed: dict[str, str],
+    classes: Mapping[str, type[Effect]], evidence: Evidence, present: Sequence[Effect], failed: dict[str, str]
 ) -> tuple[list[Member], dict[str, str]]:
     """Return the candidates that change a pixel's own histogram, and why the others do not.
 

@@ -46,10 +46,7 @@ class AddedExposure(NamedTuple):
 
 
 def added_exposures(
-    effects: Sequence[Effect],
-    frames: NDArray[np.unsignedinteger],
-    numbers: IntArray,
-    maps: PixelMaps,
+    effects: Sequence[Effect], frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps
 ) -> AddedExposure | None:
     """Return what effects add to the exposure of each pixel, all together; None where none adds any.
 
@@ -74,10 +71,7 @@ def added_exposures(
 
 
 def _in_its_place(
-    effect: Effect,
-    frames: NDArray[np.unsignedinteger],
-    numbers: IntArray,
-    maps: PixelMaps,
+    effect: Effect, frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps
 ) -> AddedExposure | None:
     """Return what an effect adds inside its region, found in its frames; nothing in the others."""
     when = np.ones(numbers.size, np.bool_) if effect.when is None else effect.when.frames(numbers)
@@ -197,11 +191,7 @@ def sample_law(
 
 
 def _with_effect(
-    effect: Effect,
-    pixels: NDArray[np.intp],
-    law: SampleLaw,
-    maps: PixelMaps,
-    places: PixelPlaces | None,
+    effect: Effect, pixels: NDArray[np.intp], law: SampleLaw, maps: PixelMaps, places: PixelPlaces | None
 ) -> list[tuple[NDArray[np.intp], SampleLaw]]:
     """Return groups of pixels with their laws: of one group, those on which an effect acts and the others."""
     if effect.everywhere:

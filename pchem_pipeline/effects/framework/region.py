@@ -131,8 +131,7 @@ class Region(_Place):
     taps: Taps | None = Field(default=None, description="readout taps")
     quadrant: Quadrant | None = Field(default=None, description="a quarter of the sensor")
     pixels: tuple[tuple[int, int, int], ...] = Field(
-        default=(),
-        description="runs of pixels: row, first column, last column + 1 (also made from a mask)",
+        default=(), description="runs of pixels: row, first column, last column + 1 (also made from a mask)"
     )
 
     @model_validator(mode="before")

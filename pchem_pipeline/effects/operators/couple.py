@@ -29,14 +29,7 @@ from pchem_pipeline.effects.framework.effect import (
 from pchem_pipeline.effects.framework.evidence import PreviousBits
 from pchem_pipeline.effects.framework.neighbours import neighbour_words, neighbours
 from pchem_pipeline.effects.framework.region import Region, Span
-from pchem_pipeline.effects.types import (
-    AnyArray,
-    EffectContext,
-    Evidence,
-    FloatArray,
-    PixelMaps,
-    SampleLaw,
-)
+from pchem_pipeline.effects.types import AnyArray, EffectContext, Evidence, FloatArray, PixelMaps, SampleLaw
 from pchem_pipeline.model.arithmetic.significance import CLEAR
 
 
@@ -475,15 +468,9 @@ class ResponseTerm(Section):
     weight: float = Field(default=1.0, ge=-1, le=1, description="relative response, no unit")
     number: int = Field(default=1, ge=1, description="samples per row, column or frame, for the PCD")
     mirrored: tuple[Axis, ...] = Field(
-        default=(),
-        max_length=2,
-        description="axes of a mirror image, from which the place is then counted",
+        default=(), max_length=2, description="axes of a mirror image, from which the place is then counted"
     )
-    above: float = Field(
-        default=0.0,
-        ge=0,
-        description="only charge above this is followed, e-; 0: all",
-    )
+    above: float = Field(default=0.0, ge=0, description="only charge above this is followed, e-; 0: all")
     columns: tuple[int, int] | None = Field(
         default=None, description="columns that follow, first and last + 1; null: all"
     )
@@ -568,9 +555,7 @@ class EmpiricalResponse(Effect, tag="empirical_response"):
     #: a sample that follows the one read four before it
     typical_values = ({"response": 0.01, "terms": (ResponseTerm(place=(0, 0, -4)),)},)
     response: Ratio = Field(
-        ge=0,
-        le=1,
-        description="share of the charge of another sample that is added, for weight 1, no unit",
+        ge=0, le=1, description="share of the charge of another sample that is added, for weight 1, no unit"
     )
     terms: tuple[ResponseTerm, ...] = Field(
         min_length=1,

@@ -81,9 +81,7 @@ class Nonlinearity(Effect, tag="nonlinearity"):
         {"step_change": change, "noise": noise} for noise in ("kept", "bent") for change in (2e-3, -2e-3)
     )
     step_change: PerElectron = Field(
-        ge=-0.2,
-        le=0.2,
-        description="relative change of the peak spacing per electron, 1/e-",
+        ge=-0.2, le=0.2, description="relative change of the peak spacing per electron, 1/e-"
     )
     noise: Noise = Field(
         default="kept",

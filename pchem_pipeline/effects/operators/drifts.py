@@ -368,9 +368,7 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
     )
     rms: Ratio = Field(ge=0, le=1, description="standard deviation of the exposure over its mean, no unit")
     correlation_frames: Frames = Field(
-        default=0.0,
-        ge=0,
-        description="correlation time (to 1/e), frames; 0: independent frames",
+        default=0.0, ge=0, description="correlation time (to 1/e), frames; 0: independent frames"
     )
     period_frames: Frames | None = Field(
         default=None, gt=1, description="period of a sine, frames; null: random fluctuations"

@@ -16,14 +16,7 @@ from pchem_pipeline.effects.framework.context import DIMS, Dim
 from pchem_pipeline.effects.framework.effect import MOST_TOLD, Dn, Effect, Plane
 from pchem_pipeline.effects.framework.region import Span
 from pchem_pipeline.effects.operators.offsets import add_offset
-from pchem_pipeline.effects.types import (
-    AnyArray,
-    EffectContext,
-    FloatArray,
-    IntArray,
-    PixelMaps,
-    SampleLaw,
-)
+from pchem_pipeline.effects.types import AnyArray, EffectContext, FloatArray, IntArray, PixelMaps, SampleLaw
 
 #: A distance: frames, rows, columns.
 Lag = tuple[int, int, int]
@@ -57,8 +50,7 @@ class NoiseMode(Section):
         default=(), max_length=64, description="correlation at each distance, no unit"
     )
     changes: Changed = Field(
-        default="offset",
-        description="what it changes: offset, gain, light, or size of the read noise",
+        default="offset", description="what it changes: offset, gain, light, or size of the read noise"
     )
     signal_dn: float = Field(
         default=1.0,
@@ -84,12 +76,10 @@ class NoiseMode(Section):
         description="relative size along a row or column, at evenly spaced points; empty: uniform",
     )
     extent: tuple[Span, Span] | None = Field(
-        default=None,
-        description="shape, profile: range of rows and of columns, ends excluded; null: all",
+        default=None, description="shape, profile: range of rows and of columns, ends excluded; null: all"
     )
     wave: Cycles | None = Field(
-        default=None,
-        description="cycles per frame, row and column of a sine; null: noise",
+        default=None, description="cycles per frame, row and column of a sine; null: noise"
     )
 
     @model_validator(mode="after")

@@ -135,8 +135,7 @@ class Glow(Effect, tag="glow"):
             weights, sizes = np.array([1.0 - self.burst_share, self.burst_share]), np.array([0.0, 1.0])
         image = self.peak_e * self.pattern(np.arange(maps.usable.shape[0]), maps.usable.shape)
         return AddedExposure(
-            sizes[:, None, None] * image,
-            np.broadcast_to(weights[:, None, None], (sizes.size, *image.shape)),
+            sizes[:, None, None] * image, np.broadcast_to(weights[:, None, None], (sizes.size, *image.shape))
         )
 
     @classmethod

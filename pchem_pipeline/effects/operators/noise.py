@@ -63,10 +63,7 @@ class FlickerNoise(Effect, tag="flicker_noise"):
     )
     share: Ratio = Field(ge=0, le=1, description="share of the read noise power, no unit")
     correlation_frames: Frames = Field(
-        default=30.0,
-        gt=0,
-        le=1e6,
-        description="correlation time, frames; one_over_f: the longest one",
+        default=30.0, gt=0, le=1e6, description="correlation time, frames; one_over_f: the longest one"
     )
     spectrum: Literal["lorentzian", "one_over_f"] = Field(
         default="lorentzian",
@@ -159,10 +156,7 @@ class HeavyTailedNoise(Effect, tag="heavy_tailed_noise"):
     )
     share: Ratio = Field(ge=0, le=1, description="probability that a sample is noisy, no unit")
     factor: Ratio = Field(
-        default=3.0,
-        ge=1,
-        le=30,
-        description="noise of such a sample relative to others, no unit",
+        default=3.0, ge=1, le=30, description="noise of such a sample relative to others, no unit"
     )
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:

@@ -139,11 +139,7 @@ def _beside(direction: float, pixel: Pixel, tools: Tools, theta: FloatArray) -> 
 
 @kernel(borrows=True)
 def _with_cumulants(
-    a: float,
-    third: float,
-    histogram: Histogram,
-    moments: tuple[float, float, float],
-    theta: FloatArray,
+    a: float, third: float, histogram: Histogram, moments: tuple[float, float, float], theta: FloatArray
 ) -> bool:
     """Fill ``theta`` of a single sample from the cumulants of its histogram, given the step, DN.
 

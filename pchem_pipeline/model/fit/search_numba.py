@@ -13,21 +13,8 @@ from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
 from pchem_pipeline.model.errors.algebra_numba import invert_arrow
-from pchem_pipeline.model.fit.climb_numba import (
-    CONVERGED,
-    DEGENERATE,
-    Goal,
-    Limits,
-    find_held,
-    same_place,
-)
-from pchem_pipeline.model.fit.starts_numba import (
-    N_ATTEMPTS,
-    fill_starts,
-    keep_start,
-    longer_steps,
-    no_starts,
-)
+from pchem_pipeline.model.fit.climb_numba import CONVERGED, DEGENERATE, Goal, Limits, find_held, same_place
+from pchem_pipeline.model.fit.starts_numba import N_ATTEMPTS, fill_starts, keep_start, longer_steps, no_starts
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.density_numba import LOG_2PI

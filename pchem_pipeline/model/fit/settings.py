@@ -25,9 +25,7 @@ class FitSettings(Section):
         "gain fits the codes as well, or with samples at a limit of the ADC; density in the others",
     )
     max_iterations: int = Field(
-        default=200,
-        ge=1,
-        description="largest number of likelihood evaluations per start, algorithm newton",
+        default=200, ge=1, description="largest number of likelihood evaluations per start, algorithm newton"
     )
     em_max_iterations: int = Field(
         default=20_000, ge=1, description="largest number of EM iterations per start, algorithm em"

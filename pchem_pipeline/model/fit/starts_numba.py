@@ -20,13 +20,7 @@ from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import FEW_STEP, QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, counting, fused, simd_load, simd_store
-from pchem_pipeline.model.fit.climb_numba import (
-    LEAST_STEP,
-    MIN_STEP,
-    min_log_variance,
-    same_place,
-    sensible,
-)
+from pchem_pipeline.model.fit.climb_numba import LEAST_STEP, MIN_STEP, min_log_variance, same_place, sensible
 from pchem_pipeline.model.law.pixel_numba import (
     AT,
     BIAS,
@@ -157,12 +151,7 @@ def ecf_at(histogram: Histogram, frequency: float) -> tuple[float, float]:
 
 
 @kernel(borrows=True)
-def _regress(
-    basis: FloatArray,
-    power: FloatArray,
-    floor: float,
-    sums: FloatArray,
-) -> tuple[float, float]:
+def _regress(basis: FloatArray, power: FloatArray, floor: float, sums: FloatArray) -> tuple[float, float]:
     """Return (satellite frequency in 1/sd, H) of the best weighted regression over all trial steps.
 
     The power is the squared modulus of the ECF at the frequencies of `regression_basis`; those below the
@@ -217,12 +206,7 @@ def _regress(
 
 
 @kernel(borrows=True)
-def assemble(
-    histogram: Histogram,
-    a: float,
-    exposure: float,
-    theta: FloatArray,
-) -> tuple[bool, bool]:
+def assemble(histogram: Histogram, a: float, exposure: float, theta: FloatArray) -> tuple[bool, bool]:
     """Turn a step and a rough H into a start; return whether there is one, and whether its lobe is clear."""
     if not (a > 0.0 and math.isfinite(a) and exposure > 0.0 and math.isfinite(exposure)):
         return False, False
@@ -232,11 +216,7 @@ def assemble(
 
 @kernel(borrows=True)
 def _on_lobe(
-    histogram: Histogram,
-    a: float,
-    exposure: float,
-    lobe: tuple[float, float],
-    theta: FloatArray,
+    histogram: Histogram, a: float, exposure: float, lobe: tuple[float, float], theta: FloatArray
 ) -> bool:
     """Fill a start from modulus (unnormalised) and phase of the ECF at 1/a; return whether it is clear."""
     _, _, _, _, n, mean, variance = histogram
@@ -269,10 +249,7 @@ def _on_lobe(
 
 @kernel(borrows=True)
 def start_regression(
-    histogram: Histogram,
-    basis: FloatArray,
-    work: FloatArray,
-    theta: FloatArray,
+    histogram: Histogram, basis: FloatArray, work: FloatArray, theta: FloatArray
 ) -> tuple[bool, bool]:
     """Start from the regression on log|phi|, see `assemble`; ``work`` has seven rows."""
     n, variance = histogram.n, histogram.variance
@@ -583,12 +560,7 @@ def keep_start(pixel: Pixel, evaluate: Any, cells: bool, scratch: Scratch) -> in
 
 @kernel(borrows=True)
 def fill_starts(
-    attempt: int,
-    quick: bool,
-    pixel: Pixel,
-    basis: FloatArray,
-    evaluate: Any,
-    scratch: Scratch,
+    attempt: int, quick: bool, pixel: Pixel, basis: FloatArray, evaluate: Any, scratch: Scratch
 ) -> tuple[bool, int]:
     """Fill the starts of an attempt from `KEPT_STARTS` on, and their `HEIGHTS`: -inf where there are fewer.
 

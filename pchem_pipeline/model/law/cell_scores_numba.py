@@ -104,13 +104,7 @@ def _add_peak(
 
 @kernel
 def fill_law(
-    exposure: float,
-    step: float,
-    offset: float,
-    width: float,
-    first: int,
-    last: int,
-    law: FloatArray,
+    exposure: float, step: float, offset: float, width: float, first: int, last: int, law: FloatArray
 ) -> None:
     """Fill ``law`` (code, column) of one pixel, of electron numbers from first to last.
 

@@ -490,12 +490,7 @@ def fill_masses(
 
 @kernel(borrows=True)
 def fill_far_enough(
-    theta: FloatArray,
-    cells: Cells,
-    what: int,
-    numbers: FloatArray,
-    edges: FloatArray,
-    room: FloatArray,
+    theta: FloatArray, cells: Cells, what: int, numbers: FloatArray, edges: FloatArray, room: FloatArray
 ) -> tuple[int, float]:
     """Fill mass and slopes of the cells, exact also where an occupied one lies far out.
 

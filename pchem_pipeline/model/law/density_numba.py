@@ -234,11 +234,7 @@ def _sums_kernel(width: int) -> Callable[..., Any]:
 
     @kernel(borrows=True)
     def sums_of(
-        bins: FloatArray,
-        comb: _Comb,
-        n_blocks: int,
-        rows: FloatArray,
-        coefficients: FloatArray,
+        bins: FloatArray, comb: _Comb, n_blocks: int, rows: FloatArray, coefficients: FloatArray
     ) -> None:
         terms = width if width > 0 else 2 * comb.half + 1
         a, half = comb.a, terms // 2

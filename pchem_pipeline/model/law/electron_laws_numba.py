@@ -98,11 +98,7 @@ def _one_law(law: int, dispersion: float, k: float, exposure: float) -> tuple[fl
 
 @kernel(borrows=True)
 def electron_number(
-    law: int,
-    dispersion: float,
-    k: int,
-    exposure: float,
-    mixtures: FloatArray,
+    law: int, dispersion: float, k: int, exposure: float, mixtures: FloatArray
 ) -> tuple[float, float, float]:
     """Return P(k) of a mixture of exposures and its first two derivatives in log exposure.
 

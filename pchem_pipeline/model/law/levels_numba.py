@@ -49,13 +49,7 @@ class Codes(NamedTuple):
 
 @kernel
 def place_codes(
-    index: int,
-    first: int,
-    n: int,
-    parts: int,
-    law: Law,
-    satellites: FloatArray,
-    pixel: Pixel,
+    index: int, first: int, n: int, parts: int, law: Law, satellites: FloatArray, pixel: Pixel
 ) -> tuple[Pixel, Codes]:
     """Fill what the law says of a pixel whose codes are ``(first + i) / parts`` DN; return both."""
     value = first / parts

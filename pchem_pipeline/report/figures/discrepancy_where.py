@@ -251,10 +251,7 @@ def _sensor_chart(
 
 
 def _map_stack(
-    each: PixelMap,
-    inside: BoolArray | None,
-    flagged: Sequence[tuple[int, int]],
-    origin: tuple[int, int],
+    each: PixelMap, inside: BoolArray | None, flagged: Sequence[tuple[int, int]], origin: tuple[int, int]
 ) -> Stack:
     limit = float(np.clip(np.quantile(np.abs(finite(each.z)), 0.995), _LEAST, _MOST))
     beyond: BoolArray = np.abs(np.nan_to_num(each.z)) > BEYOND_DOUBT

@@ -39,12 +39,7 @@ from pchem_pipeline.report.figures.figure import (
     place_of,
     sensor_stack,
 )
-from pchem_pipeline.report.style.ranges import (
-    finite,
-    histogram_edges,
-    map_colours,
-    robust_range,
-)
+from pchem_pipeline.report.style.ranges import finite, histogram_edges, map_colours, robust_range
 
 #: Bins of the histogram of a map at most; of a line of channels half as many.
 _MOST_BINS = 128

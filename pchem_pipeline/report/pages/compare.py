@@ -9,16 +9,7 @@ from typing import Any
 
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import MEASURED_MAPS
-from pchem_pipeline.base.wording import (
-    count,
-    cut,
-    heading,
-    measured,
-    percent,
-    scientific,
-    short,
-    symbol,
-)
+from pchem_pipeline.base.wording import count, cut, heading, measured, percent, scientific, short, symbol
 from pchem_pipeline.model.fit.status import words_of
 from pchem_pipeline.model.maps.defects import FAULTS
 from pchem_pipeline.report.comparison import Comparison, HistoryRow, Pair, Setting, by_change

@@ -126,11 +126,7 @@ def _fit_status(data: ReportData) -> dict[str, Any]:
         "n_failed": pixels.failed,
         "n_unfitted": int(data.unfitted.sum()),
         "reasons": {
-            bit.name.lower(): {
-                "pixels": found.get(bit, 0),
-                "meaning": MEANINGS[bit],
-                "failed": bit in FAILED,
-            }
+            bit.name.lower(): {"pixels": found.get(bit, 0), "meaning": MEANINGS[bit], "failed": bit in FAILED}
             for bit in FitStatus
             if bit.name and int(bit)
         },

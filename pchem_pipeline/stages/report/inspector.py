@@ -131,11 +131,7 @@ def inspector_data(
 
 
 def read_maps(
-    store: RunStore,
-    shape: tuple[int, int],
-    index: IntArray,
-    loaded: Arrays | None = None,
-    threads: int = 1,
+    store: RunStore, shape: tuple[int, int], index: IntArray, loaded: Arrays | None = None, threads: int = 1
 ) -> tuple[list[MapEntry], dict[str, FloatArray]]:
     """Read every stored map: packed, the important ones first, until the page is full; exact for some pixels.
 

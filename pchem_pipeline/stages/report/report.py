@@ -100,10 +100,7 @@ def _warnings(data: ReportData) -> list[str]:
 
 
 def gather(
-    store: RunStore,
-    config: RunConfig,
-    stages: Sequence[Mapping[str, Any]],
-    hand: Beside = functools.cache,
+    store: RunStore, config: RunConfig, stages: Sequence[Mapping[str, Any]], hand: Beside = functools.cache
 ) -> ReportData:
     """Read all that the report shows; ``hand`` takes what can be done meanwhile.
 

@@ -99,10 +99,7 @@ def test_several_files_and_large_counts(tmp_path):
         ("1,1e300\n2,1\n", "too large to be exact"),
         ("DN,count\n1," + "9" * 131_073, "no table of numbers"),
         ("DN,count\n1,1_0\n2,5", r"row 2 \(1,1_0\) is not 2 numbers"),
-        (
-            f"DN{',c' * 1000}\n0{',1' * 1000}\n16000000{',1' * 1000}",
-            "span more than 134217728 DN in total",
-        ),
+        (f"DN{',c' * 1000}\n0{',1' * 1000}\n16000000{',1' * 1000}", "span more than 134217728 DN in total"),
     ],
 )
 def test_refusals(tmp_path, text, words):

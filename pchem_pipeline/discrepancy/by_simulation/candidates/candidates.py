@@ -194,11 +194,7 @@ class ReplicateSimulator:
         return np.array([self._rows[self._replicate(effect, j).key] for j in range(repeats)])
 
     def refined(
-        self,
-        hypotheses: Sequence[Hypothesis],
-        shift: FloatArray,
-        noise: Noise,
-        told: Sequence[Effect] = (),
+        self, hypotheses: Sequence[Hypothesis], shift: FloatArray, noise: Noise, told: Sequence[Effect] = ()
     ) -> list[Hypothesis]:
         """Bring the strengths of the most promising hypotheses to what the data ask for, each by itself.
 

@@ -6,10 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import (
-    MOST_HYPOTHESES,
-    ReplicateSimulator,
-)
+from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import MOST_HYPOTHESES, ReplicateSimulator
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,

@@ -169,10 +169,7 @@ class _Laws:
 
 
 def measured_mixture_shifts(
-    frames: NDArray[np.unsignedinteger],
-    numbers: IntArray,
-    maps: PixelMaps,
-    effects: Sequence[Effect],
+    frames: NDArray[np.unsignedinteger], numbers: IntArray, maps: PixelMaps, effects: Sequence[Effect]
 ) -> Measurement | None:
     """Return the moves that samples of frames (t, y, x) need beside a model, given its maps; None: none."""
     found = (

@@ -21,13 +21,7 @@ from pchem_pipeline.discrepancy.observe.follows import SOURCES, FollowingSamples
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
 from pchem_pipeline.effects.framework.evidence import Evidence
 from pchem_pipeline.effects.framework.neighbours import neighbours
-from pchem_pipeline.effects.operators.couple import (
-    AXES,
-    Axis,
-    EmpiricalResponse,
-    ResponseTerm,
-    Source,
-)
+from pchem_pipeline.effects.operators.couple import AXES, Axis, EmpiricalResponse, ResponseTerm, Source
 from pchem_pipeline.model.arithmetic.significance import CLEAR, DECISIVE
 
 Mirrored = tuple[Axis, ...]

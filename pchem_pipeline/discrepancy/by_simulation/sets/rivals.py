@@ -13,10 +13,7 @@ import numpy as np
 from scipy import special
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
-from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
-    FAR,
-    Hypothesis,
-)
+from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import FAR, Hypothesis
 from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import HistogramLikelihood
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 from pchem_pipeline.discrepancy.by_simulation.sets.search import Search

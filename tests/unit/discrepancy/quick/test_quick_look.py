@@ -124,11 +124,7 @@ def test_hot_and_blinking_pixels_and_tracks_of_particles_are_no_noise_of_rows_or
 
 @pytest.mark.parametrize(
     ("name", "axes", "size"),
-    [
-        ("row_noise", (2,), SIGMA / 5),
-        ("column_noise", (1,), SIGMA / 4),
-        ("frame_noise", (1, 2), SIGMA / 10),
-    ],
+    [("row_noise", (2,), SIGMA / 5), ("column_noise", (1,), SIGMA / 4), ("frame_noise", (1, 2), SIGMA / 10)],
 )
 def test_what_pixels_share_is_found_alone_and_its_size_is_right(
     name: str, axes: tuple[int, ...], size: float

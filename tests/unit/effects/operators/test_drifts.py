@@ -6,12 +6,7 @@ from helpers.analog_signal import analog
 from helpers.small_sensors import context_of, exposures, offsets
 
 from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile
-from pchem_pipeline.effects.operators.drifts import (
-    BiasDrift,
-    ExposureDrift,
-    ExposureFlicker,
-    GainDrift,
-)
+from pchem_pipeline.effects.operators.drifts import BiasDrift, ExposureDrift, ExposureFlicker, GainDrift
 
 
 @pytest.mark.parametrize(
