@@ -23,7 +23,7 @@ from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import without_skew
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
-from pchem_pipeline.model.arithmetic.significance import CERTAIN, CLEAR, PRICE
+from pchem_pipeline.model.arithmetic.significance import CERTAIN, PRICE
 
 # statistics of neighbouring codes, and their period, DN
 _OF_CODES = {"code.alternating": 2, "code.period2": 2, "code.largest": 2, "code.rough": 3, "code.period4": 4}
@@ -378,18 +378,3 @@ def suspicious(null: NullModel, z: Measured) -> bool:
     p = null.p_values(z.both, 2)
     same = (z.train - null.mean) * (z.test - null.mean) > 0
     return bool(same.any()) and look_elsewhere(float(p[same].min()), null.effective_tests) < _SUSPICION
-
-
-def misfits(
-    null: NullModel, z: Measured, shift: FloatArray, significance: float, tolerance: FloatArray
-) -> bool:
-    """Test whether the statistics that an effect shifts most, (m,), still deviate with it in the model.
-
-    The other arguments are those of :func:`disagrees`.
-    """
-    signature = np.abs(shift) > CLEAR * null.std
-    if not signature.any():
-        return False
-    smallest = float(null.p_values(z.both, 2, tolerance)[signature].min())
-    tests = min(null.effective_tests, float(signature.sum()))
-    return look_elsewhere(smallest, tests) < significance

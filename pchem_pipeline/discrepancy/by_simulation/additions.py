@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -29,19 +28,17 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.simulations import Simulati
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import Refitted
 from pchem_pipeline.discrepancy.by_simulation.sets.rivals import Comparison, Contender
 from pchem_pipeline.discrepancy.gap import Gap
-from pchem_pipeline.discrepancy.null import NullModel, misfits
+from pchem_pipeline.discrepancy.null import NullModel
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.discrepancy.verdict import Candidate, Moved, Rival, sigma_text
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.registry import effect_classes
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, POSSIBLE
 
 _CLEAR_MARGIN = 50.0  # nats
 _OF_SIGNATURE = 0.1  # of what an effect does to all statistics, in a family where its signature stands
 _NEAR = 0.1  # relative: so little is not worth another simulation, but can be corrected without one
-_AS_GOOD = 0.5  # of what an effect closes, from which on another one does about as well
 
 
 @dataclass(frozen=True)
@@ -134,28 +131,11 @@ class Extension:
             elif rest is not None:
                 effect = self.added[member].effect
                 against = unexplained_of_its_kind(effect, parts[member], rest, self.accept.first)
-            against = against or self._against(int(member), still)
+            against = against or self.added[member].effect.stuck_words()
             later = parts[order[place + 1 :]].sum(axis=0)
             additions.append(self._addition(int(member), (gap, now), against, later))
             gap = now
-        additions = without_company(additions)
-        if still and len(additions) == 1:
-            additions = [without_better_reason(additions[0])]
-        return Added(tuple(additions), after, unfinished)
-
-    def _against(self, member: int, still: bool) -> str:
-        """Return in words why an effect is not in the data; empty: nothing.
-
-        A parameter at a limit was driven there by another effect. Where data and whole model disagree
-        (``still``) the effect must also account for all that it moves.
-        """
-        added, parts = self.added[member], self.parts
-        allowed = tolerance(parts, self.accept.allowed, self.accept.first.events)
-        significance = self.accept.settings.significance
-        wrong = still and misfits(self.last, self.accept.z, parts[member], significance, allowed)
-        return added.effect.stuck_words() or (
-            "it does not fit the statistics that it changes most" if wrong else ""
-        )
+        return Added(tuple(without_company(additions)), after, unfinished)
 
     def _addition(self, member: int, gaps: tuple[Gap, Gap], against: str, later: FloatArray) -> Addition:
         """Return an added effect; ``later`` is what those do that come after, shape (m,)."""
@@ -249,19 +229,6 @@ class _Other:
     rest: FloatArray
     closes: bool
     error: float | None = None
-
-
-def without_better_reason(addition: Addition) -> Addition:
-    """Take the name from the only effect found if an unrelated one with a name closes nearly as much."""
-    closed, effect, classes = addition.before.value - addition.after.value, addition.effect, effect_classes()
-    left = math.inf
-    for rival in addition.rivals:
-        other = classes[rival.effect]
-        if not (other.empirical or rival.effect in effect.separate or effect.tag in other.separate):
-            left = min(left, max(rival.gap_after, 0.0))
-    if addition.described or not addition.fits or addition.before.value - left <= _AS_GOOD * max(closed, 0.0):
-        return addition
-    return replace(addition, against="an unrelated effect explains nearly as much")
 
 
 def without_company(additions: Sequence[Addition]) -> list[Addition]:

@@ -11,7 +11,7 @@ from scipy import stats
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.discrepancy.build_verdict import Added, Addition, Findings, _sentence, _still
-from pchem_pipeline.discrepancy.by_simulation.additions import without_better_reason, without_company
+from pchem_pipeline.discrepancy.by_simulation.additions import without_company
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     Hypothesis,
     Noise,
@@ -27,7 +27,7 @@ from pchem_pipeline.discrepancy.gap import Gap, StatisticsGap
 from pchem_pipeline.discrepancy.null import Covariance, Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.splits import block_length, split_frames
-from pchem_pipeline.discrepancy.verdict import Candidate, Place, Rival
+from pchem_pipeline.discrepancy.verdict import Candidate, Place
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.region import Region
@@ -68,17 +68,6 @@ def test_beside_an_effect_that_moves_more_and_does_not_fit_there_is_no_name() ->
     assert without_company([mimic, measured])[1].verdict == "described"
     assert [each.verdict for each in without_company([measured, good])] == ["described", "unexplained"]
     assert without_company([good, measured]) == [good, measured]
-
-
-@pytest.mark.parametrize(("left", "fits"), [(0.9, True), (0.6, True), (0.4, False), (-0.1, False)])
-def test_what_something_unrelated_closes_nearly_as_well_gets_no_name(left: float, fits: bool) -> None:
-    related, rival = (Rival(effect=tag, gap_after=left) for tag in ("periodic_pickup", "adc_dnl"))
-    effect = _hypothesis("row_noise", np.zeros(1)).effect
-    one = _addition(effect, _gap_of(1.0), _gap_of(0.0), rivals=(related, rival))
-    assert without_better_reason(one).fits is fits
-    measured = Rival(effect="empirical_noise", gap_after=left)
-    for other in (replace(one, rivals=(related, measured)), replace(one, described=True)):
-        assert without_better_reason(other) == other
 
 
 def test_splits_share_no_frame_and_keep_blocks_whole_also_at_a_gap_in_the_numbering() -> None:
