@@ -533,12 +533,9 @@ class Verdict(_Part):
             cycles = step.parameters.get("cycles_per_row")
             if cycles is None:
                 return step
-            hertz = {
-                "value": abs(cycles.value) / line_time,
-                "stderr": cycles.stderr / line_time,
-                "unit": "Hz",
-            }
-            return step.model_copy(update={"parameters": {**step.parameters, "frequency": Measured(**hertz)}})
+            hertz, error = abs(cycles.value) / line_time, cycles.stderr / line_time
+            frequency = Measured(value=hertz, stderr=error, unit="Hz")
+            return step.model_copy(update={"parameters": {**step.parameters, "frequency": frequency}})
 
         return self.model_copy(update={"steps": tuple(map(timed, self.steps))})
 
