@@ -46,6 +46,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.refits import (
     tags_of,
 )
 from pchem_pipeline.discrepancy.effort import EffortSpentError
+from pchem_pipeline.discrepancy.observe.places import Part
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, DECISIVE
 
@@ -87,9 +88,9 @@ class Trial:
 
     def begins_with(self, other: Trial) -> bool:
         """Test whether another trial, an effect of this one alone, was to be simulated before this one."""
-        own = {h.tag for h in self.members}
+        own = {_kind_and_place(h) for h in self.members}
         new = self.way is None and other.way is None
-        return new and len(own) > 1 and len(other.members) == 1 and other.members[0].tag in own
+        return new and len(own) > 1 and len(other.members) == 1 and _kind_and_place(other.members[0]) in own
 
     @property
     def promise(self) -> float:
@@ -322,12 +323,17 @@ class Search:
         if len(members) == 1:
             return tuple(members)
         tags, common = {h.tag for h in members}, max(2, len(members) - 1)
-        own: dict[str, Hypothesis] = {}
+        own: dict[tuple[str, str], Hypothesis] = {}
         for one in sorted(self.tried, key=PENALISED, reverse=True):
             if one.tags < tags or (one.tags != tags and len(one.tags & tags) >= common):
-                own = {h.tag: h for h in one.hypotheses} | own
-        known = tuple(own.get(h.tag, h) for h in members)
+                own = {_kind_and_place(h): h for h in one.hypotheses} | own
+        known = tuple(own.get(_kind_and_place(h), h) for h in members)
         return tuple(members) if meets_itself(known) else known
+
+
+def _kind_and_place(one: Hypothesis) -> tuple[str, str]:
+    """Return the tag of an effect and where it acts: in another place it is another hypothesis."""
+    return one.tag, Part(one.effect.region, one.effect.when).text
 
 
 def _may_reach(trial: Trial, least: float) -> bool:

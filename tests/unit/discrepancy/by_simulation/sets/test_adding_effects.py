@@ -215,6 +215,12 @@ def test_a_set_begins_at_the_strengths_of_one_that_differs_in_one_effect() -> No
     assert found[1] is drift
     alone = world.refitter().refined([hypothesis("row_noise")])
     assert begun(members[:2], known, alone)[0].effect == alone.effects[0]
+    # in a part, the effect is another hypothesis, however well it does alone
+    here = Trial.of(world.refitter().refined([placed(hypothesis("row_noise"), "columns=0:8")]))
+    assert begun(members[:2], here.way.best)[0] is members[0]
+    whole = Trial(tuple(members[:2]), 0.0)
+    assert not whole.begins_with(Trial(here.members, 0.0))
+    assert whole.begins_with(Trial((members[0],), 0.0))
 
 
 def test_a_set_that_cannot_come_to_another_is_not_simulated_further() -> None:
