@@ -6,6 +6,7 @@ Picasso medians. Pyxel and getframes simulate the camera.
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from collections.abc import Callable
@@ -189,8 +190,9 @@ def _pyxel(found: Calibration, folder: Path) -> list[Path]:
     Pyxel has no maps of offset, read noise and dark current with its shot noise: these are medians.
     """
     path = folder / "pyxel" / "charge_to_volt.npy"
-    with whole_file(path) as part, part.open("wb") as stream:
-        np.save(stream, 1 / found.gain)
+    array = io.BytesIO()
+    np.save(array, 1 / found.gain)
+    write_atomic(path, array.getvalue())
     noise = _median(found.read_noise / found.gain)
     models: dict[str, dict[str, Any]] = {
         "photon_collection": {"illumination": {"level": 0.0}, "shot_noise": {}},
