@@ -91,6 +91,7 @@ def test_no_other_module_puts_files_in_their_place():
         "run/progress.py": 1,
         "base/kernel_cache.py": None,  # compiled kernels, which may be lost
         # into memory
+        "commands/adapters.py": 1,
         "stages/fit/fit.py": 1,
         "stages/simulate.py": 1,
         "commands/twin.py": 1,
