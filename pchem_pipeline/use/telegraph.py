@@ -45,7 +45,7 @@ class TelegraphJumps:
         known: KnownPixels,
         parts: int = 1,
     ) -> TelegraphJumps:
-        """Find the jumps at the codes of pixels; the arguments are those of `number_tables`."""
+        """Compute E[a | x] at the codes of the pixels with a trap; for the arguments see `number_tables`."""
         amplitude, weight = (np.asarray(each).ravel() for each in known.satellites or (np.zeros(1),) * 2)
         some = np.flatnonzero((amplitude > 0.0) & (weight > 0.0) & np.isfinite(known.exposure))
         known, amplitude, weight = known.of(some), amplitude[some], weight[some]
@@ -66,8 +66,8 @@ class TelegraphJumps:
         steps = np.array([step for step, _ in levels])
         mean = amplitude[pixel] * (steps @ masses) / np.where(total > 0.0, total, 1.0)
         # Var(a + n - E[a | x]) with Cov(n, E[a | x]) = sigma^2 E[d E[a | x] / dx], n Gaussian (Stein 1981)
-        apart = columns[pixel, 1] / parts
-        slope = np.where(np.diff(pixel, append=-1) == 0, np.diff(mean, append=0.0), 0.0) / apart
+        code_e = columns[pixel, 1] / parts
+        slope = np.where(np.diff(pixel, append=-1) == 0, np.diff(mean, append=0.0), 0.0) / code_e
         shares = np.array([share for _, share in levels])
         variance = shares.T @ steps**2 - (shares.T @ steps) ** 2
         read = (columns[:, 1] * nearest_pcd(known.parameters, known.law)[3]) ** 2
@@ -75,8 +75,8 @@ class TelegraphJumps:
         def expected(values: FloatArray) -> FloatArray:
             return np.bincount(pixel, total * values, some.size) / np.bincount(pixel, total, some.size)
 
-        told = expected(mean**2) - expected(mean) ** 2
-        left = read * (1.0 - 2.0 * expected(slope)) + amplitude**2 * variance - told
+        explained = expected(mean**2) - expected(mean) ** 2
+        left = read * (1.0 - 2.0 * expected(slope)) + amplitude**2 * variance - explained
         return cls(some, tables, mean.astype(np.float32), np.sqrt(np.maximum(left, 0.0)))
 
     def subtract(self, electrons: Float32Array, codes: NDArray[np.unsignedinteger[Any]], lift: int) -> None:

@@ -478,19 +478,31 @@ def test_row_noise_of_the_model_is_taken_from_the_frames(striped, shell):
     assert "row_offset" not in kept
 
 
+def fitted_run(folder, rng, camera, n, offset_of, effect):
+    """Fit n frames of 2 e- with an effect in the model; return the shell and what makes other frames."""
+
+    def write(name, n, exposure):
+        offset = offset_of(n)
+        electrons, dn = camera.frames(rng, exposure, n, offset)
+        tifffile.imwrite(folder / name, dn)
+        return electrons, offset
+
+    write("light.tif", n, 2.0)
+    (folder / "run.yaml").write_text(
+        "run: {store: run.zarr}\ninput: {files: [light.tif], bit_depth: 14}\n"
+        f"model: {{effects: [{effect}]}}\n"
+    )
+    shell = Shell(folder)
+    shell.ok("run", "run.yaml", "--until", "fit")
+    return shell, write
+
+
 def test_noise_along_the_readout_is_taken_from_the_frames_with_what_was_subtracted(tmp_path):
     rng = np.random.default_rng(64)
     camera = KnownCamera.drawn(rng, (12, 30), read_noise=(0.15, 0.2))
-    for name, n, exposure in (("dark.tif", 1500, 2.0), ("night.tif", 60, 0.7)):
-        offset = 3.0 * pink(rng, (12, 30), 1, n)
-        electrons, dn = camera.frames(rng, exposure, n, offset)
-        tifffile.imwrite(tmp_path / name, dn)
-    (tmp_path / "run.yaml").write_text(
-        "run: {store: run.zarr}\ninput: {files: [dark.tif], bit_depth: 14}\n"
-        "model: {effects: [{tag: read_order_noise, noise_dn: 3.0}]}\n"
-    )
-    shell = Shell(tmp_path)
-    shell.ok("run", "run.yaml", "--until", "fit")
+    effect = "{tag: read_order_noise, noise_dn: 3.0}"
+    shell, write = fitted_run(tmp_path, rng, camera, 1500, lambda n: 3.0 * pink(rng, (12, 30), 1, n), effect)
+    electrons, offset = write("night.tif", 60, 0.7)
     assert (
         "subtracted read_order_noise"
         in shell.ok("apply", "run.zarr", "night.tif", "--output", "o.zarr").stderr
@@ -506,16 +518,13 @@ def test_telegraph_jumps_are_taken_from_dark_frames_and_the_noise_left_is_as_sta
     rng = np.random.default_rng(65)
     camera = KnownCamera.drawn(rng, (12, 20), read_noise=(0.18, 0.22))
     trapped = rng.random(camera.bias.shape) < 0.3
-    for name, n, exposure in (("light.tif", 2500, 2.0), ("dark.tif", 200, 0.1)):
-        jump = trapped * rng.choice([-2.5, 0.0, 2.5], (n, *trapped.shape), p=[0.1, 0.8, 0.1])
-        electrons, dn = camera.frames(rng, exposure, n, jump / camera.gain)
-        tifffile.imwrite(tmp_path / name, dn)
-    (tmp_path / "run.yaml").write_text(
-        "run: {store: run.zarr}\ninput: {files: [light.tif], bit_depth: 14}\n"
-        "model: {effects: [{tag: rts_noise, fraction: 0.3, amplitude_e: 2.5}]}\n"
-    )
-    shell = Shell(tmp_path)
-    shell.ok("run", "run.yaml", "--until", "fit")
+
+    def jumps(n):
+        return trapped * rng.choice([-2.5, 0.0, 2.5], (n, *trapped.shape), p=[0.1, 0.8, 0.1]) / camera.gain
+
+    effect = "{tag: rts_noise, fraction: 0.3, amplitude_e: 2.5}"
+    shell, write = fitted_run(tmp_path, rng, camera, 2500, jumps, effect)
+    electrons, _ = write("dark.tif", 200, 0.1)
     said = shell.ok("apply", "run.zarr", "dark.tif", "--output", "o.zarr", "--what", "electrons").stderr
     assert "telegraph jumps subtracted in" in said
     shell.ok("apply", "run.zarr", "dark.tif", "--output", "k.zarr", "--reference", "none")

@@ -330,11 +330,9 @@ def _write(context: StageContext, found: Discrepancy, limits: Sequence[Effect]) 
     for name, array in arrays.items():
         context.store.write_array(f"{_STAGE}/{name}", array)
     kept = tuple(each.model_dump(mode="json") for each in found.model if each not in limits)
-    verdict, line_time = (
-        found.verdict.model_copy(update={"model_effects": kept}),
-        context.config.input.line_time,
-    )
-    verdict = verdict if line_time is None else verdict.in_hertz(line_time)
+    verdict = found.verdict.model_copy(update={"model_effects": kept})
+    if (line_time := context.config.input.line_time) is not None:
+        verdict = verdict.in_hertz(line_time)
     context.store.write_file(VERDICT_FILE, verdict.to_json().encode())
     for tag, reason in found.verdict.defects.items():
         context.note(f"effect {tag} failed and was not compared: {reason}")

@@ -246,11 +246,11 @@ class Search:
         return one.tags not in self._tuned and may_be_tuned(self.refitter, one)
 
     def at_maximum(self, one: Refitted) -> Refitted:
-        """Return a set with its parameters tuned, after those that could stand in its place were."""
-        near = one.penalised_log_likelihood - DECISIVE
-        for other in [each for each in self.ranked if len(each.tags - one.tags) == 1 or each is one]:
-            alike = len(other.tags) == len(one.tags) and other.penalised_log_likelihood >= near
-            if alike and other.tags not in self._tuned:
+        """Tune the parameters of a set, and of those that may be in its place as well; return it tuned."""
+        for other in self.ranked:
+            swapped = len(other.tags - one.tags) == len(one.tags - other.tags) == 1
+            near = one.penalised_log_likelihood - other.penalised_log_likelihood <= DECISIVE
+            if other.tags not in self._tuned and (other is one or (swapped and near)):
                 self._tune(other)
         return max((each for each in self.ranked if each.tags == one.tags), key=PENALISED)
 
