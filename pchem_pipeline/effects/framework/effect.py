@@ -255,7 +255,7 @@ class Effect(Section):
 
     @property
     def measured_parts(self) -> int:
-        """How many things it describes that were measured and have no explanation."""
+        """How many forms it has that were measured and have no explanation."""
         return int(type(self).empirical)
 
     def at_place(self, region: Region | None, when: When | None = None) -> Self:

@@ -183,6 +183,11 @@ class AdcInl(Effect, tag="adc_inl"):
             )
         return self
 
+    @property
+    def measured_parts(self) -> int:
+        """One where the form of the deviation was measured, too."""
+        return int(self.form == "curve")
+
     def _steepest(self) -> float:
         """Return the steepest fall of the form, per DN."""
         if self.form == "sine":

@@ -297,7 +297,9 @@ class Search:
         if named and price(trial.effects) > best.price:
             return False
         if trial.way is None:
-            if named and self._is_blind(trial.members, best):
+            # a form that was measured may stand for an effect whose fingerprint misses details
+            measured = any(effect.measured_parts for effect in best.effects)
+            if named and not measured and self._is_blind(trial.members, best):
                 return False
             share = _FAR_SHARE if named and len(trial.members) >= len(best.hypotheses) else FAR_SHARE_OF_PART
             return trial.promise + FAR + share * explained >= best.penalised_log_likelihood

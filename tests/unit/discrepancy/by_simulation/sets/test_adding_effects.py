@@ -34,6 +34,7 @@ from pchem_pipeline.discrepancy.skeleton import Prepared
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.framework.registry import effect_class
+from pchem_pipeline.effects.operators.curve import AdcInl
 from pchem_pipeline.effects.operators.empirical_noise import EmpiricalNoise, NoiseMode
 
 STRENGTHS = {
@@ -390,15 +391,19 @@ def test_what_is_measured_competes_with_several_effects_at_its_price(left: float
         assert found.chosen.tags == set(some)
 
 
-def test_a_description_that_leaves_nothing_keeps_no_named_effect_from_its_refit() -> None:
+def test_a_measured_form_that_leaves_nothing_keeps_no_named_effect_from_its_refit() -> None:
     """Noise in a few rows was not refitted, since a description of two parts had left nothing before."""
     refitter = world_of(row_noise=0.3, frame_noise=0.05).refitter()
     named = refitter.refined([hypothesis("row_noise", 0.3), hypothesis("frame_noise", 0.05)])
     noise = EmpiricalNoise(noise_dn=1.0, modes=(NoiseMode(of="row", share=1.0),))
     described = replace(named, hypotheses=(Hypothesis(noise, named.parts.sum(axis=0)),))
+    # INL through measured knots had taken the place of noise that grows with the charge
+    inl = AdcInl(inl_lsb=0.1, form="curve", curve=(0.0, 1.0, 0.0, -1.0))
+    curve = replace(named, hypotheses=(Hypothesis(inl, named.parts.sum(axis=0)),))
+    assert described.price == curve.price == named.price == PRICE_OF_MORE
     # as near as row noise by its fingerprint, which leaves what frame noise does
     other = replace(hypothesis("row_noise", 0.3), effect=effect("exposure_drift", 0.3))
-    for first, refits in ((described, 1), (named, 0)):
+    for first, refits in ((described, 1), (curve, 1), (named, 0)):
         search = Search(refitter, HistogramLikelihood(), [Trial.of(first)])
         assert search.complete
         search.compare([[other]])
