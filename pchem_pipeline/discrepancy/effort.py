@@ -9,9 +9,9 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-# CPU seconds on a core of about 2020: of a simulated sample with all that is looked at, of the fit of a
-# pixel, and of the mass of a code under one component
-_SAMPLE, _FIT, _MASS = 2.5e-7, 4.0e-5, 1.0e-7
+# CPU seconds on a core of about 2020: of a simulated sample with all that is looked at, of a code in an
+# evaluation of the likelihood by a plain fit, and of the mass of a code under one component
+_SAMPLE, _CODE, _MASS = 2.5e-7, 1.5e-8, 1.0e-7
 # of the fit of a pixel with effects, by components of the law, and the same by evaluations of its likelihood
 _REFIT, _REFIT_BY = 3.5e-5, 6.0e-7
 # of what is learnt of the sensor from a pixel, and the same by components
@@ -82,9 +82,9 @@ class Effort:
         """Let what was kept for the choice among the sets be spent, all of it."""
         self.most, self.for_choice = max(self.most, self.spent) + self.for_choice, 0.0
 
-    def simulate(self, samples: int, pixels: int, fits: int) -> None:
-        """Count a simulated stack, whose pixels are fitted so many times."""
-        self.spent += _SAMPLE * samples + _FIT * self._difficulty * pixels * fits
+    def simulate(self, samples: int, evaluated: float) -> None:
+        """Count a simulated stack whose plain fits evaluated so many codes, see `Evidence.evaluated`."""
+        self.spent += _SAMPLE * samples + _CODE * evaluated
 
     def refit(self, pixels: int, components: int, evaluations: float, tags: Iterable[str]) -> None:
         """Count a fit of pixels with effects, ``evaluations`` of the likelihood of each on average."""

@@ -108,7 +108,9 @@ class ObservedHistograms:
     def statistics(self, counts: IntArray, bare: SetComparison) -> Mapping[str, float]:
         """Return the statistics of histograms of the rows, fitted with the PCD alone, as ``bare`` does."""
         parameters = replace(bare, train=counts).plain.fit.parameters if self.joint else None
-        return _observe(counts, self.origin, self.layout, parameters).z
+        found = _observe(counts, self.origin, self.layout, parameters)
+        bare.effort.simulate(0, found.evaluated)
+        return found.z
 
     def drawn(
         self, log_masses: FloatArray, bare: SetComparison, count: int, rng: np.random.Generator
@@ -118,7 +120,6 @@ class ObservedHistograms:
         mass /= mass.sum(axis=1, keepdims=True)
         total = self.parts[0].sum(axis=1)
         bare.effort.replicates += count
-        bare.effort.simulate(0, total.size, count)
         return [self.statistics(rng.multinomial(total, mass), bare) for _ in range(count)]
 
     def maps(self, parameters: FloatArray) -> PixelMaps:

@@ -197,6 +197,7 @@ def _compared(
         tail_expected=np.stack([mapped(low[:, 1]), mapped(high[:, 1])]),
         covariance=None if fit is None else fit.covariance.reshape(*shape, 4, 4),
         ambiguous=float(ambiguous),
+        evaluated=_evaluated(seen, fit),
     )
     return evidence, laws
 
@@ -237,10 +238,18 @@ def _inside(seen: PixelHistograms) -> BoolArray:
     return np.asarray(seen.outside.sum(axis=1) <= MOST_OUTSIDE * seen.counts.sum(axis=1))
 
 
-def fitted_maps(frames: CodeArray, exclude: BoolArray) -> PixelMaps:
-    """Return the plain fit of frames, from nothing, as :func:`observe` makes it, of pixels not excluded."""
-    _, parameters, usable = _fitted(PixelHistograms.of(frames), ~exclude.ravel())
-    return PixelMaps.known(parameters.T, usable.reshape(exclude.shape))
+def fitted_maps(frames: CodeArray, exclude: BoolArray) -> tuple[PixelMaps, float]:
+    """Return the plain fit of frames, from nothing, as :func:`observe` makes it, of pixels not excluded.
+
+    With it the codes that it evaluated, see `Evidence.evaluated`.
+    """
+    seen = PixelHistograms.of(frames)
+    fit, parameters, usable = _fitted(seen, ~exclude.ravel())
+    return PixelMaps.known(parameters.T, usable.reshape(exclude.shape)), _evaluated(seen, fit)
+
+
+def _evaluated(seen: PixelHistograms, fit: FitResult | None) -> float:
+    return 0.0 if fit is None else float(fit.n_iterations @ np.count_nonzero(seen.counts, axis=1))
 
 
 def _clusters(hits: IntArray, laws: PixelLaws, shape: tuple[int, ...]) -> float:

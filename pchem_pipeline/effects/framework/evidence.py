@@ -240,6 +240,7 @@ class Evidence:
         ambiguous: share of the usable pixels whose bias may be off by an electron.
         tail_expected: samples of each pixel expected below and above the support, shape (2, y, x); None: not
             known.
+        evaluated: evaluations of the likelihood of a pixel by the fit times its codes, of all pixels.
     """
 
     maps: PixelMaps
@@ -257,6 +258,7 @@ class Evidence:
     covariance: FloatArray | None = None
     ambiguous: float = 0.0
     tail_expected: Float32Array | None = None
+    evaluated: float = 0.0
 
     def strongest(self, *names: str) -> float:
         """Return the largest |z| among the named statistics (0 where these data give none of them)."""

@@ -10,6 +10,7 @@ from helpers.small_sensors import seen as seen_in
 
 from pchem_pipeline.discrepancy.by_simulation.sensor.maps import NotFittedError, refit_maps
 from pchem_pipeline.discrepancy.effort import Effort, EffortSpentError
+from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.framework.compose import PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.operators.couple import InterpixelCapacitance
@@ -21,7 +22,7 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 def test_work_is_counted_and_refused_once_the_limit_is_reached():
     effort = Effort(1.0)
-    effort.simulate(10**9, 10**4, 3)
+    effort.simulate(10**9, 1e8)
     effort.check("nothing")  # before the null distribution is there, there is no limit
     effort.begin()
     null = effort.spent
@@ -96,7 +97,7 @@ def test_work_costs_what_makes_it_long():
     # a sensor that is learnt, from so many pixels at most
     assert spent(lambda e: e.learn(1000, 15)) == spent(lambda e: e.learn(10**6, 15)) > 1.0
     # pixels that are not identified
-    usual, poor = (spent(lambda e: e.simulate(0, 10**6, 3), share) for share in (0.0, 0.9))
+    usual, poor = (spent(lambda e: e.refit(10**6, 1, 8.0, []), share) for share in (0.0, 0.9))
     assert 4.0 * usual < poor < 6.0 * usual
     assert 1.0 < spent(lambda e: e.ask(10**6)) < 5.0
 
@@ -125,3 +126,13 @@ def test_a_law_that_fits_hardly_a_pixel_is_given_up_after_some_and_one_of_too_ma
     wave = PeriodicPickup(amplitude_dn=1.0, cycles_per_row=0.36)
     with pytest.raises(NotFittedError, match="would have 80"):
         refit_maps(frames, seen.maps, [NoiseSkew(share=0.83), wave], seen.covariance)
+
+
+def test_a_simulated_stack_costs_what_its_fits_evaluate():
+    """Plain fits of what they cannot explain take many times as long, and counted as little."""
+    camera = PlainCamera(0.2, 1.5, 10.0, (16, 16), 1000)
+    frames, numbers = camera.frames(1), np.arange(1000)
+    wide = frames + np.random.default_rng(2).integers(0, 200, frames.shape).astype(frames.dtype)
+    usual, poor = (observe(each, numbers, n_run=1000, block_frames=100).evaluated for each in (frames, wide))
+    assert poor > 5.0 * usual > 0.0
+    assert spent(lambda e: e.simulate(0, poor)) > 5.0 * spent(lambda e: e.simulate(0, usual))

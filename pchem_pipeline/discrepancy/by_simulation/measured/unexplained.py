@@ -204,5 +204,6 @@ class Unexplained:
         drawn = self.work.mapped(model).sensor.usual(seed)
         taken = replace(self.work.frames.acquisition(), numbers=self.work.frames.seen_numbers)
         frames = simulate_frames(drawn, model, seed, taken)
-        self.work.effort.simulate(frames.size, drawn.usable.size, 1)
-        return frames, fitted_maps(frames, ~drawn.usable)
+        maps, evaluated = fitted_maps(frames, ~drawn.usable)
+        self.work.effort.simulate(frames.size, evaluated)
+        return frames, maps

@@ -20,11 +20,13 @@ from pchem_pipeline.simulate.truth import TruthMaps
 
 #: Begins the names of the statistics of a replicate's second part.
 OF_OTHER = "other:"
+#: With them, the codes that its fits evaluated, see `Evidence.evaluated`.
+EVALUATED = "evaluated"
 
 
 def by_part(found: Mapping[str, float]) -> tuple[dict[str, float], ...]:
     """Return the statistics of a replicate's first part, and of its second one if it has one."""
-    first = {name: value for name, value in found.items() if not name.startswith(OF_OTHER)}
+    first = {name: value for name, value in found.items() if not name.startswith((OF_OTHER, EVALUATED))}
     second = {name.removeprefix(OF_OTHER): v for name, v in found.items() if name.startswith(OF_OTHER)}
     return (first, second) if second else (first,)
 
@@ -108,37 +110,39 @@ class Replicate:
         """Bytes that it takes, about: for each sample, and for the histogram and the law of each pixel."""
         return 8 * self.samples + (self.maps.usable.size << 13)
 
-    @property
-    def fits(self) -> int:
-        """How often its pixels are fitted."""
-        return 1 if self.acquisition.other is None else 3
-
     def simulated(self) -> NDArray[np.unsignedinteger]:
         """Return the frames of the first part, (frame, y, x), DN."""
         return simulate_frames(self.maps, self.effects, self.seed, self.acquisition)
 
     def fitted(self) -> PixelMaps:
         """Simulate, and fit the frames of the first part, from nothing, without any effect."""
-        return fitted_maps(self.simulated(), ~self.maps.usable)
+        return fitted_maps(self.simulated(), ~self.maps.usable)[0]
 
     def observed(self) -> Iterator[tuple[NDArray[np.unsignedinteger], IntArray, Evidence]]:
-        """Simulate; yield the frames of each part, their numbers and their evidence."""
+        """Simulate; yield the frames of each part, their numbers and their evidence.
+
+        That of the first part has evaluated the codes of the fit from nothing, too.
+        """
         taken = self.acquisition
         parts = (taken.numbers,) if taken.other is None else (taken.numbers, taken.other)
         seen = taken.numbers if taken.other is None else np.union1d(taken.numbers, taken.other)
         frames = simulate_frames(self.maps, self.effects, self.seed, replace(taken, numbers=seen))
-        start = self.maps if taken.other is None else fitted_maps(frames, ~self.maps.usable)
+        start, evaluated = self.maps, 0.0
+        if taken.other is not None:
+            start, evaluated = fitted_maps(frames, ~self.maps.usable)
         for numbers in parts:
             some = frames[np.isin(seen, numbers)]
-            yield some, numbers, taken.observe(some, numbers, start)
+            found = taken.observe(some, numbers, start)
+            yield some, numbers, replace(found, evaluated=found.evaluated + evaluated)
+            evaluated = 0.0
 
     def __call__(self) -> dict[str, float]:
         """Simulate, observe, and return the statistics by name, those of the second part behind a mark."""
-        return {
-            mark + name: float(value)
-            for mark, seen in zip(("", OF_OTHER), self.observed(), strict=False)
-            for name, value in self.acquisition.statistics(*seen).items()
-        }
+        found = {EVALUATED: 0.0}
+        for mark, seen in zip(("", OF_OTHER), self.observed(), strict=False):
+            found |= {mark + name: float(z) for name, z in self.acquisition.statistics(*seen).items()}
+            found[EVALUATED] += seen[2].evaluated
+        return found
 
 
 def simulate_frames(

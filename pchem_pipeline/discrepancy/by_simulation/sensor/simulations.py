@@ -26,7 +26,7 @@ from pchem_pipeline.discrepancy.by_simulation.sensor.maps import (
     refit_maps,
 )
 from pchem_pipeline.discrepancy.by_simulation.sensor.population import MANY_MISTAKEN
-from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import Replicate, by_part
+from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import EVALUATED, Replicate, by_part
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.observe.misplaced import own_lines
 from pchem_pipeline.effects.framework.compose import added_exposures
@@ -169,7 +169,7 @@ class Simulations:
         taken = replace(self.frames.acquisition(), numbers=self.frames.seen_numbers)
         one = Replicate(purpose, sensor.draw(seed), model, seed, taken)
         self.effort.replicates += 1
-        self.effort.simulate(one.samples, one.maps.usable.size, one.fits)
+        self.effort.simulate(one.samples, self.plain.evaluated)
         return one
 
     def replicates(
@@ -197,9 +197,10 @@ class Simulations:
     def counted(self, replicates: Sequence[Replicate]) -> list[Mapping[str, float] | Exception]:
         """Return the statistics of replicates, or what they raised; count the work."""
         self.effort.replicates += len(replicates)
-        for each in replicates:
-            self.effort.simulate(each.samples, each.maps.usable.size, each.fits)
-        return self.mapper(replicates)
+        found = self.mapper(replicates)
+        for each, result in zip(replicates, found, strict=True):
+            self.effort.simulate(each.samples, 0.0 if isinstance(result, Exception) else result[EVALUATED])
+        return found
 
     def seed_of(self, purpose: str, index: int = 0) -> int:
         """Return the root of the random numbers for a purpose."""

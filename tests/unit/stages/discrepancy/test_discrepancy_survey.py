@@ -31,7 +31,7 @@ class Store:
 
     def __init__(self, values):
         histograms = histogram_frames(values)
-        maps = fitted_maps(values, np.zeros(values.shape[1:], bool))
+        maps, _ = fitted_maps(values, np.zeros(values.shape[1:], bool))
         names = ("counts", "origin", "under", "over", "minimum", "maximum")
         self.arrays = {f"histogram/{name}": getattr(histograms, name) for name in names}
         for name in ("quanta_exposure", "conversion_gain", "bias", "read_noise_dn"):

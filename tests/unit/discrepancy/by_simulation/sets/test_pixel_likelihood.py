@@ -127,7 +127,7 @@ def test_a_strong_effect_for_which_no_estimator_speaks_is_found_where_a_plain_fi
     clean = np.where(strong, np.roll(frames, 7, axis=1), frames)  # rows of the rest
     kinds = {"signal_dependent_noise": GROWING, "noise_skew": SKEW}
     found, nothing = (
-        Histograms(each, fitted_maps(each, np.zeros((SIDE, SIDE), np.bool_)), (), Effort(None), samples_of)
+        Histograms(each, fitted_maps(each, np.zeros((SIDE, SIDE), np.bool_))[0], (), Effort(None), samples_of)
         .suggested(kinds, [Part(there)], ())
         for each in (frames, clean)
     )  # fmt: skip
@@ -150,7 +150,7 @@ def test_a_strength_is_told_though_the_plain_fit_has_the_bias_off_by_an_electron
 def test_rare_and_wide_tails_are_told_though_they_led_plain_fits_astray() -> None:
     """A fit that must count a sample far below all others lowers the bias for it, at times by electrons."""
     frames = frames_of(mixture(np.random.default_rng(21), 0.003, 8.0)[:1500], 22, exposure=3.5)
-    maps = fitted_maps(frames, np.zeros((SIDE, SIDE), np.bool_))
+    maps, _ = fitted_maps(frames, np.zeros((SIDE, SIDE), np.bool_))
     mistaken = np.abs(maps.quanta_exposure - 3.5)[maps.usable] > 0.5
     assert np.mean(mistaken) > 0.02
     likelihood = PixelLikelihood(frames, maps, (), Effort(None))
