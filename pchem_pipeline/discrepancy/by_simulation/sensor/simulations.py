@@ -199,7 +199,9 @@ class Simulations:
         self.effort.replicates += len(replicates)
         found = self.mapper(replicates)
         for each, result in zip(replicates, found, strict=True):
-            self.effort.simulate(each.samples, 0.0 if isinstance(result, Exception) else result[EVALUATED])
+            self.effort.simulate(
+                each.samples, 0.0 if isinstance(result, Exception) else result.get(EVALUATED, 0.0)
+            )
         return found
 
     def seed_of(self, purpose: str, index: int = 0) -> int:
