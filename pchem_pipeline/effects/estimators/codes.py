@@ -119,9 +119,7 @@ _PIXELS = 256  # that stand for all: their windows of codes overlap many times
 _PERIODS = 48  # sines that are tried, twice as many as are independent
 _MOST_CODES = 1500  # memory: a square of so many numbers
 _SHORTEST = 8.0  # DN; what changes faster is new from code to code
-# places of a break that are tried, and the share of the samples on either side that it needs
-_LEVELS = 80
-_END = 0.002
+_END = 0.002  # share of the samples on either side that a break needs
 # fall of chi2 by two coefficients at one of some 20 independent periods: p about 0.02
 _LEAST_BEND_GAIN = 14.0
 # knots of a curve, and the fall of chi2 that each further one must bring
@@ -188,7 +186,8 @@ class CurveResponse:
 
     def fits(self, deviations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return by how much pairs of deviations (kinds, 2, codes + 1) lower chi2, and their factors."""
-        designs = [self.response @ pair.T for pair in deviations]
+        kinds, _, edges = deviations.shape
+        designs = (self.response @ deviations.reshape(-1, edges).T).reshape(-1, kinds, 2).swapaxes(0, 1)
         factors = [np.linalg.lstsq(design, self.residuals, rcond=None)[0] for design in designs]
         left = [self.residuals - design @ each for design, each in zip(designs, factors, strict=True)]
         total = float((self.residuals**2).sum())
@@ -274,7 +273,7 @@ def best_stitch(evidence: Evidence) -> list[Stitch]:
     share = np.cumsum(curve.expected) / curve.expected.sum()
     inside = np.flatnonzero((share > _END) & (share < 1.0 - _END))
     # between two edges: which of them a step moves would otherwise depend on its sign
-    levels = curve.edges[inside[:: max(1, inside.size // _LEVELS)]] - 0.5
+    levels = curve.edges[inside] - 0.5
     if not levels.size:
         return []
     beyond = curve.edges - levels[:, None]

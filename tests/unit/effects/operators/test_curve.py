@@ -106,7 +106,8 @@ def test_above_the_level_the_scale_has_another_slope():
     np.testing.assert_allclose(step, np.where(values > 120, 100 + 0.9 * (values - 100), values))
 
 
-@pytest.mark.parametrize("seed", [180100, 180101, 180103])  # a kink, a step down, a step up
+# a kink, a step down, a step up, and a step down at one code of 215
+@pytest.mark.parametrize("seed", [180100, 180101, 180103, 180439])
 def test_an_independent_camera_s_stitch_is_found(seed):
     hiding = hide(("gain_stitch",), 5.0, seed, (24, 24), 1500)
     (hidden,) = hiding.effects
