@@ -16,25 +16,22 @@ import tempfile
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.commands.in_memory import stack_of, write_stack
 from pchem_pipeline.commands.new_run import settings_of, settings_there
-from pchem_pipeline.commands.notebook import open_run, require_xarray
+from pchem_pipeline.commands.notebook import Run, open_run, require_xarray
 from pchem_pipeline.config.load import dump_config, make_config, write_config
 from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.run.progress import ProgressMode
 from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import run_stages, up_to
 from pchem_pipeline.stages.table import pipeline_of
-
-if TYPE_CHECKING:
-    from pchem_pipeline.commands.notebook import Run
-    from pchem_pipeline.model.fit.result import FitResult
-    from pchem_pipeline.run.progress import ProgressMode
 
 
 def characterise(

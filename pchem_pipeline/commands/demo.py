@@ -7,7 +7,6 @@ discrepancy has to find it.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,18 +17,15 @@ from pchem_pipeline.config.load import dump_config, write_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.verdict import read_verdict
 from pchem_pipeline.effects.framework.compose import effect_words
+from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import GRAMMAR, parse_place
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.run.stage import Command
-from pchem_pipeline.run.target import find_run
+from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import run_stages
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.run.target import Target
 
 
 def run_demo(

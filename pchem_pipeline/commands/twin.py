@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,17 +11,15 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.apply.characterisation import check_run, read_calibration
 from pchem_pipeline.config.load import make_config, write_config, yaml_text
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.formats.map_files import read_image, write_npz
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.target import Target
 from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.twin import Twin, extrapolated, redrawn, twin_maps
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.run.target import Target
 
 
 def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int] | None = None) -> Twin:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from scipy.special import erfc
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.base.variables import MEASURED_MAPS, VARIABLES
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
 from pchem_pipeline.model.fit.status import FitStatus, words_of
@@ -32,9 +33,6 @@ from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.store.files import read_json, write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
 
 HISTORY = "history.csv"
 

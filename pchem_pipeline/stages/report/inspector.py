@@ -13,7 +13,7 @@ from collections import ChainMap
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +35,7 @@ from pchem_pipeline.report.inspector import (
     some_of,
 )
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
-
-if TYPE_CHECKING:
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 #: Bytes of base64 for the maps of a sensor of 512 x 512 pixels; larger ones get more, by the power 0.9, and
 #: at most so many: what does not fit is shown by ``pchem view`` and, of all pixels, in the figures.
