@@ -25,9 +25,8 @@ from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.runner.session import run_stages, run_status, working_run
 from pchem_pipeline.stages.fit.fit import keep_fit
-from pchem_pipeline.stages.histogram.arrays import extend_arrays
+from pchem_pipeline.stages.histogram.arrays import extend_arrays, single_pass_bytes
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.histogram.single_pass import PREPARED, hashed_frames, prepared
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import remove_files, write_record

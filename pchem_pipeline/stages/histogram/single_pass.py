@@ -35,9 +35,8 @@ from pchem_pipeline.run.progress import whole_mebibytes
 from pchem_pipeline.run.stage import Prepared, StageContext, allowed_bytes
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.bands import cut_rows
-from pchem_pipeline.stages.histogram.arrays import create_arrays
+from pchem_pipeline.stages.histogram.arrays import create_arrays, single_pass_bytes
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.tiles import tile_shape
 
