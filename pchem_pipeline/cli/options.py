@@ -107,11 +107,10 @@ _INPUT: tuple[tuple[str, Any, str], ...] = (
 def takes_command(
     *, without: tuple[str, ...] = (), reads_files: bool = False
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorate a command of a run: it takes the common options too, as one argument ``command``.
+    """Decorate a command of a run: it takes the common options, too, as one argument ``command``.
 
-    Args:
-        without: names of common options that the command does not have, or words differently.
-        reads_files: it takes the options of camera files too, as one argument ``given``.
+    Common options ``without`` which it goes, or which it words differently, are left out. A command that
+    ``reads_files`` also takes the options of camera files, as one argument ``given``.
     """
     common = [each for each in _COMMON if each[0] not in without]
     of_input = [

@@ -28,19 +28,11 @@ def make_plan(
     max_frames: float = 1e7,
     json: Path | None = None,
 ) -> str:
-    """Return the plan in words; write its JSON where asked. None: nothing was said.
+    """Return the plan in words, and write its numbers to the file ``json`` if one is given.
 
-    Args:
-        run: a run whose median pixel is planned for where numbers are not given.
-        read_noise: s_e, e-, quantisation included.
-        exposure: H, e-.
-        gain: g, e-/DN.
-        target: precisions as ``name=value``.
-        frames: frames there are.
-        samples: exposures separated by commas, or ``best``.
-        max_exposure: largest exposure to choose, e-.
-        max_frames: more are as good as never.
-        json: file for the numbers.
+    Read noise (quantisation included) and exposures are in e-, the gain in e-/DN; those not given are of the
+    median pixel of ``run``. Targets are precisions ``name=value``; ``frames`` are those available,
+    ``samples`` exposures separated by commas, or ``best``.
 
     Raises:
         ConfigError: a number is missing or wrong, or no number of frames reaches a target.

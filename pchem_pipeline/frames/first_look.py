@@ -102,10 +102,8 @@ def _unused_bits(values: NDArray[Any]) -> int:
 def limits_seen(first: int, samples: NDArray[Any], pixels: tuple[int, int]) -> tuple[int | None, int | None]:
     """Return the lowest and highest code if samples of several pixels pile up there, else None.
 
-    Args:
-        first: the lowest code, DN.
-        samples: number of each code from the lowest to the highest.
-        pixels: number with samples of the lowest, and of the highest code.
+    ``samples`` are the numbers of each code from the ``first`` to the highest, ``pixels`` those of pixels
+    with samples of the lowest and of the highest code.
     """
     last, few = first + samples.size - 1, _FEWEST + 1
     found: list[int | None] = []

@@ -275,13 +275,9 @@ class StageContext:
     ) -> None:
         """Make arrays of this stage with their declared dimensions, unless the stage resumes and has them.
 
-        Args:
-            names: of the arrays, with their groups.
-            lengths: of dimensions; of y and x the sensor's, chunks a tile, where these are not given.
-            chunks: length of a chunk along dimensions; the whole where none is given.
-            shards: see :meth:`RunStore.create_array`.
-            dtype: only for variables whose type the data decide.
-            attributes: further attributes.
+        Lengths are those of dimensions, of y and x the sensor's where they are not given; chunks are a tile
+        along y and x, the whole along others that are not given. For the rest see
+        :meth:`RunStore.create_array`.
         """
         self.begin()
         sizes, parts = {**LENGTHS, **(lengths or {})}, dict(chunks or {})

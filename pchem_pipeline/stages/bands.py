@@ -45,14 +45,9 @@ def plan_bands(
 ) -> list[Band]:
     """Cut the sensor into bands: as high as allowed where there is work, and one for each worker at least.
 
-    No tile and no group of rows is cut.
-
-    Args:
-        tiles: all tiles.
-        pending: keys of the tiles that are to be done.
-        most_rows: rows that fit into the memory of a worker; less than one step is taken as one.
-        workers: number of workers.
-        rows_per_read: rows that come at no more cost than one; bands keep to multiples where they can.
+    No tile and no group of rows is cut. ``pending`` are the keys of the tiles that are to be done,
+    ``most_rows`` fit into the memory of a worker; less than one step is taken as one. ``rows_per_read`` come
+    at no more cost than one; bands keep to multiples where they can.
     """
     ny = tiles[-1].y1
     step = max(tiles[0].y1, ROW_GROUP)
@@ -95,12 +90,8 @@ def cut_rows(ny: int, step: int, workers: int) -> list[tuple[int, int]]:
 def tile_bands(context: StageContext, most_rows: int, rows_per_read: int) -> list[Band | Tile]:
     """Return the units of a stage that reads the frames of fitted pixels again by bands.
 
-    They are bands of the tiles to be done, and each tile that is done, or that is not fitted.
-
-    Args:
-        context: of the stage.
-        most_rows: rows that a worker can hold; one row of tiles is the least.
-        rows_per_read: rows that come at no more cost than one.
+    They are bands of the tiles to be done, and each tile that is done, or that is not fitted. Arguments as of
+    `plan_bands`; one row of tiles is the least.
     """
     tiles = context.tiles()
     todo = {tile.key for tile in context.pending(tiles)} & context.tiles_done("fit")

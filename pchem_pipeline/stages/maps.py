@@ -48,14 +48,11 @@ def _tell_time(context: StageContext) -> None:
 def maps_tile(
     fit: Arrays, integration_time: float | None, rate: str = "charge_rate", n_frames: int | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Return all maps of a tile by name.
+    """Return all maps of a tile by name, from its arrays of the group ``fit``.
 
-    Args:
-        fit: the arrays of the group ``fit`` of the tile, by name.
-        integration_time: s, or None.
-        rate: name of H over the integration time.
-        n_frames: of the one sample, whose errors of H and mu hold the chance of being electrons off; None:
-            of several samples, which settle the bias.
+    ``rate`` is the name of H over the integration time (s, or None), ``n_frames`` the number of frames of the
+    one sample, whose errors of H and mu hold the chance of being electrons off; None: several samples, which
+    settle the bias.
     """
     parameters = {name: fit[name] for name in PARAMETERS}
     maps: dict[str, NDArray[Any]] = dict(parameters)

@@ -47,14 +47,10 @@ def read_calibration(
     extra_variance: FloatArray | None = None,
     limits: tuple[int | None, int | None] = (None, None),
 ) -> Calibration:
-    """Return the calibration of some rows of a run.
+    """Return the calibration of some rows of a run, for samples between ``limits``, DN (None: not known).
 
-    Args:
-        store: the run.
-        rows: of the sensor.
-        removed: tags of effects whose offsets are subtracted from the frames.
-        extra_variance: of these offsets' estimates, DN^2, (y, x).
-        limits: first and last code of the samples, DN; None: not known.
+    The offsets of the effects with the tags ``removed`` are subtracted from the frames; ``extra_variance``
+    (y, x) is that of their estimates, DN^2.
     """
     region = (rows, slice(None))
     maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]

@@ -78,19 +78,12 @@ def compare_runs(
 ) -> None:
     """Compare runs with the first of them, and the last with the one before it in the history.
 
-    Writes ``compare.html`` and ``compare.json``, and adds a line to ``history.csv`` for each new run.
-
-    Args:
-        paths: stores, or the YAML files that made them; two or more.
-        folder: where to write; made if needed.
-        tolerance: relative difference that counts as rounding, where the frames are the same.
-        labels: of the runs, such as setpoints: the numbers that they begin with are the axis of the history;
-            none: the dates.
-        rate: false-discovery rate at which a pixel counts as changed.
-        limits: ``name=value`` of the section ``compare``, in place of those of the first run.
-        progress: auto, on or off.
-        quiet: write nothing where nothing changed.
-        write: takes each line of what changed.
+    Writes ``compare.html`` and ``compare.json`` to the folder, and adds a line to ``history.csv`` for each
+    new run. Relative differences up to ``tolerance`` count as rounding where the frames are the same; of
+    others, pixels count as changed at the false-discovery rate ``rate``. Numbers with which ``labels`` begin
+    are the axis of the history; without labels it is the date. ``limits`` are ``name=value`` of the section
+    ``compare``, in place of those of the first run. ``write`` takes each line of what changed; with ``quiet``
+    it gets none where nothing changed.
 
     Raises:
         ChangedError: something changed; the files are written all the same.

@@ -50,15 +50,9 @@ def identity_of(store: RunStore, digest: str) -> str:
 def history_row(
     run: RunFacts, store: RunStore, states: PixelStates, label: str, folder: Path, pair: Pair | None
 ) -> HistoryRow:
-    """Return the line of a run in the history of a folder.
+    """Return the line of a run in the history of a folder, below a label, or its date where that is empty.
 
-    Args:
-        run: the run.
-        store: its store.
-        states: its pixels.
-        label: of the run; empty: its date.
-        folder: of the history.
-        pair: the differences from the reference; None: it is the reference.
+    ``pair`` are the differences from the reference; None: it is the reference.
     """
     camera = SensorInfo.read(store).camera
     date = _date(store, camera)
@@ -188,9 +182,7 @@ class PixelStates:
     def changes_since(self, first: PixelStates, confirm: CommonFit | None = None) -> tuple[DefectChange, ...]:
         """Return the pixels whose faults differ, unless what these are seen in agrees within its error.
 
-        Args:
-            first: the pixels of an earlier run.
-            confirm: p-values of pixels (y, x) for a common fit of both runs; None: not known.
+        ``confirm`` gives p-values of pixels (y, x) for a common fit of both runs; None: not known.
         """
         if self.kinds.shape != first.kinds.shape:
             return ()

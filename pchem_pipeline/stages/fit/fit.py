@@ -161,11 +161,8 @@ def code_sums(histogram: Arrays, maps: Sequence[NDArray[Any]]) -> dict[str, Any]
     """Return the samples of each code over the pixels that have a value, as JSON data for their marker.
 
     These are the codes that occur (``dn``), the ``samples`` of each, and those ``outside`` of the histograms.
-    The ensemble compares all frames with the model, and would decode every histogram again for it.
-
-    Args:
-        histogram: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x).
-        maps: (H, g, mu, sigma), (y, x) each; NaN without a value.
+    The ensemble compares all frames with the model, and would decode every histogram again for it. Histogram
+    as of `fit_tile`; maps are (H, g, mu, sigma), (y, x) each, NaN without a value.
     """
     usable, counts, origin = usable_pixels(*maps), histogram["counts"], histogram["origin"]
     start = int(origin.min())

@@ -62,11 +62,9 @@ class FittedModel:
         )
 
     def law(self, maps: Sequence[FloatArray], *, without: Sequence[str] = ()) -> SampleLaw:
-        """Return the law of the samples of the pixels.
+        """Return the law of the samples of the pixels, ``without`` the effects of some tags.
 
-        Args:
-            maps: their fitted (H, g, mu, sigma); NaN where the fit failed.
-            without: tags of effects to leave out.
+        The maps are their fitted (H, g, mu, sigma), NaN where the fit failed.
         """
         effects = [effect for effect in self.effects if effect.tag not in without]
         return sample_law(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)), self.added, self.places)

@@ -58,12 +58,9 @@ def fit_tile(
 ) -> dict[str, dict[str, NDArray[Any]]]:
     """Return the arrays of a tile by group and name: of ``fit``, and with several samples of ``samples``.
 
-    Args:
-        histograms: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of each sample.
-        how: they are fitted.
-        start: (H, g, mu, sigma, likelihood gap) of a fit of fewer frames, (y, x, 5), NaN where there is none.
-        added: exposure that the effects add to the pixels, (j, y, x); None: it counts as part of H.
-        places: of the pixels; None: not known.
+    The histograms of each sample are ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x).
+    ``start`` is (H, g, mu, sigma, likelihood gap) of a fit of fewer frames, (y, x, 5), NaN where there is
+    none, ``added`` the exposure that the effects add to the pixels, (j, y, x); None: it counts as part of H.
     """
     shape = histograms[0]["counts"].shape[:2]
     counts = [each["counts"].reshape(-1, each["counts"].shape[2]) for each in histograms]
