@@ -318,11 +318,9 @@ class RunStore:
 
     # -- files --------------------------------------------------------------------------------
 
-    def write_file(self, name: str, data: bytes) -> Path:
-        """Write a file of the run, atomically, and return its path."""
-        path = self.path / name
-        write_atomic(path, data)
-        return path
+    def write_file(self, name: str, data: bytes) -> None:
+        """Write a file of the run, atomically."""
+        write_atomic(self.path / name, data)
 
     def write_config(self, text: str) -> None:
         """Keep the resolved YAML of the run, its digest before it: no cut file is without one."""

@@ -40,12 +40,12 @@ from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.identity import quick_identity
 from pchem_pipeline.frames.sequence import FrameSequence
-from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Command, StageContext, Task
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import at_work, with_overrides
+from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.stages.overscan import overscan_samples
 from pchem_pipeline.store.files import fingerprint_of, read_json
 from pchem_pipeline.store.records import StageRecord
@@ -136,8 +136,7 @@ def _make_job(
     sensor = SensorInfo.read(run)
     frames = open_like_run(target, sensor, files, wanted.dataset)
     limits = limits_of(frames, sensor)
-    version = model_of(run, "fit")
-    effects = () if version is None else version.effects
+    effects = fitted_effects(run)
     modes, overscan = _offsets_to_remove(effects, target, frames, wanted.reference)
     some, cut = some_of(frames if overscan is None else frames.with_overscan()), 0.0
     if limits is not None:

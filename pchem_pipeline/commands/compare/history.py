@@ -27,9 +27,9 @@ from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
 from pchem_pipeline.model.fit.status import FitStatus, words_of
 from pchem_pipeline.model.maps.defects import FAULTS, Defect
 from pchem_pipeline.report.comparison import DefectChange, HistoryRow, Pair, RunFacts, by_change
-from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.defects import stored_defects
+from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.store.files import read_json, write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
@@ -56,7 +56,6 @@ def history_row(
     """
     camera = SensorInfo.read(store).camera
     date = _date(store, camera)
-    version = model_of(store, "fit")
     path = str(store.path)
     if not isinstance(store.path, RemotePath):
         path = os.path.relpath(store.path.resolve(), folder.resolve())
@@ -80,7 +79,7 @@ def history_row(
     row |= {
         "moved_pixels": "" if pair is None else pair.n_changed,
         "compared_pixels": "" if pair is None else pair.n_compared,
-        "effects": "" if version is None else " ".join(effect.tag for effect in version.effects),
+        "effects": " ".join(effect.tag for effect in fitted_effects(store)),
     }
     row |= {f"flag_{name}": n for name, n in states.flags().items()}
     row |= {"id": run.identity, "reference": run.identity if pair is None else pair.one.identity}

@@ -55,10 +55,13 @@ def run(context: StageContext) -> None:
         InputError: the frames are too few, or there are none.
         StoreError: the store refuses.
     """
-    sensor, (before, roi) = context.sensor, _start(context)
+    # the model that this search starts from, and its region, see `search_start`
+    record, model = context.store.records.read(_STAGE), model_of(context.store, _STAGE)
+    before = (context.model if model is None else model).effects
+    roi = None if record is None else tuple(record.content["input"]["roi"]) or None
     with context.reporter.phases(_STAGE) as progress, context.stop.at_once():
         try:
-            if sensor.kind == "frames":
+            if context.sensor.kind == "frames":
                 _run_frames(context, before, roi, progress)
             else:
                 _run_histograms(context, before, progress)
@@ -212,13 +215,6 @@ def _amounts(settings: DiscrepancySettings) -> dict[str, int]:
 def _survey(context: StageContext, source: FrameSource, settings: DiscrepancySettings) -> Survey:
     """Look at the whole sensor, except where all of it is compared closely."""
     return survey(context, source, min(settings.max_samples, settings.max_pixels * source.shape[0]))
-
-
-def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] | None]:
-    """Return the effects of the model that this search starts from, and its region; see `identity`."""
-    record, model = context.store.records.read(_STAGE), model_of(context.store, _STAGE)
-    roi = () if record is None else record.content["input"]["roi"]
-    return (context.model if model is None else model).effects, tuple(roi) or None
 
 
 def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...]:
