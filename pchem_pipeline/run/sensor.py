@@ -15,13 +15,9 @@ from pchem_pipeline.store.run_store import RunStore
 
 @dataclass(frozen=True)
 class Sample:
-    """One of several exposures that are fitted together.
+    """One of several exposures that are fitted together, by the name of its store; a bias holds no electrons.
 
-    Attributes:
-        name: name of its store.
-        bias: it holds no electrons.
-        integration_time: s, as its run says; None where it does not.
-        kind: dark, light or unknown, as its run says.
+    The integration time (s) and the kind (dark, light or unknown) are as its run says.
     """
 
     name: str

@@ -133,11 +133,9 @@ def _do_unit(
 
 @dataclass(frozen=True)
 class Prepared:
-    """What a single pass over the input did for a stage, which then has but to mark its units.
+    """What a single pass over the camera files did for a stage, which then has but to mark its units.
 
-    Attributes:
-        frames: the opened camera files.
-        clock: wall and CPU time when the pass began, for the stage to which its time belongs.
+    The clock, wall and CPU time when the pass began, is for the stage to which its time belongs.
     """
 
     frames: FrameSequence

@@ -22,13 +22,7 @@ FRAMES_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Band:
-    """Rows ``y0:y1`` of the sensor, over its full width.
-
-    Attributes:
-        y0: first row, at the border of a group of rows and of a tile.
-        y1: end of the rows.
-        keys: names of the tiles in it.
-    """
+    """Rows ``y0:y1`` over the full width: whole groups of rows, and the tiles with these keys."""
 
     y0: int
     y1: int

@@ -41,12 +41,9 @@ _CLEAR = 15.0
 
 @dataclass(frozen=True)
 class Window:
-    """The part of the stack that is looked at.
+    """The part of the stack that is looked at: whole blocks of frames, by number; first and end of its rows.
 
-    Attributes:
-        numbers: frame numbers, whole blocks, increasing.
-        rows, columns: first, and end.
-        copied: frames of the run that are copies of earlier ones.
+    ``copied`` are the frames of the run that are copies of earlier ones.
     """
 
     numbers: IntArray

@@ -29,13 +29,9 @@ def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
 
 @dataclass(frozen=True)
 class FittedModel:
-    """The model with which pixels of a run were fitted; without effects the PCD.
+    """The model with which pixels of a run were fitted; without effects the PCD, without a version no fit.
 
-    Attributes:
-        effects: in their order.
-        added: exposure that they add to the n pixels, (j, n); None: nothing.
-        version: of the run's model; None without a fit.
-        places: of the pixels; None: not known.
+    ``added`` is the exposure that effects add to the n pixels, (j, n); None: nothing.
     """
 
     effects: tuple[Effect, ...] = ()

@@ -33,7 +33,6 @@ class TileFit:
     """How the pixels of a tile are fitted.
 
     Attributes:
-        settings: of the fit.
         adc_limits: first and last code of the ADC, DN, or None where they are not known.
         effects: of the run's model; the plain fit is where the one under their law starts.
         set_aside: codes that the fit leaves out, e- on the comb of the fit with the PCD.
