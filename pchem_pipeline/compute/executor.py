@@ -15,7 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from pchem_pipeline.base.errors import ConfigError, ExitCode, IncompleteRunError, PchEmError
+from pchem_pipeline.base.errors import ConfigError, ExitCode, IncompleteRunError
 from pchem_pipeline.compute.environment import prepare_environment
 from pchem_pipeline.compute.settings import ComputeSettings
 
@@ -208,13 +208,10 @@ def make_executor(
     """
     if settings.workers != "auto" and settings.workers < 1:
         raise ConfigError(f"compute.workers: {settings.workers}; give 1 or more, or auto")
-    match settings.backend:
-        case "serial":
-            return SerialExecutor()
-        case "threads" | "processes":
-            return PoolExecutor(settings.count(), processes=settings.backend == "processes")
-        case "distributed":
-            from pchem_pipeline.compute.cluster import DistributedExecutor
+    if settings.backend == "serial":
+        return SerialExecutor()
+    if settings.backend == "distributed":
+        from pchem_pipeline.compute.cluster import DistributedExecutor
 
-            return DistributedExecutor(settings, say, check)
-    raise PchEmError(f"unknown backend {settings.backend}")
+        return DistributedExecutor(settings, say, check)
+    return PoolExecutor(settings.count(), processes=settings.backend == "processes")
