@@ -10,6 +10,7 @@ from typing import NamedTuple
 from pchem_pipeline.compute.memory import BASE_BYTES
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.histogram_files import is_histogram_input
+from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.model.histogram.count import most_bins
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.stage import allowed_bytes, band_bytes
@@ -51,8 +52,6 @@ def make_plan(config: RunConfig, base_dir: Path) -> Plan:
     Raises:
         InputError: the input is bad.
     """
-    from pchem_pipeline.frames.open import open_frames
-
     frames = open_frames(config.input, base_dir)
     (n, ny, nx), workers = frames.shape, config.compute.count()
     limit = most_bins(config.histogram.max_bins, frames.dtype)
