@@ -45,7 +45,6 @@ class SensorInfo:
         identity: names, sizes and content hashes of the files.
         names: names of the channels of ready-made histograms.
         samples: the exposures, where there are several.
-        camera: its name, serial number, temperature and date, as far as the files say.
         shown: place of the one whose histograms, H and ensemble are shown.
         whole: rows and columns of the frames in the files, whatever the region of interest; None: not known.
         reader: format of the files and the library that read them; empty: not known.

@@ -82,11 +82,8 @@ class Command:
     """What the command line asked for, beside the configuration, whose section ``compute`` it overrides.
 
     Attributes:
-        force: do it again.
-        dry_run: say what would be done.
         roi: only the tiles of this region.
         settings: of a stage on demand, in place of those of its section; None: those of its last result.
-        quiet: say warnings only.
         log_json: file for JSON lines.
         max_memory: MiB.
     """
@@ -171,12 +168,10 @@ class StageContext:
         base_dir: folder to which relative paths of the configuration refer.
         store: the run's store, writable.
         stop: raised signals; checked between units.
-        stage: name of the running stage.
-        fingerprint: of the running stage.
+        stage, fingerprint: of the running stage.
         fresh: True where the stage starts anew and must create its arrays.
         failed: unit key to reason, filled by :meth:`run_units`.
         n_keys: number of markers of the complete stage, filled by :meth:`run_units`.
-        config_path: the YAML file of the run, where it has one.
         notes: remarks for the report, filled by the stage.
         prepared: the stages whose arrays a single pass over the input has made.
         begin: gives up what the running stage left before, at the first call: :meth:`create` and
