@@ -257,7 +257,8 @@ def test_a_stop_in_the_middle_of_a_comparison_makes_no_verdict(monkeypatch, erro
     context = SimpleNamespace(sensor=SimpleNamespace(kind="frames"), reporter=Reporter(quiet=True))
     context.run_units = Mock(side_effect=error)
     context.stop = SimpleNamespace(at_once=contextlib.nullcontext)
-    monkeypatch.setattr(discrepancy, "_start", lambda _: ((), None))
+    context.store = SimpleNamespace(records=SimpleNamespace(read=lambda _: None))
+    monkeypatch.setattr(discrepancy, "model_of", lambda *_: SimpleNamespace(effects=()))
     monkeypatch.setattr(discrepancy, "_run_frames", search)
     with pytest.raises(type(error)) as found:
         discrepancy.run(context)
