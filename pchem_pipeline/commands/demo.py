@@ -55,7 +55,7 @@ def run_demo(
     write_config(path, dump_config(config))
     target, command = find_run(path), Command(quiet=quiet)
     run_stages(target, pipeline_of(target.config), command)
-    table = comparison_table(RunStore.open(target.store))
+    table = _comparison_table(RunStore.open(target.store))
     if effect is not None:
         table = _search(target, effect, command, table)
     place = quoted(target.store)
@@ -107,7 +107,7 @@ def _search(target: Target, effect: Effect, command: Command, plain: str) -> str
     missed = "" if effect.tag in found.effects else " (not found; take more --frames)"
     if reason := type(effect).untestable:
         missed = f" (not detectable in such frames: {reason})"
-    after = comparison_table(RunStore.open(target.store))
+    after = _comparison_table(RunStore.open(target.store))
     tables = plain if after == plain else f"with the plain model:\n{plain}\n\nwith the model found:\n{after}"
     return (
         f"{verdict_text(found)}\n\nhidden effect: {effect_words(effect)}"
@@ -117,12 +117,8 @@ def _search(target: Target, effect: Effect, command: Command, plain: str) -> str
     )
 
 
-def comparison_table(store: RunStore) -> str:
-    """Return a table of estimated against true parameters of the good pixels of a simulated run.
-
-    ``error / stderr`` is the standard deviation over pixels of (estimate - truth) / standard error: 1
-    where the standard errors are right.
-    """
+def _comparison_table(store: RunStore) -> str:
+    """Return a table of estimated against true parameters of the good pixels of a simulated run."""
     quality = store.read("maps/quality")
     good = quality == 0
     columns = ("true median", "estimated", "rms error", "stderr", "error/stderr")
@@ -138,7 +134,7 @@ def comparison_table(store: RunStore) -> str:
             np.median(estimate),
             np.sqrt(np.mean(error**2)),
             np.median(stderr),
-            np.std(error / stderr),
+            np.std(error / stderr),  # 1 where the standard errors are right
         )
         label = f"{name}, {VARIABLES[f'maps/{name}'].unit}"
         lines.append(f"{label:<24}" + "".join(f"{number:>14.4g}" for number in numbers))

@@ -195,8 +195,8 @@ def _record_histograms(context: StageContext) -> None:
     SensorInfo(
         kind="histograms",
         n_frames=int(given.counts.sum(axis=2).max()),
-        ny=given.shape[0],
-        nx=given.shape[1],
+        ny=1,
+        nx=len(given.names),
         dtype="int32" if given.origin.min() < 0 else np.min_scalar_type(highest).name,
         bit_depth=context.config.input.bit_depth,
         seen_limits=limits_in(given.counts, given.origin),

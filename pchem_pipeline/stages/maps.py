@@ -36,15 +36,6 @@ NO_TIME = "unknown integration time: no charge rate. Set input.integration_time 
 _CUT = int(FitStatus.BIAS_AMBIGUOUS | FitStatus.OUTSIDE_WINDOW)
 
 
-def _tell_time(context: StageContext) -> None:
-    """Say where the integration time is not known, or is not what the files say."""
-    time, stated = context.sensor.integration_time, SensorInfo.read(context.store).integration_time
-    if time is None:
-        context.note(NO_TIME)
-    elif stated is not None and abs(time - stated) > 1e-3 * stated:  # times are written with few digits
-        context.note(f"integration time {time:g} s from input.integration_time; the files state {stated:g} s")
-
-
 def maps_tile(
     fit: Arrays, integration_time: float | None, rate: str = "charge_rate", n_frames: int | None = None
 ) -> dict[str, NDArray[Any]]:
@@ -90,8 +81,11 @@ def run(context: StageContext) -> None:
     of_none = arrays(context.store, (slice(0), slice(0)))  # of no pixel, with all names
     context.create_like(of_none)
     context.create("maps/goodness_q")
-    if not sensor.samples:
-        _tell_time(context)
+    time, stated = sensor.integration_time, SensorInfo.read(context.store).integration_time
+    if not sensor.samples and time is None:
+        context.note(NO_TIME)
+    elif time and stated and abs(time - stated) > 1e-3 * stated:  # times are written with few digits
+        context.note(f"integration time {time:g} s from input.integration_time; the files state {stated:g} s")
     held = context.tile_pixels * 80 * 8  # arrays that are read and made
     task = functools.partial(_do_tile, arrays=arrays)
     context.run_units(context.tiles(), task, needs="fit", unit_bytes=held)

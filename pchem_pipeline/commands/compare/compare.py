@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import math
-import string
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from string import ascii_uppercase
 from typing import Any, Literal
 
 import numpy as np
@@ -134,7 +135,8 @@ def comparison_of(
     before = _before(given, rows, folder, reporter)
     sides = [*given[:-1], *([] if before is None or before in given else [before]), last]
     names = _shortest_names([side.store.path for side in sides])
-    for side, letter, name in zip(sides, _letters(len(sides)), names, strict=True):
+    letters = itertools.chain(ascii_uppercase, map("".join, itertools.product(ascii_uppercase, repeat=2)))
+    for side, letter, name in zip(sides, letters, names, strict=False):
         side.facts = replace(side.facts, label=letter, name=name)
     pairs = [between(first, side, "reference") for side in given[1:]]
     new: dict[str, HistoryRow] = {}
@@ -195,12 +197,6 @@ def _before(
         f"the last run in {folder / HISTORY}, {place}, is gone or another one: not compared with it"
     )
     return None
-
-
-def _letters(n: int) -> list[str]:
-    """Return n labels: A to Z, then AA to AZ and so on."""
-    singles = string.ascii_uppercase
-    return [(singles[i // 26 - 1] if i >= 26 else "") + singles[i % 26] for i in range(n)]
 
 
 def _shortest_names(paths: Sequence[Path]) -> list[str]:

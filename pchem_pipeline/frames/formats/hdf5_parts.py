@@ -18,8 +18,8 @@ from pchem_pipeline.frames.reader import unwritten_notes
 _MOST_PARTS, _DEEPEST = 100_000, 16
 
 
-def external_links(path: Path, file: Any) -> dict[str, str]:
-    """Return the links to what may be stacks in other files: path in this file -> name of the other."""
+def check_links(path: Path, file: Any, wanted: str | None) -> None:
+    """Raise InputError if the wanted dataset (None: any) is in another file, as in a Dectris master file."""
     from h5py import h5l
 
     links = file.id.links  # not visititems_links, which fails at links of kinds that it does not know
@@ -38,18 +38,12 @@ def external_links(path: Path, file: Any) -> dict[str, str]:
             return True
         return getattr(file.get(name), "ndim", 3) >= 3
 
-    return {name: other for name, other in found.items() if may_be_a_stack(name)}
-
-
-def check_links(path: Path, links: dict[str, str], wanted: str | None) -> None:
-    """Raise InputError if the wanted dataset (None: any) is in another file, as in a Dectris master file."""
-    asked = {name: links[name] for name in links if wanted is None or name == wanted.strip("/")}
-    if asked:
-        shown = ", ".join(f"{name} in {file}" for name, file in list(asked.items())[:4])
+    names = [name for name in found if wanted is None or name == wanted.strip("/")]
+    if asked := [f"{name} in {found[name]}" for name in names if may_be_a_stack(name)]:
         more = f" and {len(asked) - 4} more" if len(asked) > 4 else ""
         raise InputError(
-            f"{path}: its frames are in other files: {shown}{more}; give those, with --integration-time and "
-            "--bit-depth from this file, or choose a dataset with --dataset"
+            f"{path}: its frames are in other files: {', '.join(asked[:4])}{more}; give those, with "
+            "--integration-time and --bit-depth from this file, or choose a dataset with --dataset"
         )
 
 
