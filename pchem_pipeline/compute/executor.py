@@ -46,15 +46,14 @@ class Executor(Protocol):
     #: workers share the memory of this process
     shares_memory: bool
     #: bytes that a worker may take, where somebody watches over that
-    memory_limit: int | None
+    memory_limit: int | None = None
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
         """Call ``function`` on each item and ``on_result(item, outcome)`` here, in any order."""
-        ...
 
     def close(self) -> None:
-        """Free the workers."""
-        ...
+        """Free the workers, where any wait for more work."""
+        return
 
 
 def guarded(function: Callable[[T], Any], item: T) -> Outcome:
@@ -112,20 +111,16 @@ def beside(threads: int) -> Iterator[Beside]:
         pool.shutdown(cancel_futures=True)
 
 
-class SerialExecutor:
+class SerialExecutor(Executor):
     """One item after the other, in this thread."""
 
     workers = 1
     shares_memory = True
-    memory_limit: int | None = None
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
         """See :class:`Executor`."""
         for item in items:
             on_result(item, guarded(function, item))
-
-    def close(self) -> None:
-        """Nothing to free."""
 
 
 def _begin_worker() -> None:
@@ -141,10 +136,8 @@ def _begin_worker() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
-class PoolExecutor:
-    """A pool of threads or of spawned processes."""
-
-    memory_limit: int | None = None
+class PoolExecutor(Executor):
+    """A pool of threads or of spawned processes, which lives only during :meth:`map`."""
 
     def __init__(self, workers: int, *, processes: bool) -> None:
         self.workers = workers
@@ -189,9 +182,6 @@ class PoolExecutor:
             raise
         finally:
             pool.shutdown(wait, cancel_futures=True)
-
-    def close(self) -> None:
-        """The pool lives only during :meth:`map`."""
 
 
 def make_executor(
