@@ -34,9 +34,11 @@ from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, Named, StageContext
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
-from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
+from pchem_pipeline.stages.discrepancy.survey import mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import (
+    Survey,
     Window,
+    choose_window,
     fewer_samples,
     other_window,
     read_window,
@@ -158,7 +160,7 @@ class _Search:
 
     def found(self, settings: DiscrepancySettings, prefix: str) -> tuple[Window, Discrepancy]:
         """Search for what the model is missing in the window of the settings; ``prefix`` begins its units."""
-        window = self.seen.window(self.source.shape, settings, self.roi)
+        window = choose_window(self.source.shape, settings, self.roi, self.seen)
         found = find_discrepancies(
             read_window(self.source, window),
             window.times,
