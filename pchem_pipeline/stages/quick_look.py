@@ -16,7 +16,6 @@ from pchem_pipeline.discrepancy.quick.quick_look import quick_look
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.stages.histogram.arrays import COVARIANCES
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 from pchem_pipeline.store.run_store import RunStore
 
@@ -108,7 +107,9 @@ def read_sums(store: RunStore) -> StackSums | None:
         lines("column_sum", chosen[some]),
         mean,
         variance,
-        *(store.read(f"summary/{name}") for name in COVARIANCES),
+        store.read("summary/lag1_covariance"),
+        store.read("summary/neighbour_covariance_x"),
+        store.read("summary/neighbour_covariance_y"),
         odd,
         store.attributes("summary").get("spectrum", {}),
     )
