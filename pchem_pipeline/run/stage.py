@@ -130,13 +130,14 @@ def _do_unit(
 
 @dataclass(frozen=True)
 class Prepared:
-    """What a single pass over the camera files did for a stage, which then has but to mark its units.
+    """What a single pass over the camera files did for some stages, which then have but to mark their units.
 
-    The clock, wall and CPU time when the pass began, is for the stage to which its time belongs.
+    The clock is wall and CPU time when the pass began: its time belongs to the last of the stages.
     """
 
+    stages: tuple[str, ...]
     frames: FrameSequence
-    clock: tuple[float, float] | None = None
+    clock: tuple[float, float]
 
 
 def allowed_bytes(config: RunConfig, workers: int) -> int:
@@ -173,7 +174,7 @@ class StageContext:
         failed: unit key to reason, filled by :meth:`run_units`.
         n_keys: number of markers of the complete stage, filled by :meth:`run_units`.
         notes: remarks for the report, filled by the stage.
-        prepared: the stages whose arrays a single pass over the input has made.
+        prepared: by a single pass over the input, if there was one.
         begin: gives up what the running stage left before, at the first call: :meth:`create` and
             :meth:`run_units` call it, a stage that writes before those does so itself. What is refused until
             then costs nothing.
@@ -194,14 +195,14 @@ class StageContext:
     n_keys: int = 0
     config_path: Path | None = None
     notes: list[str] = field(default_factory=list)
-    prepared: Mapping[str, Prepared] = field(default_factory=dict)
+    prepared: Prepared | None = None
     begin: Callable[[], None] = lambda: None
     created: dict[str, str] = field(default_factory=dict)
 
     @property
     def is_prepared(self) -> bool:
         """The arrays of the running stage were made beforehand, by a single pass over the input."""
-        return self.stage in self.prepared
+        return self.prepared is not None and self.stage in self.prepared.stages
 
     @functools.cached_property
     def model(self) -> ModelVersion:

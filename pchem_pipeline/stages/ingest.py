@@ -61,7 +61,7 @@ def run(context: StageContext) -> None:
         _record_histograms(context)
         return
     settings = context.config.input
-    done = context.prepared.get(context.stage)
+    done = context.prepared if context.is_prepared else None
     reader = open_frames(settings, context.base_dir) if done is None else done.frames
     context.begin()
     files = f"{len(reader.paths)} file{'s' * (len(reader.paths) != 1)}"

@@ -70,12 +70,7 @@ def count_in_one_pass(context: StageContext) -> None:
         return  # the files changed meanwhile: the stages look at them again
     with suppress(StoreError):  # a store that cannot be written is a matter for those who write to it
         keep_identity(context, quick, identity)
-        context.prepared = prepared(frames, clock)
-
-
-def prepared(frames: FrameSequence, clock: tuple[float, float]) -> dict[str, Prepared]:
-    """Return what the stages are told of a pass: the time of it all belongs to the last one."""
-    return {"ingest": Prepared(frames), "histogram": Prepared(frames, clock)}
+        context.prepared = Prepared(PREPARED, frames, clock)
 
 
 @contextmanager

@@ -81,7 +81,7 @@ def compare(folder, **sections):
     apart = run_both(make_context(folder, "apart.zarr", **sections))
     once = make_context(folder, "once.zarr", **sections)
     single_pass.count_in_one_pass(once)
-    assert set(once.prepared) == {"ingest", "histogram"}
+    assert set(once.prepared.stages) == {"ingest", "histogram"}
     run_both(once)
     groups = ("frames", "histogram", "summary")
     expected, found = (arrays_of(context.store.path, groups) for context in (apart, once))
@@ -133,7 +133,7 @@ def test_every_byte_is_read_once(tmp_path, frames, name):
     context = make_context(tmp_path, "run.zarr")
     before = _bytes_read()
     single_pass.count_in_one_pass(context)
-    assert set(context.prepared) == {"ingest", "histogram"}
+    assert set(context.prepared.stages) == {"ingest", "histogram"}
     tags = 900 * 8192 if name == "tiff" else 0  # looking for the pages of frames as small as these
     assert size <= _bytes_read() - before < 1.1 * size + tags
     # the separate stages read all twice, so the count is a count
@@ -184,7 +184,7 @@ def test_a_stopped_or_killed_pass_leaves_nothing_half_done(tmp_path, frames, nam
     assert all(context.store.records.read(stage) is None for stage in ("ingest", "histogram"))
     again = make_context(tmp_path, "run.zarr")
     single_pass.count_in_one_pass(again)
-    assert set(again.prepared) == {"ingest", "histogram"}
+    assert set(again.prepared.stages) == {"ingest", "histogram"}
     run_both(again)
     np.testing.assert_array_equal(again.store.read("histogram/counts").sum(axis=2).max(), FRAMES)
 
