@@ -16,7 +16,7 @@ from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
 from pchem_pipeline.stages.bands import cut_rows
-from pchem_pipeline.stages.histogram import memory, single_pass
+from pchem_pipeline.stages.histogram import arrays, single_pass
 
 FRAMES, NY, NX = 300, 150, 40
 
@@ -150,7 +150,7 @@ def test_where_memory_is_short_the_stages_do_it(tmp_path, frames, monkeypatch):
     assert not context.prepared
     context = make_context(tmp_path, "run.zarr")
     # what the first block shows can be too much, too
-    room = memory.single_pass_bytes(context.config, frames.shape, frames.dtype, bins=0) + 1000
+    room = arrays.single_pass_bytes(context.config, frames.shape, frames.dtype, bins=0) + 1000
     monkeypatch.setattr(single_pass, "allowed_bytes", lambda config, workers: room)
     single_pass.count_in_one_pass(context)
     assert not context.prepared
