@@ -114,11 +114,9 @@ def path_arrays(
     random numbers: what comes out alike is its path. An effect that cannot do this is left out. The posterior
     mean k follows a change only in part, and the residual takes the rest: an exposure H (1 + a) moves the
     mean of k by a Var(k), and an offset of d electrons moves it by d E[Var(K|x)] / sigma_e^2, both to first
-    order (scores of H and mu of the PCD, Hendrickson et al. 2023, eq. update_eqns).
-
-    Returns:
-        ``frame_charge_model`` (relative) and ``frame_readout_model`` (DN), shape (n_frames,) each; empty
-        where no effect has a path.
+    order (scores of H and mu of the PCD, Hendrickson et al. 2023, eq. update_eqns). The arrays are
+    ``frame_charge_model`` (relative) and ``frame_readout_model`` (DN), shape (n_frames,) each; none where no
+    effect has a path.
     """
     time = evidence.time
     if time is None or not evidence.maps.usable.any():

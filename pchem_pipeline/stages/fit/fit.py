@@ -84,10 +84,7 @@ def run(context: StageContext) -> None:
 
 
 def _create(context: StageContext, how: TileFit, dtype: np.dtype[Any]) -> None:
-    """Make the arrays that a fit gives; the words of its status are explained with them.
-
-    One is made for that, which compiles the kernels before other processes do it all at the same time.
-    """
+    """Make arrays like those of a fit of one pixel, which compiles the kernels before all workers do it."""
     histogram: dict[str, NDArray[Any]] = {name: np.zeros((1, 1), np.int32) for name in _HISTOGRAM[1:]}
     histogram["counts"] = np.ones((1, 1, 8), dtype)
     everywhere = [effect.at_place(None) for effect in how.effects]

@@ -134,10 +134,7 @@ def read_maps(
     """Read every stored map: packed, the important ones first, until the page is full; exact for some pixels.
 
     ``index`` is ``y * nx + x`` of these, ``loaded`` are maps that were read already, by path; each of the
-    threads packs a map.
-
-    Returns:
-        The maps, in the order of the list, and by path of those that fit their values, shape (n,).
+    threads packs a map. The maps come in the order of the list, the values of those that fit by path, (n,).
 
     Raises:
         StoreError: an array is missing or corrupt.
@@ -170,10 +167,7 @@ def read_maps(
 
 
 def _coded(maps: Arrays, entry: MapEntry, index: IntArray, pack: bool) -> tuple[MapEntry, FloatArray]:
-    """Return a map in few bytes, or as a multiple of another, and its values at some pixels, shape (n,).
-
-    It is packed only where asked for, and no multiple.
-    """
+    """Return a map, packed if wanted, or as a multiple of another, and its values at some pixels, (n,)."""
     alike = _multiple_of_exposure(maps, entry.path)
     if alike is None and not pack:
         return entry, np.empty(0)
