@@ -178,9 +178,8 @@ def choose_inspected(
     index = index[np.sort(once)]
     if status.size > everything:
         index = index[:most]
-    there = set(index.tolist())
     found = [
-        Notable(words, tuple(i for i in where.tolist() if i in there), path) for words, path, where in reasons
+        Notable(words, tuple(where[np.isin(where, index)].tolist()), path) for words, path, where in reasons
     ]
     return index, [each for each in found if each.pixels]
 
