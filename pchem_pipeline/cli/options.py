@@ -36,50 +36,38 @@ Output = Annotated[Path, typer.Option("--output", "-o", help="folder to write to
 Strict = Annotated[bool, typer.Option("--strict", help="exit code 3 if the results are not reliable")]
 Quiet = Annotated[bool, _common("--quiet", "-q", help="warnings and errors only")]
 
-#: Name, type with help, and default of each, in the order of ``--help``.
-_COMMON: tuple[tuple[str, Any, Any], ...] = (
-    ("force", Annotated[bool, _common("--force", help="run again even if up to date")], False),
-    ("dry_run", Annotated[bool, _common("--dry-run", help="print what would be done; write nothing")], False),
-    (
-        "roi",
-        Annotated[
-            str | None,
-            _common(
-                help="region y0:y1,x0:x1 in pixels; ingest and run FILES crop to it, other commands process "
-                "only its tiles"
-            ),
-        ],
-        None,
-    ),
-    (
-        "workers",
-        Annotated[int | None, _common(min=1, help="number of workers [default: compute.workers]")],
-        None,
-    ),
-    (
-        "backend",
-        Annotated[
-            Literal["serial", "threads", "processes", "distributed"] | None,
-            _common(help="where the workers run [default: compute.backend]"),
-        ],
-        None,
-    ),
-    (
-        "max_memory",
-        Annotated[int | None, _common(help="memory limit, MiB, at least 300 [default: compute.max_memory]")],
-        None,
-    ),
-    (
-        "log_json",
-        Annotated[
-            Path | None, _common(help="append events as JSON lines to this file", callback=on_this_machine)
-        ],
-        None,
-    ),
-    ("progress", Progress, "auto"),
-    ("quiet", Quiet, False),
-)
 
+def _common_options(
+    *,
+    force: Annotated[bool, _common("--force", help="run again even if up to date")] = False,
+    dry_run: Annotated[bool, _common("--dry-run", help="print what would be done; write nothing")] = False,
+    roi: Annotated[
+        str | None,
+        _common(
+            help="region y0:y1,x0:x1 in pixels; ingest and run FILES crop to it, other commands process "
+            "only its tiles"
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, _common(min=1, help="number of workers [default: compute.workers]")
+    ] = None,
+    backend: Annotated[
+        Literal["serial", "threads", "processes", "distributed"] | None,
+        _common(help="where the workers run [default: compute.backend]"),
+    ] = None,
+    max_memory: Annotated[
+        int | None, _common(help="memory limit, MiB, at least 300 [default: compute.max_memory]")
+    ] = None,
+    log_json: Annotated[
+        Path | None, _common(help="append events as JSON lines to this file", callback=on_this_machine)
+    ] = None,
+    progress: Progress = "auto",
+    quiet: Quiet = False,
+) -> None:
+    """Declare the common options, in the order of ``--help``; it is never called."""
+
+
+_COMMON = inspect.signature(_common_options, eval_str=True).parameters
 #: Settings of the section ``input`` that have an option: name, type, help.
 _INPUT: tuple[tuple[str, Any, str], ...] = (
     ("integration_time", float, "integration time per frame, s"),
@@ -107,17 +95,21 @@ _INPUT: tuple[tuple[str, Any, str], ...] = (
 def takes_command(
     *, without: tuple[str, ...] = (), reads_files: bool = False
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorate a command of a run: it takes the common options too, as one argument ``command``.
+    """Decorate a command of a run: it takes the common options, too, as one argument ``command``.
 
-    Args:
-        without: names of common options that the command does not have, or words differently.
-        reads_files: it takes the options of camera files too, as one argument ``given``.
+    Common options ``without`` which it goes, or which it words differently, are left out. A command that
+    ``reads_files`` also takes the options of camera files, as one argument ``given``.
     """
-    common = [each for each in _COMMON if each[0] not in without]
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    common = [option for name, option in _COMMON.items() if name not in without]
     of_input = [
-        (name, Annotated[kind | None, typer.Option(help=words, rich_help_panel="Camera files")], None)
-        for name, kind, words in _INPUT
-        if reads_files
+        inspect.Parameter(
+            name,
+            keyword,
+            default=None,
+            annotation=Annotated[kind | None, typer.Option(help=words, rich_help_panel="Camera files")],
+        )
+        for name, kind, words in (_INPUT if reads_files else ())
     ]
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
@@ -125,26 +117,22 @@ def takes_command(
         def wrapper(**given: Any) -> None:
             from pchem_pipeline.run.stage import Command
 
-            options = {name: given.pop(name) for name, _, _ in common}
+            options = {each.name: given.pop(each.name) for each in common}
             if reads_files:
-                given["given"] = _settings_of_input({name: given.pop(name) for name, _, _ in of_input})
+                given["given"] = _settings_of_input({each.name: given.pop(each.name) for each in of_input})
             command = Command(**{**options, "roi": region_of(options.get("roi"))})
             function(**given, command=command)
 
         hints = typing.get_type_hints(function, localns={"Command": object}, include_extras=True)
-        kind = inspect.Parameter.KEYWORD_ONLY
         own = [
-            parameter.replace(annotation=hints[name], kind=kind)
+            parameter.replace(annotation=hints[name], kind=keyword)
             for name, parameter in inspect.signature(function).parameters.items()
             if name not in ("command", "given")
         ]
-        added = [
-            inspect.Parameter(name, kind, default=default, annotation=hint)
-            for name, hint, default in [*of_input, *common]
-        ]
+        options = [*own, *of_input, *common]
         signature: Any = wrapper
-        signature.__signature__ = inspect.Signature([*own, *added])
-        wrapper.__annotations__ = {each.name: each.annotation for each in [*own, *added]}
+        signature.__signature__ = inspect.Signature(options)
+        wrapper.__annotations__ = {each.name: each.annotation for each in options}
         del signature.__wrapped__  # or the signature of the function itself would be read
         return wrapper
 

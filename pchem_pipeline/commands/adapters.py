@@ -40,15 +40,12 @@ class Calibration:
     Maps have shape (y, x), and the median where a pixel has no fit.
 
     Attributes:
-        camera: what its files say of it.
         integration_time: s; None: not known.
         bits: of the codes of its ADC.
         bias: DN.
         gain: conversion gain, e-/DN.
         read_noise: e-.
         electrons: mean of the dark electrons of a frame, e-; 0 in a run of frames with light.
-        fitted: which pixels have a fit.
-        defects: which pixels have a defect.
     """
 
     camera: CameraFacts

@@ -9,33 +9,27 @@ from __future__ import annotations
 
 import math
 import time
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from pchem_pipeline.base.errors import InputError, StoreError, quoted
 from pchem_pipeline.compute.environment import cpu_seconds
 from pchem_pipeline.frames.identity import digest_of, quick_identity
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.resolve import input_paths
-from pchem_pipeline.run.fingerprint import setting_values
+from pchem_pipeline.frames.sequence import FrameSequence
+from pchem_pipeline.run.fingerprint import StageState, setting_values
 from pchem_pipeline.run.input import ingested_identity, keep_identity, known_identity
-from pchem_pipeline.run.stage import Command, allowed_bytes
+from pchem_pipeline.run.stage import Command, Prepared, StageContext, allowed_bytes
+from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.execute import execute
 from pchem_pipeline.runner.session import run_stages, run_status, working_run
 from pchem_pipeline.stages.fit.fit import keep_fit
-from pchem_pipeline.stages.histogram.arrays import extend_arrays
+from pchem_pipeline.stages.histogram.arrays import extend_arrays, single_pass_bytes
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import single_pass_bytes
-from pchem_pipeline.stages.histogram.single_pass import PREPARED, hashed_frames, prepared
+from pchem_pipeline.stages.histogram.single_pass import PREPARED, hashed_frames
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import remove_files, write_record
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pchem_pipeline.frames.sequence import FrameSequence
-    from pchem_pipeline.run.fingerprint import StageState
-    from pchem_pipeline.run.stage import StageContext
-    from pchem_pipeline.run.target import Target
 
 #: exists while the arrays are neither of the old nor of all frames
 _BEGUN = ".pchem/appending.json"
@@ -71,7 +65,7 @@ def append_frames(target: Target, command: Command) -> list[StageState]:
         keep_fit(context)
         files = kept["files"] + _go_on(context, frames, added)["files"]
         keep_identity(context, quick, {"files": files, "digest": digest_of(files)})
-        context.prepared = prepared(frames, clock)
+        context.prepared = Prepared(PREPARED, frames, clock)
         states = [execute(name, context) for name in PREPARED]
         remove_files(begun)
         return states

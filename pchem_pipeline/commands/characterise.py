@@ -16,25 +16,22 @@ import tempfile
 import weakref
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.commands.in_memory import stack_of, write_stack
-from pchem_pipeline.commands.new_run import settings_of, settings_there
-from pchem_pipeline.commands.notebook import open_run, require_xarray
-from pchem_pipeline.config.load import dump_config, make_config, write_config
+from pchem_pipeline.commands.new_run import settings_of, stated_run
+from pchem_pipeline.commands.notebook import Run, open_run, require_xarray
+from pchem_pipeline.config.load import dump_config, write_config
 from pchem_pipeline.model.fit.api import fit_histograms
+from pchem_pipeline.model.fit.result import FitResult
+from pchem_pipeline.run.progress import ProgressMode
 from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import run_stages, up_to
 from pchem_pipeline.stages.table import pipeline_of
-
-if TYPE_CHECKING:
-    from pchem_pipeline.commands.notebook import Run
-    from pchem_pipeline.model.fit.result import FitResult
-    from pchem_pipeline.run.progress import ProgressMode
 
 
 def characterise(
@@ -116,16 +113,12 @@ def fit_counts(counts: NDArray[Any], origin: NDArray[Any] | int = 0, **options: 
 def _target(place: Path, given: Mapping[str, Any], settings: Mapping[str, Mapping[str, Any]]) -> Target:
     """Return the run, its YAML beside the store; raise ConfigError where that has other settings."""
     path = settings_of(place)
-    content: dict[str, Any] = {name: dict(section) for name, section in settings.items()}
-    content["run"] = {**content.get("run", {}), "store": place.name}
-    known = {"files": [f"{path.stem}-frames.npy"], "mode": "reference"}
+    known: dict[str, Any] = {"files": [f"{path.stem}-frames.npy"], "mode": "reference"}
     known |= {name: value for name, value in given.items() if value is not None}
-    content["input"] = {**known, **content.get("input", {})}
-    config = make_config(content, "characterise")
-    if path.exists():
-        ways = "omit these arguments to continue with the settings in the file, or give another store"
-        config = settings_there(path, content, ways)
-    else:
+    sections = {**settings, "input": {**known, **settings.get("input", {})}}
+    ways = "omit these arguments to continue with the settings in the file, or give another store"
+    target = stated_run(place, sections, "characterise", ways)
+    if not path.exists():
         place.parent.mkdir(parents=True, exist_ok=True)
-        write_config(path, dump_config(config))
-    return Target(config, path.parent, place, path)
+        write_config(path, dump_config(target.config))
+    return target

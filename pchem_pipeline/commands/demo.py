@@ -7,7 +7,6 @@ discrepancy has to find it.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,18 +17,15 @@ from pchem_pipeline.config.load import dump_config, write_config
 from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.verdict import read_verdict
 from pchem_pipeline.effects.framework.compose import effect_words
+from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import GRAMMAR, parse_place
 from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.run.stage import Command
-from pchem_pipeline.run.target import find_run
+from pchem_pipeline.run.target import Target, find_run
 from pchem_pipeline.runner.session import run_stages
 from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 from pchem_pipeline.stages.table import pipeline_of
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.run.target import Target
 
 
 def run_demo(
@@ -59,7 +55,7 @@ def run_demo(
     write_config(path, dump_config(config))
     target, command = find_run(path), Command(quiet=quiet)
     run_stages(target, pipeline_of(target.config), command)
-    table = comparison_table(RunStore.open(target.store))
+    table = _comparison_table(RunStore.open(target.store))
     if effect is not None:
         table = _search(target, effect, command, table)
     place = quoted(target.store)
@@ -111,7 +107,7 @@ def _search(target: Target, effect: Effect, command: Command, plain: str) -> str
     missed = "" if effect.tag in found.effects else " (not found; take more --frames)"
     if reason := type(effect).untestable:
         missed = f" (not detectable in such frames: {reason})"
-    after = comparison_table(RunStore.open(target.store))
+    after = _comparison_table(RunStore.open(target.store))
     tables = plain if after == plain else f"with the plain model:\n{plain}\n\nwith the model found:\n{after}"
     return (
         f"{verdict_text(found)}\n\nhidden effect: {effect_words(effect)}"
@@ -121,12 +117,8 @@ def _search(target: Target, effect: Effect, command: Command, plain: str) -> str
     )
 
 
-def comparison_table(store: RunStore) -> str:
-    """Return a table of estimated against true parameters of the good pixels of a simulated run.
-
-    ``error / stderr`` is the standard deviation over pixels of (estimate - truth) / standard error: 1
-    where the standard errors are right.
-    """
+def _comparison_table(store: RunStore) -> str:
+    """Return a table of estimated against true parameters of the good pixels of a simulated run."""
     quality = store.read("maps/quality")
     good = quality == 0
     columns = ("true median", "estimated", "rms error", "stderr", "error/stderr")
@@ -142,7 +134,7 @@ def comparison_table(store: RunStore) -> str:
             np.median(estimate),
             np.sqrt(np.mean(error**2)),
             np.median(stderr),
-            np.std(error / stderr),
+            np.std(error / stderr),  # 1 where the standard errors are right
         )
         label = f"{name}, {VARIABLES[f'maps/{name}'].unit}"
         lines.append(f"{label:<24}" + "".join(f"{number:>14.4g}" for number in numbers))

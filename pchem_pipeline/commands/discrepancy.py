@@ -20,12 +20,9 @@ from pchem_pipeline.stages.discrepancy.summary_text import verdict_text
 def find_and_add(target: Target, command: Command, *, refit: bool, effort: float | None = None) -> str:
     """Search for effects, add those named to the model, and fit with it; return the verdict as text.
 
-    Args:
-        target: the run.
-        command: from the command line.
-        refit: make the verdict's model a version, unless ``discrepancy.add`` is off, and bring fit, maps,
-            ensemble and report up to date where they were done before; else model and YAML stay.
-        effort: replaces ``discrepancy.effort`` of the configuration.
+    With ``refit`` the verdict's model becomes a version, unless ``discrepancy.add`` is off, and fit, maps,
+    ensemble and report are brought up to date where they were done before; else model and YAML stay.
+    ``effort`` replaces ``discrepancy.effort`` of the configuration.
 
     Raises:
         PchEmError: a stage cannot be done.

@@ -70,15 +70,9 @@ def figures_of_run(
 ) -> list[Path]:
     """Write the figures of a run, given by its store or YAML, and their numbers; return the files.
 
-    Args:
-        path: the run.
-        folder: where to write; made if needed.
-        formats: pdf, svg, png.
-        width: such as ``88mm`` or ``3.5in``; None: each figure's own.
-        only: names of figures; empty: all.
-        dpi: resolution of PNG, and of maps inside the other formats, dots per inch.
-        style: style sheet of matplotlib, a name or a file; empty: none.
-        progress: auto, on or off.
+    A width is a text such as ``88mm``; None: each figure's own. ``only`` are names of figures (empty: all),
+    ``dpi`` is the resolution of PNG, and of maps inside the other formats, ``style`` a style sheet of
+    matplotlib, a name or a file.
 
     Raises:
         ConfigError: an unknown format, width, figure or style.

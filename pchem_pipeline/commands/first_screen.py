@@ -61,8 +61,7 @@ def _tell(
     if "report" not in stages or numbers is None:
         say(str(target.store))
         return ""
-    reporter = Reporter("off", quiet=command.quiet, log=command.log_json)
-    try:
+    with contextlib.closing(Reporter("off", quiet=command.quiet, log=command.log_json)) as reporter:
         reporter.event("verdict", answers=numbers["answers"], next=numbers["next"])
         if not command.quiet:
             for line in first_screen(numbers, typed(target)):
@@ -70,8 +69,6 @@ def _tell(
         serious = " ".join(_one_line(each) for each in numbers["answers"] if each["level"] == "serious")
         if serious and warn:
             reporter.warning(serious)
-    finally:
-        reporter.close()
     say(str(target.store / "report.html"))
     return serious
 

@@ -24,11 +24,10 @@ def paths_of(frames: Any) -> list[str] | None:
 
 
 def stack_of(frames: Any, *, least: int) -> Any:
-    """Return frames as an array (frame, y, x) of whole DN; it may be lazy.
+    """Return frames as an array (frame, y, x) of whole DN, with ``least`` frames or more; it may be lazy.
 
-    Args:
-        frames: an array, a list of frames, or anything whose slices along the frames become an array.
-        least: frames that are needed; of 1 an array (y, x) is one frame.
+    Given is an array, a list of frames, or anything whose slices along the frames become an array. Where one
+    frame is enough, it may be an array (y, x).
 
     Raises:
         ConfigError: the message says what it should be.

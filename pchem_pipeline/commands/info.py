@@ -50,7 +50,7 @@ def about_files(places: Sequence[Path]) -> Iterator[str]:
     settings, here = InputSettings(files=tuple(map(str, places))), Path.cwd()
     if is_histogram_input(settings, here):
         given = read_histograms(settings, here)
-        yield f"histograms of {given.shape[0] * given.shape[1]} channels, {given.counts.shape[2]} bins"
+        yield f"histograms of {len(given.names)} channels, {given.counts.shape[2]} bins"
         return
     readers, report = survey(settings, here)
     by_path = {reader.paths[0]: reader for reader in readers}

@@ -32,10 +32,7 @@ _SEARCH = "discrepancy"
 
 
 def _listed(target: Target) -> list[tuple[ModelVersion, bool, list[str]]]:
-    """Return each version, whether it is in force, and the stages whose results rest on it.
-
-    One that is in the YAML but not in the run yet comes last.
-    """
+    """Return each version, one that is only in the YAML last; is it in force; which stages rest on it."""
     store = target.stored()
     current = model_in_force(store, target.config.model)
     versions = {version.number: version for version in (*model_versions(store), current)}

@@ -88,7 +88,7 @@ def find_or_start(
             options = ", ".join(f"--{name}" for name in words)
             raise ConfigError(f"{options}: only with camera files; change the settings in {first}")
         return find_run(first), False
-    missing = [path for path in targets if not path.exists() and not set("*?[") & set(str(path))]
+    missing = [path for path in targets if not path.exists() and not glob.has_magic(str(path))]
     if missing:
         raise InputError(
             f"{missing[0]} does not exist; give camera files, a folder of them, or a config.yaml"
@@ -97,22 +97,44 @@ def find_or_start(
     path = settings_of(place)
     region = {} if roi is None else {"roi": roi}
     stated = {"files": _file_list(targets, path.parent), **region, **given}
-    return _stated_run(place, stated, "run", anew=path.exists() and _came_to_nothing(place, path)), True
+    anew = path.exists() and _came_to_nothing(place, path)
+    return stated_run(place, {"input": stated}, "the command line", _ways("run", path), anew=anew), True
 
 
-def _stated_run(place: Path, stated: Mapping[str, Any], command: str, *, anew: bool = False) -> Target:
-    """Return the run with a store and a stated input; a YAML that is there must agree, or is made anew."""
+def _ways(command: str, path: Path) -> str:
+    return (
+        f"continue with these: pchem {command} {quoted(path)}; or edit the file, or start another run with "
+        "--store NAME.zarr"
+    )
+
+
+def stated_run(
+    place: Path, sections: Mapping[str, Mapping[str, Any]], name: str, ways: str, *, anew: bool = False
+) -> Target:
+    """Return the run with a store and stated sections of its YAML, which messages call ``name``.
+
+    A YAML that is there must agree with them, whatever else it sets, unless the run is made ``anew``.
+
+    Raises:
+        ConfigError: a setting is wrong, or the YAML differs; in one line how, and ``ways`` to resolve it.
+    """
     path = settings_of(place)
     store = str(place) if isinstance(place, RemotePath) else place.name
-    content = {"run": {"store": store}, "input": stated}
-    config = make_config(content, "the command line")
-    if path.exists() and not anew:
-        ways = (
-            f"continue with these: pchem {command} {quoted(path)}; or edit the file, or start another run "
-            "with --store NAME.zarr"
-        )
-        config = settings_there(path, content, ways)
-    return Target(config, path.parent, place, path)
+    content = {**sections, "run": {**sections.get("run", {}), "store": store}}
+    config = make_config(content, name)
+    if anew or not path.exists():
+        return Target(config, path.parent, place, path)
+    there = load_config(path)
+    both = _laid_over(yaml_content(dump_config(there), str(path)), content)
+    differ = settings_that_differ(there, make_config(both, "the command line", path.parent))
+    if differ:
+        shown = [
+            f"{each.name} {shorten(each.one, _WIDTH)} in the file, {shorten(each.other, _WIDTH)} here"
+            for each in differ[:_SHOWN]
+        ]
+        more = [f"{len(differ) - _SHOWN} more"] if len(differ) > _SHOWN else []
+        raise ConfigError(f"{path} exists with other settings ({'; '.join([*shown, *more])}); {ways}")
+    return Target(there, path.parent, place, path)
 
 
 def settings_of(store: Path) -> Path:
@@ -125,25 +147,6 @@ def settings_of(store: Path) -> Path:
         raise ConfigError(f"--store {store.name}: this is the name of a YAML file; give NAME.zarr")
     name = store.name.removesuffix(".zarr") + ".yaml"
     return Path(name).resolve() if isinstance(store, RemotePath) else store.with_name(name)
-
-
-def settings_there(path: Path, stated: Mapping[str, Any], ways: str) -> RunConfig:
-    """Return the settings of a YAML file, which must agree with the sections that are stated.
-
-    Raises:
-        ConfigError: the YAML is wrong, or differs; in one line how, and ``ways`` to resolve it.
-    """
-    there = load_config(path)
-    content = _laid_over(yaml_content(dump_config(there), str(path)), stated)
-    differ = settings_that_differ(there, make_config(content, "the command line", path.parent))
-    if not differ:
-        return there
-    shown = [
-        f"{each.name} {shorten(each.one, _WIDTH)} in the file, {shorten(each.other, _WIDTH)} here"
-        for each in differ[:_SHOWN]
-    ]
-    more = [f"{len(differ) - _SHOWN} more"] if len(differ) > _SHOWN else []
-    raise ConfigError(f"{path} exists with other settings ({'; '.join([*shown, *more])}); {ways}")
 
 
 def _laid_over(there: Any, stated: Any) -> Any:
@@ -239,9 +242,9 @@ def find_joint(
                 raise ConfigError(f"--{name}: only with runs; {targets[0]} sets {option}, change it there")
         return found, False
     place = place_of(store or Path("joint.zarr")).resolve()
-    folder = settings_of(place).parent
-    samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, folder)} for each in targets]
-    samples += [{"run": os.path.relpath(each, folder), "bias": True} for each in bias]
+    path = settings_of(place)
+    samples: list[dict[str, Any]] = [{"run": os.path.relpath(each, path.parent)} for each in targets]
+    samples += [{"run": os.path.relpath(each, path.parent), "bias": True} for each in bias]
     if levels:
         against = against or "light_level"
         for sample, level in zip(samples, _light_levels(levels, len(targets), against), strict=False):
@@ -251,7 +254,7 @@ def find_joint(
         given["against"] = against or "none"  # a line needs two exposures
     for each in (*targets, *bias):
         find_run(each)
-    return _stated_run(place, given, "joint"), True
+    return stated_run(place, {"input": given}, "the command line", _ways("joint", path)), True
 
 
 def _light_levels(levels: Sequence[str], n: int, against: str) -> list[float]:

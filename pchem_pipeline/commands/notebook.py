@@ -25,6 +25,8 @@ from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.base.wording import symbol
 from pchem_pipeline.commands.figures import gather_run, millimetres
 from pchem_pipeline.commands.in_memory import paths_of, stack_of, write_stack
+from pchem_pipeline.config.tree import RunConfig
+from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.model.fit.result import html_table
 from pchem_pipeline.model.fit.status import FitStatus, words_of
 from pchem_pipeline.model.maps.maps import CAUTION, GOOD
@@ -32,9 +34,12 @@ from pchem_pipeline.report.charts.chart import COLUMN_MM, Chart
 from pchem_pipeline.report.charts.on_paper import Look, draw_chart, draw_panels
 from pchem_pipeline.report.data import PixelFit
 from pchem_pipeline.report.figures.catalogue import run_figures
+from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.pixels import pixel_columns, pixels_chart
 from pchem_pipeline.run.model_versions import ModelVersion, model_of, model_versions
+from pchem_pipeline.run.progress import ProgressMode
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.stage import Command
 from pchem_pipeline.run.target import Target, find_run, with_maps
 from pchem_pipeline.runner.session import run_status
 from pchem_pipeline.stages.defects import stored_defects
@@ -49,10 +54,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.discrepancy.verdict import Verdict
-    from pchem_pipeline.report.figures.figure import Figure
-    from pchem_pipeline.run.progress import ProgressMode
     from pchem_pipeline.use.twin import Twin
 
 
@@ -329,7 +330,6 @@ class Run:
         """
         from pchem_pipeline.commands.apply.apply import apply_to_frames
         from pchem_pipeline.commands.apply.settings import ApplySettings, kinds_of
-        from pchem_pipeline.run.stage import Command
 
         wanted = ApplySettings(kinds_of(what), prior)
         with tempfile.TemporaryDirectory(prefix="pchem-") as folder:
@@ -350,8 +350,6 @@ class Run:
         Raises:
             StoreError: nobody has searched yet.
         """
-        from pchem_pipeline.discrepancy.verdict import read_verdict
-
         found = read_verdict(self.path)
         if found is None:
             name = quoted(self._target.config_path or self.path)
@@ -373,7 +371,6 @@ class Run:
             PchEmError: the frames are gone or too few, or another command works on the run.
         """
         from pchem_pipeline.commands.discrepancy import find_and_add
-        from pchem_pipeline.run.stage import Command
 
         command = Command(progress=progress, quiet=progress == "off")
         find_and_add(self._target, command, refit=refit, effort=effort)

@@ -28,19 +28,11 @@ def make_plan(
     max_frames: float = 1e7,
     json: Path | None = None,
 ) -> str:
-    """Return the plan in words; write its JSON where asked. None: nothing was said.
+    """Return the plan in words, and write its numbers to the file ``json`` if one is given.
 
-    Args:
-        run: a run whose median pixel is planned for where numbers are not given.
-        read_noise: s_e, e-, quantisation included.
-        exposure: H, e-.
-        gain: g, e-/DN.
-        target: precisions as ``name=value``.
-        frames: frames there are.
-        samples: exposures separated by commas, or ``best``.
-        max_exposure: largest exposure to choose, e-.
-        max_frames: more are as good as never.
-        json: file for the numbers.
+    Read noise (quantisation included) and exposures are in e-, the gain in e-/DN; those not given are of the
+    median pixel of ``run``. Targets are precisions ``name=value``; ``frames`` are those available,
+    ``samples`` exposures separated by commas, or ``best``.
 
     Raises:
         ConfigError: a number is missing or wrong, or no number of frames reaches a target.
@@ -77,8 +69,8 @@ def _median_pixel(run: Path) -> tuple[dict[str, float], str]:
     """Return the medians of a run's maps, with ``noise_e`` that of a sample, and the effects of its model."""
     from pchem_pipeline.commands.apply.characterisation import read_calibration
     from pchem_pipeline.effects.framework.compose import effect_words
-    from pchem_pipeline.run.model_versions import model_of
     from pchem_pipeline.run.target import find_run, with_maps
+    from pchem_pipeline.stages.fit.fitted_model import fitted_effects
     from pchem_pipeline.use.electrons import read_stderr
 
     store = with_maps(find_run(run).stored())
@@ -90,11 +82,10 @@ def _median_pixel(run: Path) -> tuple[dict[str, float], str]:
             f"{store.path}: every pixel is flagged or has no value; give --read-noise and --exposure"
         )
     found["noise_e"] = found["read_noise_e"]
-    version, effects = model_of(store, "fit"), ""
-    if version is not None and version.effects:
-        effects = ", ".join(map(effect_words, version.effects))
+    effects = fitted_effects(store)
+    if effects:
         found["noise_e"] = max(np.nanmedian(read_stderr(read_calibration(store))), found["read_noise_e"])
-    return {name: float(value) for name, value in found.items()}, effects
+    return {name: float(value) for name, value in found.items()}, ", ".join(map(effect_words, effects))
 
 
 def _effects_line(effects: str, known: dict[str, float], noise: float) -> str:

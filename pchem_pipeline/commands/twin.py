@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,26 +11,21 @@ from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.commands.apply.characterisation import check_run, read_calibration
 from pchem_pipeline.config.load import make_config, write_config, yaml_text
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.formats.map_files import read_image, write_npz
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.target import Target
 from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.twin import Twin, extrapolated, redrawn, twin_maps
 
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.run.target import Target
-
 
 def twin_of(target: Target, *, redraw: int | None = None, shape: tuple[int, int] | None = None) -> Twin:
-    """Return the camera of a run.
+    """Return the camera of a run, or another sensor of this type with a given shape (rows, columns).
 
-    Args:
-        target: the run.
-        redraw: seed with which the maps are drawn within their errors; None: the estimates themselves.
-        shape: rows and columns of another sensor of the same type; None: this one.
+    ``redraw`` is a seed with which the maps are drawn within their errors; None: the estimates themselves.
 
     Raises:
         StoreError: the run is not finished as far as its fit.
@@ -83,17 +77,9 @@ def write_twin(
     shape: tuple[int, int] | None = None,
     force: bool = False,
 ) -> list[Path]:
-    """Write a YAML for ``pchem simulate`` and the maps beside it.
+    """Write a YAML for ``pchem simulate`` and the maps beside it; ``redraw`` and ``shape`` as of `twin_of`.
 
-    Args:
-        target: the run.
-        output: the YAML.
-        scene: a number, e- per frame, or a file with an image or a sequence; None: the exposure of the run.
-        frames: number of frames; None: as many as the run has.
-        seed: of the frames.
-        redraw: see `twin_of`.
-        shape: see `twin_of`.
-        force: replace existing files.
+    The scene is a number, e- per frame, or a file with an image or a sequence; None: the exposure of the run.
 
     Raises:
         ConfigError: a file exists, or the scene does not fit.

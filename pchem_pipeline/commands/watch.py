@@ -76,15 +76,10 @@ def watch(
     terminal: bool = False,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Write how far a run is.
+    """Write how far a run is; ``write`` takes a text of whole lines, the last without its end.
 
-    Args:
-        target: the run.
-        write: takes a text of whole lines, the last without its end.
-        follow: continue until no command works on the run; Ctrl-C ends it, too.
-        as_json: JSON lines instead of rows.
-        terminal: rows are drawn over; else only those that changed are written.
-        sleep: waits between two looks.
+    With ``follow`` it goes on until no command works on the run, or Ctrl-C. On a terminal rows are drawn
+    over, else only those that changed are written.
     """
     shown: list[str] = []
     try:

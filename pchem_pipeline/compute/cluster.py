@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pchem_pipeline.base.errors import ConfigError, IncompleteRunError, MissingDependencyError, install_hint
 from pchem_pipeline.compute.environment import prepare_environment, versions_of
-from pchem_pipeline.compute.executor import OnResult, Outcome, guarded, out_of_memory
+from pchem_pipeline.compute.executor import Executor, OnResult, Outcome, guarded, out_of_memory
 from pchem_pipeline.compute.settings import ComputeSettings
 
 T = TypeVar("T")
@@ -24,7 +24,7 @@ class OtherVersionsError(ConfigError):
     """A worker of the cluster has other versions of the libraries."""
 
 
-class DistributedExecutor:
+class DistributedExecutor(Executor):
     """A dask.distributed cluster: local, or at an address."""
 
     shares_memory = False

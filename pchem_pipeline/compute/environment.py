@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
-import importlib.util
 import math
 import os
+import resource
 import sys
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
@@ -14,9 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from pchem_pipeline.base.kernel_cache import cache_folder
-
-#: Unix alone has it.
-_RESOURCE: Any = importlib.import_module("resource") if importlib.util.find_spec("resource") else None
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLOSC_NTHREADS", "NUMBA_NUM_THREADS")
@@ -166,11 +162,9 @@ def cpu_seconds() -> float:
 
 
 def peak_rss_bytes() -> int:
-    """Return the largest resident set of this process or of one of its finished children; 0 if not known."""
-    if _RESOURCE is None:
-        return 0
+    """Return the largest resident set of this process or of one of its finished children."""
     unit = 1 if sys.platform == "darwin" else 1024
     # since the program began; other counts keep that of who started it
     own = [kibibytes << 10 for kibibytes in _named(Path("/proc/self/status"), "VmHWM:")]
-    own = own or [unit * _RESOURCE.getrusage(_RESOURCE.RUSAGE_SELF).ru_maxrss]
-    return int(max(*own, unit * _RESOURCE.getrusage(_RESOURCE.RUSAGE_CHILDREN).ru_maxrss))
+    own = own or [unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss]
+    return max(*own, unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)

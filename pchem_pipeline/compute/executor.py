@@ -15,7 +15,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from pchem_pipeline.base.errors import ConfigError, ExitCode, IncompleteRunError, PchEmError
+from pchem_pipeline.base.errors import ConfigError, ExitCode, IncompleteRunError
 from pchem_pipeline.compute.environment import prepare_environment
 from pchem_pipeline.compute.settings import ComputeSettings
 
@@ -46,15 +46,14 @@ class Executor(Protocol):
     #: workers share the memory of this process
     shares_memory: bool
     #: bytes that a worker may take, where somebody watches over that
-    memory_limit: int | None
+    memory_limit: int | None = None
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
         """Call ``function`` on each item and ``on_result(item, outcome)`` here, in any order."""
-        ...
 
     def close(self) -> None:
-        """Free the workers."""
-        ...
+        """Free the workers, where any wait for more work."""
+        return
 
 
 def guarded(function: Callable[[T], Any], item: T) -> Outcome:
@@ -112,20 +111,16 @@ def beside(threads: int) -> Iterator[Beside]:
         pool.shutdown(cancel_futures=True)
 
 
-class SerialExecutor:
+class SerialExecutor(Executor):
     """One item after the other, in this thread."""
 
     workers = 1
     shares_memory = True
-    memory_limit: int | None = None
 
     def map(self, function: Callable[[T], Any], items: Iterable[T], on_result: OnResult) -> None:
         """See :class:`Executor`."""
         for item in items:
             on_result(item, guarded(function, item))
-
-    def close(self) -> None:
-        """Nothing to free."""
 
 
 def _begin_worker() -> None:
@@ -141,10 +136,8 @@ def _begin_worker() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
-class PoolExecutor:
-    """A pool of threads or of spawned processes."""
-
-    memory_limit: int | None = None
+class PoolExecutor(Executor):
+    """A pool of threads or of spawned processes, which lives only during :meth:`map`."""
 
     def __init__(self, workers: int, *, processes: bool) -> None:
         self.workers = workers
@@ -190,9 +183,6 @@ class PoolExecutor:
         finally:
             pool.shutdown(wait, cancel_futures=True)
 
-    def close(self) -> None:
-        """The pool lives only during :meth:`map`."""
-
 
 def make_executor(
     settings: ComputeSettings,
@@ -208,13 +198,10 @@ def make_executor(
     """
     if settings.workers != "auto" and settings.workers < 1:
         raise ConfigError(f"compute.workers: {settings.workers}; give 1 or more, or auto")
-    match settings.backend:
-        case "serial":
-            return SerialExecutor()
-        case "threads" | "processes":
-            return PoolExecutor(settings.count(), processes=settings.backend == "processes")
-        case "distributed":
-            from pchem_pipeline.compute.cluster import DistributedExecutor
+    if settings.backend == "serial":
+        return SerialExecutor()
+    if settings.backend == "distributed":
+        from pchem_pipeline.compute.cluster import DistributedExecutor
 
-            return DistributedExecutor(settings, say, check)
-    raise PchEmError(f"unknown backend {settings.backend}")
+        return DistributedExecutor(settings, say, check)
+    return PoolExecutor(settings.count(), processes=settings.backend == "processes")

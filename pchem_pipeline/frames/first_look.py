@@ -61,7 +61,7 @@ def first_look(frames: FrameSequence, settings: InputSettings) -> list[str]:
     low, high = int(values.min()), int(values.max())
     if not frames.bit_shift and high - low < _LARGEST_SPAN:
         at_low, at_high = (int((values == end).any(axis=0).sum()) for end in (low, high))
-        frames.seen_limits = limits_seen(low, np.bincount((values - low).ravel()), (at_low, at_high))
+        frames.seen_limits = _limits_seen(low, np.bincount((values - low).ravel()), (at_low, at_high))
     if frames.order_by_habit and not frames.unwritten and _is_time_last(values):
         notes.append(
             f"{name.name}: read as {n} frames of {rows} x {columns} pixels, but the last axis looks like "
@@ -99,14 +99,8 @@ def _unused_bits(values: NDArray[Any]) -> int:
     return (used & -used).bit_length() - 1
 
 
-def limits_seen(first: int, samples: NDArray[Any], pixels: tuple[int, int]) -> tuple[int | None, int | None]:
-    """Return the lowest and highest code if samples of several pixels pile up there, else None.
-
-    Args:
-        first: the lowest code, DN.
-        samples: number of each code from the lowest to the highest.
-        pixels: number with samples of the lowest, and of the highest code.
-    """
+def _limits_seen(first: int, samples: NDArray[Any], pixels: tuple[int, int]) -> tuple[int | None, int | None]:
+    """Return the lowest and highest code if samples pile up there, in several of the pixels that have it."""
     last, few = first + samples.size - 1, _FEWEST + 1
     found: list[int | None] = []
     for code, n, (at, *beside) in (
@@ -119,7 +113,10 @@ def limits_seen(first: int, samples: NDArray[Any], pixels: tuple[int, int]) -> t
 
 
 def limits_in(counts: NDArray[Any], origin: NDArray[Any]) -> tuple[int | None, int | None]:
-    """Return the same of histograms, shape (..., B), with the DN of their bins 0, shape (...)."""
+    """Return the lowest and highest code of histograms, (..., bin), where samples pile up there, else None.
+
+    ``origin`` are the DN of their bins 0, shape (...).
+    """
     first = int(origin.min())
     codes = (origin - first)[..., None] + np.arange(counts.shape[-1])
     samples, pixels = np.bincount(codes.ravel(), counts.ravel()), np.bincount(codes[counts > 0])
@@ -127,7 +124,7 @@ def limits_in(counts: NDArray[Any], origin: NDArray[Any]) -> tuple[int | None, i
     if not used.size:
         return None, None
     low, high = int(used[0]), int(used[-1])
-    return limits_seen(first + low, samples[low : high + 1], (int(pixels[low]), int(pixels[high])))
+    return _limits_seen(first + low, samples[low : high + 1], (int(pixels[low]), int(pixels[high])))
 
 
 def _is_time_last(values: NDArray[Any]) -> bool:

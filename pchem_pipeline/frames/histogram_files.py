@@ -46,11 +46,6 @@ class HistogramInput:
     paths: tuple[Path, ...]
     notes: tuple[str, ...]
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(rows, columns) of the sensor whose pixels are the channels."""
-        return 1, len(self.names)
-
 
 class _Channel(NamedTuple):
     """One histogram with its leading and trailing zeros cut off."""

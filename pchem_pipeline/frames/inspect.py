@@ -33,12 +33,10 @@ class InputReport:
     Attributes:
         files: one entry per file, in reading order.
         notes: remarks that stop nothing, such as gaps in the numbers of the files.
-        skipped: whether the bad files were left out (``on_bad_file: skip``).
     """
 
-    files: list[FileReport] = field(default_factory=list)
+    files: list[FileReport]
     notes: list[str] = field(default_factory=list)
-    skipped: bool = False
 
     @property
     def bad(self) -> list[FileReport]:
@@ -50,24 +48,20 @@ class InputReport:
         """The files that can be used."""
         return [file for file in self.files if not file.problem]
 
-    def message(self) -> str:
+    def message(self, done: str = "skipped (input.on_bad_file: skip)") -> str:
         """Return one line: all bad files, what was done about them, and notes; empty if all is well."""
         lines = []
         if bad := self.bad:
             several = f"{len(bad)} of {len(self.files)} input files cannot be used: "
             listed = "; ".join(f"{file.path}: {file.problem}" for file in bad)
-            lines.append((several if len(self.files) > 1 else "") + listed)
-            if self.skipped:
-                lines.append("skipped (input.on_bad_file: skip)")
-        return "; ".join(lines + self.notes)
+            lines += [(several if len(self.files) > 1 else "") + listed, done]
+        return "; ".join(filter(None, lines + self.notes))
 
     def raise_if_refused(self, on_bad_file: Literal["error", "skip"]) -> None:
         """Raise InputError if there are bad files that are not to be skipped, or no good ones are left."""
-        self.skipped = on_bad_file == "skip"
         if self.bad and (on_bad_file == "error" or not self.good):
             cure = "" if len(self.files) == 1 else "; repair or remove them, or set input.on_bad_file: skip"
-            self.skipped = False
-            raise InputError(self.message() + cure)
+            raise InputError(self.message("") + cure)
 
 
 def survey(

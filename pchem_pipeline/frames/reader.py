@@ -72,7 +72,7 @@ class FrameReader(ABC):
     byte_order: str | None = None
     unwritten: bool = False
     rows_per_read: int = 1
-    order_by_habit: ClassVar[bool] = False
+    order_by_habit: bool = False
 
     @classmethod
     @abstractmethod

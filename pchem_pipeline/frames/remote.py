@@ -7,6 +7,7 @@ reading, and asks for the state of the object after fetching it, so that a chang
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import re
@@ -18,7 +19,6 @@ from pchem_pipeline.frames.formats.raw import SIDECARS, RawReader
 from pchem_pipeline.store.files import whole_file, write_atomic
 
 _URL = re.compile(r"^[a-z][a-z0-9+-]+://")
-_GLOB = re.compile(r"[*?\[]")
 
 
 def is_remote(entry: str) -> bool:
@@ -63,7 +63,7 @@ def fetch(url: str) -> list[Path]:
 
 
 def _names(storage: Any, path: str) -> list[str]:
-    if _GLOB.search(path):
+    if glob.has_magic(path):
         return [str(name) for name in storage.glob(path)]
     if storage.isdir(path):
         return [str(each["name"]) for each in storage.ls(path, detail=True) if each["type"] == "file"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import re
 from contextlib import suppress
@@ -15,7 +16,6 @@ from pchem_pipeline.frames.remote import fetch, is_remote
 from pchem_pipeline.frames.settings import InputSettings
 
 HISTOGRAM_SUFFIXES = {".csv": "histogram", ".npy": "histogram", ".npz": "histogram", ".txt": "histogram"}
-_GLOB = re.compile(r"[*?\[]")
 _NUMBER = re.compile(r"(\d+)")
 
 
@@ -49,7 +49,7 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
             found += _folder(path, settings)
         elif path.exists():
             found.append(path)
-        elif _GLOB.search(entry):
+        elif glob.has_magic(entry):
             found += _glob(pattern, base_dir)
         else:
             missing.append(path)

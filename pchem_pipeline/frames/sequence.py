@@ -36,11 +36,6 @@ class FrameSequence(FrameReader):
     excluded: BoolArray | None = None
     exclusions: tuple[str, ...] = ()
 
-    @property
-    def order_by_habit(self) -> bool:  # type: ignore[override]
-        """The format of the files does not say which axis is time."""
-        return self._readers[0].order_by_habit
-
     def __init__(
         self, readers: Sequence[FrameReader], settings: InputSettings, report: InputReport, least: int = 2
     ) -> None:
@@ -68,7 +63,7 @@ class FrameSequence(FrameReader):
         self.shape = (end - self._first, y1 - self._y0, self._x1 - self._x0)
         self.dtype = readers[0].dtype
         self.rows_per_read = max(reader.rows_per_read for reader in readers)
-        self.byte_order = readers[0].byte_order
+        self.byte_order, self.order_by_habit = readers[0].byte_order, readers[0].order_by_habit
         self.seen_limits: tuple[int | None, int | None] = (None, None)
         self._set_areas(settings)
         self.unwritten = any(reader.unwritten for reader in readers)

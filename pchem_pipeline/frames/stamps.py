@@ -38,9 +38,7 @@ def stamp_notes(readers: Sequence[FrameReader], frame_range: tuple[int, int | No
     total = sum(reader.shape[0] for reader in readers)
     end = total if end is None else min(end, total)
     missing, start = 0, 0
-    after: list[int] = []
-    repeated: list[int] = []
-    back: list[int] = []
+    after, repeated, back = list[int](), list[int](), list[int]()
     for reader in readers:
         a, b = max(first, start), min(end, start + reader.shape[0])
         if reader.frame_stamps is not None and b - a > 1:

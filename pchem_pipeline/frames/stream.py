@@ -64,12 +64,8 @@ class FrameStream:
     ) -> None:
         """Take the memory, two blocks; nothing is read yet.
 
-        Args:
-            source: the frames.
-            bands: the rows that are wanted, by bands.
-            step: frames in a block; blocks end at multiples of it.
-            frames: first frame and end of those that are wanted; None: all.
-            threads: that share the reading of a block (coded files cost time to decode).
+        Bands of rows, and ``frames`` from the first to the end (None: all), are wanted; blocks end at
+        multiples of ``step`` frames. Threads share the reading of a block (coded files cost time to decode).
         """
         self.bands = bands
         self._source, self._threads = source, threads

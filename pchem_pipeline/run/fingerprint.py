@@ -27,7 +27,6 @@ class StageState:
     """How far a stage is.
 
     Attributes:
-        stage: its name.
         state: missing, partial, stale, complete or failed.
         why: reason, for people.
         done: finished units.

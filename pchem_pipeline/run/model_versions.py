@@ -38,8 +38,7 @@ class AddedArrays:
 
     Attributes:
         group: of the store, with ``added_exposure`` and ``added_weight``.
-        rows: of the window that they cover, first and end.
-        columns: likewise.
+        rows, columns: of the window that they cover, first and end.
         effects: those that add it, as JSON data: it counts for nothing under a model without them.
         digest: of the arrays.
     """

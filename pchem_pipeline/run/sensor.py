@@ -15,13 +15,9 @@ from pchem_pipeline.store.run_store import RunStore
 
 @dataclass(frozen=True)
 class Sample:
-    """One of several exposures that are fitted together.
+    """One of several exposures that are fitted together, by the name of its store; a bias holds no electrons.
 
-    Attributes:
-        name: name of its store.
-        bias: it holds no electrons.
-        integration_time: s, as its run says; None where it does not.
-        kind: dark, light or unknown, as its run says.
+    The integration time (s) and the kind (dark, light or unknown) are as its run says.
     """
 
     name: str
@@ -49,7 +45,6 @@ class SensorInfo:
         identity: names, sizes and content hashes of the files.
         names: names of the channels of ready-made histograms.
         samples: the exposures, where there are several.
-        camera: its name, serial number, temperature and date, as far as the files say.
         shown: place of the one whose histograms, H and ensemble are shown.
         whole: rows and columns of the frames in the files, whatever the region of interest; None: not known.
         reader: format of the files and the library that read them; empty: not known.

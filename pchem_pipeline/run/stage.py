@@ -82,11 +82,8 @@ class Command:
     """What the command line asked for, beside the configuration, whose section ``compute`` it overrides.
 
     Attributes:
-        force: do it again.
-        dry_run: say what would be done.
         roi: only the tiles of this region.
         settings: of a stage on demand, in place of those of its section; None: those of its last result.
-        quiet: say warnings only.
         log_json: file for JSON lines.
         max_memory: MiB.
     """
@@ -133,15 +130,14 @@ def _do_unit(
 
 @dataclass(frozen=True)
 class Prepared:
-    """What a single pass over the input did for a stage, which then has but to mark its units.
+    """What a single pass over the camera files did for some stages, which then have but to mark their units.
 
-    Attributes:
-        frames: the opened camera files.
-        clock: wall and CPU time when the pass began, for the stage to which its time belongs.
+    The clock is wall and CPU time when the pass began: its time belongs to the last of the stages.
     """
 
+    stages: tuple[str, ...]
     frames: FrameSequence
-    clock: tuple[float, float] | None = None
+    clock: tuple[float, float]
 
 
 def allowed_bytes(config: RunConfig, workers: int) -> int:
@@ -173,14 +169,12 @@ class StageContext:
         base_dir: folder to which relative paths of the configuration refer.
         store: the run's store, writable.
         stop: raised signals; checked between units.
-        stage: name of the running stage.
-        fingerprint: of the running stage.
+        stage, fingerprint: of the running stage.
         fresh: True where the stage starts anew and must create its arrays.
         failed: unit key to reason, filled by :meth:`run_units`.
         n_keys: number of markers of the complete stage, filled by :meth:`run_units`.
-        config_path: the YAML file of the run, where it has one.
         notes: remarks for the report, filled by the stage.
-        prepared: the stages whose arrays a single pass over the input has made.
+        prepared: by a single pass over the input, if there was one.
         begin: gives up what the running stage left before, at the first call: :meth:`create` and
             :meth:`run_units` call it, a stage that writes before those does so itself. What is refused until
             then costs nothing.
@@ -201,14 +195,14 @@ class StageContext:
     n_keys: int = 0
     config_path: Path | None = None
     notes: list[str] = field(default_factory=list)
-    prepared: Mapping[str, Prepared] = field(default_factory=dict)
+    prepared: Prepared | None = None
     begin: Callable[[], None] = lambda: None
     created: dict[str, str] = field(default_factory=dict)
 
     @property
     def is_prepared(self) -> bool:
         """The arrays of the running stage were made beforehand, by a single pass over the input."""
-        return self.stage in self.prepared
+        return self.prepared is not None and self.stage in self.prepared.stages
 
     @functools.cached_property
     def model(self) -> ModelVersion:
@@ -275,13 +269,9 @@ class StageContext:
     ) -> None:
         """Make arrays of this stage with their declared dimensions, unless the stage resumes and has them.
 
-        Args:
-            names: of the arrays, with their groups.
-            lengths: of dimensions; of y and x the sensor's, chunks a tile, where these are not given.
-            chunks: length of a chunk along dimensions; the whole where none is given.
-            shards: see :meth:`RunStore.create_array`.
-            dtype: only for variables whose type the data decide.
-            attributes: further attributes.
+        Lengths are those of dimensions, of y and x the sensor's where they are not given; chunks are a tile
+        along y and x, the whole along others that are not given. For the rest see
+        :meth:`RunStore.create_array`.
         """
         self.begin()
         sizes, parts = {**LENGTHS, **(lengths or {})}, dict(chunks or {})

@@ -51,9 +51,8 @@ def execute(name: str, context: StageContext) -> StageState:
             )
     if before.state == "stale":
         context.reporter.info(f"{name}: running again: {before.why}")
-    prepared = context.prepared.get(name)
-    if prepared is not None and prepared.clock is not None:
-        clock = prepared.clock
+    if context.prepared is not None and name == context.prepared.stages[-1]:
+        clock = context.prepared.clock
     return _perform(stage, context, before, clock)
 
 

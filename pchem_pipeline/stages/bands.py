@@ -22,13 +22,7 @@ FRAMES_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Band:
-    """Rows ``y0:y1`` of the sensor, over its full width.
-
-    Attributes:
-        y0: first row, at the border of a group of rows and of a tile.
-        y1: end of the rows.
-        keys: names of the tiles in it.
-    """
+    """Rows ``y0:y1`` over the full width: whole groups of rows, and the tiles with these keys."""
 
     y0: int
     y1: int
@@ -45,14 +39,9 @@ def plan_bands(
 ) -> list[Band]:
     """Cut the sensor into bands: as high as allowed where there is work, and one for each worker at least.
 
-    No tile and no group of rows is cut.
-
-    Args:
-        tiles: all tiles.
-        pending: keys of the tiles that are to be done.
-        most_rows: rows that fit into the memory of a worker; less than one step is taken as one.
-        workers: number of workers.
-        rows_per_read: rows that come at no more cost than one; bands keep to multiples where they can.
+    No tile and no group of rows is cut. ``pending`` are the keys of the tiles that are to be done,
+    ``most_rows`` fit into the memory of a worker; less than one step is taken as one. ``rows_per_read`` come
+    at no more cost than one; bands keep to multiples where they can.
     """
     ny = tiles[-1].y1
     step = max(tiles[0].y1, ROW_GROUP)
@@ -95,12 +84,8 @@ def cut_rows(ny: int, step: int, workers: int) -> list[tuple[int, int]]:
 def tile_bands(context: StageContext, most_rows: int, rows_per_read: int) -> list[Band | Tile]:
     """Return the units of a stage that reads the frames of fitted pixels again by bands.
 
-    They are bands of the tiles to be done, and each tile that is done, or that is not fitted.
-
-    Args:
-        context: of the stage.
-        most_rows: rows that a worker can hold; one row of tiles is the least.
-        rows_per_read: rows that come at no more cost than one.
+    They are bands of the tiles to be done, and each tile that is done, or that is not fitted. Arguments as of
+    `plan_bands`; one row of tiles is the least.
     """
     tiles = context.tiles()
     todo = {tile.key for tile in context.pending(tiles)} & context.tiles_done("fit")

@@ -55,13 +55,13 @@ def run(context: StageContext) -> None:
         samples = check_samples(context.config, context.base_dir)
         context.begin()
         sample_sensor(context.config, samples).write(context.store)
-        _run_whole(context)
+        context.run_units([WHOLE])
         return
     if is_histogram_input(context.config.input, context.base_dir):
         _record_histograms(context)
         return
     settings = context.config.input
-    done = context.prepared.get(context.stage)
+    done = context.prepared if context.is_prepared else None
     reader = open_frames(settings, context.base_dir) if done is None else done.frames
     context.begin()
     files = f"{len(reader.paths)} file{'s' * (len(reader.paths) != 1)}"
@@ -78,7 +78,7 @@ def run(context: StageContext) -> None:
     write_overscan(context.store, reader)
     keep_ingested(context)
     if settings.mode == "reference":
-        _run_whole(context)
+        context.run_units([WHOLE])
         return
     chunk = chunk_shape(reader.shape, reader.dtype.itemsize)
     units = list(copy_units(reader.shape, reader.dtype.itemsize, chunk))
@@ -182,11 +182,6 @@ def _copy(unit: Named[_Copied], store: RunStore, *, reader: FrameReader) -> None
         store.write("frames/dn", (slice(t0, t1), slice(y, end), slice(None)), reader.read(t0, t1, y, end))
 
 
-def _run_whole(context: StageContext) -> None:
-    """Finish the stage where nothing is copied."""
-    context.run_units([WHOLE], unit_name="input")
-
-
 # -- ready-made histograms ----------------------------------------------------------------------
 
 
@@ -200,8 +195,8 @@ def _record_histograms(context: StageContext) -> None:
     SensorInfo(
         kind="histograms",
         n_frames=int(given.counts.sum(axis=2).max()),
-        ny=given.shape[0],
-        nx=given.shape[1],
+        ny=1,
+        nx=len(given.names),
         dtype="int32" if given.origin.min() < 0 else np.min_scalar_type(highest).name,
         bit_depth=context.config.input.bit_depth,
         seen_limits=limits_in(given.counts, given.origin),
@@ -212,4 +207,4 @@ def _record_histograms(context: StageContext) -> None:
         reader="histogram",
     ).write(context.store)
     keep_ingested(context)
-    _run_whole(context)
+    context.run_units([WHOLE])

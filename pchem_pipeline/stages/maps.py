@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import Arrays
+from pchem_pipeline.base.arrays import Arrays, FloatArray
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
 from pchem_pipeline.model.checks.multiple_testing import false_discovery, poorest
@@ -36,26 +36,14 @@ NO_TIME = "unknown integration time: no charge rate. Set input.integration_time 
 _CUT = int(FitStatus.BIAS_AMBIGUOUS | FitStatus.OUTSIDE_WINDOW)
 
 
-def _tell_time(context: StageContext) -> None:
-    """Say where the integration time is not known, or is not what the files say."""
-    time, stated = context.sensor.integration_time, SensorInfo.read(context.store).integration_time
-    if time is None:
-        context.note(NO_TIME)
-    elif stated is not None and abs(time - stated) > 1e-3 * stated:  # times are written with few digits
-        context.note(f"integration time {time:g} s from input.integration_time; the files state {stated:g} s")
-
-
 def maps_tile(
     fit: Arrays, integration_time: float | None, rate: str = "charge_rate", n_frames: int | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Return all maps of a tile by name.
+    """Return all maps of a tile by name, from its arrays of the group ``fit``.
 
-    Args:
-        fit: the arrays of the group ``fit`` of the tile, by name.
-        integration_time: s, or None.
-        rate: name of H over the integration time.
-        n_frames: of the one sample, whose errors of H and mu hold the chance of being electrons off; None:
-            of several samples, which settle the bias.
+    ``rate`` is the name of H over the integration time (s, or None), ``n_frames`` the number of frames of the
+    one sample, whose errors of H and mu hold the chance of being electrons off; None: several samples, which
+    settle the bias.
     """
     parameters = {name: fit[name] for name in PARAMETERS}
     maps: dict[str, NDArray[Any]] = dict(parameters)
@@ -93,8 +81,11 @@ def run(context: StageContext) -> None:
     of_none = arrays(context.store, (slice(0), slice(0)))  # of no pixel, with all names
     context.create_like(of_none)
     context.create("maps/goodness_q")
-    if not sensor.samples:
-        _tell_time(context)
+    time, stated = sensor.integration_time, SensorInfo.read(context.store).integration_time
+    if not sensor.samples and time is None:
+        context.note(NO_TIME)
+    elif time and stated and abs(time - stated) > 1e-3 * stated:  # times are written with few digits
+        context.note(f"integration time {time:g} s from input.integration_time; the files state {stated:g} s")
     held = context.tile_pixels * 80 * 8  # arrays that are read and made
     task = functools.partial(_do_tile, arrays=arrays)
     context.run_units(context.tiles(), task, needs="fit", unit_bytes=held)
@@ -102,19 +93,15 @@ def run(context: StageContext) -> None:
     _summarise(context, [path.removeprefix("maps/") for path in with_error if path.startswith("maps/")])
 
 
-@dataclass(frozen=True)
-class Line:
-    """What slope and offset of several samples are called, and where each stands (NaN: nowhere)."""
-
-    names: tuple[str, ...]
-    x: tuple[float, ...]
+#: What slope and offset of several samples are called, and where each stands (NaN: nowhere).
+_Line = tuple[tuple[str, ...], FloatArray]
 
 
-def _line(context: StageContext) -> Line | None:
+def _line(context: StageContext) -> _Line | None:
     settings, samples = context.config.input, context.sensor.samples
     if not samples or (x := exposure_axis(settings, samples)) is None:
         return None
-    return Line(line_map_names(settings.against, context.charge_rate), tuple(x.tolist()))
+    return line_map_names(settings.against, context.charge_rate), x
 
 
 def _arrays(
@@ -123,29 +110,24 @@ def _arrays(
     *,
     integration_time: float | None,
     rate: str,
-    line: Line | None,
+    line: _Line | None,
     n_frames: int | None,
 ) -> dict[str, NDArray[Any]]:
     """Return all that the stage makes of the fit of some pixels, by path."""
     maps = maps_tile(store.at(region, "fit"), integration_time, rate, n_frames)
     found = {f"maps/{name}": values for name, values in maps.items()}
-    return found if line is None else found | line_tile(store.at(region, "samples"), line)
+    return found if line is None else found | _line_arrays(store.at(region, "samples"), line)
 
 
 def _do_tile(tile: Tile, store: RunStore, *, arrays: Callable[..., dict[str, NDArray[Any]]]) -> None:
     store.at(tile.region).update(arrays(store, tile.region))
 
 
-def line_tile(samples: Arrays, line: Line) -> dict[str, NDArray[Any]]:
-    """Return the results of a line through the exposures of each pixel, by path.
-
-    ``samples`` has ``quanta_exposure`` (sample, y, x) and ``covariance`` (y, x, parameter, parameter).
-    """
-    exposure, covariance = samples["quanta_exposure"], samples["covariance"]
+def _line_arrays(samples: Arrays, line: _Line) -> dict[str, NDArray[Any]]:
+    """Return the results of a line through the exposures of each pixel, by path."""
+    exposure, covariance, (names, x) = samples["quanta_exposure"], samples["covariance"], line
     n, *shape = exposure.shape
-    maps, left = line_maps(
-        exposure.reshape(n, -1).T, covariance.reshape(-1, *covariance.shape[2:]), np.array(line.x), line.names
-    )
+    maps, left = line_maps(exposure.reshape(n, -1).T, covariance.reshape(-1, *covariance.shape[2:]), x, names)
     return {
         f"{group}/{name}": np.ascontiguousarray(values.T).reshape(*values.shape[1:], *shape)
         for group, found in (("maps", maps), ("samples", left))

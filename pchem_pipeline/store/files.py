@@ -73,15 +73,11 @@ def is_fatal(error: BaseException) -> bool:
 
 
 def write_atomic(path: Path, data: disk.Data, *, sync: bool = True) -> None:
-    """Write a small file, so that whoever reads it finds the old or the new one, whole.
+    """Write a small file, so that whoever reads it finds the old or the new one, whole; make its folders.
 
-    A file that is there keeps its mode. An object of an object storage is put at once.
-
-    Args:
-        path: the file; folders above it are made.
-        data: its content.
-        sync: it is on the disk before it takes its place, so that a power cut cannot leave it empty, and the
-            place is on the disk on return.
+    A file that is there keeps its mode. With ``sync`` the file is on the disk before it takes its place, so
+    that a power cut cannot leave it empty, and the place is on the disk on return. An object of an object
+    storage is put at once.
 
     Raises:
         StoreError: the file system, or the object storage, refused.

@@ -161,16 +161,10 @@ class RunStore:
         dtype: Any = None,
         attributes: Mapping[str, Any] | None = None,
     ) -> None:
-        """Make the array of a registered variable, replacing an older one.
+        """Make the array of a variable in `VARIABLES` in place of an older one.
 
-        Args:
-            name: path in :data:`pchem_pipeline.base.variables.VARIABLES`.
-            shape: its shape.
-            chunks: chunk shape; one task must write whole chunks.
-            shards: multiples of the chunks that share a file; one task must write them whole. None: each
-                chunk is a file.
-            dtype: only for variables whose type the data decide.
-            attributes: further attributes (JSON).
+        One task must write whole chunks, or whole shards: multiples of the chunks that share a file (None:
+        each chunk is a file). A type is given only for variables whose type the data decide.
 
         Raises:
             StoreError: the file system refused.
@@ -324,11 +318,9 @@ class RunStore:
 
     # -- files --------------------------------------------------------------------------------
 
-    def write_file(self, name: str, data: bytes) -> Path:
-        """Write a file of the run, atomically, and return its path."""
-        path = self.path / name
-        write_atomic(path, data)
-        return path
+    def write_file(self, name: str, data: bytes) -> None:
+        """Write a file of the run, atomically."""
+        write_atomic(self.path / name, data)
 
     def write_config(self, text: str) -> None:
         """Keep the resolved YAML of the run, its digest before it: no cut file is without one."""

@@ -29,10 +29,8 @@ def test_the_citation_is_of_this_version():
     assert {each["url"].rsplit("/", 1)[1] for each in citation["references"]} == {"2302.14654", "2403.04498"}
 
 
-def test_a_system_without_the_module_resource_is_no_reason_to_fail(monkeypatch):
+def test_memory_and_workers_of_this_process_are_known():
     assert environment.peak_rss_bytes() > 0
-    monkeypatch.setattr(environment, "_RESOURCE", None)
-    assert environment.peak_rss_bytes() == 0
     assert environment.available_workers() >= 1
 
 

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -37,12 +37,15 @@ from pchem_pipeline.commands.apply.source import (
 from pchem_pipeline.commands.apply.tasks import N_SUMS, convert_piece, count_piece, offsets_piece
 from pchem_pipeline.compute.memory import keep_to_limit
 from pchem_pipeline.effects.framework.compose import model_words
+from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.identity import quick_identity
-from pchem_pipeline.run.model_versions import model_of
+from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Command, StageContext, Task
+from pchem_pipeline.run.target import Target
 from pchem_pipeline.runner.session import at_work, with_overrides
+from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.stages.overscan import overscan_samples
 from pchem_pipeline.store.files import fingerprint_of, read_json
 from pchem_pipeline.store.records import StageRecord
@@ -53,11 +56,6 @@ from pchem_pipeline.use.calibration import PEAKS_OVERLAP_E, Calibration
 from pchem_pipeline.use.common_modes import CommonModes, scene_of
 from pchem_pipeline.use.electrons import read_stderr
 from pchem_pipeline.use.overscan import Overscan
-
-if TYPE_CHECKING:
-    from pchem_pipeline.effects.framework.effect import Effect
-    from pchem_pipeline.frames.sequence import FrameSequence
-    from pchem_pipeline.run.target import Target
 
 #: Name of the work in the records of the output.
 STAGE = "apply"
@@ -138,8 +136,7 @@ def _make_job(
     sensor = SensorInfo.read(run)
     frames = open_like_run(target, sensor, files, wanted.dataset)
     limits = limits_of(frames, sensor)
-    version = model_of(run, "fit")
-    effects = () if version is None else version.effects
+    effects = fitted_effects(run)
     modes, overscan = _offsets_to_remove(effects, target, frames, wanted.reference)
     some, cut = some_of(frames if overscan is None else frames.with_overscan()), 0.0
     if limits is not None:

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
+from pchem_pipeline.commands.apply.settings import Job, Piece
+from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import moves_gain
 from pchem_pipeline.model.maps.maps import electron_shifts
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.fit.fitted_model import FittedModel, fitted_satellites
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration, covariance_of
-
-if TYPE_CHECKING:
-    from pchem_pipeline.commands.apply.settings import Job, Piece
-    from pchem_pipeline.model.fit.settings import FitSettings
 
 #: Gap below which a rival counts, nats; read noise and standard error of the bias from which on, e-, the
 #: curvature of the likelihood at its maximum does not give its width: where either is less, or the
@@ -50,14 +47,10 @@ def read_calibration(
     extra_variance: FloatArray | None = None,
     limits: tuple[int | None, int | None] = (None, None),
 ) -> Calibration:
-    """Return the calibration of some rows of a run.
+    """Return the calibration of some rows of a run, for samples between ``limits``, DN (None: not known).
 
-    Args:
-        store: the run.
-        rows: of the sensor.
-        removed: tags of effects whose offsets are subtracted from the frames.
-        extra_variance: of these offsets' estimates, DN^2, (y, x).
-        limits: first and last code of the samples, DN; None: not known.
+    The offsets of the effects with the tags ``removed`` are subtracted from the frames; ``extra_variance``
+    (y, x) is that of their estimates, DN^2.
     """
     region = (rows, slice(None))
     maps = [store.read(f"fit/{name}", region) for name in PARAMETERS]

@@ -6,7 +6,7 @@ import functools
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,12 @@ from pchem_pipeline.base.variables import Variable, variables_of
 from pchem_pipeline.commands.apply.finish import FLAGS
 from pchem_pipeline.frames.formats.fits_files import FitsImage, image_cards, input_cards, write_images
 from pchem_pipeline.frames.formats.map_files import write_tiff_cube
+from pchem_pipeline.frames.reader import FrameReader
 from pchem_pipeline.frames.registry import require
+from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.store.files import write_json
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.electrons import stderr_at
-
-if TYPE_CHECKING:
-    from pchem_pipeline.frames.reader import FrameReader
-    from pchem_pipeline.frames.sequence import FrameSequence
 
 _WHOLE = slice(None)
 _AT_LIMIT = "applied/at_adc_limit"

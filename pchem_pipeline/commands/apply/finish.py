@@ -127,10 +127,7 @@ def _variance(sums: FloatArray, n: int) -> FloatArray:
 
 
 def _row_words(means: FloatArray, pixels: FloatArray, usable: BoolArray) -> str:
-    """Return the noise that the pixels of a row share, with its error, DN.
-
-    Variances over frames are given of the row means (y,) of usable pixels and of samples (y, x), DN^2.
-    """
+    """Return the noise that a row shares, DN, from variances of its mean (y,) and of samples (y, x), DN^2."""
     number = usable.sum(axis=1)
     several = number > 1
     own = np.where(usable, pixels, 0.0).sum(axis=1)[several] / number[several] ** 2

@@ -62,12 +62,7 @@ def kinds_of(text: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Piece:
-    """Rows ``y0:y1`` of frames ``t0:t1``.
-
-    Attributes:
-        name: of the work.
-        number: of the segment of frames.
-    """
+    """Rows ``y0:y1`` of frames ``t0:t1``: name of the work, and number of the segment of frames."""
 
     name: str
     y0: int

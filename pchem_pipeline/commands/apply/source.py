@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +14,15 @@ from pchem_pipeline.base.errors import ConfigError, InputError
 from pchem_pipeline.frames.camera import IMAGE_TYPES, CameraFacts
 from pchem_pipeline.frames.first_look import first_look
 from pchem_pipeline.frames.open import open_frames
+from pchem_pipeline.frames.sequence import FrameSequence
+from pchem_pipeline.frames.settings import InputSettings
 from pchem_pipeline.run.sensor import SensorInfo
+from pchem_pipeline.run.target import Target
 from pchem_pipeline.stages.overscan import read_overscan
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.calibration import Calibration
 from pchem_pipeline.use.overscan import Overscan
-
-if TYPE_CHECKING:
-    from pchem_pipeline.frames.sequence import FrameSequence
-    from pchem_pipeline.frames.settings import InputSettings
-    from pchem_pipeline.run.target import Target
 
 #: K; beyond it offset and dark current are others.
 MOST_WARMER = 2.0

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import math
-import string
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from string import ascii_uppercase
 from typing import Any, Literal
 
 import numpy as np
@@ -78,19 +79,12 @@ def compare_runs(
 ) -> None:
     """Compare runs with the first of them, and the last with the one before it in the history.
 
-    Writes ``compare.html`` and ``compare.json``, and adds a line to ``history.csv`` for each new run.
-
-    Args:
-        paths: stores, or the YAML files that made them; two or more.
-        folder: where to write; made if needed.
-        tolerance: relative difference that counts as rounding, where the frames are the same.
-        labels: of the runs, such as setpoints: the numbers that they begin with are the axis of the history;
-            none: the dates.
-        rate: false-discovery rate at which a pixel counts as changed.
-        limits: ``name=value`` of the section ``compare``, in place of those of the first run.
-        progress: auto, on or off.
-        quiet: write nothing where nothing changed.
-        write: takes each line of what changed.
+    Writes ``compare.html`` and ``compare.json`` to the folder, and adds a line to ``history.csv`` for each
+    new run. Relative differences up to ``tolerance`` count as rounding where the frames are the same; of
+    others, pixels count as changed at the false-discovery rate ``rate``. Numbers with which ``labels`` begin
+    are the axis of the history; without labels it is the date. ``limits`` are ``name=value`` of the section
+    ``compare``, in place of those of the first run. ``write`` takes each line of what changed; with ``quiet``
+    it gets none where nothing changed.
 
     Raises:
         ChangedError: something changed; the files are written all the same.
@@ -141,7 +135,8 @@ def comparison_of(
     before = _before(given, rows, folder, reporter)
     sides = [*given[:-1], *([] if before is None or before in given else [before]), last]
     names = _shortest_names([side.store.path for side in sides])
-    for side, letter, name in zip(sides, _letters(len(sides)), names, strict=True):
+    letters = itertools.chain(ascii_uppercase, map("".join, itertools.product(ascii_uppercase, repeat=2)))
+    for side, letter, name in zip(sides, letters, names, strict=False):
         side.facts = replace(side.facts, label=letter, name=name)
     pairs = [between(first, side, "reference") for side in given[1:]]
     new: dict[str, HistoryRow] = {}
@@ -202,12 +197,6 @@ def _before(
         f"the last run in {folder / HISTORY}, {place}, is gone or another one: not compared with it"
     )
     return None
-
-
-def _letters(n: int) -> list[str]:
-    """Return n labels: A to Z, then AA to AZ and so on."""
-    singles = string.ascii_uppercase
-    return [(singles[i // 26 - 1] if i >= 26 else "") + singles[i % 26] for i in range(n)]
 
 
 def _shortest_names(paths: Sequence[Path]) -> list[str]:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +21,18 @@ from scipy.special import erfc
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import StoreError
 from pchem_pipeline.base.variables import MEASURED_MAPS, VARIABLES
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.model.checks.run_differences import LIMIT, CommonFit
 from pchem_pipeline.model.fit.status import FitStatus, words_of
 from pchem_pipeline.model.maps.defects import FAULTS, Defect
 from pchem_pipeline.report.comparison import DefectChange, HistoryRow, Pair, RunFacts, by_change
-from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.stages.defects import stored_defects
+from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.store.files import read_json, write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
 
 HISTORY = "history.csv"
 
@@ -52,19 +50,12 @@ def identity_of(store: RunStore, digest: str) -> str:
 def history_row(
     run: RunFacts, store: RunStore, states: PixelStates, label: str, folder: Path, pair: Pair | None
 ) -> HistoryRow:
-    """Return the line of a run in the history of a folder.
+    """Return the line of a run in the history of a folder, below a label, or its date where that is empty.
 
-    Args:
-        run: the run.
-        store: its store.
-        states: its pixels.
-        label: of the run; empty: its date.
-        folder: of the history.
-        pair: the differences from the reference; None: it is the reference.
+    ``pair`` are the differences from the reference; None: it is the reference.
     """
     camera = SensorInfo.read(store).camera
     date = _date(store, camera)
-    version = model_of(store, "fit")
     path = str(store.path)
     if not isinstance(store.path, RemotePath):
         path = os.path.relpath(store.path.resolve(), folder.resolve())
@@ -88,7 +79,7 @@ def history_row(
     row |= {
         "moved_pixels": "" if pair is None else pair.n_changed,
         "compared_pixels": "" if pair is None else pair.n_compared,
-        "effects": "" if version is None else " ".join(effect.tag for effect in version.effects),
+        "effects": " ".join(effect.tag for effect in fitted_effects(store)),
     }
     row |= {f"flag_{name}": n for name, n in states.flags().items()}
     row |= {"id": run.identity, "reference": run.identity if pair is None else pair.one.identity}
@@ -190,9 +181,7 @@ class PixelStates:
     def changes_since(self, first: PixelStates, confirm: CommonFit | None = None) -> tuple[DefectChange, ...]:
         """Return the pixels whose faults differ, unless what these are seen in agrees within its error.
 
-        Args:
-            first: the pixels of an earlier run.
-            confirm: p-values of pixels (y, x) for a common fit of both runs; None: not known.
+        ``confirm`` gives p-values of pixels (y, x) for a common fit of both runs; None: not known.
         """
         if self.kinds.shape != first.kinds.shape:
             return ()

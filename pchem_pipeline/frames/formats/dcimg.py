@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,15 +41,6 @@ _BEFORE_STAMPS, _STAMP = 272, 12
 _MARKER = np.array([0, 65535, 0, 65535], "<u2").tobytes()
 
 
-class _Apart(NamedTuple):
-    """Samples that are stored apart: byte of those of the first frame, bytes to the next, and their place."""
-
-    start: int
-    step: int
-    row: int
-    columns: slice
-
-
 class DcimgReader(ContiguousReader):
     """DCIMG files with monochrome frames of 8 or 16 bits."""
 
@@ -57,7 +48,8 @@ class DcimgReader(ContiguousReader):
     kind = "DCIMG file"
     suffixes: ClassVar[tuple[str, ...]] = (".dcimg",)
     magic: ClassVar[tuple[bytes, ...]] = (_MAGIC,)
-    _apart: _Apart | None = None
+    #: of samples that are stored apart: byte of those of the first frame, bytes to the next, row, columns
+    _apart: tuple[int, int, int, slice] | None = None
 
     def _inspect(self, path: Path, settings: InputSettings) -> None:
         size = path.stat().st_size
@@ -158,7 +150,7 @@ class DcimgReader(ContiguousReader):
                 "again"
             )
         self._check_end(start + step * (n - 1) + n_bytes)
-        self._apart = _Apart(start, step, row, slice(column, end))
+        self._apart = start, step, row, slice(column, end)
 
     def _check_end(self, end: int) -> None:
         if end > self._size:
@@ -166,7 +158,7 @@ class DcimgReader(ContiguousReader):
 
     def put_right(self, buffer: NDArray[Any], t0: int, y0: int) -> None:
         """See `ContiguousReader.put_right`."""
-        if self._apart is None or not y0 <= self._apart.row < y0 + buffer.shape[1]:
+        if self._apart is None or not y0 <= self._apart[2] < y0 + buffer.shape[1]:
             return
         start, step, row, columns = self._apart
         stored = self._layout.stored

@@ -28,7 +28,6 @@ from pchem_pipeline.frames.formats.hdf5_parts import (
     check_links,
     check_sources,
     check_virtual,
-    external_links,
     is_own,
     opened,
     virtual_files,
@@ -106,7 +105,7 @@ class Hdf5Reader(ContiguousReader):
         wanted = settings.dataset
         file.visititems(visit)
         if not any(len(shape) >= 3 for shape in found.values()) or wanted is not None:
-            check_links(path, external_links(path, file), wanted)
+            check_links(path, file, wanted)
         self._name = choose_dataset(path, found, settings.dataset)
         dataset = file[self._name]
         self.set_stack(path, dataset.shape, dataset.dtype, settings, f"dataset {self._name}")

@@ -18,8 +18,8 @@ from pchem_pipeline.frames.reader import unwritten_notes
 _MOST_PARTS, _DEEPEST = 100_000, 16
 
 
-def external_links(path: Path, file: Any) -> dict[str, str]:
-    """Return the links to what may be stacks in other files: path in this file -> name of the other."""
+def check_links(path: Path, file: Any, wanted: str | None) -> None:
+    """Raise InputError if the wanted dataset (None: any) is in another file, as in a Dectris master file."""
     from h5py import h5l
 
     links = file.id.links  # not visititems_links, which fails at links of kinds that it does not know
@@ -33,23 +33,17 @@ def external_links(path: Path, file: Any) -> dict[str, str]:
 
     def may_be_a_stack(name: str) -> bool:
         try:
-            source_file(path, path.parent / found[name])
+            _source_file(path, path.parent / found[name])
         except InputError:
             return True
         return getattr(file.get(name), "ndim", 3) >= 3
 
-    return {name: other for name, other in found.items() if may_be_a_stack(name)}
-
-
-def check_links(path: Path, links: dict[str, str], wanted: str | None) -> None:
-    """Raise InputError if the wanted dataset (None: any) is in another file, as in a Dectris master file."""
-    asked = {name: links[name] for name in links if wanted is None or name == wanted.strip("/")}
-    if asked:
-        shown = ", ".join(f"{name} in {file}" for name, file in list(asked.items())[:4])
+    names = [name for name in found if wanted is None or name == wanted.strip("/")]
+    if asked := [f"{name} in {found[name]}" for name in names if may_be_a_stack(name)]:
         more = f" and {len(asked) - 4} more" if len(asked) > 4 else ""
         raise InputError(
-            f"{path}: its frames are in other files: {shown}{more}; give those, with --integration-time and "
-            "--bit-depth from this file, or choose a dataset with --dataset"
+            f"{path}: its frames are in other files: {', '.join(asked[:4])}{more}; give those, with "
+            "--integration-time and --bit-depth from this file, or choose a dataset with --dataset"
         )
 
 
@@ -87,7 +81,7 @@ def _check_raw_parts(path: Path, dataset: Any) -> tuple[str, ...]:
                 f"{path}: the samples of {dataset.name} are in {name}, which is not found; start the command "
                 "in the folder of this file"
             )
-        found += max(0, min(size, source_file(path, Path(name)).stat().st_size - offset))
+        found += max(0, min(size, _source_file(path, Path(name)).stat().st_size - offset))
     names = {name for name, *_ in dataset.external}
     if found < needed:
         raise InputError(
@@ -97,12 +91,8 @@ def _check_raw_parts(path: Path, dataset: Any) -> tuple[str, ...]:
     return _elsewhere(path, names)
 
 
-def source_file(path: Path, other: Path) -> Path:
-    """Return a file that another one names as its source.
-
-    Raises:
-        InputError: it is not beside or below that one, or no regular file.
-    """
+def _source_file(path: Path, other: Path) -> Path:
+    """Return a file that another one names as its source; refuse one that is not beside or below that one."""
     home, real = path.resolve().parent, other.resolve()
     if home not in real.parents:
         raise InputError(f"{path}: its source {real} is not in the same folder or below; copy it there")
@@ -128,11 +118,11 @@ def check_virtual(path: Path, dataset: Any, above: tuple[tuple[Path, str], ...] 
     sources = dataset.virtual_sources()
     for source in sources:
         name = source.file_name
-        other = source_file(path, path if name == "." else path.parent / name)
+        other = _source_file(path, path if name == "." else path.parent / name)
         if "%" in name:  # numbered files without an end: as many as there are
             pattern = re.sub(r"%\d*b", "*", other.name)
             for each in other.parent.glob(pattern):
-                source_file(path, each)
+                _source_file(path, each)
             continue
         if (other, source.dset_name.strip("/")) in here:
             raise InputError(f"{path}: {dataset.name} contains itself; write its frames again")

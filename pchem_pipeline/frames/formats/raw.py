@@ -63,11 +63,8 @@ class _Sidecar(BaseModel):
 
 def find_sidecar(path: Path) -> Path | None:
     """Return the sidecar of a raw file, or None."""
-    for suffix in SIDECARS:
-        for candidate in (path.with_name(path.name + suffix), path.with_suffix(suffix)):
-            if candidate.is_file():
-                return candidate
-    return None
+    places = (each for end in SIDECARS for each in (path.with_name(path.name + end), path.with_suffix(end)))
+    return next((place for place in places if place.is_file()), None)
 
 
 def _read_sidecar(path: Path) -> _Sidecar:

@@ -62,20 +62,13 @@ class SerReader(ContiguousReader):
         self.set_layout(path, Layout(offsets, rows, columns, stored), size)
         self.bit_depth, self.byte_order = depth, order
         taken = (ticks - _EPOCH) * 1e-7 if ticks > _EPOCH else None
-        self._read_times()
-        if self.timestamps is not None:
-            taken = float(self.timestamps[0])
-        self.camera = CameraFacts(text_of(instrument), taken=taken)
-
-    def _read_times(self) -> None:
-        """Read the trailer of times, if it is there."""
-        n = self.shape[0]
         end = self._layout.end
-        if n == 0 or self._size < end + 8 * n:
-            return
-        ticks = np.fromfile(self.paths[0], "<i8", n, offset=end)
-        if (ticks > 0).all():
-            self.timestamps = (ticks - _EPOCH) * 1e-7
+        if n and size >= end + 8 * n:  # there is a trailer of times
+            times = np.fromfile(path, "<i8", n, offset=end)
+            if (times > 0).all():
+                self.timestamps = (times - _EPOCH) * 1e-7
+                taken = float(self.timestamps[0])
+        self.camera = CameraFacts(text_of(instrument), taken=taken)
 
 
 def write_frames(path: Path, blocks: Iterator[NDArray[Any]], stack: StackFacts) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -55,23 +55,17 @@ class SifReader(ContiguousReader):
         columns, rows = info["size"]
         offsets = np.array([tile[2] for tile in info["tile"]], np.int64)
         self.set_layout(path, Layout(offsets, rows, columns, np.dtype("<f4")), path.stat().st_size)
-        self.take_facts(_stated_facts(info))
+        taken = float(info["ExperimentTime"])
+        setup = {"binning": f"{info['xbin']} x {info['ybin']}", "gain": info["GainDAC"]}
+        camera = CameraFacts(
+            text_of(info["DetectorType"]),
+            temperature=celsius(info["DetectorTemperature"]),
+            taken=taken if taken > 0 else None,
+            setup=texts_of(setup, setup),
+        )
+        self.take_facts(StatedFacts(camera, duration_of("ExposureTime", info["ExposureTime"], "s")))
         if (sums := info["AccumulatedCycles"]) > 1:
             self.notes = (f"{path.name}: each frame is the sum of {sums} exposures",)
         ticks = np.array([info[f"timestamp_of_{t}"] for t in range(len(offsets))], np.int64)  # us
         if self.camera.taken is not None and (np.diff(ticks) > 0).all():
             self.timestamps = self.camera.taken + 1e-6 * ticks.astype(np.float64)
-
-
-def _stated_facts(info: dict[str, Any]) -> StatedFacts:
-    taken = float(info["ExperimentTime"])
-    binning = {"binning": f"{info['xbin']} x {info['ybin']}", "gain": info["GainDAC"]}
-    return StatedFacts(
-        CameraFacts(
-            text_of(info["DetectorType"]),
-            temperature=celsius(info["DetectorTemperature"]),
-            taken=taken if taken > 0 else None,
-            setup=texts_of(binning, binning),
-        ),
-        duration_of("ExposureTime", info["ExposureTime"], "s"),
-    )

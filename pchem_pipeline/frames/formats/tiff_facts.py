@@ -8,7 +8,7 @@ import math
 import re
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import (
@@ -26,17 +26,6 @@ from pchem_pipeline.frames.camera import (
 )
 from pchem_pipeline.frames.settings import Area
 
-
-class _Kind(NamedTuple):
-    """Bytes of the parts of a directory, and where the header names the first one."""
-
-    count_size: int
-    tag: int
-    pointer: int
-    first: int
-
-
-_CLASSIC, _BIG = _Kind(2, 12, 4, 4), _Kind(8, 20, 8, 8)
 #: tags of a directory, as in tifffile
 _MOST_TAGS = 4096
 _MOST_PAGES = 100_000
@@ -61,8 +50,9 @@ def check_chain(path: Path, size: int) -> None:
         version = int.from_bytes(head[2:4], order)
         if len(head) < 8 or head[:2] not in (b"II", b"MM") or version not in (42, 43):
             raise InputError(f"{path}: not a valid TIFF file, or truncated (header); copy it again")
-        kind = _BIG if version == 43 else _CLASSIC
-        following = int.from_bytes(head[kind.first : kind.first + kind.pointer], order)
+        # bytes of the count of a directory, of a tag and of a pointer; where the header names the first one
+        count_bytes, tag_bytes, pointer, first = (8, 20, 8, 8) if version == 43 else (2, 12, 4, 4)
+        following = int.from_bytes(head[first : first + pointer], order)
         seen: set[int] = set()
         while following:
             if len(seen) > _MOST_PAGES:
@@ -75,10 +65,10 @@ def check_chain(path: Path, size: int) -> None:
                 )
             seen.add(following)
             stream.seek(following)
-            tags = int.from_bytes(stream.read(kind.count_size), order)
-            stream.seek(following + kind.count_size + min(tags, _MOST_TAGS) * kind.tag)
-            data = stream.read(kind.pointer)
-            if tags > _MOST_TAGS or len(data) < kind.pointer:
+            tags = int.from_bytes(stream.read(count_bytes), order)
+            stream.seek(following + count_bytes + min(tags, _MOST_TAGS) * tag_bytes)
+            data = stream.read(pointer)
+            if tags > _MOST_TAGS or len(data) < pointer:
                 raise _broken_chain(path, len(seen) - 1, size)
             following = int.from_bytes(data, order)
         if not seen:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import Float32Array, FloatArray
+from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import error_words
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.discrepancy.by_simulation.sensor.replicate import truth_of
@@ -48,31 +48,23 @@ def evidence_arrays(
     """
     code = evidence.code
     found: dict[str, NDArray[Any]] = {
-        "goodness": _single(evidence.goodness),
+        "goodness": np.asarray(evidence.goodness, np.float32),
         "tail": np.stack([evidence.tail_low, evidence.tail_high]).astype(np.uint32),
         "code_dn": (code.first + np.arange(code.observed.size)).astype(np.int32),
-        "code_observed": _double(code.observed),
-        "code_expected": _double(code.expected),
+        "code_observed": np.asarray(code.observed, np.float64),
+        "code_expected": np.asarray(code.expected, np.float64),
         "z_before": _vector(evidence.z if before is None else before),
     }
     if all(name in evidence.scores for name in SCORES):
-        found["score"] = np.stack([_single(evidence.scores[name]) for name in SCORES])
+        found["score"] = np.stack([np.asarray(evidence.scores[name], np.float32) for name in SCORES])
     if code_extended is not None:
-        found["code_extended"] = _double(code_extended)
+        found["code_extended"] = np.asarray(code_extended, np.float64)
     if after is not None:
         found["z_after"] = _vector(after)
     if evidence.time is not None:
         found |= _time_arrays(evidence, evidence.time)
         found |= path_arrays(evidence, effects, integration_time, bit_depth)
     return found
-
-
-def _single(values: NDArray[Any]) -> Float32Array:
-    return np.asarray(values, dtype=np.float32)
-
-
-def _double(values: NDArray[Any]) -> FloatArray:
-    return np.asarray(values, dtype=np.float64)
 
 
 def _vector(z: Mapping[str, float]) -> FloatArray:
@@ -88,18 +80,18 @@ def _time_arrays(evidence: Evidence, time: TimeSeries) -> dict[str, NDArray[Any]
         frame_sd = np.sqrt([float(v.sum()) for v in variance]) / sizes
     found: dict[str, NDArray[Any]] = {
         "frame_number": np.asarray(time.frames, dtype=np.int64),
-        "frame_charge": _double(time.frame_charge),
-        "frame_readout": _double(time.frame_readout),
+        "frame_charge": np.asarray(time.frame_charge, np.float64),
+        "frame_readout": np.asarray(time.frame_readout, np.float64),
         "frame_sd": np.where(np.isfinite(frame_sd), frame_sd, np.nan),
     }
     if time.frame_noise is not None:
-        found["frame_noise"] = _double(time.frame_noise)
+        found["frame_noise"] = np.asarray(time.frame_noise, np.float64)
     maps = pixel_maps(evidence)
     for name, short in (("lag1", "lag"), ("block_spread", "spread"), ("trend", "trend")):
-        found[name] = _single(np.stack([maps[f"{short}.{channel}"] for channel in CHANNELS]))
+        found[name] = np.asarray(np.stack([maps[f"{short}.{channel}"] for channel in CHANNELS]), np.float32)
     if time.neighbour_maps:
         nothing = np.full(usable.shape, np.nan)
-        found["neighbour"] = _single(np.stack([maps.get(name, nothing) for name in PAIRS]))
+        found["neighbour"] = np.asarray(np.stack([maps.get(name, nothing) for name in PAIRS]), np.float32)
     for line, axis, charge, readout in (
         ("row", 1, time.row_charge, time.row_readout),
         ("column", 0, time.column_charge, time.column_readout),
@@ -109,7 +101,7 @@ def _time_arrays(evidence: Evidence, time: TimeSeries) -> dict[str, NDArray[Any]
             scaled = np.stack([charge / sd[0], readout / sd[1]])
         scaled[~np.isfinite(scaled)] = np.nan
         found[f"{line}_rms"] = np.sqrt(np.mean(scaled.astype(np.float64) ** 2, axis=1))
-        found[f"{line}_image"] = _single(scaled[:, :96])
+        found[f"{line}_image"] = np.asarray(scaled[:, :96], np.float32)
     return found
 
 
@@ -122,11 +114,9 @@ def path_arrays(
     random numbers: what comes out alike is its path. An effect that cannot do this is left out. The posterior
     mean k follows a change only in part, and the residual takes the rest: an exposure H (1 + a) moves the
     mean of k by a Var(k), and an offset of d electrons moves it by d E[Var(K|x)] / sigma_e^2, both to first
-    order (scores of H and mu of the PCD, Hendrickson et al. 2023, eq. update_eqns).
-
-    Returns:
-        ``frame_charge_model`` (relative) and ``frame_readout_model`` (DN), shape (n_frames,) each; empty
-        where no effect has a path.
+    order (scores of H and mu of the PCD, Hendrickson et al. 2023, eq. update_eqns). The arrays are
+    ``frame_charge_model`` (relative) and ``frame_readout_model`` (DN), shape (n_frames,) each; none where no
+    effect has a path.
     """
     time = evidence.time
     if time is None or not evidence.maps.usable.any():

@@ -34,9 +34,11 @@ from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.model_versions import model_of, write_added_exposure
 from pchem_pipeline.run.stage import WHOLE, Named, StageContext
 from pchem_pipeline.stages.discrepancy.arrays import evidence_arrays
-from pchem_pipeline.stages.discrepancy.survey import Survey, mean_codes, survey
+from pchem_pipeline.stages.discrepancy.survey import mean_codes, survey
 from pchem_pipeline.stages.discrepancy.window import (
+    Survey,
     Window,
+    choose_window,
     fewer_samples,
     other_window,
     read_window,
@@ -55,10 +57,13 @@ def run(context: StageContext) -> None:
         InputError: the frames are too few, or there are none.
         StoreError: the store refuses.
     """
-    sensor, (before, roi) = context.sensor, _start(context)
+    # the model that this search starts from, and its region, see `search_start`
+    record, model = context.store.records.read(_STAGE), model_of(context.store, _STAGE)
+    before = (context.model if model is None else model).effects
+    roi = None if record is None else tuple(record.content["input"]["roi"]) or None
     with context.reporter.phases(_STAGE) as progress, context.stop.at_once():
         try:
-            if sensor.kind == "frames":
+            if context.sensor.kind == "frames":
                 _run_frames(context, before, roi, progress)
             else:
                 _run_histograms(context, before, progress)
@@ -76,8 +81,8 @@ def _run_frames(
     block_length(source.shape[0], context.config.discrepancy.block_frames)
     limits = _limits(context, before)
     model = (*before, *limits)
-    settings, seen, whole = _surveyed(context, source, model, roi, progress)
-    search = _Search(context, source, model, roi, seen, progress)
+    search = _Search(context, source, model, roi, Survey(), progress)
+    settings, whole = search.survey()
     window, found = search.found(settings, "")
     elsewhere = search.elsewhere(settings, "elsewhere-", window, found)
     if elsewhere is not None and elsewhere.deviates and whole != settings:
@@ -91,7 +96,7 @@ def _run_frames(
     verdict = found.verdict.on_sensor(
         source.shape[1:], rows, columns, lambda y, x: (y + rows[0], x + columns[0])
     )
-    verdict = seen.told(verdict, window.share(source.shape)).costing(search.work)
+    verdict = search.seen.told(verdict, window.share(source.shape)).costing(search.work)
     found = replace(found, verdict=verdict if elsewhere is None else verdict.checked(elsewhere))
     _write(context, found, limits)
     write_added_exposure(context.store, _STAGE, found.added, found.model, rows, columns)
@@ -109,9 +114,53 @@ class _Search:
     progress: Callable[[str], None]
     work: float = 0.0
 
+    def survey(self) -> tuple[DiscrepancySettings, DiscrepancySettings]:
+        """Look at the whole sensor, once; return the settings of the search, and the most that it may take.
+
+        A marker keeps what was seen: a search that was stopped goes on in the same window.
+        """
+        context, store, settings = self.context, self.context.store, self.context.config.discrepancy
+
+        def scanned(chosen: DiscrepancySettings) -> Survey:  # except where all of it is compared closely
+            compared = min(chosen.max_samples, chosen.max_pixels * self.source.shape[0])
+            return survey(context, self.source, compared)
+
+        known = store.records.summaries(_STAGE, context.fingerprint).get(WHOLE.key)
+        if known is None:
+            limit = context.config.compute.max_memory
+            if limit is not None:
+                codes = mean_codes(store) if store.has("histogram/counts") else 128.0
+                less = within_memory(settings, self.source.shape, self.roi, codes, limit << 20)
+                if less != settings:
+                    context.note(
+                        f"compute.max_memory (--max-memory) limits the comparison to {less.max_pixels} "
+                        f"pixels ({settings.max_pixels} without this limit)"
+                    )
+                settings = less
+            self.progress("scanning all pixels and frames")
+            seen = scanned(settings)
+            if seen.left_out:
+                context.note(
+                    f"left out (empty, repeated, outlying or moved): {frame_words(np.array(seen.left_out))}"
+                )
+            few = fewer_samples(self.source, settings, self.roi, seen, self.model)
+            if few != settings:
+                context.note(
+                    f"clear disagreement in {few.max_samples:,} samples, so no more are compared; for "
+                    "smaller errors and weaker effects raise discrepancy.clear_samples"
+                )
+                seen = scanned(few)
+            known = {"window": _amounts(few), "whole": _amounts(settings), **seen.numbers()}
+            context.run_units([WHOLE], lambda *_: known, total=1)
+        self.seen = Survey.of_numbers(known)
+        few, most = (
+            settings.model_copy(update=known.get(name, known["window"])) for name in ("window", "whole")
+        )
+        return few, most
+
     def found(self, settings: DiscrepancySettings, prefix: str) -> tuple[Window, Discrepancy]:
         """Search for what the model is missing in the window of the settings; ``prefix`` begins its units."""
-        window = self.seen.window(self.source.shape, settings, self.roi)
+        window = choose_window(self.source.shape, settings, self.roi, self.seen)
         found = find_discrepancies(
             read_window(self.source, window),
             window.times,
@@ -159,66 +208,10 @@ class _Search:
         }
 
 
-def _surveyed(
-    context: StageContext,
-    source: FrameSource,
-    model: Sequence[Effect],
-    roi: tuple[int, ...] | None,
-    progress: Callable[[str], None],
-) -> tuple[DiscrepancySettings, Survey, DiscrepancySettings]:
-    """Look at the whole sensor, once; return the settings of the search, that, and the most that it may take.
-
-    A marker keeps all: a search that was stopped goes on in the same window.
-    """
-    settings, store = context.config.discrepancy, context.store
-    known = store.records.summaries(_STAGE, context.fingerprint).get(WHOLE.key)
-    if known is None:
-        limit = context.config.compute.max_memory
-        if limit is not None:
-            codes = mean_codes(store) if store.has("histogram/counts") else 128.0
-            less = within_memory(settings, source.shape, roi, codes, limit << 20)
-            if less != settings:
-                context.note(
-                    f"compute.max_memory (--max-memory) limits the comparison to {less.max_pixels} pixels "
-                    f"({settings.max_pixels} without this limit)"
-                )
-            settings = less
-        progress("scanning all pixels and frames")
-        seen = _survey(context, source, settings)
-        if seen.left_out:
-            context.note(
-                f"left out (empty, repeated, outlying or moved): {frame_words(np.array(seen.left_out))}"
-            )
-        few = fewer_samples(source, settings, roi, seen, model)
-        if few != settings:
-            context.note(
-                f"clear disagreement in {few.max_samples:,} samples, so no more are compared; for smaller "
-                "errors and weaker effects raise discrepancy.clear_samples"
-            )
-            seen = _survey(context, source, few)
-        known = {"window": _amounts(few), "whole": _amounts(settings), **seen.numbers()}
-        context.run_units([WHOLE], lambda *_: known, total=1)
-    whole = known.get("whole", known["window"])
-    few, most = (settings.model_copy(update=each) for each in (known["window"], whole))
-    return few, Survey.of_numbers(known), most
-
-
 def _amounts(settings: DiscrepancySettings) -> dict[str, int]:
     """Return the settings that the memory, or a clear disagreement, may lower."""
     names = ("max_samples", "max_pixels", "replicates", "extended_replicates")
     return {name: getattr(settings, name) for name in names}
-
-
-def _survey(context: StageContext, source: FrameSource, settings: DiscrepancySettings) -> Survey:
-    """Look at the whole sensor, except where all of it is compared closely."""
-    return survey(context, source, min(settings.max_samples, settings.max_pixels * source.shape[0]))
-
-
-def _start(context: StageContext) -> tuple[tuple[Effect, ...], tuple[int, ...] | None]:
-    """Return the effects of the model that this search starts from, and its region; see `identity`."""
-    record, model = context.store.records.read(_STAGE), model_of(context.store, _STAGE)
-    roi = () if record is None else record.content["input"]["roi"]
-    return (context.model if model is None else model).effects, tuple(roi) or None
 
 
 def _limits(context: StageContext, model: Sequence[Effect]) -> tuple[Effect, ...]:

@@ -10,10 +10,8 @@ pixels and a block of frames take the memory that the run may have, or no more t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -28,8 +26,6 @@ from pchem_pipeline.discrepancy.observe.vector import goodness_of
 from pchem_pipeline.discrepancy.quick.sums import CellMap, StackSums, sensor_cells, sensor_places
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.scan_pairs import pairs_bytes, scan_pairs
-from pchem_pipeline.discrepancy.settings import DiscrepancySettings
-from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.evidence import SCORES, PixelMaps
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.frames.stream import FrameSource
@@ -37,7 +33,7 @@ from pchem_pipeline.model.arithmetic.significance import NO_CHANCE, SIGNIFICANCE
 from pchem_pipeline.run.model_versions import model_of
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
-from pchem_pipeline.stages.discrepancy.window import Window, choose_window, frame_blocks
+from pchem_pipeline.stages.discrepancy.window import PAIRS, SHAPES, SUMS, Survey, frame_blocks
 from pchem_pipeline.stages.histogram.odd_frames import odd_frames_of
 from pchem_pipeline.stages.quick_look import read_sums
 from pchem_pipeline.store.run_store import RunStore
@@ -51,78 +47,6 @@ _CODE_BYTES, _PIXEL_BYTES, _SAMPLE_BYTES = 20, 800, 28
 _MOST_AT_ONCE = 1 << 22
 #: Samples whose pairs are summed at most: some five minutes.
 _MOST_SAMPLES = 1 << 31
-
-SUMS, SHAPES, PAIRS = (
-    "neighbours, successive frames, levels",
-    "shapes and tails of the histograms",
-    "pairs of pixels in rows, columns and frames",
-)
-
-
-@dataclass(frozen=True)
-class Survey:
-    """What stands out, and how much was looked at.
-
-    Attributes:
-        places: the most significant place of each map (next_x, score.C2, pairs.row.readout) that has one.
-        shares: of the run's samples, by what was looked at; what is absent was not.
-        left_out: frames that are empty, copies, far from the others or moved: nothing is said of them.
-        copied: those of them that are copies of earlier ones.
-    """
-
-    places: Mapping[str, Suspect] = field(default_factory=dict)
-    shares: Mapping[str, float] = field(default_factory=dict)
-    left_out: tuple[int, ...] = ()
-    copied: tuple[int, ...] = ()
-
-    def window(
-        self, shape: tuple[int, int, int], settings: DiscrepancySettings, roi: Sequence[int] | None
-    ) -> Window:
-        """Return what to compare closely, see `choose_window`."""
-        return choose_window(shape, settings, roi, self.places, self.left_out, self.copied)
-
-    def numbers(self) -> dict[str, Any]:
-        """Return it as JSON data, of which :meth:`of_numbers` makes it again."""
-        places = {
-            name: {"region": at.region.numbers(), "p": at.p, "inside": at.inside, "outside": at.outside}
-            for name, at in self.places.items()
-        }
-        frames = {"left_out": list(self.left_out), "copied": list(self.copied)}
-        return {"places": places, "shares": dict(self.shares), **frames}
-
-    @classmethod
-    def of_numbers(cls, numbers: Mapping[str, Any]) -> Survey:
-        """Return it as :meth:`numbers` gave it, its places without family and z."""
-        places = {
-            name: Suspect(
-                family="",
-                z=0.0,
-                log_p=math.log(each["p"]),
-                inside=each["inside"],
-                outside=each["outside"],
-                region=Region.model_validate(each["region"]),
-            )
-            for name, each in numbers["places"].items()
-        }
-        return cls(places, numbers["shares"], tuple(numbers["left_out"]), tuple(numbers["copied"]))
-
-    def told(self, verdict: Verdict, share: float) -> Verdict:
-        """Return the verdict with this survey, and the share of the samples that was compared."""
-        spots = tuple(
-            Surveyed(map=name, region=place.region.numbers(), p=place.p)
-            for name, place in sorted(self.places.items(), key=lambda item: item[1].p)
-        )
-        least = min(self.shares.get(kind, 0.0) for kind in (SUMS, SHAPES, PAIRS))
-        examined = verdict.examined.model_copy(
-            update={
-                "share": share,
-                "surveyed": max(share, least),
-                "surveyed_by": dict(self.shares),
-                "places": (*verdict.examined.places, *spots),
-                "left_out": self.left_out,
-            }
-        )
-        return verdict.model_copy(update={"examined": examined})
 
 
 def survey(context: StageContext, source: FrameSource, compared: int) -> Survey:

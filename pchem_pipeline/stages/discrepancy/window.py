@@ -8,8 +8,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,10 @@ from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.splits import block_length
+from pchem_pipeline.discrepancy.verdict import Surveyed, Verdict
 from pchem_pipeline.effects.framework.effect import Effect
+from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
-
-if TYPE_CHECKING:
-    from pchem_pipeline.stages.discrepancy.survey import Survey
 
 #: Bytes of a search: with its program and kernels, however small the window; of a sample; of a pixel, and of
 #: each code of its law. Measured with one worker, 256 to 8190 pixels and 1000 to 6000 frames.
@@ -39,14 +38,78 @@ _FEWEST_PIXELS, _SMALLER = 256, 0.9
 _CLEAR = 15.0
 
 
+SUMS, SHAPES, PAIRS = (
+    "neighbours, successive frames, levels",
+    "shapes and tails of the histograms",
+    "pairs of pixels in rows, columns and frames",
+)
+
+
 @dataclass(frozen=True)
-class Window:
-    """The part of the stack that is looked at.
+class Survey:
+    """What stands out, and how much was looked at.
 
     Attributes:
-        numbers: frame numbers, whole blocks, increasing.
-        rows, columns: first, and end.
-        copied: frames of the run that are copies of earlier ones.
+        places: the most significant place of each map (next_x, score.C2, pairs.row.readout) that has one.
+        shares: of the run's samples, by what was looked at; what is absent was not.
+        left_out: frames that are empty, copies, far from the others or moved: nothing is said of them.
+        copied: those of them that are copies of earlier ones.
+    """
+
+    places: Mapping[str, Suspect] = field(default_factory=dict)
+    shares: Mapping[str, float] = field(default_factory=dict)
+    left_out: tuple[int, ...] = ()
+    copied: tuple[int, ...] = ()
+
+    def numbers(self) -> dict[str, Any]:
+        """Return it as JSON data, of which :meth:`of_numbers` makes it again."""
+        places = {
+            name: {"region": at.region.numbers(), "p": at.p, "inside": at.inside, "outside": at.outside}
+            for name, at in self.places.items()
+        }
+        frames = {"left_out": list(self.left_out), "copied": list(self.copied)}
+        return {"places": places, "shares": dict(self.shares), **frames}
+
+    @classmethod
+    def of_numbers(cls, numbers: Mapping[str, Any]) -> Survey:
+        """Return it as :meth:`numbers` gave it, its places without family and z."""
+        places = {
+            name: Suspect(
+                family="",
+                z=0.0,
+                log_p=math.log(each["p"]),
+                inside=each["inside"],
+                outside=each["outside"],
+                region=Region.model_validate(each["region"]),
+            )
+            for name, each in numbers["places"].items()
+        }
+        return cls(places, numbers["shares"], tuple(numbers["left_out"]), tuple(numbers["copied"]))
+
+    def told(self, verdict: Verdict, share: float) -> Verdict:
+        """Return the verdict with this survey, and the share of the samples that was compared."""
+        spots = tuple(
+            Surveyed(map=name, region=place.region.numbers(), p=place.p)
+            for name, place in sorted(self.places.items(), key=lambda item: item[1].p)
+        )
+        least = min(self.shares.get(kind, 0.0) for kind in (SUMS, SHAPES, PAIRS))
+        examined = verdict.examined.model_copy(
+            update={
+                "share": share,
+                "surveyed": max(share, least),
+                "surveyed_by": dict(self.shares),
+                "places": (*verdict.examined.places, *spots),
+                "left_out": self.left_out,
+            }
+        )
+        return verdict.model_copy(update={"examined": examined})
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of the stack that is looked at: whole blocks of frames, by number; first and end of its rows.
+
+    ``copied`` are the frames of the run that are copies of earlier ones.
     """
 
     numbers: IntArray
@@ -73,9 +136,7 @@ def choose_window(
     shape: tuple[int, int, int],
     settings: DiscrepancySettings,
     roi: Sequence[int] | None = None,
-    places: Mapping[str, Suspect] | None = None,
-    left_out: Sequence[int] = (),
-    copied: tuple[int, ...] = (),
+    seen: Survey = Survey(),
 ) -> Window:
     """Return what to look at: everything if small enough, else a window and blocks over the whole run.
 
@@ -83,10 +144,8 @@ def choose_window(
     there shows against its quiet neighbours. Without such a place it lies in the middle.
 
     The shape of the stack is (frames, rows, columns), the ``roi`` (y0, y1, x0, x1) that the user asked for.
-    ``places`` are those where the sensor stands out, ``left_out`` odd frames, and ``copied`` those of them
-    that are copies of earlier ones.
     """
-    kept = np.setdiff1d(np.arange(shape[0], dtype=np.int64), left_out)
+    kept = np.setdiff1d(np.arange(shape[0], dtype=np.int64), seen.left_out)
     n_frames, ny, nx = kept.size, *shape[1:]
     y0, y1, x0, x1 = roi or (0, ny, 0, nx)
     within = (y1 - y0) * (x1 - x0)
@@ -96,7 +155,7 @@ def choose_window(
     if within > pixels:
         height = min(y1 - y0, max(int(np.sqrt(pixels)), pixels // (x1 - x0)))
         width = min(x1 - x0, pixels // height)
-        worst = min((places or {}).values(), key=lambda place: place.p, default=None)
+        worst = min(seen.places.values(), key=lambda place: place.p, default=None)
         mask = None if worst is None else worst.region.mask(shape[1:])
         y0, x0 = _corner(mask, (y0, y1, x0, x1), (height, width))
         y1, x1 = y0 + height, x0 + width
@@ -105,7 +164,7 @@ def choose_window(
         length = block_length(frames, settings.block_frames)
         starts = np.linspace(0, n_frames - length, frames // length).astype(np.int64)
         numbers = kept[(starts[:, None] + np.arange(length)).ravel()]
-    return Window(numbers, (y0, y1), (x0, x1), copied)
+    return Window(numbers, (y0, y1), (x0, x1), seen.copied)
 
 
 def other_window(window: Window, shape: tuple[int, int, int], roi: Sequence[int] | None) -> Window | None:
@@ -225,11 +284,11 @@ def fewer_samples(
     """
     if model:  # only a simulation tells what disagrees with effects
         return settings
-    most = seen.window(source.shape, settings, roi).share(source.shape)
+    most = choose_window(source.shape, settings, roi, seen).share(source.shape)
     samples = settings.clear_samples
     while samples < settings.max_samples:
         few = settings.model_copy(update={"max_samples": samples})
-        window = seen.window(source.shape, few, roi)
+        window = choose_window(source.shape, few, roi, seen)
         if window.share(source.shape) >= most:
             break
         length = block_length(window.numbers.size, settings.block_frames)

@@ -80,14 +80,9 @@ def ensemble_tile(
 ) -> tuple[IntArray, FloatArray]:
     """Return what some pixels add to the ensemble: rows of integers and floats, in the places of ``axes``.
 
-    Args:
-        maps: (H, g, mu, sigma) of the pixels, each of shape (n,); NaN where the fit failed.
-        chosen: histograms of the chosen frames.
-        everything: histograms of all frames.
-        axes: of the ensemble.
-        law: of the samples; None: that of the PCD.
-        satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n,); None: none.
-        errors: of the maps; None: not known.
+    The maps are (H, g, mu, sigma) of the pixels, each of shape (n,), NaN where the fit failed; ``chosen`` are
+    the histograms of the chosen frames, ``everything`` those of all. The law (None: that of the PCD) is that
+    of the samples; satellites are amplitude (e-) and weight of the pixels' free ones, shape (n,) each.
     """
     integers = np.zeros(list(axes.integers.values())[-1].stop, dtype=np.int64)
     floats = np.zeros(list(axes.floats.values())[-1].stop)

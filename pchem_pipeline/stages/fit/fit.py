@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray
 from pchem_pipeline.base.variables import PARAMETERS, VARIABLES
+from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
+from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
 from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding
-from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
+from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, moves_gain
 from pchem_pipeline.model.law.parameters import usable_pixels
 from pchem_pipeline.run.fingerprint import setting_values
 from pchem_pipeline.run.model_versions import ModelVersion, read_added_exposure
@@ -23,15 +25,16 @@ from pchem_pipeline.run.progress import parts_told
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.fit.fitted_model import pixel_places
 from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
-from pchem_pipeline.stages.fit.together import judge_sensor
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.files import write_atomic
 from pchem_pipeline.store.remote_path import RemotePath
 from pchem_pipeline.store.run_store import RunStore
-from pchem_pipeline.store.tiles import Tile
+from pchem_pipeline.store.tiles import Tile, equal_rows
 
 _HISTOGRAM = ("counts", "origin", "under", "over")
+_LARGEST_POOL = 2**19  # pixels: every so many-th of a larger sensor
+_LARGEST_KEPT = 2**22  # pixels, 24 bytes each
 
 
 def run(context: StageContext) -> None:
@@ -81,10 +84,7 @@ def run(context: StageContext) -> None:
 
 
 def _create(context: StageContext, how: TileFit, dtype: np.dtype[Any]) -> None:
-    """Make the arrays that a fit gives; the words of its status are explained with them.
-
-    One is made for that, which compiles the kernels before other processes do it all at the same time.
-    """
+    """Make arrays like those of a fit of one pixel, which compiles the kernels before all workers do it."""
     histogram: dict[str, NDArray[Any]] = {name: np.zeros((1, 1), np.int32) for name in _HISTOGRAM[1:]}
     histogram["counts"] = np.ones((1, 1, 8), dtype)
     everywhere = [effect.at_place(None) for effect in how.effects]
@@ -161,11 +161,8 @@ def code_sums(histogram: Arrays, maps: Sequence[NDArray[Any]]) -> dict[str, Any]
     """Return the samples of each code over the pixels that have a value, as JSON data for their marker.
 
     These are the codes that occur (``dn``), the ``samples`` of each, and those ``outside`` of the histograms.
-    The ensemble compares all frames with the model, and would decode every histogram again for it.
-
-    Args:
-        histogram: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x).
-        maps: (H, g, mu, sigma), (y, x) each; NaN without a value.
+    The ensemble compares all frames with the model, and would decode every histogram again for it. Histogram
+    as of `fit_tile`; maps are (H, g, mu, sigma), (y, x) each, NaN without a value.
     """
     usable, counts, origin = usable_pixels(*maps), histogram["counts"], histogram["origin"]
     start = int(origin.min())
@@ -180,6 +177,60 @@ def code_sums(histogram: Arrays, maps: Sequence[NDArray[Any]]) -> dict[str, Any]
         "samples": samples[occupied].tolist(),
         "outside": sum(int(histogram[name][usable].sum(dtype=np.int64)) for name in ("under", "over")),
     }
+
+
+# -- what all pixels of the sensor together say about the fit of each ------------------------------
+
+
+def judge_sensor(context: StageContext) -> int:
+    """Set ``WEAKLY_IDENTIFIED`` or ``BIAS_UNSURE`` where a pixel is clear by chance; return the number.
+
+    The latter where a bias that is an electron off leaves the gain as it is. The words depend on the sensor
+    as a whole, not on its tiles, and may be given again and again.
+
+    Raises:
+        StoreError: the store refuses.
+    """
+    store, shape = context.store, context.sensor.shape
+    bands = [(slice(*rows), slice(0, shape[1])) for rows in equal_rows(shape[0], context.tile[0])]
+    every = -(-shape[0] * shape[1] // _LARGEST_POOL)
+    kept: dict[int, Judged] = {}  # of a sensor that is not large: nothing is read twice
+    chosen = []
+    for band in bands:
+        pixels = _judged(store, band)
+        some = pixels.of(slice(-band[0].start * shape[1] % every, None, every))
+        chosen.append(Judged.join([some]))  # a copy: a view would keep the whole band
+        if shape[0] * shape[1] <= _LARGEST_KEPT:
+            kept[band[0].start] = pixels
+    pool = NoisePool.of(Judged.join(chosen))
+    weakly, unsure = (np.uint16(int(bit)) for bit in (FitStatus.WEAKLY_IDENTIFIED, FitStatus.BIAS_UNSURE))
+    found = 0
+    for band in bands:
+        words = store.read("fit/fit_status", band)
+        new = words & ~(weakly | unsure)
+        if pool is not None:
+            pixels = kept[band[0].start] if kept else _judged(store, band)
+            weak, ambiguous = pool.reasons(pixels, context.config.fit)
+            exposure = store.read("fit/quanta_exposure", band).ravel()
+            of_gain = bool(context.sensor.samples) | moves_gain(exposure, pixels.noise)
+            weak |= ambiguous & of_gain
+            new[weak.reshape(words.shape)] |= weakly
+            new[(ambiguous & ~of_gain).reshape(words.shape)] |= unsure
+            found += int(np.count_nonzero(weak | ambiguous))
+        if not np.array_equal(new, words):
+            store.write("fit/fit_status", band, new)
+    return found
+
+
+def _judged(store: RunStore, band: tuple[slice, slice]) -> Judged:
+    """Return the pixels of a band, in order; NaN where they are not fitted."""
+    names = ("conversion_gain", "read_noise_dn")
+    fit = store.at(band, "fit")
+    pair = CORRELATION_PAIRS.index(tuple(map(PARAMETERS.index, names)))
+    gain, sigma = (fit[name].ravel() for name in names)
+    of_gain, of_sigma = (fit[f"{name}_stderr"].ravel() for name in names)
+    together = store.read("fit/correlation", (*band, slice(pair, pair + 1))).ravel()
+    return Judged(*noise_of(gain, sigma, of_gain, of_sigma, together), fit["likelihood_gap"].ravel())
 
 
 # -- the answer of an earlier fit, from which that of more frames starts ---------------------------

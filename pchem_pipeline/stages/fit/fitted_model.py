@@ -29,13 +29,9 @@ def fitted_effects(store: RunStore) -> tuple[Effect, ...]:
 
 @dataclass(frozen=True)
 class FittedModel:
-    """The model with which pixels of a run were fitted; without effects the PCD.
+    """The model with which pixels of a run were fitted; without effects the PCD, without a version no fit.
 
-    Attributes:
-        effects: in their order.
-        added: exposure that they add to the n pixels, (j, n); None: nothing.
-        version: of the run's model; None without a fit.
-        places: of the pixels; None: not known.
+    ``added`` is the exposure that effects add to the n pixels, (j, n); None: nothing.
     """
 
     effects: tuple[Effect, ...] = ()
@@ -62,11 +58,9 @@ class FittedModel:
         )
 
     def law(self, maps: Sequence[FloatArray], *, without: Sequence[str] = ()) -> SampleLaw:
-        """Return the law of the samples of the pixels.
+        """Return the law of the samples of the pixels, ``without`` the effects of some tags.
 
-        Args:
-            maps: their fitted (H, g, mu, sigma); NaN where the fit failed.
-            without: tags of effects to leave out.
+        The maps are their fitted (H, g, mu, sigma), NaN where the fit failed.
         """
         effects = [effect for effect in self.effects if effect.tag not in without]
         return sample_law(effects, pixel_maps(maps, np.ones(maps[0].shape, bool)), self.added, self.places)

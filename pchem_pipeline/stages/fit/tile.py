@@ -8,7 +8,7 @@ exposure has of its own.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,7 +33,6 @@ class TileFit:
     """How the pixels of a tile are fitted.
 
     Attributes:
-        settings: of the fit.
         adc_limits: first and last code of the ADC, DN, or None where they are not known.
         effects: of the run's model; the plain fit is where the one under their law starts.
         set_aside: codes that the fit leaves out, e- on the comb of the fit with the PCD.
@@ -58,30 +57,30 @@ def fit_tile(
 ) -> dict[str, dict[str, NDArray[Any]]]:
     """Return the arrays of a tile by group and name: of ``fit``, and with several samples of ``samples``.
 
-    Args:
-        histograms: ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x) of each sample.
-        how: they are fitted.
-        start: (H, g, mu, sigma, likelihood gap) of a fit of fewer frames, (y, x, 5), NaN where there is none.
-        added: exposure that the effects add to the pixels, (j, y, x); None: it counts as part of H.
-        places: of the pixels; None: not known.
+    The histograms of each sample are ``counts`` (y, x, bin), ``origin``, ``under`` and ``over`` (y, x).
+    ``start`` is (H, g, mu, sigma, likelihood gap) of a fit of fewer frames, (y, x, 5), NaN where there is
+    none, ``added`` the exposure that the effects add to the pixels, (j, y, x); None: it counts as part of H.
     """
     shape = histograms[0]["counts"].shape[:2]
     counts = [each["counts"].reshape(-1, each["counts"].shape[2]) for each in histograms]
     origins = [each["origin"].ravel() for each in histograms]
-    found = _fit_model(
-        functools.partial(
-            fit_histograms,
-            counts if how.bias else counts[0],
-            origins if how.bias else origins[0],
-            under=np.ravel(sum(each["under"].astype(np.int64) + each["over"] for each in histograms)),
-            dark=list(how.bias) or None,
-            adc_limits=how.adc_limits,
-        ),
-        how,
-        None if start is None else start.reshape(-1, start.shape[2]),
-        added,
-        places,
+    fit = functools.partial(
+        fit_histograms,
+        counts if how.bias else counts[0],
+        origins if how.bias else origins[0],
+        under=np.ravel(sum(each["under"].astype(np.int64) + each["over"] for each in histograms)),
+        dark=list(how.bias) or None,
+        adc_limits=how.adc_limits,
     )
+    begin: FitResult | FloatArray | None = None if start is None else start.reshape(-1, start.shape[2])
+    law: SampleLaw | list[SampleLaw] | None = None
+    if how.effects:  # they compose the law after a fit with the PCD
+        # the law is integrated over the cells: a start with all of them would be in vain
+        likelihood = "density" if how.settings.likelihood == "density" else "auto"
+        simple = how.settings.model_copy(update={"likelihood": likelihood, "intervals": "normal"})
+        begin = plain = fit(settings=simple, start=begin)
+        law = _laws(plain, how.effects, added, places)
+    found = fit(settings=how.settings, start=begin, law=law, excluding=how.set_aside)
     fitted = _fit_arrays(found, how)
     arrays = {"fit": {name: values.reshape(shape + values.shape[1:]) for name, values in fitted.items()}}
     if how.bias:
@@ -102,30 +101,6 @@ def _errors(covariance: FloatArray) -> FloatArray:
     """Return the standard errors (pixel, parameter) of a covariance; NaN where a variance is negative."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
-
-
-def _fit_model(
-    fit: Callable[..., FitResult],
-    how: TileFit,
-    start: FloatArray | None,
-    added: AddedExposure | None,
-    places: PixelPlaces | None,
-) -> FitResult:
-    """Fit with the PCD or, where the model has effects, with the law that they compose after such a fit.
-
-    ``fit`` is :func:`fit_histograms` of the pixels; the other arguments are those of :func:`fit_tile`, with
-    the pixels along one axis.
-    """
-    settings, effects = how.settings, how.effects
-    if not effects:
-        return fit(settings=settings, start=start, excluding=how.set_aside)
-    # the law is integrated over the cells: a start with all of them would be in vain
-    likelihood = "density" if settings.likelihood == "density" else "auto"
-    simple = settings.model_copy(update={"likelihood": likelihood, "intervals": "normal"})
-    plain = fit(settings=simple, start=start)
-    return fit(
-        settings=settings, start=plain, law=_laws(plain, effects, added, places), excluding=how.set_aside
-    )
 
 
 def _laws(

@@ -1,10 +1,14 @@
-"""The arrays of the histogram stage, and how those along time are cut into chunks."""
+"""The arrays of the histogram stage, how those along time are cut into chunks, and what counting takes."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
+import numpy as np
+
+from pchem_pipeline.compute.memory import BASE_BYTES
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.model.histogram.count import counts_dtype
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP, block_starts
@@ -15,9 +19,9 @@ MAPS = ("origin", "under", "over", "minimum", "maximum")
 COVARIANCES = ("lag1_covariance", "neighbour_covariance_x", "neighbour_covariance_y")
 
 #: frames, or blocks, in a chunk of the arrays along time
-COLUMN_FRAMES = 1024
-ROW_FRAMES = 4096
-CHUNK_BLOCKS = 8
+_COLUMN_FRAMES = 1024
+_ROW_FRAMES = 4096
+_CHUNK_BLOCKS = 8
 #: a chunk of row sums of all rows is read at once in the end: fewer frames on tall sensors
 _ROWS_AT_ONCE = 2048
 #: rows and columns of pixels that are decoded to read the histogram of one, where tiles are larger than a few
@@ -26,7 +30,7 @@ _READ_ROWS, _READ_COLUMNS, _FEW_PIXELS = 16, 64, 4096
 
 def row_frames(ny: int) -> int:
     """Return the frames in a chunk of row sums."""
-    return max(ROW_FRAMES // 16, ROW_FRAMES // -(-ny // _ROWS_AT_ONCE))
+    return max(_ROW_FRAMES // 16, _ROW_FRAMES // -(-ny // _ROWS_AT_ONCE))
 
 
 def create_counts(context: StageContext, bins: int, dtype: Any) -> None:
@@ -61,10 +65,10 @@ def create_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
         *(f"summary/{name}" for name in (*COVARIANCES, "open_sums", "open_covariances")), lengths=lengths
     )
     rows = max(context.tile[0], ROW_GROUP)
-    chunks = {"frame": row_frames(ny), "block": CHUNK_BLOCKS, "y": rows, "x": nx}
+    chunks = {"frame": row_frames(ny), "block": _CHUNK_BLOCKS, "y": rows, "x": nx}
     names = ("block_sum", "block_sum_square", "row_sum", "row_sum_square")
     context.create(*(f"summary/{name}" for name in names), lengths=lengths, chunks=chunks)
-    chunks |= {"frame": COLUMN_FRAMES, "row_group": rows // ROW_GROUP}
+    chunks |= {"frame": _COLUMN_FRAMES, "row_group": rows // ROW_GROUP}
     context.create("summary/column_sum", lengths=lengths, chunks=chunks, rows=ROW_GROUP)
     if context.fresh:
         context.store.write_array("summary/block_start", starts, {"frames": n_frames, "block": length})
@@ -93,3 +97,22 @@ def extend_arrays(context: StageContext, shape: tuple[int, int, int], bins: int)
         for name in ("block_sum", "block_sum_square"):
             store.resize(f"summary/{name}", starts.size)
         store.write_array("summary/block_start", starts, {"frames": n_frames, "block": length})
+
+
+def bytes_per_row(columns: int, n_frames: int, itemsize: int, bins: int, settings: HistogramSettings) -> int:
+    """Return the memory that a worker needs for each row of its band."""
+    block = 2 * min(settings.window_frames, n_frames) * itemsize
+    pixel = block + bins * counts_dtype(n_frames).itemsize + 21 + 2 * itemsize
+    row = 0
+    if settings.summaries:
+        # sums, covariances and their temporaries; then what waits for its chunk along time to be whole
+        pixel += 170 + 2 * 2 * _CHUNK_BLOCKS * 8
+        pixel += math.ceil(2 * min(_COLUMN_FRAMES, n_frames) * 4 / ROW_GROUP)
+        row = 2 * 2 * min(_ROW_FRAMES, n_frames) * 8
+    return columns * pixel + row
+
+
+def single_pass_bytes(config: RunConfig, shape: tuple[int, int, int], dtype: np.dtype[Any], bins: int) -> int:
+    """Return the memory of a single pass over frames (frame, y, x), the program included."""
+    n_frames, ny, nx = shape
+    return BASE_BYTES + ny * bytes_per_row(nx, n_frames, dtype.itemsize, bins, config.histogram)

@@ -72,13 +72,9 @@ class _AlongTime:
 
 @dataclass(frozen=True)
 class CountJob:
-    """What is counted, and into which run.
+    """What is counted of a stack (frames, rows, columns), into which run, which has the arrays.
 
-    Attributes:
-        store: path of the run, which has the arrays.
-        shape: frames, rows and columns of the whole stack.
-        bins: of a pixel.
-        copies: the frames go into ``frames/dn``, too.
+    With ``copies`` the frames go into ``frames/dn``, too.
     """
 
     store: Path

@@ -23,9 +23,8 @@ from pchem_pipeline.model.histogram.summaries import ROW_GROUP, frame_statistics
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.stage import StageContext, Task
 from pchem_pipeline.stages.bands import Band, plan_bands
-from pchem_pipeline.stages.histogram.arrays import create_arrays, create_counts, row_frames
+from pchem_pipeline.stages.histogram.arrays import bytes_per_row, create_arrays, create_counts, row_frames
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import bytes_per_row
 from pchem_pipeline.stages.histogram.odd_frames import leave_out_odd_frames
 from pchem_pipeline.stages.samples import sample_targets
 from pchem_pipeline.store.run_store import RunStore

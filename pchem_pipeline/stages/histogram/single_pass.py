@@ -35,9 +35,8 @@ from pchem_pipeline.run.progress import whole_mebibytes
 from pchem_pipeline.run.stage import Prepared, StageContext, allowed_bytes
 from pchem_pipeline.stages import ingest
 from pchem_pipeline.stages.bands import cut_rows
-from pchem_pipeline.stages.histogram.arrays import create_arrays
+from pchem_pipeline.stages.histogram.arrays import create_arrays, single_pass_bytes
 from pchem_pipeline.stages.histogram.counting import CountJob, StackCounter
-from pchem_pipeline.stages.histogram.memory import single_pass_bytes
 from pchem_pipeline.stages.table import STAGES
 from pchem_pipeline.store.tiles import tile_shape
 
@@ -71,12 +70,7 @@ def count_in_one_pass(context: StageContext) -> None:
         return  # the files changed meanwhile: the stages look at them again
     with suppress(StoreError):  # a store that cannot be written is a matter for those who write to it
         keep_identity(context, quick, identity)
-        context.prepared = prepared(frames, clock)
-
-
-def prepared(frames: FrameSequence, clock: tuple[float, float]) -> dict[str, Prepared]:
-    """Return what the stages are told of a pass: the time of it all belongs to the last one."""
-    return {"ingest": Prepared(frames), "histogram": Prepared(frames, clock)}
+        context.prepared = Prepared(PREPARED, frames, clock)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from collections import ChainMap
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +35,7 @@ from pchem_pipeline.report.inspector import (
     some_of,
 )
 from pchem_pipeline.stages.fit.fitted_model import FittedModel
-
-if TYPE_CHECKING:
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore
 
 #: Bytes of base64 for the maps of a sensor of 512 x 512 pixels; larger ones get more, by the power 0.9, and
 #: at most so many: what does not fit is shown by ``pchem view`` and, of all pixels, in the figures.
@@ -136,10 +134,7 @@ def read_maps(
     """Read every stored map: packed, the important ones first, until the page is full; exact for some pixels.
 
     ``index`` is ``y * nx + x`` of these, ``loaded`` are maps that were read already, by path; each of the
-    threads packs a map.
-
-    Returns:
-        The maps, in the order of the list, and by path of those that fit their values, shape (n,).
+    threads packs a map. The maps come in the order of the list, the values of those that fit by path, (n,).
 
     Raises:
         StoreError: an array is missing or corrupt.
@@ -172,10 +167,7 @@ def read_maps(
 
 
 def _coded(maps: Arrays, entry: MapEntry, index: IntArray, pack: bool) -> tuple[MapEntry, FloatArray]:
-    """Return a map in few bytes, or as a multiple of another, and its values at some pixels, shape (n,).
-
-    It is packed only where asked for, and no multiple.
-    """
+    """Return a map, packed if wanted, or as a multiple of another, and its values at some pixels, (n,)."""
     alike = _multiple_of_exposure(maps, entry.path)
     if alike is None and not pack:
         return entry, np.empty(0)

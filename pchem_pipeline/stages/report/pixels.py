@@ -158,11 +158,8 @@ def choose_inspected(
 
     These are the ``shown`` ones, the ``suspects`` of the search for missing effects, odd ones, and an even
     sample. A sensor of at most ``everything`` pixels is taken whole, of a larger one ``most``; histograms of
-    so many ``bins`` have at most `MAX_BINS` together.
-
-    Returns:
-        ``y * nx + x`` of each, each once, the shown and odd ones first, shape (n,); and why they were chosen,
-        those of the even sample excepted.
+    so many ``bins`` have at most `MAX_BINS` together. Return ``y * nx + x`` of each, the shown and odd ones
+    first, shape (n,), and why they were chosen, those of the even sample excepted.
     """
     status = np.asarray(fit["fit_status"])
     ny, nx = status.shape
@@ -181,9 +178,8 @@ def choose_inspected(
     index = index[np.sort(once)]
     if status.size > everything:
         index = index[:most]
-    there = set(index.tolist())
     found = [
-        Notable(words, tuple(i for i in where.tolist() if i in there), path) for words, path, where in reasons
+        Notable(words, tuple(where[np.isin(where, index)].tolist()), path) for words, path, where in reasons
     ]
     return index, [each for each in found if each.pixels]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pchem_pipeline.base.wording import short_name
 from pchem_pipeline.compute.executor import Beside, beside
 from pchem_pipeline.compute.memory import BASE_BYTES, SECOND_PROGRAM_BYTES
 from pchem_pipeline.compute.settings import ComputeSettings
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.report.data import PixelFit, ReportData
 from pchem_pipeline.report.figures.figure import Figure
 from pchem_pipeline.report.figures.stability import stability_figures
@@ -38,9 +39,6 @@ from pchem_pipeline.stages.report.pixels import (
 from pchem_pipeline.stages.report.stored import StoredRun, read_histograms, read_run
 from pchem_pipeline.stages.table import pipeline
 from pchem_pipeline.store.run_store import RunStore
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
 
 
 def run(context: StageContext) -> None:

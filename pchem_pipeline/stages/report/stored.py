@@ -6,7 +6,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from pchem_pipeline.base.variables import (
 from pchem_pipeline.base.wording import short_name
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.config.load import dump_config
+from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.verdict import Verdict, read_verdict
 from pchem_pipeline.effects.framework.compose import model_words
@@ -39,11 +40,7 @@ from pchem_pipeline.stages.fit.fitted_model import FittedModel
 from pchem_pipeline.stages.maps import NO_TIME
 from pchem_pipeline.stages.methods import read_methods
 from pchem_pipeline.stages.samples import exposure_axis
-from pchem_pipeline.store.run_store import stored_config
-
-if TYPE_CHECKING:
-    from pchem_pipeline.config.tree import RunConfig
-    from pchem_pipeline.store.run_store import RunStore
+from pchem_pipeline.store.run_store import RunStore, stored_config
 
 #: Group to the names of the arrays that the report is made from.
 _ARRAYS: dict[str, tuple[str, ...]] = {

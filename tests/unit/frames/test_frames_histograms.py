@@ -37,7 +37,7 @@ def test_csv(tmp_path, text):
     assert found.counts.dtype == np.uint32
     assert found.counts.tolist() == [[WANTED]]
     assert found.origin.tolist() == [[100]]
-    assert (found.names, found.shape) == (("a",), (1, 1))
+    assert (found.names, found.origin.shape) == (("a",), (1, 1))
     assert any("are taken as 0" in note for note in found.notes)
 
 

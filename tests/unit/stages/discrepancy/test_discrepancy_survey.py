@@ -14,14 +14,8 @@ from pchem_pipeline.discrepancy.scan_pairs import pairs_bytes
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.stages.discrepancy import survey as module
-from pchem_pipeline.stages.discrepancy.survey import (
-    PAIRS,
-    SHAPES,
-    SUMS,
-    Survey,
-    places_of_bands,
-    places_of_sums,
-)
+from pchem_pipeline.stages.discrepancy.survey import places_of_bands, places_of_sums
+from pchem_pipeline.stages.discrepancy.window import PAIRS, SHAPES, SUMS, Survey
 
 SHAPE, FRAMES = (40, 32), 600
 

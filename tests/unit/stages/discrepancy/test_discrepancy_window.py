@@ -22,8 +22,8 @@ from pchem_pipeline.effects.operators.curve import Clipping
 from pchem_pipeline.run.progress import Reporter
 from pchem_pipeline.run.signals import InterruptedRunError
 from pchem_pipeline.stages.discrepancy import discrepancy
-from pchem_pipeline.stages.discrepancy.survey import Survey
 from pchem_pipeline.stages.discrepancy.window import (
+    Survey,
     Window,
     choose_window,
     fewer_samples,
@@ -51,13 +51,13 @@ def stored(survey):
 def test_odd_frames_are_not_looked_at_and_those_delivered_twice_once():
     seen = stored(Survey(left_out=(0, 700)))
     for shape in ((900, 16, 16), (17750, 512, 512)):
-        numbers = seen.window(shape, WHOLE, None).numbers
+        numbers = choose_window(shape, WHOLE, None, seen).numbers
         assert not np.isin(numbers, (0, 700)).any()
         assert np.all(np.diff(numbers) > 0)
     assert seen.told(verdict_of("named"), 1.0).examined.left_out == (0, 700)
     copied = tuple(range(1, 1800, 2))
     seen = stored(Survey(left_out=(6, *copied), copied=copied))
-    window = seen.window((1800, 16, 16), WHOLE, None)
+    window = choose_window((1800, 16, 16), WHOLE, None, seen)
     np.testing.assert_array_equal(window.numbers, np.delete(np.arange(0, 1800, 2), 3))
     np.testing.assert_array_equal(window.times, np.delete(np.arange(900), 3))
     assert split_frames(window.times, 20).train.size == 280
@@ -115,19 +115,19 @@ def place(p=1e-9, **region):
 
 def test_the_window_lies_where_the_sensor_disagrees_half_of_it_outside():
     tap = {"next_x": place(columns=[448, 512])}
-    window = choose_window((17750, 512, 512), WHOLE, None, tap)
+    window = choose_window((17750, 512, 512), WHOLE, None, Survey(tap))
     x0, x1 = window.columns
     assert 0.4 < (x1 - 448) / (x1 - x0) < 0.6
     blob = {"lag": place(1e-5, columns=[0, 9]), "spread": place(1e-20, rows=[20, 40], columns=[30, 50])}
-    window = choose_window((17750, 512, 512), WHOLE, None, blob)
+    window = choose_window((17750, 512, 512), WHOLE, None, Survey(blob))
     (y0, y1), (x0, x1) = window.rows, window.columns
     assert y0 <= 20 < 40 <= y1
     assert x0 <= 30 < 50 <= x1
     # without a place, or with one outside of the region asked for, the middle is looked at
     middle = choose_window((17750, 512, 512), WHOLE)
-    assert choose_window((17750, 512, 512), WHOLE, None, {}).rows == middle.rows
+    assert choose_window((17750, 512, 512), WHOLE, None, Survey({})).rows == middle.rows
     elsewhere = {"lag": place(rows=[500, 512])}
-    asked = choose_window((17750, 512, 512), WHOLE, (0, 256, 0, 256), elsewhere)
+    asked = choose_window((17750, 512, 512), WHOLE, (0, 256, 0, 256), Survey(elsewhere))
     assert asked.rows == choose_window((17750, 512, 512), WHOLE, (0, 256, 0, 256)).rows
 
 
@@ -257,7 +257,8 @@ def test_a_stop_in_the_middle_of_a_comparison_makes_no_verdict(monkeypatch, erro
     context = SimpleNamespace(sensor=SimpleNamespace(kind="frames"), reporter=Reporter(quiet=True))
     context.run_units = Mock(side_effect=error)
     context.stop = SimpleNamespace(at_once=contextlib.nullcontext)
-    monkeypatch.setattr(discrepancy, "_start", lambda _: ((), None))
+    context.store = SimpleNamespace(records=SimpleNamespace(read=lambda _: None))
+    monkeypatch.setattr(discrepancy, "model_of", lambda *_: SimpleNamespace(effects=()))
     monkeypatch.setattr(discrepancy, "_run_frames", search)
     with pytest.raises(type(error)) as found:
         discrepancy.run(context)

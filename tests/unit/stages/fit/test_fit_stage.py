@@ -9,7 +9,7 @@ from pchem_pipeline.base.variables import FREE_SATELLITES, PARAMETERS, interval_
 from pchem_pipeline.effects.operators.fate import BranchingCounts
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus
-from pchem_pipeline.stages.fit import together
+from pchem_pipeline.stages.fit import fit
 from pchem_pipeline.stages.fit.tile import TileFit, fit_tile
 
 WEAK = np.uint16(int(FitStatus.WEAKLY_IDENTIFIED))
@@ -33,15 +33,15 @@ def test_words_given_in_common_depend_on_no_tiling(tmp_path, monkeypatch):
     assert np.count_nonzero((words[0] & ~WEAK) == 0) > 5  # clear one by one
     # given again it is the same, and a pool of some pixels says the same of all
     context = contexts[0]
-    assert together.judge_sensor(context) == words[0].size
-    monkeypatch.setattr(together, "_LARGEST_POOL", 60)
-    assert together.judge_sensor(context) == words[0].size
+    assert fit.judge_sensor(context) == words[0].size
+    monkeypatch.setattr(fit, "_LARGEST_POOL", 60)
+    assert fit.judge_sensor(context) == words[0].size
     np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0])
-    monkeypatch.setattr(together, "_LARGEST_KEPT", 0)
-    assert together.judge_sensor(context) == words[0].size
+    monkeypatch.setattr(fit, "_LARGEST_KEPT", 0)
+    assert fit.judge_sensor(context) == words[0].size
     # fewer pixels than make a pool take the words back
-    monkeypatch.setattr(together, "_LARGEST_POOL", 10)
-    assert together.judge_sensor(context) == 0
+    monkeypatch.setattr(fit, "_LARGEST_POOL", 10)
+    assert fit.judge_sensor(context) == 0
     np.testing.assert_array_equal(context.store.read("fit/fit_status"), words[0] & ~WEAK)
 
 

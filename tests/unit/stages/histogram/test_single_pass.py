@@ -16,7 +16,7 @@ from pchem_pipeline.compute.executor import make_executor
 from pchem_pipeline.compute.settings import ComputeSettings
 from pchem_pipeline.run.signals import InterruptedRunError, StopRequest
 from pchem_pipeline.stages.bands import cut_rows
-from pchem_pipeline.stages.histogram import memory, single_pass
+from pchem_pipeline.stages.histogram import arrays, single_pass
 
 FRAMES, NY, NX = 300, 150, 40
 
@@ -81,7 +81,7 @@ def compare(folder, **sections):
     apart = run_both(make_context(folder, "apart.zarr", **sections))
     once = make_context(folder, "once.zarr", **sections)
     single_pass.count_in_one_pass(once)
-    assert set(once.prepared) == {"ingest", "histogram"}
+    assert set(once.prepared.stages) == {"ingest", "histogram"}
     run_both(once)
     groups = ("frames", "histogram", "summary")
     expected, found = (arrays_of(context.store.path, groups) for context in (apart, once))
@@ -133,7 +133,7 @@ def test_every_byte_is_read_once(tmp_path, frames, name):
     context = make_context(tmp_path, "run.zarr")
     before = _bytes_read()
     single_pass.count_in_one_pass(context)
-    assert set(context.prepared) == {"ingest", "histogram"}
+    assert set(context.prepared.stages) == {"ingest", "histogram"}
     tags = 900 * 8192 if name == "tiff" else 0  # looking for the pages of frames as small as these
     assert size <= _bytes_read() - before < 1.1 * size + tags
     # the separate stages read all twice, so the count is a count
@@ -150,7 +150,7 @@ def test_where_memory_is_short_the_stages_do_it(tmp_path, frames, monkeypatch):
     assert not context.prepared
     context = make_context(tmp_path, "run.zarr")
     # what the first block shows can be too much, too
-    room = memory.single_pass_bytes(context.config, frames.shape, frames.dtype, bins=0) + 1000
+    room = arrays.single_pass_bytes(context.config, frames.shape, frames.dtype, bins=0) + 1000
     monkeypatch.setattr(single_pass, "allowed_bytes", lambda config, workers: room)
     single_pass.count_in_one_pass(context)
     assert not context.prepared
@@ -184,7 +184,7 @@ def test_a_stopped_or_killed_pass_leaves_nothing_half_done(tmp_path, frames, nam
     assert all(context.store.records.read(stage) is None for stage in ("ingest", "histogram"))
     again = make_context(tmp_path, "run.zarr")
     single_pass.count_in_one_pass(again)
-    assert set(again.prepared) == {"ingest", "histogram"}
+    assert set(again.prepared.stages) == {"ingest", "histogram"}
     run_both(again)
     np.testing.assert_array_equal(again.store.read("histogram/counts").sum(axis=2).max(), FRAMES)
 
