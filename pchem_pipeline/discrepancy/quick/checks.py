@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
 Level = Literal["good", "note", "caution", "serious"]
+GRAVEST_FIRST: tuple[Level, ...] = ("serious", "caution", "note", "good")
 
 
 @dataclass(frozen=True)
@@ -168,9 +169,8 @@ class QuickLook:
     @property
     def found(self) -> tuple[Check, ...]:
         """Return the significant checks, the most severe first."""
-        order = ("serious", "caution", "note", "good")
         beyond = [check for check in self.checks if check.found]
-        return tuple(sorted(beyond, key=lambda check: (order.index(check.level), check.p)))
+        return tuple(sorted(beyond, key=lambda check: (GRAVEST_FIRST.index(check.level), check.p)))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON; unknown numbers are NaN."""

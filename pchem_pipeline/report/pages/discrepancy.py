@@ -375,14 +375,9 @@ PARTS = (
 def finding(data: DiscrepancyData) -> Finding:
     """Return the verdict with its key numbers and remarks."""
     found = data.found
-    return Finding(
-        VERDICT_LEVELS.get(found.verdict, "note"),
-        found.verdict.replace("_", " ").capitalize(),
-        typeset(found.sentence),
-        frames_text(found),
-        key_facts(data),
-        remarks(data),
-    )
+    level, sentence = VERDICT_LEVELS.get(found.verdict, "note"), typeset(found.sentence)
+    facts = key_facts(data), remarks(data)
+    return Finding(level, found.word.capitalize(), sentence, frames_text(found), *facts)
 
 
 def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
@@ -493,14 +488,14 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
     return [
         KeyFact(
             f"largest change: {_parameter_name(name)}",
-            f"{_signed(largest.median, 2)} {unit}".strip(),
-            (f"{_signed(largest.in_stderr, 2)} standard errors of one pixel{small}",),
+            f"{_signed(largest.median)} {unit}".strip(),
+            (f"{_signed(largest.in_stderr)} standard errors of one pixel{small}",),
         )
     ]
 
 
-def _signed(value: float, digits: int = 3) -> str:
-    return short(value, digits) if value < 0 or not math.isfinite(value) else f"+{short(value, digits)}"
+def _signed(value: float) -> str:
+    return short(value, 2) if value < 0 or not math.isfinite(value) else f"+{short(value, 2)}"
 
 
 def _chance_fact(found: Verdict) -> list[KeyFact]:

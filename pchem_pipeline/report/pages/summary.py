@@ -21,7 +21,7 @@ from pchem_pipeline.base.wording import (
     symbol,
     typeset,
 )
-from pchem_pipeline.discrepancy.quick.checks import Check, Level, QuickLook
+from pchem_pipeline.discrepancy.quick.checks import GRAVEST_FIRST, Check, Level, QuickLook
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.checks.map_parts import Parts
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of, words_of
@@ -78,10 +78,6 @@ def _failed(data: ReportData) -> _Found:
     return pixels.failed / max(pixels.total, 1), f"{data.noun}s without a value"
 
 
-def _flagged_share(data: ReportData) -> _Found:
-    return float(data.flagged.mean()), f"flagged {data.noun}s"
-
-
 def _hot(data: ReportData) -> _Found:
     """Return the share of hot pixels; a flagged one is hot, too, whatever electrons it is open by."""
     if data.few_channels or data.defects is None or not data.has_values("quanta_exposure"):
@@ -120,7 +116,7 @@ def _gain_spread(data: ReportData) -> _Found:
 _MEASURES: dict[str, tuple[Callable[[ReportData], _Found], Callable[[float], str]]] = {
     "read_noise_e": (_read_noise, lambda value: f"{short(value)} e⁻"),
     "failed_pixels": (_failed, percent),
-    "flagged_pixels": (_flagged_share, percent),
+    "flagged_pixels": (lambda data: (float(data.flagged.mean()), f"flagged {data.noun}s"), percent),
     "hot_pixels": (_hot, percent),
     "outlying_pixels": (_outlying, percent),
     "gain_nonuniformity": (_gain_spread, percent),
@@ -299,8 +295,7 @@ def flags(data: ReportData) -> list[Flag]:
 
 def gravest_first(found: Iterable[Flag]) -> list[Flag]:
     """Return remarks by their level, the gravest first."""
-    order = ("serious", "caution", "note", "good")
-    return sorted(found, key=lambda flag: order.index(flag.level))
+    return sorted(found, key=lambda flag: GRAVEST_FIRST.index(flag.level))
 
 
 def _levels(data: ReportData) -> Iterator[Flag]:
@@ -567,10 +562,8 @@ def _sensor(data: ReportData) -> Answer:
         noisy = data.summary("read_noise_e").median > _TOO_NOISY
         word = "Too noisy to count electrons" if noisy else "Too noisy"
         return Answer(question, "caution", word, text, judged)
-    if data.often_flagged:
-        return Answer(question, "caution", "Partly known", text, judged)
-    if missed:
-        return Answer(question, "caution", "Mostly", text, judged)
+    if data.often_flagged or missed:
+        return Answer(question, "caution", "Partly known" if data.often_flagged else "Mostly", text, judged)
     return Answer(question, "good", "Yes", text, judged)
 
 
@@ -592,10 +585,8 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
         looked, yes = _not_looked_for(data), "No problem found by the quick checks"
     pixels = pixel_counts(data)
     if pixels.failed > data.allowed_failed * pixels.total:
-        word = f"For the {data.noun}s with a value"
-        return Answer(
-            question, "caution", word, f"{checks}; {count(pixels.failed, data.noun)} without a value.{looked}"
-        )
+        text = f"{checks}; {count(pixels.failed, data.noun)} without a value.{looked}"
+        return Answer(question, "caution", f"For the {data.noun}s with a value", text)
     return Answer(question, "good", yes, f"{checks}.{looked}")
 
 
@@ -635,10 +626,8 @@ def next_steps(data: ReportData) -> list[Step]:
         return [Step(f"pchem run {RUN}", "finish the run")]
     step = data.code_step
     if step > 1 and not step & (step - 1):
-        why = (
-            f"set input.bit_shift: {step.bit_length() - 1} in the YAML (left-justified samples) and run again"
-        )
-        return [Step(f"pchem run {RUN}", why)]
+        shift = f"set input.bit_shift: {step.bit_length() - 1} in the YAML"
+        return [Step(f"pchem run {RUN}", f"{shift} (left-justified samples) and run again")]
     if data.failed.all():
         return [
             Step(
