@@ -76,12 +76,10 @@ class PackedMap:
 
 
 def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0) -> Scale:
-    """Choose the range and the step of a map's codes.
+    """Choose the range and the step of a map's codes; NaN and infinities are left out.
 
-    Args:
-        values: any shape; NaN and infinities are left out. Integers keep a step of 1.
-        step: wanted step, in the unit of the map; 0: a 64th of the robust standard deviation.
-        coarse: factor on the step, for maps that must be smaller.
+    The wanted step is in the unit of the map (0: a 64th of the robust standard deviation; of integers it is
+    1), ``coarse`` a factor on it, for maps that must be smaller.
     """
     flat = np.asarray(values).ravel()
     if flat.dtype.kind in "iub" and flat.size:
@@ -107,12 +105,12 @@ def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0
     return Scale(float(first) - shift * wide, wide, log)
 
 
-def some_of(values: NDArray[Any], enough: int = 65_537) -> NDArray[Any]:
+def some_of(values: NDArray[Any]) -> NDArray[Any]:
     """Return the values of a flat array, of many every k-th: enough for a quantile that only sets a scale.
 
     k is odd: no column of a sensor is left out for good.
     """
-    return values[:: max(values.size // enough, 1) | 1]
+    return values[:: max(values.size // 65_537, 1) | 1]
 
 
 def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
@@ -120,7 +118,11 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
     flat = np.asarray(values).ravel()
     place = _places(flat, scale)
     bars = None if flat.dtype.kind in "iub" else _bars(place)
-    codes = _codes(place, flat).astype("<u2")
+    np.rint(place, out=place)
+    place += _FIRST
+    np.clip(place, _BELOW, _ABOVE, out=place)
+    place[~np.isfinite(flat) | np.isnan(place)] = _NONE
+    codes = place.astype("<u2")
     outside = (codes == _BELOW) | (codes == _ABOVE)
     if scale.log:  # zeros, which may be many, need no place in the list
         outside &= flat != 0
@@ -142,15 +144,6 @@ def _places(values: NDArray[Any], scale: Scale) -> FloatArray:
         place: FloatArray = np.log10(values, dtype=np.float64) if scale.log else values.astype(np.float64)
         place -= scale.low
         place /= scale.step
-    return place
-
-
-def _codes(place: FloatArray, values: NDArray[Any]) -> FloatArray:
-    """Return the code of each value from its place, which is changed."""
-    np.rint(place, out=place)
-    place += _FIRST
-    np.clip(place, _BELOW, _ABOVE, out=place)
-    place[~np.isfinite(values) | np.isnan(place)] = _NONE
     return place
 
 

@@ -269,11 +269,8 @@ def select(
 ) -> FittedSet:
     """Select effects stepwise (Efroymson 1960): one is added, else exchanged, else left out, while that pays.
 
-    Args:
-        sets: fits and scores them.
-        candidates: starts; several may be of one effect.
-        start: a set to begin with; None: no effect.
-        largest: number of effects.
+    Several candidates may be of one effect. It begins with the set ``start`` (None: no effect), and no set
+    has more than ``largest`` effects.
     """
     best, passed = start or sets.plain, set[frozenset[str]]()
     while best.kinds not in passed:

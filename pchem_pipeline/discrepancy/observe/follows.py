@@ -164,12 +164,10 @@ class FollowingSamples:
     def by_excess(
         self, place: tuple[int, int, int], columns: tuple[int, int] | None, above: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return ``sum u f`` and ``sum f^2`` of residuals u and of the charge f above some numbers, (n,).
+        """Return ``sum u f`` and ``sum f^2`` of residuals u and of the charge f above some electrons, (n,).
 
-        Args:
-            place: frames, rows and columns from the residual to the charge.
-            columns: first column of residuals that count, and end; None: all.
-            above: electrons, (n,).
+        The place is in frames, rows and columns from the residual to the charge; only residuals of some
+        columns (first, end) count; None: all.
         """
         step, (ny, nx) = -place[0], self.inside.shape
         here, there = self._pairs(place)

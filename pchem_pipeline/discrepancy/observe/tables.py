@@ -174,13 +174,8 @@ def efficient_scores(
 ) -> FloatArray:
     """Compute the standardised efficient scores of the samples, their skewness and kurtosis, (n, 3, N_TESTS).
 
-    NaN where a score has no variance.
-
-    Args:
-        sums: see :func:`~.tables_numba.sum_scores`, (n, N_TESTS, N_TESTS + 3).
-        factors: of the whitening, (n, N_NUISANCE, N_COLUMNS).
-        samples: of each pixel, (n,).
-        exposure: H, e-, (n,).
+    NaN where a score has no variance. The sums are (n, N_TESTS, N_TESTS + 3), see `tables_numba`, the factors
+    of the whitening (n, N_NUISANCE, N_COLUMNS), samples and exposures (H, e-) of each pixel (n,).
     """
     products, (total, third, fourth) = sums[:, :, :N_TESTS], np.moveaxis(sums[:, :, N_TESTS:], 2, 0)
     variance, samples = np.einsum("pii->pi", products), samples[:, None]

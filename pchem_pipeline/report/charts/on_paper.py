@@ -247,9 +247,7 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
 def draw_panels(given: Any, chart: Chart) -> None:
     """Draw the panels of a chart into axes of another figure, in the style of that figure.
 
-    Args:
-        given: axes, one or an array of any shape: one for each panel, in order.
-        chart: what is drawn.
+    Axes are one or an array of any shape: one for each panel, in order.
 
     Raises:
         ConfigError: they are no axes, or not as many as the chart has panels.
@@ -472,7 +470,11 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
     beside = axes.get_subplotspec()
     columns = 1 if beside is None else beside.get_topmost_subplotspec().get_gridspec().ncols
     values, x, y = mark.shown(look.width_mm / 25.4 * look.dpi / columns)
-    colours = _colours(mark).with_extremes(bad=LIGHT.no_value)
+    if isinstance(mark.scale, str):
+        scale: Colormap = mpl.colormaps[colour_of(mark.scale) or MAP_COLOURS].resampled(SHADES)
+    else:
+        scale = ListedColormap([colour_of(each) for each in mark.scale])
+    colours = scale.with_extremes(bad=LIGHT.no_value)
     low, high = mark.ends
     axes.set_facecolor(LIGHT.no_value)
     # a vector file keeps the pixels as they are, but for more of them than it can show
@@ -489,10 +491,3 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
             bar.ax.set_yticklabels(texts)
         bar.ax.minorticks_off()
         bar.set_label(mark.unit)
-
-
-def _colours(mark: Image) -> Colormap:
-    """Return the colours of a map."""
-    if isinstance(mark.scale, str):
-        return mpl.colormaps[colour_of(mark.scale) or MAP_COLOURS].resampled(SHADES)
-    return ListedColormap([colour_of(each) for each in mark.scale])
