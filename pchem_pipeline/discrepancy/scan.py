@@ -104,15 +104,11 @@ def scan_map(
         found = families.best_place([*_regions(contrast), families.single(values, left) if single else None])
         return _significant(found, values, left, significance, either_side=True)
 
-    def share(place: families.Place, left: BoolArray) -> float:
-        deviations = np.where(some, math.copysign(1.0, place.z) * values, -np.inf)[some]
-        return affected_share(deviations, (place.mask & left)[some])
-
     return [
         Suspect(
             **place.means(values, left),
             region=Region.of_mask(_reaching(place.mask, next_along)),
-            share=share(place, left),
+            share=affected_share(math.copysign(1.0, place.z) * values[some], (place.mask & left)[some]),
         )
         for place, left in families.successive(best, some, most)
     ]

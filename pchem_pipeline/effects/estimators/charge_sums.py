@@ -25,15 +25,9 @@ from pchem_pipeline.model.law.pcd import pcd_posterior
 
 
 class ExposureProfile(NamedTuple):
-    """Relative deviation of the exposure of each frame from its mean, and its shot noise.
+    """Relative deviation of the exposure of each numbered frame from the mean, (n,), and its shot noise."""
 
-    Attributes:
-        frames: frame numbers, shape (n,).
-        deviation: estimates, no unit, shape (n,).
-        variance: their variance if the exposure is constant, one for all.
-    """
-
-    frames: FloatArray
+    frames: IntArray
     deviation: FloatArray
     variance: float
 
@@ -52,7 +46,7 @@ def exposure_profile(evidence: Evidence) -> ExposureProfile | None:
     if not (variance > 0 and exposure > 0):
         return None
     deviation = np.asarray(time.frame_charge, np.float64) * (exposure / variance)
-    return ExposureProfile(time.frames.astype(np.float64), deviation, 1.0 / variance)
+    return ExposureProfile(time.frames.astype(np.int64), deviation, 1.0 / variance)
 
 
 class BlockCharge(NamedTuple):

@@ -156,12 +156,7 @@ _WAVES = (0, 12)
 
 @dataclass(frozen=True)
 class Steps:
-    """Levels of one series.
-
-    Attributes:
-        starts: where each level begins, the first at 0, shape (s,).
-        levels: shape (s,), with mean 0 over the series.
-    """
+    """Levels of one series, with mean 0 over it, and where each begins, the first at 0, (s,) both."""
 
     starts: IntArray
     levels: FloatArray
@@ -304,12 +299,7 @@ _STEPS = 200  # of EM; levels that are as far apart as the noise is wide take so
 
 
 class Levels(NamedTuple):
-    """Values and how often each is taken.
-
-    Attributes:
-        values: shape (k,), rising.
-        shares: sum to 1, shape (k,).
-    """
+    """Rising values and how often each is taken, (k,) both; the shares sum to 1."""
 
     values: FloatArray
     shares: FloatArray
@@ -318,10 +308,6 @@ class Levels(NamedTuple):
     def rms(self) -> float:
         """Standard deviation."""
         return float(np.sqrt(self.shares @ (self.values - self.shares @ self.values) ** 2))
-
-    def loglik(self, seen: FloatArray, variance: float) -> float:
-        """Return the log-likelihood of what is seen, shape (n,), with normal noise of this variance."""
-        return float(_log_density(self, seen, variance)[0].sum())
 
 
 def few_levels(seen: FloatArray, variance: float) -> Levels | None:
@@ -335,11 +321,11 @@ def few_levels(seen: FloatArray, variance: float) -> Levels | None:
     best, criterion = None, -0.5 * seen.size * (math.log(2.0 * math.pi * total) + whole / total) - 0.5 * price
     for k in range(2, _MOST_LEVELS + 1):
         levels = _fitted(seen, variance, k)
-        now = levels.loglik(seen, variance) - (k - 0.5) * price
-        if now <= criterion and best is not None:
-            break
+        now = float(_log_density(levels, seen, variance)[0].sum()) - (k - 0.5) * price
         if now > criterion:
             best, criterion = levels, now
+        elif best is not None:
+            break
     return best
 
 
