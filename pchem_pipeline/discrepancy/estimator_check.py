@@ -26,11 +26,9 @@ _BLOCK = 50  # frames, as many as a search looks at in one piece
 
 @dataclass(frozen=True)
 class RecoveredStrength:
-    """The strengths that an estimator finds in several stacks.
+    """The true strength, and those that an estimator finds in several stacks, (n,).
 
-    Attributes:
-        true: strength that the effect has in the stacks.
-        found: that of the likeliest hypothesis in each stack, NaN where there is none, shape (n,).
+    That is the strength of the likeliest hypothesis in each stack, NaN where there is none.
     """
 
     true: float

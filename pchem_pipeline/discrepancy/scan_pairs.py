@@ -56,9 +56,7 @@ _LINE_BY_CHANCE = 1e-4  # probability of a line that stands out by itself, among
 class Shared(Suspect):
     """A place whose pixels move together, unlike the rest; inside and outside are mean correlations of pairs.
 
-    Attributes:
-        channel: 0 for electron numbers, 1 for residuals.
-        mode: row, column or frame: what the pixels share.
+    Channel 0 is that of electron numbers, 1 of residuals; the mode (row, column, frame) is what pixels share.
     """
 
     channel: int

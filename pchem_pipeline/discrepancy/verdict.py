@@ -66,12 +66,9 @@ class Measured(_Part):
 
 
 class Candidate(_Part):
-    """An effect that was compared, by its tag and fields.
+    """An effect that was compared, by its tag and fields, with its posterior probability among all of them.
 
-    Attributes:
-        score: held-out log-likelihood minus that of the best effect, nats (0 for the best).
-        stderr: standard error of ``score``, nats.
-        probability: posterior probability among all candidates.
+    The score is the held-out log-likelihood minus that of the best effect, nats, with its standard error.
     """
 
     effect: str
@@ -113,12 +110,10 @@ class Size(_Part):
 
 
 class Rival(_Part):
-    """Another effect (its tag) fitted instead of the named one, in the same way.
+    """Another effect (its tag) fitted instead of the named one, in the same way, and why it is rejected.
 
-    Attributes:
-        gap_after: the remaining gap, nats per sample.
-        behind: log-likelihood minus that of the named one, nats; NaN if it was not scored.
-        why: reason of the rejection.
+    ``gap_after`` is the remaining gap, nats per sample, ``behind`` the log-likelihood minus that of the named
+    one, nats; NaN if it was not scored.
     """
 
     effect: str

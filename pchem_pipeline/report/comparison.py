@@ -49,13 +49,9 @@ class ArrayRow:
 
     Attributes:
         name: its path in the store.
-        state: how it compares.
         counts: whether a change of it is a change of the results.
-        dtype: of the first run (of the second where it is new).
-        shape: the same.
-        n_values: values compared.
-        n_different: values that differ at all.
-        n_beyond: values that differ by more than rounding.
+        dtype, shape: of the first run (of the second where it is new).
+        n_different, n_beyond: values that differ at all, and by more than rounding.
         largest: largest absolute difference, in the array's unit.
         scale: largest absolute value.
         sha256: digests of the values of both, empty where there are none.

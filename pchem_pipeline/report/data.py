@@ -128,17 +128,11 @@ class DiscrepancyData:
 
 @dataclass(frozen=True)
 class Sample:
-    """One exposure of the sensor.
-
-    Attributes:
-        kind: ``exposed``, or ``bias`` for frames without electrons.
-        x: integration time or light level; None where it is not on the line.
-        n_frames: frames of a pixel.
-    """
+    """One exposure of the sensor."""
 
     name: str
-    kind: str
-    x: float | None
+    kind: str  # exposed, or bias for frames without electrons
+    x: float | None  # integration time or light level; None where it is not on the line
     n_frames: int
 
 

@@ -260,19 +260,12 @@ class PixelSample:
 
 @dataclass(frozen=True)
 class InspectorData:
-    """All that the inspector holds.
+    """All that the inspector holds: maps in the order of the list, and pixels in full."""
 
-    Attributes:
-        maps: in the order of the list; those not packed are shown by ``pchem view`` only.
-        sample: the pixels in full.
-        kept_to: how true the packed maps are: a part of a standard error, in words.
-        command: what shows every pixel.
-    """
-
-    maps: tuple[MapEntry, ...]
+    maps: tuple[MapEntry, ...]  # those not packed are shown by ``pchem view`` only
     sample: PixelSample
-    kept_to: str
-    command: str
+    kept_to: str  # how true the packed maps are: a part of a standard error, in words
+    command: str  # what shows every pixel
 
 
 #: The part of the policy that forbids every connection, and that of a page which ``pchem view`` serves.

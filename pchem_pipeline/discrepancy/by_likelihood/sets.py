@@ -37,12 +37,9 @@ _SECANT = 0.1  # of the start: where the slope at no effect is taken
 
 @dataclass(frozen=True)
 class FittedSet:
-    """A set of candidates, fitted.
+    """A set of candidates at their fitted coordinates: log masses of the codes, (n, B), and the score.
 
-    Attributes:
-        members: at the fitted coordinates.
-        log_masses: of the codes, shape (n, B).
-        score: log-likelihood of the other part, nats.
+    The score is the log-likelihood of the other part, nats.
     """
 
     members: tuple[Member, ...]

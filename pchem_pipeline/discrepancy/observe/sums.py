@@ -113,12 +113,7 @@ def samples_beyond(
 
 @dataclass(frozen=True)
 class FrameBlocks:
-    """Frames of some rows that come by blocks.
-
-    Attributes:
-        n_frames: number of them.
-        blocks: yields about so many successive frames at a time, (frame, y, x), DN.
-    """
+    """Frames of some rows; ``blocks`` yields about so many successive ones at a time, (frame, y, x), DN."""
 
     n_frames: int
     blocks: Callable[[int], Iterable[CodeArray]]

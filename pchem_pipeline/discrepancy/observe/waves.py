@@ -33,12 +33,7 @@ _AROUND = 7  # frequencies along rows and columns whose median is the noise of t
 
 @dataclass(frozen=True)
 class Waves:
-    """Waves across rows and columns.
-
-    Attributes:
-        found: those that stand out, the one whose phase runs on first.
-        z: of the spectrum.
-    """
+    """Waves across rows and columns that stand out, one whose phase runs on first; z of the spectrum."""
 
     found: tuple[Wave, ...]
     z: dict[str, float]

@@ -361,19 +361,12 @@ def _exponential(blocks: BlockCharge, decay: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class Fading:
-    """How the cells fade.
+    """How the cells fade."""
 
-    Attributes:
-        decay: time constant, frames.
-        slow_decay: of a second, slower part, frames, or None.
-        slow_share: share of the slower part in the first frame.
-        scale: the first frame's amplitude over that of the cells.
-    """
-
-    decay: float
-    slow_decay: float | None
-    slow_share: float
-    scale: float
+    decay: float  # time constant, frames
+    slow_decay: float | None  # of a second, slower part, frames
+    slow_share: float  # of the slower part in the first frame
+    scale: float  # the first frame's amplitude over that of the cells
 
 
 def fading_of(blocks: BlockCharge, cells: FadingCells, n_run: int) -> Fading:

@@ -81,17 +81,12 @@ class Mark:
 
 @dataclass(frozen=True)
 class Line(Mark):
-    """A curve through points (n,), with a gap where y is NaN.
-
-    Attributes:
-        dots: diameter of a dot at each point, points.
-        step: each value holds half-way to its neighbours.
-    """
+    """A curve through points (n,), with a gap where y is NaN."""
 
     x: Values
     y: Values
-    dots: float = 0.0
-    step: bool = False
+    dots: float = 0.0  # diameter of a dot at each point, points
+    step: bool = False  # each value holds half-way to its neighbours
 
 
 @dataclass(frozen=True)
