@@ -46,20 +46,13 @@ BOXES = {"rows": (True, False), "columns": (False, True), "rectangle": (True, Tr
 
 @dataclass(frozen=True)
 class Place:
-    """The best place of a family.
-
-    Attributes:
-        mask: its pixels, (y, x).
-        z: deviation of the mean inside from that outside, standard errors.
-        log_places: logarithm of the number of places that were looked at.
-        edges: of the cells with which a box ends, of rows and of columns.
-    """
+    """The best place of a family."""
 
     family: str
-    mask: BoolArray
-    z: float
-    log_places: float
-    edges: Edges | None = None
+    mask: BoolArray  # its pixels, (y, x)
+    z: float  # deviation of the mean inside from that outside, standard errors
+    log_places: float  # logarithm of the number of places that were looked at
+    edges: Edges | None = None  # of the cells with which a box ends, of rows and of columns
 
     @property
     def log_p(self) -> float:

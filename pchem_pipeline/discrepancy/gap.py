@@ -31,21 +31,13 @@ _APART = 8.0
 
 @dataclass(frozen=True)
 class Gap:
-    """A gap, nats per sample.
+    """A gap, nats per sample."""
 
-    Attributes:
-        value: negative by sampling noise only.
-        floor: 95 % quantile under the model.
-        interval: 95 % interval.
-        families: contribution of each family of statistics.
-        standing_out: families that are significant by themselves.
-    """
-
-    value: float
-    floor: float
-    interval: tuple[float, float]
-    families: Mapping[str, float]
-    standing_out: tuple[str, ...] = ()
+    value: float  # negative by sampling noise only
+    floor: float  # 95 % quantile under the model
+    interval: tuple[float, float]  # 95 % interval
+    families: Mapping[str, float]  # contribution of each family of statistics
+    standing_out: tuple[str, ...] = ()  # families that are significant by themselves
 
     @classmethod
     def of(

@@ -53,14 +53,10 @@ class Covariance:
 
     The sample covariance shrunk towards its diagonal has this form, and so have all sums with it; whitening
     is linear in the number of statistics, not cubic.
-
-    Attributes:
-        own: variance of each statistic by itself, above 0, shape (m,).
-        common: modes that they share, shape (r, m).
     """
 
-    own: FloatArray
-    common: FloatArray
+    own: FloatArray  # variance of each statistic by itself, above 0, shape (m,)
+    common: FloatArray  # modes that they share, shape (r, m)
 
     @property
     def variances(self) -> FloatArray:

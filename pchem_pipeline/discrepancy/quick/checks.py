@@ -153,18 +153,12 @@ def check_of(name: str, p: float, size: float, *, how: str = "", **rest: Any) ->
 
 @dataclass(frozen=True)
 class QuickLook:
-    """All checks of a run, in the order in which they were made.
-
-    Attributes:
-        missing: checks that were not made, and why.
-        samples: frames x pixels of the checks.
-        command: command for a full search.
-    """
+    """All checks of a run, in the order in which they were made."""
 
     checks: tuple[Check, ...]
-    missing: dict[str, str] = field(default_factory=dict)
-    samples: int = 0
-    command: str = ""
+    missing: dict[str, str] = field(default_factory=dict)  # checks that were not made, and why
+    samples: int = 0  # frames x pixels of the checks
+    command: str = ""  # command for a full search
 
     @property
     def found(self) -> tuple[Check, ...]:

@@ -161,19 +161,12 @@ class Stitch:
 
 @dataclass(frozen=True)
 class CurveResponse:
-    """What a small deviation of the transfer curve leaves in the counts per code.
+    """What a small deviation of the transfer curve leaves in the counts per code."""
 
-    Attributes:
-        edges: lower edges of the codes and the upper one of the last, DN, (codes + 1,).
-        response: standard errors per DN of deviation at each edge, (codes, codes + 1).
-        residuals: those seen, standard errors, (codes,).
-        expected: counts per code, (codes,).
-    """
-
-    edges: FloatArray
-    response: FloatArray
-    residuals: FloatArray
-    expected: FloatArray
+    edges: FloatArray  # lower edges of the codes and the upper one of the last, DN, (codes + 1,)
+    response: FloatArray  # standard errors per DN of deviation at each edge, (codes, codes + 1)
+    residuals: FloatArray  # those seen, standard errors, (codes,)
+    expected: FloatArray  # counts per code, (codes,)
 
     @classmethod
     def of(cls, evidence: Evidence) -> CurveResponse | None:

@@ -273,23 +273,14 @@ _DARK = 0.05
 
 @dataclass(frozen=True)
 class FadingCells:
-    """Amplitudes of a falling exponential in the cells of a grid over the sensor.
+    """Amplitudes of a falling exponential in the cells of a grid over the sensor."""
 
-    Attributes:
-        decay: time constant, frames.
-        amplitude: e-, less what goes with H, shape (rows, columns); 0 in cells without pixels.
-        noise: standard errors, e-; infinite in cells without pixels.
-        exposure: mean H, e-.
-        score: chi-square of all cells against 0, as a standard normal number.
-        cell: which of them each pixel of the blocks is in, flat, shape (n,).
-    """
-
-    decay: float
-    amplitude: FloatArray
-    noise: FloatArray
-    exposure: FloatArray
-    score: float
-    cell: IntArray
+    decay: float  # time constant, frames
+    amplitude: FloatArray  # e-, less what goes with H, shape (rows, columns); 0 in cells without pixels
+    noise: FloatArray  # standard errors, e-; infinite in cells without pixels
+    exposure: FloatArray  # mean H, e-
+    score: float  # chi-square of all cells against 0, as a standard normal number
+    cell: IntArray  # which of them each pixel of the blocks is in, flat, shape (n,)
 
     @classmethod
     def of(cls, blocks: BlockCharge, exposure: FloatArray, decay: float, grid: int) -> FadingCells:

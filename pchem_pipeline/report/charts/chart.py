@@ -61,22 +61,14 @@ class Axis:
 
 @dataclass(frozen=True, kw_only=True)
 class Mark:
-    """What all marks have.
-
-    Attributes:
-        label: in the legend; on the page its values are shown below it.
-        listed: whether the legend on paper has it too.
-        width: of its line, points (1/72 inch).
-        dash: style of its line.
-        alpha: 1 where nothing shines through.
-    """
+    """What all marks have."""
 
     colour: str = "blue"
-    label: str = ""
-    listed: bool = True
-    width: float = 1.1
-    dash: Dash = "-"
-    alpha: float = 1.0
+    label: str = ""  # in the legend; on the page its values are shown below it
+    listed: bool = True  # whether the legend on paper has it too
+    width: float = 1.1  # of its line, points (1/72 inch)
+    dash: Dash = "-"  # style of its line
+    alpha: float = 1.0  # 1 where nothing shines through
 
 
 @dataclass(frozen=True)
@@ -118,23 +110,15 @@ class Sticks(Mark):
 
 @dataclass(frozen=True)
 class Points(Mark):
-    """Points (n,).
-
-    Attributes:
-        mark: its shape, as matplotlib calls it; the page's script draws disks, squares and crosses.
-        size: diameter, points.
-        face: colour within an outline, ``none`` of nothing; empty: filled.
-        error: lengths of the error bars below and above, (2, n); None: there are none.
-        cap: length of the bars' ends, points.
-    """
+    """Points (n,)."""
 
     x: Values
     y: Values
-    mark: Shape = "o"
-    size: float = 3.5
-    face: str = ""
-    error: Values | None = None
-    cap: float = 0.0
+    mark: Shape = "o"  # its shape, as matplotlib calls it; the page's script draws disks, squares and crosses
+    size: float = 3.5  # diameter, points
+    face: str = ""  # colour within an outline, ``none`` of nothing; empty: filled
+    error: Values | None = None  # lengths of the error bars below and above, (2, n); None: there are none
+    cap: float = 0.0  # length of the bars' ends, points
 
 
 @dataclass(frozen=True)

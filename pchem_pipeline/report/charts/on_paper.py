@@ -95,19 +95,12 @@ _COMPRESSION = 4
 
 @dataclass(frozen=True)
 class Look:
-    """How a figure is drawn.
+    """How a figure is drawn."""
 
-    Attributes:
-        width_mm: width; panels stand side by side on a page, one above the other on a column.
-        svg_text: whether text of SVG stays text; else it becomes outlines.
-        dpi: dots per inch that images are drawn for at most.
-        style: style sheet of matplotlib over the package's own, a name or a file; empty: none.
-    """
-
-    width_mm: float = COLUMN_MM
-    svg_text: bool = False
-    dpi: int = 300
-    style: str = ""
+    width_mm: float = COLUMN_MM  # width; panels stand side by side on a page, one above the other on a column
+    svg_text: bool = False  # whether text of SVG stays text; else it becomes outlines
+    dpi: int = 300  # dots per inch that images are drawn for at most
+    style: str = ""  # style sheet of matplotlib over the package's own, a name or a file; empty: none
 
     @property
     def wide(self) -> bool:

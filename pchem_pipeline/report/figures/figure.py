@@ -41,21 +41,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DataTable:
-    """Named columns with units: of n rows, or maps of a sensor (y, x) of one shape.
+    """Named columns with units: of n rows, or maps of a sensor (y, x) of one shape."""
 
-    Attributes:
-        columns: name to values.
-        units: name to unit, of those that have one.
-        part: what of the figure it is, for the name of its file; empty for the main part.
-        index: names of the axes of maps.
-        origin: place of their first value.
-    """
-
-    columns: Mapping[str, Sequence[Any] | NDArray[Any]]
-    units: Mapping[str, str] = field(default_factory=dict)
-    part: str = ""
-    index: tuple[str, str] = ("y (pixel)", "x (pixel)")
-    origin: tuple[int, int] = (0, 0)
+    columns: Mapping[str, Sequence[Any] | NDArray[Any]]  # name to values
+    units: Mapping[str, str] = field(default_factory=dict)  # name to unit, of those that have one
+    part: str = ""  # what of the figure it is, for the name of its file; empty for the main part
+    index: tuple[str, str] = ("y (pixel)", "x (pixel)")  # names of the axes of maps
+    origin: tuple[int, int] = (0, 0)  # place of their first value
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return np.asarray(self.columns[name])
