@@ -128,22 +128,14 @@ def _between(table: FloatArray, axes: int, ranges: Ranges) -> FloatArray:
 
 @dataclass(frozen=True)
 class Contrast:
-    """Sums over places, and how far they are from their share of the whole.
+    """Sums over places, and how far they are from their share of the whole."""
 
-    Attributes:
-        edges: of the cells of the tables.
-        sums, counts: cumulative tables, see :func:`box_sums`.
-        null: returns the deviations of sums with such counts, standard errors; 0 where one is no place.
-        axes: of the tables that are rows, and columns.
-        frames: numbers of the columns where these are frames.
-    """
-
-    edges: Edges
-    sums: FloatArray
-    counts: FloatArray
-    null: Null
-    axes: tuple[int, int] = (1, 1)
-    frames: IntArray | None = None
+    edges: Edges  # of the cells of the tables
+    sums: FloatArray  # cumulative tables, see :func:`box_sums`
+    counts: FloatArray  # the same of what counts
+    null: Null  # returns the deviations of sums with such counts, standard errors; 0 where one is no place
+    axes: tuple[int, int] = (1, 1)  # of the tables that are rows, and columns
+    frames: IntArray | None = None  # numbers of the columns where these are frames
 
     @classmethod
     def of_pixels(

@@ -115,26 +115,16 @@ class Covariance:
 
 @dataclass(frozen=True)
 class NullModel:
-    """Mean, covariance and skewness of the statistics of one split under a model.
+    """Mean, covariance and skewness of the statistics of one split under a model."""
 
-    Attributes:
-        names: names of the statistics, shape (m,).
-        mean, std: mean and standard deviation of each, shape (m,).
-        covariance: shrunk towards its diagonal.
-        replicates: the vectors, shape (b, m).
-        skewness: skewness of the statistics of one split, shape (m,).
-        effective_tests: equivalent number of independent statistics.
-        strengths: shift of the statistics by one standard error of the strength of each effect, (e, m).
-    """
-
-    names: tuple[str, ...]
-    mean: FloatArray
-    std: FloatArray
-    covariance: Covariance
-    replicates: FloatArray
-    skewness: FloatArray
-    effective_tests: float
-    strengths: FloatArray | None = None
+    names: tuple[str, ...]  # names of the statistics, (m,)
+    mean: FloatArray  # of each, (m,)
+    std: FloatArray  # standard deviation of each, (m,)
+    covariance: Covariance  # shrunk towards its diagonal
+    replicates: FloatArray  # the vectors, (b, m)
+    skewness: FloatArray  # skewness of the statistics of one split, (m,)
+    effective_tests: float  # equivalent number of independent statistics
+    strengths: FloatArray | None = None  # shifts by one standard error of the strength of each effect, (e, m)
 
     @classmethod
     def from_replicates(

@@ -35,22 +35,14 @@ _MOST_EVENTS = 500  # frames with an event that are looked at: so many drawn of 
 
 @dataclass(frozen=True, kw_only=True)
 class Cluster:
-    """A part of a map or of a series that stands out.
+    """A part of a map or of a series that stands out."""
 
-    Attributes:
-        family: rows, columns, rectangle, disc, period or pixels; of frames range, period or frames.
-        z: deviation of its mean from that of the rest, standard errors.
-        log_p: logarithm of the probability of such a deviation by chance in any place.
-        inside, outside: mean there and elsewhere.
-        share: of its pixels that deviate, at least (at 95 %, for all places at once).
-    """
-
-    family: str
-    z: float
-    log_p: float
-    inside: float
-    outside: float
-    share: float = 0.0
+    family: str  # rows, columns, rectangle, disc, period or pixels; of frames range, period or frames
+    z: float  # deviation of its mean from that of the rest, standard errors
+    log_p: float  # logarithm of the probability of such a deviation by chance in any place
+    inside: float  # mean there
+    outside: float  # mean elsewhere
+    share: float = 0.0  # of its pixels that deviate, at least (at 95 %, for all places at once)
 
     @property
     def p(self) -> float:

@@ -140,21 +140,13 @@ HistoryRow = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs against the first of them.
+    """Runs against the first of them."""
 
-    Attributes:
-        runs: the first, the others in the order given, and the one before the last in the history.
-        pairs: the first with each of the others, and the one before the last with the last.
-        tolerance: relative difference that counts as rounding.
-        history: of all runs that were ever compared with the first, a row for each.
-        rate: false-discovery rate at which pixels count as moved.
-    """
-
-    runs: Sequence[RunFacts]
-    pairs: Sequence[Pair]
-    tolerance: float
-    history: Sequence[HistoryRow] = ()
-    rate: float = 0.01
+    runs: Sequence[RunFacts]  # the first, the others as given, and the one before the last in the history
+    pairs: Sequence[Pair]  # the first with each of the others, and the one before the last with the last
+    tolerance: float  # relative difference that counts as rounding
+    history: Sequence[HistoryRow] = ()  # of all runs that were ever compared with the first, a row for each
+    rate: float = 0.01  # false-discovery rate at which pixels count as moved
 
     @property
     def changed(self) -> bool:

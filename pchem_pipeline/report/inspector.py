@@ -60,19 +60,12 @@ class Bars:
 
 @dataclass(frozen=True)
 class PackedMap:
-    """A map in few bytes.
+    """A map in few bytes."""
 
-    Attributes:
-        scale: how codes stand for values.
-        n_odd: values outside the range of the codes, at the end of ``data`` as indices and float32.
-        data: gzip of the low bytes, the high bytes, ``n_odd`` uint32 and ``n_odd`` float32, little-endian.
-        bars: its histogram; None where the codes are fine enough.
-    """
-
-    scale: Scale
-    n_odd: int
-    data: bytes
-    bars: Bars | None = None
+    scale: Scale  # how codes stand for values
+    n_odd: int  # values outside the range of the codes, at the end of ``data`` as indices and float32
+    data: bytes  # gzip of low bytes, high bytes, ``n_odd`` uint32 and ``n_odd`` float32, little-endian
+    bars: Bars | None = None  # its histogram; None where the codes are fine enough
 
 
 def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0) -> Scale:

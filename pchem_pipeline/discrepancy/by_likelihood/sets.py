@@ -74,28 +74,17 @@ class FittedSet:
 
 @dataclass
 class SetComparison:
-    """Fits sets of effects to one part of the samples and scores them on another.
+    """Fits sets of effects to one part of the samples and scores them on another."""
 
-    Attributes:
-        train, test: histograms, shape (n, B); a row for each sample of each pixel.
-        origin: DN of bin 0, shape (n,).
-        kept: codes that count, shape (n, B).
-        present: effects that the model has.
-        start: (H, g, mu, sigma), shape (n, 4).
-        samples: which rows are of one pixel.
-        failed: candidates that could not be fitted, and why; out.
-        effort: counts the masses, and ends the search at its limit.
-    """
-
-    train: IntArray
-    test: IntArray
-    origin: IntArray
-    kept: BoolArray
-    present: tuple[Effect, ...]
-    start: FloatArray
-    samples: Samples = field(default_factory=Samples)
-    failed: dict[str, str] = field(default_factory=dict)
-    effort: Effort = field(default_factory=lambda: Effort(None))
+    train: IntArray  # histograms, (n, B); a row for each sample of each pixel
+    test: IntArray  # the same
+    origin: IntArray  # DN of bin 0, (n,)
+    kept: BoolArray  # codes that count, (n, B)
+    present: tuple[Effect, ...]  # effects that the model has
+    start: FloatArray  # (H, g, mu, sigma), (n, 4)
+    samples: Samples = field(default_factory=Samples)  # which rows are of one pixel
+    failed: dict[str, str] = field(default_factory=dict)  # candidates that could not be fitted, and why; out
+    effort: Effort = field(default_factory=lambda: Effort(None))  # ends the search at its limit
     _known: dict[frozenset[str], FittedSet] = field(default_factory=dict, init=False)
 
     def of(self, rows: slice, start: FloatArray) -> SetComparison:

@@ -204,20 +204,13 @@ def bit_statistics(found: PreviousBits | None) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Repeats:
-    """Lines that are, sample by sample, the one before.
+    """Lines that are, sample by sample, the one before."""
 
-    Attributes:
-        frames: positions of frames equal to the one before.
-        rows_in_time: number of rows of other frames that equal those of the frame before.
-        rows, columns: number of those that equal the row above, and the column on the left.
-        consecutive: number of frames that directly follow another.
-    """
-
-    frames: IntArray
-    rows_in_time: int
-    rows: int
-    columns: int
-    consecutive: int
+    frames: IntArray  # positions of frames equal to the one before
+    rows_in_time: int  # number of rows of other frames that equal those of the frame before
+    rows: int  # number of rows that equal the one above
+    columns: int  # number of columns that equal the one on the left
+    consecutive: int  # number of frames that directly follow another
 
     @classmethod
     def of(cls, frames: CodeArray, numbers: IntArray) -> Repeats:

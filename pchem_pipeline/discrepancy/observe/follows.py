@@ -65,24 +65,15 @@ class Follows:
 
 @dataclass(frozen=True)
 class FollowingSamples:
-    """Frames as residuals and as the charge that these do not hold, each in its standard deviation.
+    """Frames as residuals and as the charge that these do not hold, each in its standard deviation."""
 
-    Attributes:
-        samples: groups of successive frames.
-        inside: pixels whose residuals count, (y, x).
-        mixed: correlation of charge and residual of a sample, (y, x).
-        scale: of what the residual leaves of the charge, 0 where too little, (y, x).
-        exposure, spread: mean and standard deviation of the charge, e-, (y, x).
-        mirrored: axes of (frame, y, x) along which the charge is counted from the other end.
-    """
-
-    samples: Samples
-    inside: BoolArray
-    mixed: Float32Array
-    scale: Float32Array
-    exposure: Float32Array
-    spread: Float32Array
-    mirrored: Axes = ()
+    samples: Samples  # groups of successive frames
+    inside: BoolArray  # pixels whose residuals count, (y, x)
+    mixed: Float32Array  # correlation of charge and residual of a sample, (y, x)
+    scale: Float32Array  # of what the residual leaves of the charge, 0 where too little, (y, x)
+    exposure: Float32Array  # mean of the charge, e-, (y, x)
+    spread: Float32Array  # standard deviation of the charge, e-, (y, x)
+    mirrored: Axes = ()  # axes of (frame, y, x) along which the charge is counted from the other end
 
     @classmethod
     def of(

@@ -28,18 +28,12 @@ _LEADING = 2  # statistics of a signature that are looked at
 
 @dataclass(frozen=True)
 class SensorWindow:
-    """The rows and columns of a sensor that are looked at; regions are in coordinates of the sensor.
+    """The rows and columns of a sensor that are looked at; regions are in coordinates of the sensor."""
 
-    Attributes:
-        rows, columns: first, and end.
-        shape: rows and columns of the sensor.
-        known: regions of the sensor that a look at all of it found.
-    """
-
-    rows: tuple[int, int]
-    columns: tuple[int, int]
-    shape: tuple[int, int]
-    known: tuple[Region, ...] = ()
+    rows: tuple[int, int]  # first, and end
+    columns: tuple[int, int]  # first, and end
+    shape: tuple[int, int]  # rows and columns of the sensor
+    known: tuple[Region, ...] = ()  # regions of the sensor that a look at all of it found
 
     @classmethod
     def whole(cls, shape: tuple[int, ...]) -> SensorWindow:

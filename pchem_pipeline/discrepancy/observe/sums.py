@@ -141,24 +141,15 @@ def laws_of_frames(frames: CodeArray, maps: PixelMaps) -> PixelLaws:
 
 @dataclass(frozen=True)
 class Samples:
-    """Frames as standardised deviations of their pixels, of both channels.
+    """Frames as standardised deviations of their pixels, of both channels."""
 
-    Attributes:
-        frames: codes (n, y, x), DN.
-        first, last: smallest and largest code of each pixel's table, (y, x).
-        start: row of the first one in ``tables``, (y, x).
-        tables: k and r of each code over their standard deviation, (rows, 2).
-        usable: pixels that count, (y, x).
-        most: samples that are looked at at a time, whole frames.
-    """
-
-    frames: FrameBlocks
-    first: NDArray[np.int32]
-    last: NDArray[np.int32]
-    start: NDArray[np.int32]
-    tables: Float32Array
-    usable: BoolArray
-    most: int = 1 << 20
+    frames: FrameBlocks  # codes (n, y, x), DN
+    first: NDArray[np.int32]  # smallest code of each pixel's table, (y, x)
+    last: NDArray[np.int32]  # largest code of each pixel's table, (y, x)
+    start: NDArray[np.int32]  # row of the first one in ``tables``, (y, x)
+    tables: Float32Array  # k and r of each code over their standard deviation, (rows, 2)
+    usable: BoolArray  # pixels that count, (y, x)
+    most: int = 1 << 20  # samples that are looked at at a time, whole frames
 
     @classmethod
     def of(cls, frames: CodeArray, maps: PixelMaps) -> Samples:

@@ -52,19 +52,12 @@ MOMENTS = np.dtype([
 
 @dataclass(frozen=True)
 class PixelHistograms:
-    """Histograms of n pixels.
+    """Histograms of n pixels."""
 
-    Attributes:
-        counts: (n, B).
-        origin: DN of bin 0, (n,).
-        outside: samples below and above the histogram, (n, 2).
-        ends: smallest and largest code of each, DN, (2, n); None: those of the histograms.
-    """
-
-    counts: CodeArray
-    origin: IntArray
-    outside: FloatArray
-    ends: NDArray[np.integer[Any]] | None = None
+    counts: CodeArray  # (n, B)
+    origin: IntArray  # DN of bin 0, (n,)
+    outside: FloatArray  # samples below and above the histogram, (n, 2)
+    ends: NDArray[np.integer[Any]] | None = None  # smallest and largest code, DN, (2, n); None: of counts
 
     @classmethod
     def of(cls, frames: CodeArray) -> PixelHistograms:

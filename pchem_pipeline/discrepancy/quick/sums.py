@@ -238,18 +238,12 @@ def _lines(
 
 @dataclass(frozen=True)
 class CellMap:
-    """Clipped sums over cells of a map of the sensor whose pixels are N(0, 1) where nothing is wrong.
+    """Clipped sums over cells of a map of the sensor whose pixels are N(0, 1) where nothing is wrong."""
 
-    Attributes:
-        rows, columns: edges of the cells, pixels.
-        sums: of the values, (cell y, cell x).
-        counts: pixels that have one.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    sums: FloatArray
-    counts: FloatArray
+    rows: IntArray  # edges of the cells, pixels
+    columns: IntArray  # edges of the cells, pixels
+    sums: FloatArray  # of the values, (cell y, cell x)
+    counts: FloatArray  # pixels that have one
 
     @classmethod
     def empty(cls, shape: tuple[int, int]) -> CellMap:

@@ -50,21 +50,14 @@ def exposure_profile(evidence: Evidence) -> ExposureProfile | None:
 
 
 class BlockCharge(NamedTuple):
-    """Deviations of the block means of the usable pixels' charge, the part common to all of them taken away.
+    """Deviations of the block means of the usable pixels' charge, without what is common to all of them."""
 
-    Attributes:
-        start, length: first frame and number of frames of each block, shape (b,).
-        deviation: e- of exposure (the slope Var(k) / H taken out), shape (b, n).
-        variance: of a single frame, e-^2 of exposure, shape (n,).
-        y, x: rows and columns of the pixels, shape (n,).
-    """
-
-    start: FloatArray
-    length: FloatArray
-    deviation: FloatArray
-    variance: FloatArray
-    y: IntArray
-    x: IntArray
+    start: FloatArray  # first frame of each block, (b,)
+    length: FloatArray  # number of frames of each block, (b,)
+    deviation: FloatArray  # e- of exposure (the slope Var(k) / H taken out), (b, n)
+    variance: FloatArray  # of a single frame, e-^2 of exposure, (n,)
+    y: IntArray  # rows of the pixels, (n,)
+    x: IntArray  # columns of the pixels, (n,)
 
 
 def block_charge(evidence: Evidence) -> BlockCharge | None:

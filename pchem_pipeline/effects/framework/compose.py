@@ -90,18 +90,12 @@ def pixel_maps(parameters: Sequence[FloatArray], usable: BoolArray) -> PixelMaps
 
 @dataclass(frozen=True)
 class PixelPlaces:
-    """Where pixels lie on the sensor, and which frames they were seen in.
+    """Where pixels lie on the sensor, and which frames they were seen in."""
 
-    Attributes:
-        rows, columns: of each pixel on the sensor, shape (n,).
-        shape: rows and columns of the sensor.
-        frames: numbers of the frames in the run, shape (frame,); none where they have no order.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    shape: tuple[int, int]
-    frames: IntArray
+    rows: IntArray  # of each pixel on the sensor, (n,)
+    columns: IntArray  # of each pixel on the sensor, (n,)
+    shape: tuple[int, int]  # rows and columns of the sensor
+    frames: IntArray  # numbers of the frames in the run, (frame,); none where they have no order
 
     @classmethod
     def of_block(

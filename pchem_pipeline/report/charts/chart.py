@@ -210,65 +210,38 @@ class Image(Mark):
 
 @dataclass(frozen=True)
 class Panel:
-    """Marks between two axes.
+    """Marks between two axes."""
 
-    Attributes:
-        y: the upright axis; that of x is the stack's.
-        marks: what is drawn, the lowest first.
-        height: share of the stack.
-        legend: place on paper of a legend of its own; empty: none.
-        columns: of that legend.
-        room: factor by which the upper end of y is raised for it on paper, on a page and in a column.
-        note: small words in a corner.
-        corner: which one.
-        square: one is as long on both axes; the height of its stack follows from its width.
-    """
-
-    y: Axis
-    marks: tuple[Mark, ...]
-    height: float = 1.0
-    legend: str = ""
-    columns: int = 1
-    room: tuple[float, float] = (1.0, 1.0)
-    note: str = ""
-    corner: str = "upper right"
-    square: bool = False
+    y: Axis  # the upright axis; that of x is the stack's
+    marks: tuple[Mark, ...]  # what is drawn, the lowest first
+    height: float = 1.0  # share of the stack
+    legend: str = ""  # place on paper of a legend of its own; empty: none
+    columns: int = 1  # of that legend
+    room: tuple[float, float] = (1.0, 1.0)  # factor on the upper end of y for it, on a page and in a column
+    note: str = ""  # small words in a corner
+    corner: str = "upper right"  # which one
+    square: bool = False  # one is as long on both axes; the height of its stack follows from its width
 
 
 @dataclass(frozen=True)
 class Stack:
-    """Panels over each other that share the axis of x.
+    """Panels over each other that share the axis of x."""
 
-    Attributes:
-        panels: from top to bottom.
-        x: their common axis.
-        title: over the first one; lines that are too long for a width are broken at three blanks.
-        height_mm: on paper.
-        wide: shown only where panels have room side by side.
-    """
-
-    panels: tuple[Panel, ...]
-    x: Axis
-    title: str = ""
-    height_mm: float = 60.0
-    wide: bool = False
+    panels: tuple[Panel, ...]  # from top to bottom
+    x: Axis  # their common axis
+    title: str = ""  # over the first one; lines that are too long for a width are broken at three blanks
+    height_mm: float = 60.0  # on paper
+    wide: bool = False  # shown only where panels have room side by side
 
 
 @dataclass(frozen=True)
 class Chart:
-    """What a figure draws.
+    """What a figure draws."""
 
-    Attributes:
-        stacks: from left to right and from top to bottom, at least one.
-        widths: shares of the columns where stacks have room side by side; one below the other elsewhere.
-        legend: columns of a legend below all on paper, on a page and in a column; 0: none.
-        keys: colours and what they mean, in lines below all.
-    """
-
-    stacks: tuple[Stack, ...]
-    widths: tuple[float, ...] = (1.0,)
-    legend: tuple[int, int] = (0, 0)
-    keys: tuple[tuple[str, str], ...] = ()
+    stacks: tuple[Stack, ...]  # from left to right and from top to bottom, at least one
+    widths: tuple[float, ...] = (1.0,)  # shares of the columns where stacks have room side by side
+    legend: tuple[int, int] = (0, 0)  # its columns below all, on a page and in a column; 0: none
+    keys: tuple[tuple[str, str], ...] = ()  # colours and what they mean, in lines below all
 
     @property
     def still(self) -> bool:

@@ -86,25 +86,16 @@ class DataTable:
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure of a page.
+    """One figure of a page."""
 
-    Attributes:
-        name: name of its files.
-        section: id of the section that shows it.
-        caption: what is drawn and how to read it.
-        alt: what a reader who does not see it should know, with the numbers.
-        tables: its data, the main part first.
-        width_mm: width at which it is saved.
-    """
-
-    name: str
-    section: str
+    name: str  # name of its files
+    section: str  # id of the section that shows it
     title: str
-    caption: str
-    alt: str
-    tables: tuple[DataTable, ...]
+    caption: str  # what is drawn and how to read it
+    alt: str  # what a reader who does not see it should know, with the numbers
+    tables: tuple[DataTable, ...]  # its data, the main part first
     chart: Chart
-    width_mm: float = COLUMN_MM
+    width_mm: float = COLUMN_MM  # width at which it is saved
 
     def __repr__(self) -> str:
         return f"<Figure {self.name}: {self.title}>"
