@@ -45,31 +45,20 @@ class RunFacts:
 
 @dataclass(frozen=True)
 class ArrayRow:
-    """One array of the store in two runs.
+    """One array of the store in two runs."""
 
-    Attributes:
-        name: its path in the store.
-        counts: whether a change of it is a change of the results.
-        dtype, shape: of the first run (of the second where it is new).
-        n_different, n_beyond: values that differ at all, and by more than rounding.
-        largest: largest absolute difference, in the array's unit.
-        scale: largest absolute value.
-        sha256: digests of the values of both, empty where there are none.
-        why: in words, where shapes or types differ.
-    """
-
-    name: str
+    name: str  # its path in the store
     state: State
-    counts: bool
-    dtype: str
-    shape: tuple[int, ...]
+    counts: bool  # whether a change of it is a change of the results
+    dtype: str  # of the first run, of the second where it is new
+    shape: tuple[int, ...]  # the same
     n_values: int = 0
-    n_different: int = 0
-    n_beyond: int = 0
-    largest: float = 0.0
-    scale: float = 0.0
-    sha256: tuple[str, str] = ("", "")
-    why: str = ""
+    n_different: int = 0  # values that differ at all
+    n_beyond: int = 0  # values that differ by more than rounding
+    largest: float = 0.0  # largest absolute difference, in the array's unit
+    scale: float = 0.0  # largest absolute value
+    sha256: tuple[str, str] = ("", "")  # digests of the values of both, empty where there are none
+    why: str = ""  # in words, where shapes or types differ
 
 
 @dataclass(frozen=True)

@@ -64,33 +64,19 @@ def reasons_in(status: NDArray[np.integer[Any]]) -> list[tuple[FitStatus, str, i
 
 @dataclass(frozen=True)
 class PixelFit:
-    """Histogram and fit of one shown pixel.
+    """Histogram and fit of one shown pixel."""
 
-    Attributes:
-        label: why the pixel is shown, e.g. ``"low read noise, high exposure"``.
-        y, x: position on the sensor; for ready-made histograms ``y = 0`` and ``x`` is the channel.
-        origin: DN of ``counts[0]``.
-        counts: number of frames at each DN, shape (n_bins,).
-        parameters: ``quanta_exposure`` (e-), ``conversion_gain`` (e-/DN), ``bias`` (DN),
-            ``read_noise_dn`` (DN) and ``read_noise_e`` (e-); NaN where the fit failed.
-        stderr: standard errors under the same names; may lack some.
-        status: words of ``fit_status``; empty if all is well.
-        goodness_p: probability of a larger chi-square if the model holds; NaN if unknown.
-        channel: whether it is a channel of ready-made histograms.
-        mass: probability of each DN under a model with effects; None where the PCD was fitted.
-    """
-
-    label: str
-    y: int
-    x: int
-    origin: int
-    counts: NDArray[np.integer[Any]]
-    parameters: Mapping[str, float]
-    stderr: Mapping[str, float] = field(default_factory=dict)
-    status: str = ""
-    goodness_p: float = float("nan")
-    channel: bool = False
-    mass: FloatArray | None = None
+    label: str  # why the pixel is shown, such as ``low read noise``
+    y: int  # row on the sensor; 0 for ready-made histograms
+    x: int  # column, or channel
+    origin: int  # DN of ``counts[0]``
+    counts: NDArray[np.integer[Any]]  # number of frames at each DN, (n_bins,)
+    parameters: Mapping[str, float]  # of the PCD, and ``read_noise_e``, in stored units; NaN: no fit
+    stderr: Mapping[str, float] = field(default_factory=dict)  # errors under the same names; may lack some
+    status: str = ""  # words of ``fit_status``; empty if all is well
+    goodness_p: float = float("nan")  # probability of a larger chi-square if the model holds; NaN if unknown
+    channel: bool = False  # whether it is a channel of ready-made histograms
+    mass: FloatArray | None = None  # of each DN under a model with effects; None where the PCD was fitted
 
     @property
     def place(self) -> str:

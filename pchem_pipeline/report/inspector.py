@@ -197,27 +197,16 @@ def pack_counts(
 
 @dataclass(frozen=True)
 class MapEntry:
-    """A map that the inspector can show.
+    """A map that the inspector can show."""
 
-    Attributes:
-        path: ``group/name`` of the stored array.
-        label: words for the list of maps.
-        unit: unit as the store writes it.
-        sentence: the array's own sentence.
-        kind: ``value``, ``stderr``, ``bits`` (each bit has a word) or ``words`` (each number has one).
-        words: number or bit to words, for the last two.
-        packed: the map; None where it is not in the file or where ``same_as`` says it all.
-        same_as: path of a map that this one is a multiple of, and the factor.
-    """
-
-    path: str
-    label: str
-    unit: str
-    sentence: str
-    kind: str = "value"
-    words: Mapping[int, str] = field(default_factory=dict)
-    packed: PackedMap | None = None
-    same_as: tuple[str, float] | None = None
+    path: str  # ``group/name`` of the stored array
+    label: str  # words for the list of maps
+    unit: str  # as the store writes it
+    sentence: str  # the array's own sentence
+    kind: str = "value"  # value, stderr, bits (each bit has a word) or words (each number has one)
+    words: Mapping[int, str] = field(default_factory=dict)  # number or bit to words
+    packed: PackedMap | None = None  # None where it is not in the file or ``same_as`` says it all
+    same_as: tuple[str, float] | None = None  # path of a map that this one is a multiple of, and factor
 
 
 class Notable(NamedTuple):
@@ -230,25 +219,15 @@ class Notable(NamedTuple):
 
 @dataclass(frozen=True)
 class PixelSample:
-    """Pixels that are in the file in full.
+    """Pixels that are in the file in full."""
 
-    Attributes:
-        index: ``y * nx + x`` of each, shape (n,).
-        exact: path of a map to its values at these pixels, shape (n,).
-        origin: DN of the first bin of each histogram, shape (n,).
-        counts: their histograms.
-        deciding: parameters that decide electron numbers, where these are not the fitted ones: (4, n).
-        masses: probability of each bin under a model with effects, of as many of the first pixels.
-        reasons: why pixels are here, those of the even sample excepted.
-    """
-
-    index: IntArray
-    exact: Mapping[str, FloatArray]
-    origin: IntArray
-    counts: list[NDArray[np.integer[Any]]]
-    deciding: FloatArray | None = None
-    masses: list[FloatArray] = field(default_factory=list)
-    reasons: Sequence[Notable] = ()
+    index: IntArray  # ``y * nx + x`` of each, (n,)
+    exact: Mapping[str, FloatArray]  # path of a map to its values at these pixels, (n,)
+    origin: IntArray  # DN of the first bin of each histogram, (n,)
+    counts: list[NDArray[np.integer[Any]]]  # their histograms
+    deciding: FloatArray | None = None  # parameters (4, n) that decide numbers, if not the fitted ones
+    masses: list[FloatArray] = field(default_factory=list)  # of bins, with effects, of the first pixels
+    reasons: Sequence[Notable] = ()  # why pixels are here, those of the even sample excepted
 
 
 @dataclass(frozen=True)

@@ -94,29 +94,18 @@ def find_in_histograms(
 
 @dataclass
 class HistogramExplainer(Explainer[Explanation]):
-    """Distinguishes effects in histograms.
+    """Distinguishes effects in histograms."""
 
-    Attributes:
-        prepared: the histograms, split, and replicates of the model.
-        sets: fits sets of effects to the train part, and scores them by the test part.
-        whole: fits them to both, and scores them by the final part.
-        bare: fits the rows without any effects.
-        members: the candidates.
-        effects: of the model, those added included.
-        final: the fit of the final model to train and test part.
-        found: what the search found; None: nothing.
-    """
-
-    prepared: Prepared
+    prepared: Prepared  # the histograms, split, and replicates of the model
     observed: ObservedHistograms
-    sets: SetComparison
-    whole: SetComparison
-    bare: SetComparison
+    sets: SetComparison  # fits sets of effects to the train part, and scores them by the test part
+    whole: SetComparison  # fits them to both, and scores them by the final part
+    bare: SetComparison  # fits the rows without any effects
     rng: np.random.Generator
-    members: Sequence[Member]
-    effects: tuple[Effect, ...]
-    final: FittedSet
-    found: Explanation | None = None
+    members: Sequence[Member]  # the candidates
+    effects: tuple[Effect, ...]  # of the model, those added included
+    final: FittedSet  # the fit of the final model to train and test part
+    found: Explanation | None = None  # what the search found; None: nothing
 
     @classmethod
     def begin(

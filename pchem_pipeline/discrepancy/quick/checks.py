@@ -24,39 +24,22 @@ GRAVEST_FIRST: tuple[Level, ...] = ("serious", "caution", "note", "good")
 
 @dataclass(frozen=True)
 class Check:
-    """One check.
+    """One check."""
 
-    Attributes:
-        name: row_noise, lag, ...
-        title: the disturbance, a noun.
-        p: p-value of this check alone.
-        size: estimate; the root of a variance is 0 if the variance is negative.
-        unit: unit of the size: DN, LSB, or 1 for correlations and shares.
-        limit: size found in 19 of 20 runs like this one; NaN if unknown.
-        where: rows, columns, frames or codes concerned, in words; empty for all.
-        region: part of the sensor, as in ``model.effects``; None: uniform.
-        advice: consequence for the results, and the cure.
-        level: severity; "good" if not significant.
-        p_global: p-value corrected for the number of checks.
-        in_model: whether the fitted model has such an effect.
-        size_e: the size in electrons, if it is in DN.
-        share: the size over the read noise, if it is in DN.
-    """
-
-    name: str
-    title: str
-    p: float
-    size: float
-    unit: str
-    limit: float = math.nan
-    where: str = ""
-    region: dict[str, Any] | None = None
-    advice: str = ""
-    level: Level = "good"
-    p_global: float = math.nan
-    in_model: bool = False
-    size_e: float = math.nan
-    share: float = math.nan
+    name: str  # row_noise, lag, ..
+    title: str  # the disturbance, a noun
+    p: float  # p-value of this check alone
+    size: float  # estimate; the root of a variance is 0 if the variance is negative
+    unit: str  # unit of the size: DN, LSB, or 1 for correlations and shares
+    limit: float = math.nan  # size found in 19 of 20 runs like this one; NaN if unknown
+    where: str = ""  # rows, columns, frames or codes concerned, in words; empty for all
+    region: dict[str, Any] | None = None  # part of the sensor, as in ``model.effects``; None: uniform
+    advice: str = ""  # consequence for the results, and the cure
+    level: Level = "good"  # severity; "good" if not significant
+    p_global: float = math.nan  # p-value corrected for the number of checks
+    in_model: bool = False  # whether the fitted model has such an effect
+    size_e: float = math.nan  # the size in electrons, if it is in DN
+    share: float = math.nan  # the size over the read noise, if it is in DN
 
     @property
     def found(self) -> bool:

@@ -37,26 +37,16 @@ _MARGIN = 0.05
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis.
+    """An axis."""
 
-    Attributes:
-        label: with the unit.
-        low, high: its ends; None: those of the marks and a margin.
-        log: logarithmic.
-        linear_to: logarithmic to both sides beyond this, linear between; 0: not so.
-        whole: ticks at whole numbers alone.
-        ticks: places and texts of the ticks; empty: as the renderer finds them.
-        down: its values grow downwards; both ends are given.
-    """
-
-    label: str
-    low: float | None = None
-    high: float | None = None
-    log: bool = False
-    linear_to: float = 0.0
-    whole: bool = False
-    ticks: tuple[tuple[float, str], ...] = ()
-    down: bool = False
+    label: str  # with the unit
+    low: float | None = None  # None: that of the marks and a margin
+    high: float | None = None  # the same
+    log: bool = False  # logarithmic
+    linear_to: float = 0.0  # logarithmic to both sides beyond this, linear between; 0: not so
+    whole: bool = False  # ticks at whole numbers alone
+    ticks: tuple[tuple[float, str], ...] = ()  # places and texts; empty: as the renderer finds them
+    down: bool = False  # its values grow downwards; both ends are given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,29 +150,17 @@ class Words(Mark):
 
 @dataclass(frozen=True)
 class Image(Mark):
-    """A map: the values of pixels (row, column) as colours; of many rows and columns some are drawn.
+    """A map: the values of pixels (row, column) as colours; of many rows and columns some are drawn."""
 
-    Attributes:
-        values: of the pixels, NaN where there is none.
-        x: left and right end on the axis of x.
-        y: end of the first and of the last row on the upright axis.
-        scale: name of a scale of colours, or the colours themselves, one more than edges.
-        ends: values with the first and the last colour, in equal steps between; others have the nearest one.
-        edges: instead of these the values between one colour and the next, rising.
-        bar: places along a bar of the colours, 0 to 1, and their texts; empty: as the renderer finds them.
-        unit: what the bar shows; empty: no bar.
-        whole: ticks of the bar at whole numbers alone.
-    """
-
-    values: Values
-    x: tuple[float, float]
-    y: tuple[float, float]
-    scale: str | tuple[str, ...] = ""
-    ends: tuple[float, float] = (0.0, 1.0)
-    edges: Values | None = None
-    bar: tuple[tuple[float, str], ...] = ()
-    unit: str = ""
-    whole: bool = False
+    values: Values  # of the pixels, NaN where there is none
+    x: tuple[float, float]  # left and right end on the axis of x
+    y: tuple[float, float]  # end of the first and of the last row on the upright axis
+    scale: str | tuple[str, ...] = ""  # name of a scale, or the colours, one more than edges
+    ends: tuple[float, float] = (0.0, 1.0)  # values of the first and the last colour; others have the nearest
+    edges: Values | None = None  # instead of these the values between one colour and the next, rising
+    bar: tuple[tuple[float, str], ...] = ()  # places (0 to 1) and texts along a bar of colours; empty: found
+    unit: str = ""  # what the bar shows; empty: no bar
+    whole: bool = False  # ticks of the bar at whole numbers alone
 
     def shown(self, dots: float) -> tuple[Values, tuple[float, float], tuple[float, float]]:
         """Return the rows and columns that so many dots from left to right can show, and the ends of these.

@@ -162,20 +162,13 @@ def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
 
 
 class PixelMap(NamedTuple):
-    """A statistic of every pixel in sigma, (y, x), with its overall significance.
-
-    Attributes:
-        far: the largest of three departures from N(0, 1), each in its own standard errors: of the mean, of
-            the mean square, and of the number of pixels beyond 5.
-        outliers: pixels beyond 5.
-        region: deviating part of the sensor; None: uniform.
-    """
+    """A statistic of every pixel in sigma, (y, x), with its overall significance."""
 
     title: str
     z: FloatArray
-    far: float
-    outliers: int
-    region: Region | None = None
+    far: float  # departure from N(0, 1), see :func:`_pixel_map`
+    outliers: int  # pixels beyond 5
+    region: Region | None = None  # deviating part of the sensor; None: uniform
 
 
 def regions_of(data: DiscrepancyData) -> dict[str, Region]:
@@ -220,6 +213,7 @@ def _named_maps(arrays: Arrays) -> dict[str, tuple[str, NDArray[Any]]]:
 
 
 def _pixel_map(words: str, values: NDArray[Any], region: Region | None) -> PixelMap:
+    """Return a map with the largest departure of mean, mean square or outliers, in its standard errors."""
     z = np.asarray(values, dtype=np.float64)
     known = finite(z)
     n, outliers = known.size, int((np.abs(known) > BEYOND_DOUBT).sum())
