@@ -26,10 +26,7 @@ _BLOCK = 50  # frames, as many as a search looks at in one piece
 
 @dataclass(frozen=True)
 class RecoveredStrength:
-    """The true strength, and those that an estimator finds in several stacks, (n,).
-
-    That is the strength of the likeliest hypothesis in each stack, NaN where there is none.
-    """
+    """The true strength, and that of the likeliest hypothesis in each of n stacks, NaN without any."""
 
     true: float
     found: FloatArray

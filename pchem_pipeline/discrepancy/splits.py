@@ -61,10 +61,7 @@ def block_length(n_frames: int, wanted: int | None = None) -> int:
 
 
 def split_frames(numbers: IntArray, block_frames: int) -> Splits:
-    """Deal whole blocks of consecutive frames (numbers, increasing) to train, test and final in turn.
-
-    A rest of fewer than three blocks is left out.
-    """
+    """Deal whole blocks of consecutive frames to train, test and final in turn; a rest is left out."""
     # a block never spans a gap in the numbering
     breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
     starts = [

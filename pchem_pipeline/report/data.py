@@ -54,10 +54,7 @@ _FEWEST_CODES = 8
 
 
 def reasons_in(status: NDArray[np.integer[Any]]) -> list[tuple[FitStatus, str, int]]:
-    """Return each reason for caution or failure in status words, gravest first: bit, sentence, pixels.
-
-    A pixel with several reasons counts for each of them.
-    """
+    """Return each reason for caution or failure, gravest first: bit, sentence, pixels that have it."""
     counts = [(bit, text, int(np.count_nonzero(status & int(bit)))) for bit, text in MEANINGS.items()]
     return [row for row in counts if row[2]]
 
@@ -331,10 +328,7 @@ class ReportData:
         return self._ordered[name]
 
     def summary(self, name: str, *, with_flagged: bool = False) -> MapSummary:
-        """Describe a map by order statistics, of all pixels with a value or of those without a flag.
-
-        This is done once: the map is large, and many ask.
-        """
+        """Describe a map, once, by order statistics of all pixels with a value or of unflagged ones."""
         if (name, with_flagged) not in self._summaries:
             self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
             if self.flagged.any():

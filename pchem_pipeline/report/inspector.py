@@ -268,10 +268,7 @@ _GROUPS = {
 
 
 def embedded(data: ReportData) -> dict[str, Any] | None:
-    """Return the inspector's part of the page: ``facts`` as JSON, ``blobs`` of data by id, the ``script``.
-
-    None where the run has nothing to inspect.
-    """
+    """Return the inspector's ``facts`` as JSON, ``blobs`` of data by id, and ``script``; None without."""
     if data.inspector is None:
         return None
     shown = data.inspector()

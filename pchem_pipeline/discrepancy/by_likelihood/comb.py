@@ -28,10 +28,7 @@ _SIGNIFICANT = 0.005
 
 
 def doubtful_peaks(counts: NDArray[np.integer], electrons: FloatArray) -> list[Interval]:
-    """Return peaks of few samples of histograms (n, B): each alone, and with all above it.
-
-    The place of every code is in e-, shape (n, B).
-    """
+    """Return peaks of few samples: each alone, and with all above it; codes are at ``electrons``, (n, B)."""
     peaks: list[Interval] = [(None, 0.5)]
     for k in range(1, _last(electrons) + 1):
         peaks += [(k - 0.5, k + 0.5), (k - 0.5, None)]

@@ -37,15 +37,12 @@ _SECANT = 0.1  # of the start: where the slope at no effect is taken
 
 @dataclass(frozen=True)
 class FittedSet:
-    """A set of candidates at their fitted coordinates: log masses of the codes, (n, B), and the score.
-
-    The score is the log-likelihood of the other part, nats.
-    """
+    """A set of candidates at their fitted coordinates; its score is the log-likelihood of the other part."""
 
     members: tuple[Member, ...]
     fit: SharedFit
-    log_masses: FloatArray
-    score: float
+    log_masses: FloatArray  # of the codes, (n, B)
+    score: float  # nats
 
     @property
     def n_parameters(self) -> int:

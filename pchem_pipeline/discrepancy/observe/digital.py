@@ -228,10 +228,7 @@ class Repeats:
         )
 
     def statistics(self, seen: PixelHistograms, shape: tuple[int, ...]) -> dict[str, float]:
-        """Return the statistics of repeats in frames of a shape (frame, y, x).
-
-        None of lines so short that chance repeats them in a frame.
-        """
+        """Return the statistics of repeats in frames (frame, y, x); none of lines that chance repeats."""
         real = seen.counts.astype(np.float32)
         total = np.maximum(real.sum(axis=1) + seen.outside.sum(axis=1), 1.0)
         # the log of the chance that two samples of a pixel are equal
@@ -275,10 +272,7 @@ def equal_squares(frames: CodeArray) -> IntArray:
 
 
 def square_statistics(frames: CodeArray, seen: PixelHistograms, usable: BoolArray) -> dict[str, float]:
-    """Return the statistic of squares of equal samples; none without squares of usable pixels.
-
-    Given the histograms, frames without an effect are in random order.
-    """
+    """Return the statistic of squares of equal samples; none without squares of usable pixels."""
     counts, origin = seen.counts, seen.origin
     good = usable[1:, 1:] & usable[1:, :-1] & usable[:-1, 1:] & usable[:-1, :-1]
     first = int(origin[usable.ravel()].min(initial=origin.max(initial=0)))

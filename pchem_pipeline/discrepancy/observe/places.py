@@ -172,10 +172,7 @@ def part_statistics(
     block_frames: int,
     window: SensorWindow | None = None,
 ) -> dict[str, float]:
-    """Return the leading statistics of parts, by ``name@part``; none of a part that cannot be looked at.
-
-    Arguments as in :func:`part_evidence`.
-    """
+    """Return the leading statistics of parts, ``name@part``, where it can be; see :func:`part_evidence`."""
     found: dict[str, float] = {}
     # of all effects, in the order of the catalogue
     wanted = {name for effect in effect_classes().values() for name in effect.signature[:_LEADING]}

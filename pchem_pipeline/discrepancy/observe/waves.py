@@ -47,10 +47,7 @@ class Waves:
 def waves_across(
     frames: CodeArray, numbers: IntArray, laws: PixelLaws, maps: PixelMaps, inside: BoolArray | None = None
 ) -> Waves:
-    """Look for waves in the residuals of frames (frame, y, x) with these numbers in the run, increasing.
-
-    Only pixels ``inside`` are looked at, (y, x); None: all.
-    """
+    """Look for waves in the residuals of frames (frame, y, x), of pixels ``inside``, (y, x); None: all."""
     ny, nx = maps.usable.shape
     some = numbers - numbers[0] < max(_MOST_SAMPLES // maps.usable.size, 1)
     numbers = numbers[some]

@@ -631,10 +631,7 @@ class EmpiricalResponse(Effect, tag="empirical_response"):
         return found
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with the variance of what samples follow, of electrons as many as the pixel's own.
-
-        Terms of some columns are left out: see `by_law`.
-        """
+        """Return the law with the variance of what is followed, terms of some columns excepted (`by_law`)."""
         exposure = np.nan_to_num(maps.quanta_exposure)
         power: Any = sum(
             term.number * term.weight**2 * excess_moments(exposure, term.above)[1]

@@ -63,10 +63,7 @@ class OffsetEffect(Effect):
         """Return the offsets of a block of frames, DN, with shape (frame, y, x) or 1 along each of them."""
 
     def offset_values(self) -> FloatArray | None:
-        """Return values, DN, that stand, each as likely, for the offset of a pixel in a run.
-
-        None: the offsets are Gaussian, and the strength is their standard deviation.
-        """
+        """Return equally likely values of the offset, DN; None: Gaussian, of the strength's deviation."""
         return None
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:

@@ -102,10 +102,7 @@ def ensembles_figures(runs: Sequence[RunFacts]) -> Iterator[Figure]:
 
 
 def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
-    """Return the ensembles of runs, raw and after correction where all have it: run, signal, density, error.
-
-    The error is that of counting.
-    """
+    """Return the ensembles of runs, raw and after correction where all have it; errors are of counting."""
     tables = []
     for part, axis, prefix, _, unit, *_ in HALVES:
         if not all(axis in run.ensemble and np.sum(run.ensemble[f"{prefix}counts"]) > 0 for run in runs):

@@ -218,10 +218,7 @@ def pixel_counts(data: ReportData) -> PixelCounts:
 
 
 def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumber]:
-    """Return the numbers of the first screen, of all pixels with a value or of those without a flag.
-
-    If most are flagged, nothing is said of the others.
-    """
+    """Return the numbers of the first screen, of all pixels or of unflagged ones, if these are not few."""
     if data.mostly_flagged and not with_flagged:
         return []
     found = []
@@ -518,10 +515,7 @@ def _as_sentence(text: str) -> str:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to a question: a word, the reason in a sentence, and the criteria that it rests on, if any.
-
-    ``level`` is the class of the style sheet.
-    """
+    """The answer to a question: a word, the reason in a sentence, and the criteria it rests on, if any."""
 
     question: str
     level: Level
