@@ -243,11 +243,6 @@ class GapChange(_Part):
     standing_out: tuple[str, ...] = ()
 
     @property
-    def within_chance(self) -> bool:
-        """Whether the gap is within sampling noise before anything is added."""
-        return self.before <= self.floor
-
-    @property
     def after_text(self) -> str:
         """The gap with the effects, micronats: ``< 13`` where it is within sampling noise of up to 13."""
         reached = self.after <= self.floor < self.before

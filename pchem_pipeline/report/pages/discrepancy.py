@@ -547,7 +547,7 @@ def _closing(found: Verdict) -> Iterator[Flag]:
     gap = found.gap
     if not (math.isfinite(gap.after) and math.isfinite(gap.floor)):
         return
-    if gap.within_chance:
+    if gap.before <= gap.floor:
         yield Flag("note", "The gap is within sampling noise before, too: only single statistics show it.")
     elif gap.after <= gap.floor and gap.standing_out:
         families = families_words(gap.standing_out)
