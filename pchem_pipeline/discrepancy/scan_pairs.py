@@ -222,15 +222,12 @@ def _scattered(contrast: PairContrast, axis: int, usable: BoolArray) -> families
 class PairContrast(families.Contrast):
     """Sums of products of pairs of pixels that share a row (column, frame), over boxes of the sensor.
 
-    Pairs are counted twice, as (a, b) and (b, a). Only sums that are too large count.
-
-    Attributes:
-        area: pixels that count, cumulative over the cells, (y, x).
-        by_number: sums and counts of all by the numbers modulo :data:`PERIOD` of their rows and of their
-            columns, (2, PERIOD, PERIOD); 0 for lines that the pixels share.
+    Pairs are counted twice, as (a, b) and (b, a). Only sums that are too large count. ``by_number`` has sums
+    and counts of all by the numbers modulo :data:`PERIOD` of their rows and of their columns, (2, PERIOD,
+    PERIOD); 0 for lines that the pixels share.
     """
 
-    area: FloatArray
+    area: FloatArray  # pixels that count, cumulative over the cells, (y, x)
     by_number: tuple[FloatArray, FloatArray]
 
     def boxes(self, rows: families.Ranges, columns: families.Ranges) -> FloatArray:

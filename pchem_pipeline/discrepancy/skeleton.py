@@ -44,17 +44,11 @@ class Prepared:
 
 
 class Explainer(ABC, Generic[Explanation]):
-    """A way to tell effects apart in one kind of data; it keeps the model.
+    """A way to tell effects apart in one kind of data; it keeps the model."""
 
-    Attributes:
-        prepared: the data and the model before the search.
-        candidates: tags of the effects that are compared, once they are.
-        limit: what was not tried when the search had used its budget; empty if it finished.
-    """
-
-    prepared: Prepared
-    candidates: Sequence[str] = ()
-    limit: str = ""
+    prepared: Prepared  # the data and the model before the search
+    candidates: Sequence[str] = ()  # tags of the effects that are compared, once they are
+    limit: str = ""  # what was not tried when the search had used its budget; empty if it finished
 
     @property
     @abstractmethod

@@ -15,27 +15,18 @@ State = Literal["identical", "equal", "changed", "lost", "new"]
 
 @dataclass(frozen=True)
 class RunFacts:
-    """One run.
+    """One run; its summary has median, standard error and robust scatter of each map, in the map's unit."""
 
-    Attributes:
-        label: A, B, ...
-        digest: of the content of its input files.
-        summary: map to median, its standard error and the robust scatter of the pixels, in the map's unit.
-        rmse: of the predictions of the ensemble.
-        pixels: number of pixels with a good fit, with caution, and without a value.
-        identity: digest of its frames and of how they were characterised.
-    """
-
-    label: str
+    label: str  # A, B, ...
     name: str
     shape: tuple[int, int]
     n_frames: int | None
-    digest: str
+    digest: str  # of the content of its input files
     summary: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     ensemble: Arrays = field(default_factory=dict)
-    rmse: Mapping[str, float] = field(default_factory=dict)
-    pixels: tuple[int, int, int] = (0, 0, 0)
-    identity: str = ""
+    rmse: Mapping[str, float] = field(default_factory=dict)  # of the predictions of the ensemble
+    pixels: tuple[int, int, int] = (0, 0, 0)  # with a good fit, with caution, without a value
+    identity: str = ""  # digest of its frames and of how they were characterised
 
     @property
     def title(self) -> str:

@@ -123,18 +123,14 @@ class Sample:
 class Samples:
     """Several exposures of the same pixels that were fitted together.
 
-    Attributes:
-        samples: in their order.
-        against: what their exposures are drawn against: integration_time, light_level or none.
-        arrays: ``quanta_exposure``, ``mean``, ``variance``, ``linearity_residual``, (sample, y, x);
-            ``linearity_p`` (y, x); any may lack.
-        shown: place of the one whose H the maps and the first screen show.
+    Arrays are ``quanta_exposure``, ``mean``, ``variance``, ``linearity_residual``, (sample, y, x), and
+    ``linearity_p`` (y, x); any may lack.
     """
 
     samples: tuple[Sample, ...]
-    against: str
+    against: str  # what exposures are drawn against: integration_time, light_level or none
     arrays: Arrays
-    shown: int = 0
+    shown: int = 0  # place of the one whose H the maps and the first screen show
 
     @property
     def on_line(self) -> list[int]:

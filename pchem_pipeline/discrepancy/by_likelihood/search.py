@@ -22,17 +22,14 @@ _COINCIDE = 0.3  # e-
 
 @dataclass(frozen=True)
 class Named:
-    """An effect of the explanation.
+    """An effect of the explanation, and the rivals that could stand in its place, the best first.
 
-    Attributes:
-        rivals: effects that could stand in its place, the best first, with the gain of the set with each over
-            the chosen one, nats, and its standard error.
-        apart: by how much its strength differs when fewer codes are compared.
+    With each rival is the gain of the set with it over the chosen one, nats, and its standard error.
     """
 
     member: Member
     rivals: tuple[tuple[Member, float, float], ...]
-    apart: float = 0.0
+    apart: float = 0.0  # by how much its strength differs when fewer codes are compared
 
     @property
     def equals(self) -> tuple[str, ...]:

@@ -88,23 +88,14 @@ class PixelHistograms:
 
 
 class PixelLaws(NamedTuple):
-    """What the fitted law of n pixels and their histograms give.
+    """What the fitted law of n pixels and their histograms give."""
 
-    Attributes:
-        good: pixels with a law, (n,); all else is meaningless elsewhere.
-        moments: fields of :data:`MOMENTS`, (n,).
-        scores: standardised score, its skewness and its kurtosis excess, (n, 3, N_TESTS).
-        support: first DN, number of codes, first row in ``tables``, (n, 3); (0, 1, 0) where not good.
-        tables: k (e-) and r (DN) of every code of the support, minus their mean over the samples, (rows, 2).
-        codes: sums over all pixels.
-    """
-
-    good: BoolArray
-    moments: NDArray[np.void]
-    scores: FloatArray
-    support: IntArray
-    tables: Float32Array
-    codes: CodeSums
+    good: BoolArray  # pixels with a law, (n,); all else is meaningless elsewhere
+    moments: NDArray[np.void]  # fields of :data:`MOMENTS`, (n,)
+    scores: FloatArray  # standardised score, its skewness and its kurtosis excess, (n, 3, N_TESTS)
+    support: IntArray  # first DN, number of codes, first row in ``tables``, (n, 3); (0, 1, 0) where not good
+    tables: Float32Array  # k (e-) and r (DN) of codes, less their mean over the samples, (rows, 2)
+    codes: CodeSums  # sums over all pixels
 
 
 def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: BoolArray) -> PixelLaws:

@@ -103,13 +103,10 @@ class SharedNoise(OffsetEffect):
 
     What is sampled once for many pixels shifts them all: ``x += n_t`` with ``n_t ~ N(0, s^2)``; the strength
     is s. A pixel's own histogram only broadens, to ``(sigma^2 + s^2)^(1/2)`` DN.
-
-    Attributes:
-        shared_by: what has one offset.
     """
 
     power = 2.0
-    shared_by: ClassVar[Literal["frame", "row", "column"]]
+    shared_by: ClassVar[Literal["frame", "row", "column"]]  # what has one offset
 
     def offsets(self, context: EffectContext) -> FloatArray:
         """Return one offset for each frame, or for each row or column of a frame, DN."""
