@@ -23,7 +23,7 @@ from pchem_pipeline.discrepancy.observe.digital import GROUP, MOST_SAMPLES, grou
 from pchem_pipeline.discrepancy.observe.sums import FrameBlocks, Samples, pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.operators.couple import Source
+from pchem_pipeline.effects.operators.couple import ALONG, Source
 
 Spectra = NDArray[np.complexfloating]
 Axes = tuple[int, ...]  # of (frame, y, x)
@@ -51,7 +51,7 @@ class Follows:
 
     def of(self, source: Source) -> tuple[FloatArray, FloatArray]:
         """Return the products and pairs of single samples, or of all of a row, column or frame."""
-        axes = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}[source]
+        axes = ALONG[source]
         if not axes:
             return self.products, self.pairs
         return self.products.sum(axis=axes, keepdims=True), self.pairs.sum(axis=axes, keepdims=True)
