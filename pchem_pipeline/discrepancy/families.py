@@ -334,8 +334,7 @@ def every_nth(
 ) -> Place | None:
     """Return the best set of every n-th row (axis 0) or column (axis 1).
 
-    Periods (increasing) with fewer cycles among the lines are not tried; a longer one must deviate more by
-    the factor ``better``.
+    Periods with fewer cycles are not tried; a longer one must deviate more by the factor ``better``.
     """
     number, z, lines = contrast.numbers(axis), 0.0, np.zeros(0, np.bool_)
     periods = [each for each in periods if cycles * each <= number.size]

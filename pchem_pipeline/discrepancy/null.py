@@ -198,8 +198,7 @@ class NullModel:
     def p_of(self, pulls: FloatArray, splits: int = 1) -> FloatArray:
         """Compute two-sided p-values of pulls of the mean of ``splits`` vectors.
 
-        Student's t-distribution, since the standard deviation is from few replicates, of the pulls after the
-        transformation of Wilson and Hilferty 1931 for their skewness.
+        Student's t (few replicates) of pulls without their skewness (Wilson and Hilferty 1931).
         """
         straight = _straight(self.names, pulls, self.std, self.skewness / np.sqrt(splits))
         return two_sided(straight, self.freedom)

@@ -143,8 +143,7 @@ def _places(values: NDArray[Any], scale: Scale) -> FloatArray:
 def _bars(place: FloatArray) -> Bars | None:
     """Return the histogram over the bulk of a map's places; None where codes are narrow enough to be bars.
 
-    The axis is that of the script: from the 1st to the 99th percentile and 0.3 of it beyond, where there are
-    values; those beyond it are in no bar.
+    Its axis is the script's: from the 1st to the 99th percentile, and 0.3 of it beyond where values are.
     """
     known = Ordered.of(some_of(place))
     if known.size < 2:

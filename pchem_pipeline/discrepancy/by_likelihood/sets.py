@@ -252,8 +252,7 @@ def select(
 ) -> FittedSet:
     """Select effects stepwise (Efroymson 1960): one is added, else exchanged, else left out, while that pays.
 
-    Several candidates may be of one effect. It begins with the set ``start`` (None: no effect), and no set
-    has more than ``largest`` effects.
+    Several candidates may be of one effect; ``start`` None: no effect; a set has at most ``largest`` ones.
     """
     best, passed = start or sets.plain, set[frozenset[str]]()
     while best.kinds not in passed:

@@ -223,8 +223,7 @@ def follow_statistics(
 ) -> dict[str, float]:
     """Return the statistics of residuals that follow the charge of other samples, in space and in time.
 
-    Left out are the samples next to it in the same frame and its own one frame before, which have their own.
-    Arguments as of :meth:`FollowingSamples.of`.
+    Samples next to it in the frame and its own one frame before have statistics of their own.
     """
     prepared = FollowingSamples.of(frames, edges, laws, maps, most=MOST_SAMPLES)
     if prepared is None:

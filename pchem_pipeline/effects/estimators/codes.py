@@ -49,8 +49,7 @@ def usable_codes(code: CodeResiduals, *, most: int = 1 << 12) -> tuple[IntArray,
 def few_shifts(residuals: FloatArray, expected: FloatArray) -> FloatArray | None:
     """Return shifts of the edges, DN, shape (codes + 1,), if a few of them explain all that is rough.
 
-    One edge after the other, the one that lowers chi2 the most (matching pursuit); None if the residuals ask
-    for more than a few, or for none.
+    One edge after the other (matching pursuit); None if residuals ask for more than a few, or for none.
     """
     if residuals.size < 2:
         return None  # no edge between two codes

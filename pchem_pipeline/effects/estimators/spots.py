@@ -50,8 +50,7 @@ def spot_to_window(
 ) -> dict[str, float]:
     """Return a spot as it is on some rows and columns that are taken for a sensor of their own.
 
-    By ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect on a sensor of ``shape`` (rows,
-    columns); ranges as in `to_window`.
+    By its fields ``centre_y``, ``centre_x``, ``radius`` and ``peak_e``; ranges as in `to_window`.
     """
     centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
     # the brightest of these pixels is the one nearest to the centre
@@ -107,8 +106,7 @@ def best_spot(
 ) -> Spot | None:
     """Return the spot that fits amplitudes in the cells of a grid best; None if none is positive.
 
-    On a sensor of this shape, with standard errors ``noise``, infinite without pixels. What is like the
-    ``background`` may be there in any proportion beside the spot.
+    Standard errors ``noise`` are infinite without pixels; any part of the ``background`` may be beside it.
     """
     y, x = ((np.arange(n) + 0.5) * size / n - 0.5 for n, size in zip(amplitude.shape, shape, strict=True))
     inverse = noise**-2.0

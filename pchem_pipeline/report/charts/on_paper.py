@@ -149,8 +149,7 @@ def _in(look: Look) -> Iterator[None]:
 def _lay_out(drawing: Drawing) -> None:
     """Let the layout engine place everything, and leave the drawing without one.
 
-    Nothing is drawn for it. Any engine that is left, one that does nothing too, would make each saving draw
-    the figure twice.
+    Nothing is drawn for it. With any engine left each saving would draw the figure twice.
     """
     engine = drawing.get_layout_engine()
     if engine is None:
