@@ -74,39 +74,24 @@ class DefectChange:
 
 @dataclass(frozen=True)
 class Pair:
-    """A run compared with the first one, or with the one before it in the history.
-
-    Attributes:
-        since: what the first of them is to the second.
-        same_data: both come from the same frames.
-        arrays: every array of the results; empty where the frames differ.
-        maps: map to its difference; empty where the shapes differ.
-        reasons: map to why it changed, for runs on different frames.
-        transitions: quality (good, caution, no value) of one by quality of the other: numbers of pixels.
-        settings, versions: those that differ, of versions those of programs and algorithms.
-        changes: what changed, one sentence each.
-        defects: pixels with other defects in the other run.
-        n_changed: pixels with other defects, or of which a value changed beyond its limit.
-        n_compared: these, and those with a good fit in both.
-        limits: beyond which something counts as changed; empty: beyond its errors.
-    """
+    """A run compared with the first one, or with the one before it in the history."""
 
     one: RunFacts
     other: RunFacts
-    since: Literal["reference", "last run"]
-    same_data: bool
-    arrays: Sequence[ArrayRow] = ()
-    maps: Mapping[str, MapDifference] = field(default_factory=dict)
-    reasons: Mapping[str, Reasons] = field(default_factory=dict)
-    transitions: Sequence[Sequence[int]] = ()
-    settings: Sequence[Setting] = ()
-    versions: Sequence[Setting] = ()
+    since: Literal["reference", "last run"]  # what the first of them is to the second
+    same_data: bool  # both come from the same frames
+    arrays: Sequence[ArrayRow] = ()  # every array of the results; empty where the frames differ
+    maps: Mapping[str, MapDifference] = field(default_factory=dict)  # empty where the shapes differ
+    reasons: Mapping[str, Reasons] = field(default_factory=dict)  # map to why it changed
+    transitions: Sequence[Sequence[int]] = ()  # pixels by the quality of one and of the other
+    settings: Sequence[Setting] = ()  # those that differ
+    versions: Sequence[Setting] = ()  # of programs and algorithms that differ
     changed: bool = False
-    changes: Sequence[str] = ()
-    defects: Sequence[DefectChange] = ()
-    n_changed: int = 0
-    n_compared: int = 0
-    limits: Mapping[str, float | str] = field(default_factory=dict)
+    changes: Sequence[str] = ()  # what changed, one sentence each
+    defects: Sequence[DefectChange] = ()  # pixels with other defects in the other run
+    n_changed: int = 0  # pixels with other defects, or of which a value changed beyond its limit
+    n_compared: int = 0  # these, and those with a good fit in both
+    limits: Mapping[str, float | str] = field(default_factory=dict)  # of changes; empty: errors
 
     @property
     def key(self) -> str:

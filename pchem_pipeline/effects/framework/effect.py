@@ -139,19 +139,12 @@ class SharedOffset(NamedTuple):
 
 
 class Replacement(NamedTuple):
-    """A rule: of the samples that exceed a number by more than so much, that number comes out.
+    """A rule: of the samples that exceed a number by more than so much, that number comes out."""
 
-    Attributes:
-        value: the number, DN, shape (frame, y, x).
-        inside: pixels for which the rule holds, shape (y, x).
-        excess: by how much, DN.
-        share: of those samples that is replaced, no unit.
-    """
-
-    value: NDArray[np.integer[Any]]
-    inside: BoolArray
-    excess: int
-    share: float
+    value: NDArray[np.integer[Any]]  # the number, DN, (frame, y, x)
+    inside: BoolArray  # pixels for which the rule holds, (y, x)
+    excess: int  # by how much, DN
+    share: float  # of those samples that is replaced, no unit
 
 
 class Effect(Section):
