@@ -199,13 +199,10 @@ def _crossing(rows: Iterable[tuple[float, float | None, float | None]]) -> float
 def crossing_text(study: _Rows) -> str:
     """Say up to which read noise one-sample PCH-EM beats photon transfer with as many frames."""
     expected, measured = bound_crossing(study), measured_crossing(study)
-    if expected is None and measured is None:
+    both = ((expected, "by the Cramer-Rao bound"), (measured, "on the simulated pixels"))
+    parts = [f"{short(noise, 2)} e- {words}" for noise, words in both if noise is not None]
+    if not parts:
         return "the errors of one-sample PCH-EM and two-sample photon transfer do not cross in this range"
-    parts = []
-    if expected is not None:
-        parts.append(f"{short(expected, 2)} e- by the Cramer-Rao bound")
-    if measured is not None:
-        parts.append(f"{short(measured, 2)} e- on the simulated pixels")
     return (
         "one-sample PCH-EM is more precise in the gain than two-sample photon transfer with the same number "
         f"of frames up to a read noise of {', '.join(parts)}; above it, take several exposures"

@@ -30,12 +30,8 @@ class DisplayRange:
 
     def remark(self) -> str:
         """Return a note on what is not drawn, e.g. ``3 outside the axis; 5 without a value``."""
-        parts = []
-        if self.n_outside:
-            parts.append(f"{self.n_outside:,} outside the axis")
-        if self.n_missing:
-            parts.append(f"{self.n_missing:,} without a value")
-        return "; ".join(parts)
+        counts = ((self.n_outside, "outside the axis"), (self.n_missing, "without a value"))
+        return "; ".join(f"{n:,} {words}" for n, words in counts if n)
 
 
 def finite(values: NDArray[Any]) -> FloatArray:
