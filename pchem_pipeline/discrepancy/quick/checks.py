@@ -166,18 +166,17 @@ def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[
     Given are the median gain, e-/DN, the median read noise, DN, and the effects of the fitted model.
     """
     shown = {name for effect in model for name in effect.signature}
-    found = []
-    for check in checks:
-        in_dn = check.unit == "DN"
-        done = replace(
+    found = [
+        replace(
             check,
             p_global=look_elsewhere(check.p, len(checks)),
             in_model=any(re.fullmatch(KINDS[check.name].signs, name) for name in shown),
-            size_e=check.size * gain if in_dn else math.nan,
-            share=check.size / read_noise if in_dn else math.nan,
+            size_e=check.size * gain if check.unit == "DN" else math.nan,
+            share=check.size / read_noise if check.unit == "DN" else math.nan,
         )
-        found.append(replace(done, level=_level(done)))
-    return tuple(found)
+        for check in checks
+    ]
+    return tuple(replace(check, level=_level(check)) for check in found)
 
 
 def _level(check: Check) -> Level:

@@ -63,11 +63,9 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
         f"{measured(each.median, each.median_stderr, unit)} ({signed(each.median_z)} sigma of one pixel); "
         f"scatter {short(each.spread_z, 2)} sigma; {count(each.n_changed, 'good pixel')} changed."
     )
-    caption = (
-        "Line: N(0, 1), expected from sampling noise alone."
-        if not pair.same_data
-        else "Both runs use the same frames, so there is no sampling noise."
-    )
+    caption = "Line: N(0, 1), expected from sampling noise alone."
+    if pair.same_data:
+        caption = "Both runs use the same frames, so there is no sampling noise."
     title = f"{label}: {pair.other.label} − {pair.one.label}"
     return Figure(
         f"difference_{name}_{pair.key}",

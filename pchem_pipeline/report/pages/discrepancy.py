@@ -483,15 +483,10 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
     name, largest = max(moved, key=lambda pair: abs(pair[1].in_stderr), default=("", None))
     if largest is None or abs(largest.in_stderr) < _NOT_MOVED:
         return []
-    unit = unit_text(largest.unit)
     small = ", negligible" if abs(largest.in_stderr) < _IMMATERIAL else ""
-    return [
-        KeyFact(
-            f"largest change: {_parameter_name(name)}",
-            f"{_signed(largest.median)} {unit}".strip(),
-            (f"{_signed(largest.in_stderr)} standard errors of one pixel{small}",),
-        )
-    ]
+    value = f"{_signed(largest.median)} {unit_text(largest.unit)}".strip()
+    more = f"{_signed(largest.in_stderr)} standard errors of one pixel{small}"
+    return [KeyFact(f"largest change: {_parameter_name(name)}", value, (more,))]
 
 
 def _signed(value: float) -> str:
@@ -553,8 +548,6 @@ def _closing(found: Verdict) -> Iterator[Flag]:
         families = families_words(gap.standing_out)
         yield Flag("caution", f"A significant discrepancy remains in {families}.")
     elif gap.after > gap.floor:
-        left = percent(1.0 - gap.closed_fraction)
         words = f"{micronats(gap.after)} micronats per sample, sampling noise up to {micronats(gap.floor)}"
-        yield Flag(
-            "caution" if found.verdict == "named_in_part" else "note", f"{left} of the gap remains: {words}."
-        )
+        left = f"{percent(1.0 - gap.closed_fraction)} of the gap remains: {words}."
+        yield Flag("caution" if found.verdict == "named_in_part" else "note", left)

@@ -60,9 +60,8 @@ def criteria(data: ReportData) -> list[Criterion]:
         if data.has_values(name):
             median, (_, words, unit) = data.summary(name).median, symbol(name)
             shown, within = f"{short(median, 4)} {unit}", f"{low:g} to {high:g} {unit}"
-            found.append(
-                Criterion(f"medians.{name}", f"median {words}", shown, within, low <= median <= high)
-            )
+            met, words = low <= median <= high, f"median {words}"
+            found.append(Criterion(f"medians.{name}", words, shown, within, met))
     return found
 
 
@@ -544,9 +543,8 @@ def _sensor(data: ReportData) -> Answer:
         text = f"Most {data.noun}s are flagged: the data do not fix their gain and read noise."
         return Answer(question, "serious", "Unknown", text, kept)
     missed = [each for each in judged if not each.met]
-    limits = "; ".join(
-        f"{each.words} {each.found} (limit {each.limit.removeprefix('≤ ')})" for each in missed
-    )
+    words = (f"{each.words} {each.found} (limit {each.limit.removeprefix('≤ ')})" for each in missed)
+    limits = "; ".join(words)
     met = f"all {len(judged)} criteria pass" if judged else "no limits are set (report.criteria)"
     share = "All" if pixels.failed == 0 else f"{percent(pixels.fitted, pixels.total)} of"
     text = f"{share} {count(pixels.total, data.noun)} have a value; {limits or met}."
@@ -568,8 +566,7 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
     about = [flag for flag in remarks if flag.about == "results"]
     doubts: tuple[tuple[Level, str], ...] = (("serious", "No"), ("caution", "With caution"))
     for level, word in doubts:
-        texts = [flag.text for flag in about if flag.level == level]
-        if texts:
+        if texts := [flag.text for flag in about if flag.level == level]:
             more = f" ({len(texts) - 1} more below)" if len(texts) > 1 else ""
             return Answer(question, level, word, f"{texts[0]}{more}")
     passed = sum(flag.level == "good" for flag in about)
