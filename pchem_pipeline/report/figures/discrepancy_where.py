@@ -86,14 +86,13 @@ def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
         return
     origin = data.found.examined.origin
     flagged = [pixel for place in data.found.where for pixel in place.pixels]
-    words = []
-    for each in maps:
-        known = finite(each.z)
-        words.append(
-            f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} "
-            f"(expected 0 and 1), {count(each.outliers, 'pixel')} beyond 5"
-            + (f", mainly in {each.region.describe()}" if each.region is not None else "")
-        )
+    words = [
+        f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} "
+        f"(expected 0 and 1), {count(each.outliers, 'pixel')} beyond 5"
+        + (f", mainly in {each.region.describe()}" if each.region is not None else "")
+        for each in maps
+        for known in [finite(each.z)]
+    ]
     columns = {each.title: each.z for each in maps}
     table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)
     yield Figure(
@@ -154,11 +153,8 @@ def _line_tables(line: str, rms: NDArray[Any], image: NDArray[Any], first: int) 
 
 
 def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
-    found = []
-    for channel, values in zip(CHANNELS, rms, strict=False):
-        known = finite(values)
-        if known.size:
-            found.append(f"{channel} median {np.median(known):.2f}, largest {known.max():.2f}")
+    channels = zip(CHANNELS, map(finite, rms), strict=False)
+    found = [f"{c} median {np.median(v):.2f}, largest {v.max():.2f}" for c, v in channels if v.size]
     return f"{LINE_WORDS[line]}: {' and '.join(found) or 'not known'}"
 
 
@@ -200,7 +196,7 @@ def _named_maps(arrays: Arrays) -> dict[str, tuple[str, NDArray[Any]]]:
     if "goodness" in arrays:
         found["goodness"] = ("goodness of fit (large: poor)", arrays["goodness"])
     for name, values in zip(SCORES, arrays.get("score", ()), strict=False):
-        found[f"score.{name}"] = (_SCORE_WORDS.get(name, name), values)
+        found[f"score.{name}"] = (_SCORE_WORDS[name], values)
     for array, name, words in (
         ("block_spread", "spread", "block means vary"),
         ("trend", "trend", "block means rise"),
