@@ -159,24 +159,15 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Findings:
-    """The results of a search.
+    """The results of a search; see :class:`~pchem_pipeline.discrepancy.verdict.Verdict`."""
 
-    Attributes:
-        samples: kind of data ("frames", "histograms").
-        first, last: null distribution of the model before and after.
-        before: gap on the final samples without new effects.
-        places: disagreements of the data with the model before.
-        still: whether the data disagree with the final model.
-        doubt, limit: see :class:`~pchem_pipeline.discrepancy.verdict.Verdict`.
-    """
-
-    samples: str
+    samples: str  # kind of data ("frames", "histograms")
     z: Measured
-    first: NullModel
-    last: NullModel
-    before: Gap
-    places: Sequence[schema.Place]
-    still: bool
+    first: NullModel  # null distribution of the model before
+    last: NullModel  # and after
+    before: Gap  # gap on the final samples without new effects
+    places: Sequence[schema.Place]  # disagreements of the data with the model before
+    still: bool  # whether the data disagree with the final model
     added: Added
     doubt: str = ""
     limit: str = ""

@@ -285,24 +285,17 @@ def pairs_bytes(shape: tuple[int, int]) -> int:
 
 
 class _Gathered:
-    """Sums of products of different pixels of a row, of a column, and of all of a frame.
-
-    Attributes:
-        cells: edges of the cells of rows and of columns; those of frames are every ``stride`` of these.
-        lines: products of the pixels of a row (y, x, x), and of a column (x, y, y).
-        by_number: of pixels of a row (column), and of a frame, by the numbers of their columns (rows).
-        frames: products of all pixels, (y' x', y' x').
-        squares: of all pixels, (y', x').
-    """
+    """Sums of products of different pixels of a row, of a column, and of all of a frame."""
 
     def __init__(self, cells: families.Edges) -> None:
-        self.cells = cells
+        self.cells = cells  # edges of those of rows and of columns
         y, x = (each.size - 1 for each in cells)
-        self.stride = [2 if n > _CELLS // 2 else 1 for n in (y, x)]
-        self.lines = np.zeros((y, x, x)), np.zeros((x, y, y))
+        self.stride = [2 if n > _CELLS // 2 else 1 for n in (y, x)]  # of the cells of frames in these
+        self.lines = np.zeros((y, x, x)), np.zeros((x, y, y))  # products of pixels of a row, of a column
+        # of pixels of a row (column), and of a frame, by the numbers of their columns (rows)
         self.by_number = np.zeros((2, 2, PERIOD, PERIOD))
-        self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])
-        self.frames = np.zeros((self.squares.size, self.squares.size))
+        self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])  # of all pixels
+        self.frames = np.zeros((self.squares.size, self.squares.size))  # products of all pixels
 
     def edges(self, mode: str) -> families.Edges:
         """Return the edges of the cells of rows and of columns, pixels."""

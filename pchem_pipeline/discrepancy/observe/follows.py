@@ -38,11 +38,9 @@ _RESOLVED = 0.05  # of the variance of the charge, at least, that its residual d
 class Follows:
     """Sums of products of residuals with the charge of other samples, each in its standard deviation.
 
-    Attributes:
-        products: by frames before, rows and columns from the residual to the charge, the distance 0 in the
-            middle, shape (2, 2 y - 1, 2 x - 1); 0 for a sample with itself.
-        pairs: their number.
-        wider: for each of `SOURCES`, the standard deviation of their sum over that of independent products.
+    Products and their numbers are by frames before, rows and columns from the residual to the charge, the
+    distance 0 in the middle, (2, 2 y - 1, 2 x - 1); 0 for a sample with itself. ``wider``: for each of
+    `SOURCES`, the standard deviation of their sum over that of independent products.
     """
 
     products: FloatArray
