@@ -44,30 +44,20 @@ LEAVES_TOO_MUCH = "it leaves too much of the discrepancy"
 
 @dataclass(frozen=True)
 class Addition:
-    """An effect added to the model with its fitted parameters, or the likeliest of several.
-
-    Attributes:
-        alone: whether all others are excluded.
-        against: reason of its rejection, starting with "it"; empty if it is accepted.
-        stderr: standard errors of its parameters, of those that have one.
-        before, after: gap on the final samples without and with it.
-        described: whether it is an empirical description without a cause.
-        certain: whether its strength is significant.
-        candidates, rivals, pulls, moved: see :class:`~pchem_pipeline.discrepancy.verdict.Step`.
-    """
+    """An effect added to the model with its fitted parameters, or the likeliest of several."""
 
     effect: Effect
-    alone: bool
-    against: str
+    alone: bool  # whether all others are excluded
+    against: str  # reason of its rejection, starting with "it"; empty if it is accepted
     candidates: tuple[schema.Candidate, ...]
-    stderr: Mapping[str, float]
-    before: Gap
-    after: Gap
+    stderr: Mapping[str, float]  # standard errors of its parameters, of those that have one
+    before: Gap  # gap on the final samples without it
+    after: Gap  # the same with it
     rivals: tuple[schema.Rival, ...]
     pulls: tuple[schema.Pull, ...]
     moved: Mapping[str, schema.Moved] = field(default_factory=dict)
-    described: bool = False
-    certain: bool = True
+    described: bool = False  # whether it is an empirical description without a cause
+    certain: bool = True  # whether its strength is significant
 
     @property
     def fits(self) -> bool:
@@ -144,23 +134,14 @@ class Addition:
 
 @dataclass(frozen=True)
 class Added:
-    """All effects added to the model, and the remaining discrepancy.
+    """All effects added to the model, and the remaining discrepancy."""
 
-    Attributes:
-        additions: the effects, the largest first.
-        after: gap on the final samples with all of them.
-        unfinished: whether the remaining gap is too large for a complete model.
-        stand_ins: tags of effects that explain some codes, but not all.
-        residuals: codes that the final model does not explain.
-        set_aside: intervals of (x - bias) * gain, e-, whose codes the fit leaves out.
-    """
-
-    additions: tuple[Addition, ...]
-    after: Gap
-    unfinished: bool = False
-    stand_ins: tuple[str, ...] = ()
-    residuals: tuple[schema.Place, ...] = ()
-    set_aside: tuple[tuple[float | None, float | None], ...] = ()
+    additions: tuple[Addition, ...]  # the effects, the largest first
+    after: Gap  # gap on the final samples with all of them
+    unfinished: bool = False  # whether the remaining gap is too large for a complete model
+    stand_ins: tuple[str, ...] = ()  # tags of effects that explain some codes, but not all
+    residuals: tuple[schema.Place, ...] = ()  # codes that the final model does not explain
+    set_aside: tuple[tuple[float | None, float | None], ...] = ()  # intervals of (x - bias) * gain, e-
 
 
 @dataclass(frozen=True)
@@ -178,24 +159,15 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Findings:
-    """The results of a search.
+    """The results of a search; see :class:`~pchem_pipeline.discrepancy.verdict.Verdict`."""
 
-    Attributes:
-        samples: kind of data ("frames", "histograms").
-        first, last: null distribution of the model before and after.
-        before: gap on the final samples without new effects.
-        places: disagreements of the data with the model before.
-        still: whether the data disagree with the final model.
-        doubt, limit: see :class:`~pchem_pipeline.discrepancy.verdict.Verdict`.
-    """
-
-    samples: str
+    samples: str  # kind of data ("frames", "histograms")
     z: Measured
-    first: NullModel
-    last: NullModel
-    before: Gap
-    places: Sequence[schema.Place]
-    still: bool
+    first: NullModel  # null distribution of the model before
+    last: NullModel  # and after
+    before: Gap  # gap on the final samples without new effects
+    places: Sequence[schema.Place]  # disagreements of the data with the model before
+    still: bool  # whether the data disagree with the final model
     added: Added
     doubt: str = ""
     limit: str = ""

@@ -26,12 +26,7 @@ _BLOCK = 50  # frames, as many as a search looks at in one piece
 
 @dataclass(frozen=True)
 class RecoveredStrength:
-    """The strengths that an estimator finds in several stacks.
-
-    Attributes:
-        true: strength that the effect has in the stacks.
-        found: that of the likeliest hypothesis in each stack, NaN where there is none, shape (n,).
-    """
+    """The true strength, and that of the likeliest hypothesis in each of n stacks, NaN without any."""
 
     true: float
     found: FloatArray

@@ -46,20 +46,13 @@ BOXES = {"rows": (True, False), "columns": (False, True), "rectangle": (True, Tr
 
 @dataclass(frozen=True)
 class Place:
-    """The best place of a family.
-
-    Attributes:
-        mask: its pixels, (y, x).
-        z: deviation of the mean inside from that outside, standard errors.
-        log_places: logarithm of the number of places that were looked at.
-        edges: of the cells with which a box ends, of rows and of columns.
-    """
+    """The best place of a family."""
 
     family: str
-    mask: BoolArray
-    z: float
-    log_places: float
-    edges: Edges | None = None
+    mask: BoolArray  # its pixels, (y, x)
+    z: float  # deviation of the mean inside from that outside, standard errors
+    log_places: float  # logarithm of the number of places that were looked at
+    edges: Edges | None = None  # of the cells with which a box ends, of rows and of columns
 
     @property
     def log_p(self) -> float:
@@ -135,22 +128,14 @@ def _between(table: FloatArray, axes: int, ranges: Ranges) -> FloatArray:
 
 @dataclass(frozen=True)
 class Contrast:
-    """Sums over places, and how far they are from their share of the whole.
+    """Sums over places, and how far they are from their share of the whole."""
 
-    Attributes:
-        edges: of the cells of the tables.
-        sums, counts: cumulative tables, see :func:`box_sums`.
-        null: returns the deviations of sums with such counts, standard errors; 0 where one is no place.
-        axes: of the tables that are rows, and columns.
-        frames: numbers of the columns where these are frames.
-    """
-
-    edges: Edges
-    sums: FloatArray
-    counts: FloatArray
-    null: Null
-    axes: tuple[int, int] = (1, 1)
-    frames: IntArray | None = None
+    edges: Edges  # of the cells of the tables
+    sums: FloatArray  # cumulative tables, see :func:`box_sums`
+    counts: FloatArray  # the same of what counts
+    null: Null  # returns the deviations of sums with such counts, standard errors; 0 where one is no place
+    axes: tuple[int, int] = (1, 1)  # of the tables that are rows, and columns
+    frames: IntArray | None = None  # numbers of the columns where these are frames
 
     @classmethod
     def of_pixels(
@@ -349,8 +334,7 @@ def every_nth(
 ) -> Place | None:
     """Return the best set of every n-th row (axis 0) or column (axis 1).
 
-    Periods (increasing) with fewer cycles among the lines are not tried; a longer one must deviate more by
-    the factor ``better``.
+    Periods with fewer cycles are not tried; a longer one must deviate more by the factor ``better``.
     """
     number, z, lines = contrast.numbers(axis), 0.0, np.zeros(0, np.bool_)
     periods = [each for each in periods if cycles * each <= number.size]

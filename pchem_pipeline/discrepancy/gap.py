@@ -31,21 +31,13 @@ _APART = 8.0
 
 @dataclass(frozen=True)
 class Gap:
-    """A gap, nats per sample.
+    """A gap, nats per sample."""
 
-    Attributes:
-        value: negative by sampling noise only.
-        floor: 95 % quantile under the model.
-        interval: 95 % interval.
-        families: contribution of each family of statistics.
-        standing_out: families that are significant by themselves.
-    """
-
-    value: float
-    floor: float
-    interval: tuple[float, float]
-    families: Mapping[str, float]
-    standing_out: tuple[str, ...] = ()
+    value: float  # negative by sampling noise only
+    floor: float  # 95 % quantile under the model
+    interval: tuple[float, float]  # 95 % interval
+    families: Mapping[str, float]  # contribution of each family of statistics
+    standing_out: tuple[str, ...] = ()  # families that are significant by themselves
 
     @classmethod
     def of(
@@ -86,13 +78,9 @@ class StatisticsGap:
     """Computes gaps from statistics: ``sum_f (D_f - E_f) / (2 N)`` over their families.
 
     D_f is the squared Mahalanobis distance of the statistics of a family from their expectation, E_f its mean
-    over replicates of the model. All models are compared with one covariance, that of the model before
-    anything was added: otherwise an effect could reduce the gap by widening the distribution. Exact counts
-    have the Poisson variance of their expectation in addition.
-
-    Attributes:
-        null: null distribution before anything was added.
-        n_samples: samples per statistic (frames x usable pixels).
+    over replicates of the model, N is ``n_samples`` (frames x usable pixels). All models are compared with
+    one covariance, that of the model before anything was added: otherwise an effect could reduce the gap by
+    widening the distribution. Exact counts have the Poisson variance of their expectation in addition.
     """
 
     null: NullModel
@@ -104,14 +92,10 @@ class StatisticsGap:
     def gap(
         self, z: FloatArray, mean: FloatArray, replicates: FloatArray, strengths: FloatArray | None = None
     ) -> Gap:
-        """Compute the gap of a model.
+        """Compute the gap of the data's statistics ``z`` from their expectation under a model, (m,).
 
-        Args:
-            z: statistics of the data, shape (m,).
-            mean: expectation under the model, shape (m,).
-            replicates: vectors of a model with that mean or another, for the floor, shape (b, m).
-            strengths: shift of the statistics by one standard error of the strength of each effect, shape
-                (e, m), since strengths were fitted to other samples.
+        The floor is from replicates (b, m) of a model with that mean or another. Since strengths of effects
+        were fitted to other samples, ``strengths`` are the shifts by one standard error of each, (e, m).
         """
         own, covariance = self._own_distances(replicates, strengths), self._covariance(mean)
         distances = {

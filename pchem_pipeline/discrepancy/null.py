@@ -53,14 +53,10 @@ class Covariance:
 
     The sample covariance shrunk towards its diagonal has this form, and so have all sums with it; whitening
     is linear in the number of statistics, not cubic.
-
-    Attributes:
-        own: variance of each statistic by itself, above 0, shape (m,).
-        common: modes that they share, shape (r, m).
     """
 
-    own: FloatArray
-    common: FloatArray
+    own: FloatArray  # variance of each statistic by itself, above 0, shape (m,)
+    common: FloatArray  # modes that they share, shape (r, m)
 
     @property
     def variances(self) -> FloatArray:
@@ -119,26 +115,16 @@ class Covariance:
 
 @dataclass(frozen=True)
 class NullModel:
-    """Mean, covariance and skewness of the statistics of one split under a model.
+    """Mean, covariance and skewness of the statistics of one split under a model."""
 
-    Attributes:
-        names: names of the statistics, shape (m,).
-        mean, std: mean and standard deviation of each, shape (m,).
-        covariance: shrunk towards its diagonal.
-        replicates: the vectors, shape (b, m).
-        skewness: skewness of the statistics of one split, shape (m,).
-        effective_tests: equivalent number of independent statistics.
-        strengths: shift of the statistics by one standard error of the strength of each effect, (e, m).
-    """
-
-    names: tuple[str, ...]
-    mean: FloatArray
-    std: FloatArray
-    covariance: Covariance
-    replicates: FloatArray
-    skewness: FloatArray
-    effective_tests: float
-    strengths: FloatArray | None = None
+    names: tuple[str, ...]  # names of the statistics, (m,)
+    mean: FloatArray  # of each, (m,)
+    std: FloatArray  # standard deviation of each, (m,)
+    covariance: Covariance  # shrunk towards its diagonal
+    replicates: FloatArray  # the vectors, (b, m)
+    skewness: FloatArray  # skewness of the statistics of one split, (m,)
+    effective_tests: float  # equivalent number of independent statistics
+    strengths: FloatArray | None = None  # shifts by one standard error of the strength of each effect, (e, m)
 
     @classmethod
     def from_replicates(
@@ -212,8 +198,7 @@ class NullModel:
     def p_of(self, pulls: FloatArray, splits: int = 1) -> FloatArray:
         """Compute two-sided p-values of pulls of the mean of ``splits`` vectors.
 
-        Student's t-distribution, since the standard deviation is from few replicates, of the pulls after the
-        transformation of Wilson and Hilferty 1931 for their skewness.
+        Student's t (few replicates) of pulls without their skewness (Wilson and Hilferty 1931).
         """
         straight = _straight(self.names, pulls, self.std, self.skewness / np.sqrt(splits))
         return two_sided(straight, self.freedom)

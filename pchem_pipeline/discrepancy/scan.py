@@ -35,22 +35,14 @@ _MOST_EVENTS = 500  # frames with an event that are looked at: so many drawn of 
 
 @dataclass(frozen=True, kw_only=True)
 class Cluster:
-    """A part of a map or of a series that stands out.
+    """A part of a map or of a series that stands out."""
 
-    Attributes:
-        family: rows, columns, rectangle, disc, period or pixels; of frames range, period or frames.
-        z: deviation of its mean from that of the rest, standard errors.
-        log_p: logarithm of the probability of such a deviation by chance in any place.
-        inside, outside: mean there and elsewhere.
-        share: of its pixels that deviate, at least (at 95 %, for all places at once).
-    """
-
-    family: str
-    z: float
-    log_p: float
-    inside: float
-    outside: float
-    share: float = 0.0
+    family: str  # rows, columns, rectangle, disc, period or pixels; of frames range, period or frames
+    z: float  # deviation of its mean from that of the rest, standard errors
+    log_p: float  # logarithm of the probability of such a deviation by chance in any place
+    inside: float  # mean there
+    outside: float  # mean elsewhere
+    share: float = 0.0  # of its pixels that deviate, at least (at 95 %, for all places at once)
 
     @property
     def p(self) -> float:
@@ -104,15 +96,11 @@ def scan_map(
         found = families.best_place([*_regions(contrast), families.single(values, left) if single else None])
         return _significant(found, values, left, significance, either_side=True)
 
-    def share(place: families.Place, left: BoolArray) -> float:
-        deviations = np.where(some, math.copysign(1.0, place.z) * values, -np.inf)[some]
-        return affected_share(deviations, (place.mask & left)[some])
-
     return [
         Suspect(
             **place.means(values, left),
             region=Region.of_mask(_reaching(place.mask, next_along)),
-            share=share(place, left),
+            share=affected_share(math.copysign(1.0, place.z) * values[some], (place.mask & left)[some]),
         )
         for place, left in families.successive(best, some, most)
     ]

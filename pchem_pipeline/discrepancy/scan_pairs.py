@@ -56,9 +56,7 @@ _LINE_BY_CHANCE = 1e-4  # probability of a line that stands out by itself, among
 class Shared(Suspect):
     """A place whose pixels move together, unlike the rest; inside and outside are mean correlations of pairs.
 
-    Attributes:
-        channel: 0 for electron numbers, 1 for residuals.
-        mode: row, column or frame: what the pixels share.
+    Channel 0 is that of electron numbers, 1 of residuals; the mode (row, column, frame) is what pixels share.
     """
 
     channel: int
@@ -224,15 +222,12 @@ def _scattered(contrast: PairContrast, axis: int, usable: BoolArray) -> families
 class PairContrast(families.Contrast):
     """Sums of products of pairs of pixels that share a row (column, frame), over boxes of the sensor.
 
-    Pairs are counted twice, as (a, b) and (b, a). Only sums that are too large count.
-
-    Attributes:
-        area: pixels that count, cumulative over the cells, (y, x).
-        by_number: sums and counts of all by the numbers modulo :data:`PERIOD` of their rows and of their
-            columns, (2, PERIOD, PERIOD); 0 for lines that the pixels share.
+    Pairs are counted twice, as (a, b) and (b, a). Only sums that are too large count. ``by_number`` has sums
+    and counts of all by the numbers modulo :data:`PERIOD` of their rows and of their columns, (2, PERIOD,
+    PERIOD); 0 for lines that the pixels share.
     """
 
-    area: FloatArray
+    area: FloatArray  # pixels that count, cumulative over the cells, (y, x)
     by_number: tuple[FloatArray, FloatArray]
 
     def boxes(self, rows: families.Ranges, columns: families.Ranges) -> FloatArray:
@@ -290,24 +285,17 @@ def pairs_bytes(shape: tuple[int, int]) -> int:
 
 
 class _Gathered:
-    """Sums of products of different pixels of a row, of a column, and of all of a frame.
-
-    Attributes:
-        cells: edges of the cells of rows and of columns; those of frames are every ``stride`` of these.
-        lines: products of the pixels of a row (y, x, x), and of a column (x, y, y).
-        by_number: of pixels of a row (column), and of a frame, by the numbers of their columns (rows).
-        frames: products of all pixels, (y' x', y' x').
-        squares: of all pixels, (y', x').
-    """
+    """Sums of products of different pixels of a row, of a column, and of all of a frame."""
 
     def __init__(self, cells: families.Edges) -> None:
-        self.cells = cells
+        self.cells = cells  # edges of those of rows and of columns
         y, x = (each.size - 1 for each in cells)
-        self.stride = [2 if n > _CELLS // 2 else 1 for n in (y, x)]
-        self.lines = np.zeros((y, x, x)), np.zeros((x, y, y))
+        self.stride = [2 if n > _CELLS // 2 else 1 for n in (y, x)]  # of the cells of frames in these
+        self.lines = np.zeros((y, x, x)), np.zeros((x, y, y))  # products of pixels of a row, of a column
+        # of pixels of a row (column), and of a frame, by the numbers of their columns (rows)
         self.by_number = np.zeros((2, 2, PERIOD, PERIOD))
-        self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])
-        self.frames = np.zeros((self.squares.size, self.squares.size))
+        self.squares = np.zeros([each.size - 1 for each in self.edges("frame")])  # of all pixels
+        self.frames = np.zeros((self.squares.size, self.squares.size))  # products of all pixels
 
     def edges(self, mode: str) -> families.Edges:
         """Return the edges of the cells of rows and of columns, pixels."""

@@ -61,8 +61,7 @@ def size_of(effect: Effect, maps: PixelMaps, n_frames: int) -> Size | None:
         return None
     inside = np.ones_like(maps.usable)
     if whole and effect.region is not None:
-        ny, nx = maps.usable.shape
-        inside = effect.region.mask((ny, nx))
+        inside = effect.region.mask(inside.shape)
     changes = [change[:, inside] for change in drawn if change is not None]
     if not changes:
         return None

@@ -29,42 +29,26 @@ Explanation = TypeVar("Explanation")
 
 @dataclass(frozen=True)
 class Prepared:
-    """Data that are split into train, test and final part, and the model that they are compared with.
-
-    Attributes:
-        samples: what the data are, for the verdict's sentence ("frames", "histograms").
-        evidence: of the train part.
-        first: statistics of the model before anything is added, from its replicates.
-        z: statistics of the data.
-        untestable: effects that such data cannot show, and why.
-        doubt: why the pixels are not identified and what would help; empty where they are.
-        defects: candidates that failed, and why; more come to them.
-    """
+    """Data that are split into train, test and final part, and the model that they are compared with."""
 
     settings: DiscrepancySettings
-    samples: str
-    evidence: Evidence
+    samples: str  # what the data are, for the verdict's sentence ("frames", "histograms")
+    evidence: Evidence  # of the train part
     examined: Examined
-    first: NullModel
-    z: Measured
+    first: NullModel  # statistics of the model before anything is added, from its replicates
+    z: Measured  # statistics of the data
     effort: Effort
-    untestable: dict[str, str]
-    doubt: str = ""
-    defects: dict[str, str] = field(default_factory=dict)
+    untestable: dict[str, str]  # effects that such data cannot show, and why
+    doubt: str = ""  # why the pixels are not identified and what would help; empty where they are
+    defects: dict[str, str] = field(default_factory=dict)  # candidates that failed, and why
 
 
 class Explainer(ABC, Generic[Explanation]):
-    """A way to tell effects apart in one kind of data; it keeps the model.
+    """A way to tell effects apart in one kind of data; it keeps the model."""
 
-    Attributes:
-        prepared: the data and the model before the search.
-        candidates: tags of the effects that are compared, once they are.
-        limit: what was not tried when the search had used its budget; empty if it finished.
-    """
-
-    prepared: Prepared
-    candidates: Sequence[str] = ()
-    limit: str = ""
+    prepared: Prepared  # the data and the model before the search
+    candidates: Sequence[str] = ()  # tags of the effects that are compared, once they are
+    limit: str = ""  # what was not tried when the search had used its budget; empty if it finished
 
     @property
     @abstractmethod

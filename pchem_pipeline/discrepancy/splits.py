@@ -21,11 +21,8 @@ _ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1), (0, 2, 1), (2, 1, 0), (1, 0, 2))
 class Splits:
     """Positions (along the first axis of the stack) of the frames of each part, equally many each.
 
-    Attributes:
-        train: to estimate on.
-        test: to score on.
-        final: used for the remaining gap, and to confirm what was found without them.
-        block_frames: frames in a block of consecutive ones.
+    Effects are estimated on the part train and scored on test; final is for the remaining gap, and to confirm
+    what was found without it. Consecutive frames come in blocks of ``block_frames``.
     """
 
     train: IntArray
@@ -64,10 +61,7 @@ def block_length(n_frames: int, wanted: int | None = None) -> int:
 
 
 def split_frames(numbers: IntArray, block_frames: int) -> Splits:
-    """Deal whole blocks of consecutive frames (numbers, increasing) to train, test and final in turn.
-
-    A rest of fewer than three blocks is left out.
-    """
+    """Deal whole blocks of consecutive frames to train, test and final in turn; a rest is left out."""
     # a block never spans a gap in the numbering
     breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
     starts = [

@@ -66,12 +66,9 @@ class Measured(_Part):
 
 
 class Candidate(_Part):
-    """An effect that was compared, by its tag and fields.
+    """An effect that was compared, by its tag and fields, with its posterior probability among all of them.
 
-    Attributes:
-        score: held-out log-likelihood minus that of the best effect, nats (0 for the best).
-        stderr: standard error of ``score``, nats.
-        probability: posterior probability among all candidates.
+    The score is the held-out log-likelihood minus that of the best effect, nats, with its standard error.
     """
 
     effect: str
@@ -113,12 +110,10 @@ class Size(_Part):
 
 
 class Rival(_Part):
-    """Another effect (its tag) fitted instead of the named one, in the same way.
+    """Another effect (its tag) fitted instead of the named one, in the same way, and why it is rejected.
 
-    Attributes:
-        gap_after: the remaining gap, nats per sample.
-        behind: log-likelihood minus that of the named one, nats; NaN if it was not scored.
-        why: reason of the rejection.
+    ``gap_after`` is the remaining gap, nats per sample, ``behind`` the log-likelihood minus that of the named
+    one, nats; NaN if it was not scored.
     """
 
     effect: str
@@ -145,43 +140,25 @@ class Pull(_Part):
 
 
 class Place(_Part):
-    """A disagreement of data and model: a statistic, and its pixels, codes or frames.
+    """A disagreement of data and model: a statistic, and its pixels, codes or frames."""
 
-    Attributes:
-        statistic, sentence, channel: its name, words and channel in the catalogue.
-        direction: "+" or "-".
-        z: deviation from the expectation under the model, standard deviations.
-        p: p-value, corrected for the number of statistics.
-        pixels: (y, x) on the sensor, if few pixels deviate.
-        dn: first and last code, if codes deviate.
-        frames: frame numbers, if few frames deviate.
-        seen, expected: number of samples in these codes, if counted.
-        share_of_gap: share of the remaining gap, if measured.
-        region: part of the sensor in which the map of the statistic deviates, as in ``model.effects``; None:
-            uniform, or no map.
-        region_p: p-value of the region, corrected for the number of regions searched.
-        region_share: lower 95 % limit of the share of deviating pixels in the region.
-        when: frames in which the time series deviates, as in ``model.effects``; None: uniform.
-        when_p: p-value of these frames, corrected in the same way.
-    """
-
-    statistic: str
+    statistic: str  # its name, words and channel in the catalogue
     sentence: str = ""
     channel: str = ""
-    direction: str = ""
-    z: Number = _NAN
-    p: Number = _NAN
-    pixels: tuple[tuple[int, int], ...] = ()
-    dn: tuple[int, int] | None = None
-    frames: tuple[int, ...] = ()
-    seen: Number = _NAN
-    expected: Number = _NAN
-    share_of_gap: Number = _NAN
-    region: dict[str, Any] | None = None
-    region_p: Number = _NAN
-    region_share: Number = _NAN
-    when: dict[str, Any] | None = None
-    when_p: Number = _NAN
+    direction: str = ""  # "+" or "-"
+    z: Number = _NAN  # deviation from the expectation under the model, standard deviations
+    p: Number = _NAN  # p-value, corrected for the number of statistics
+    pixels: tuple[tuple[int, int], ...] = ()  # (y, x) on the sensor, if few pixels deviate
+    dn: tuple[int, int] | None = None  # first and last code, if codes deviate
+    frames: tuple[int, ...] = ()  # frame numbers, if few frames deviate
+    seen: Number = _NAN  # number of samples in these codes, if counted
+    expected: Number = _NAN  # the same under the model
+    share_of_gap: Number = _NAN  # share of the remaining gap, if measured
+    region: dict[str, Any] | None = None  # part of the sensor where its map deviates; None: uniform
+    region_p: Number = _NAN  # p-value of the region, corrected for the number of regions searched
+    region_share: Number = _NAN  # lower 95 % limit of the share of deviating pixels in the region
+    when: dict[str, Any] | None = None  # frames where its series deviates; None: uniform
+    when_p: Number = _NAN  # p-value of these frames, corrected in the same way
 
     @classmethod
     def of(cls, statistic: str, z: float, **more: Any) -> Place:
@@ -229,28 +206,16 @@ def families_words(families: Sequence[str]) -> str:
 
 
 class GapChange(_Part):
-    """The gap on held-out samples, before and after effects were added; see :mod:`.gap`.
+    """The gap on held-out samples, before and after effects were added; see :mod:`.gap`."""
 
-    Attributes:
-        unit: unit of all numbers except ``closed_fraction`` (:func:`closed_share`).
-        floor: 95 % quantile of sampling noise under the model.
-        interval_before, interval_after: 95 % intervals.
-        standing_out: families of statistics that are significant by themselves with the effects.
-    """
-
-    unit: str = "nats/sample"
+    unit: str = "nats/sample"  # unit of all numbers except ``closed_fraction`` (:func:`closed_share`)
     before: Number
     after: Number
-    floor: Number
+    floor: Number  # 95 % quantile of sampling noise under the model
     closed_fraction: Number
-    interval_before: Interval = (_NAN, _NAN)
-    interval_after: Interval = (_NAN, _NAN)
-    standing_out: tuple[str, ...] = ()
-
-    @property
-    def within_chance(self) -> bool:
-        """Whether the gap is within sampling noise before anything is added."""
-        return self.before <= self.floor
+    interval_before: Interval = (_NAN, _NAN)  # 95 % interval
+    interval_after: Interval = (_NAN, _NAN)  # 95 % interval
+    standing_out: tuple[str, ...] = ()  # families that are significant by themselves with the effects
 
     @property
     def after_text(self) -> str:
@@ -302,37 +267,22 @@ class Elsewhere(_Part):
 
 
 class Examined(_Part):
-    """The samples that were examined.
+    """The samples that were examined."""
 
-    Attributes:
-        frames: number of frames; of histograms the largest number of samples.
-        rows, columns: first and end on the sensor.
-        train, test, final: frames (of histograms: samples) to fit, to score, and to measure the final gap.
-        histograms: number of histograms, if frames are unknown; those of all exposures count.
-        share: share of the run's samples compared with simulations.
-        surveyed: share of the run's samples in every survey of ``surveyed_by``, or compared.
-        surveyed_by: share of the run's samples by survey of the whole sensor: neighbours and successive
-            frames, shapes of the histograms, pairs of pixels in rows, columns and frames.
-        places: deviating parts of the sensor in these surveys.
-        unfitted: number of pixels left out for lack of a reliable fit.
-        elsewhere: test of the model in another window; None: not done.
-        left_out: empty, repeated, outlying and moved frames.
-    """
-
-    frames: int
-    rows: tuple[int, int]
-    columns: tuple[int, int]
-    train: int
-    test: int
-    final: int
-    histograms: int | None = None
-    share: Number = _NAN
-    surveyed: Number = _NAN
-    surveyed_by: dict[str, Number] = {}
-    places: tuple[Surveyed, ...] = ()
-    unfitted: int = 0
-    elsewhere: Elsewhere | None = None
-    left_out: tuple[int, ...] = ()
+    frames: int  # number of frames; of histograms the largest number of samples
+    rows: tuple[int, int]  # first and end on the sensor
+    columns: tuple[int, int]  # first and end on the sensor
+    train: int  # frames (of histograms: samples) to fit
+    test: int  # those to score
+    final: int  # those to measure the final gap
+    histograms: int | None = None  # number of histograms, if frames are unknown; those of all exposures count
+    share: Number = _NAN  # share of the run's samples compared with simulations
+    surveyed: Number = _NAN  # share of the run's samples in every survey of ``surveyed_by``, or compared
+    surveyed_by: dict[str, Number] = {}  # share of the run's samples by survey of the whole sensor
+    places: tuple[Surveyed, ...] = ()  # deviating parts of the sensor in these surveys
+    unfitted: int = 0  # number of pixels left out for lack of a reliable fit
+    elsewhere: Elsewhere | None = None  # test of the model in another window; None: not done
+    left_out: tuple[int, ...] = ()  # empty, repeated, outlying and moved frames
 
     @property
     def origin(self) -> tuple[int, int]:
@@ -341,48 +291,29 @@ class Examined(_Part):
 
 
 class Step(_Part):
-    """An effect added to the model, or several between which the data do not decide.
-
-    Attributes:
-        effect: tag of the named effect; None if ambiguous or rejected.
-        verdict: verdict of this step alone.
-        why: reason of its rejection; empty if it is not rejected.
-        candidates: effects compared, the likeliest first.
-        parameters: parameters of the named or the likeliest effect.
-        form: its text fields that differ from their default.
-        factors: what changes, what shares it, how it varies; of several effects all values; one is certain.
-        place: region and frames in words; empty: everywhere, always.
-        gap_before, gap_after, gap_floor: gap on the final samples without and with it, nats per sample.
-        gap_interval_after: 95 % interval of the gap with it.
-        size: size of the effect; None if unknown.
-        families: the gap by family of statistics.
-        rivals: the next best effects, the best first, each fitted instead of it.
-        moved: change of each parameter map by the refit with the effect.
-        separate: by effect, the measurement that would distinguish it.
-        pulls: the statistics that change most.
-    """
+    """An effect added to the model, or several between which the data do not decide."""
 
     # a key that only older files have is left out
     model_config = ConfigDict(extra="ignore")
 
-    effect: str | None
-    verdict: State
-    why: str = ""
-    candidates: tuple[Candidate, ...]
-    parameters: dict[str, Measured]
-    form: dict[str, str] = {}
-    factors: dict[str, tuple[str, ...]] = {}
-    place: str = ""
-    gap_before: Number
-    gap_after: Number
-    gap_floor: Number
-    gap_interval_after: Interval = (_NAN, _NAN)
-    size: Size | None = None
-    families: Families = Families()
-    rivals: tuple[Rival, ...] = ()
-    moved: dict[str, Moved] = {}
-    separate: dict[str, str] = {}
-    pulls: tuple[Pull, ...] = ()
+    effect: str | None  # tag of the named effect; None if ambiguous or rejected
+    verdict: State  # verdict of this step alone
+    why: str = ""  # reason of its rejection; empty if it is not rejected
+    candidates: tuple[Candidate, ...]  # effects compared, the likeliest first
+    parameters: dict[str, Measured]  # parameters of the named or the likeliest effect
+    form: dict[str, str] = {}  # its text fields that differ from their default
+    factors: dict[str, tuple[str, ...]] = {}  # all values among the candidates; one is certain
+    place: str = ""  # region and frames in words; empty: everywhere, always
+    gap_before: Number  # gap on the final samples without it, nats per sample
+    gap_after: Number  # the same with it
+    gap_floor: Number  # its floor
+    gap_interval_after: Interval = (_NAN, _NAN)  # 95 % interval of the gap with it
+    size: Size | None = None  # size of the effect; None if unknown
+    families: Families = Families()  # the gap by family of statistics
+    rivals: tuple[Rival, ...] = ()  # the next best effects, the best first, each fitted instead of it
+    moved: dict[str, Moved] = {}  # change of each parameter map by the refit with the effect
+    separate: dict[str, str] = {}  # by effect, the measurement that would distinguish it
+    pulls: tuple[Pull, ...] = ()  # the statistics that change most
 
     @property
     def runner_up(self) -> Rival | None:

@@ -272,11 +272,9 @@ def _frames(name: str, evidence: Evidence) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class RareSamples:
-    """Samples that are as rare in all pixels, no two of them in one frame or in one pixel.
+    """Samples (frame, y, x, DN), (n, 4), as rare in all pixels, no two of them in one frame or in one pixel.
 
-    Attributes:
-        hits: frame, y, x, DN, (n, 4), by frame.
-        expected: how many of them chance makes in each pixel, but for a factor, (y, x).
+    ``expected``: how many of them chance makes in each pixel, but for a factor, (y, x).
     """
 
     hits: IntArray

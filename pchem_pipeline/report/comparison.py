@@ -15,27 +15,18 @@ State = Literal["identical", "equal", "changed", "lost", "new"]
 
 @dataclass(frozen=True)
 class RunFacts:
-    """One run.
+    """One run; its summary has median, standard error and robust scatter of each map, in the map's unit."""
 
-    Attributes:
-        label: A, B, ...
-        digest: of the content of its input files.
-        summary: map to median, its standard error and the robust scatter of the pixels, in the map's unit.
-        rmse: of the predictions of the ensemble.
-        pixels: number of pixels with a good fit, with caution, and without a value.
-        identity: digest of its frames and of how they were characterised.
-    """
-
-    label: str
+    label: str  # A, B, ...
     name: str
     shape: tuple[int, int]
     n_frames: int | None
-    digest: str
+    digest: str  # of the content of its input files
     summary: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     ensemble: Arrays = field(default_factory=dict)
-    rmse: Mapping[str, float] = field(default_factory=dict)
-    pixels: tuple[int, int, int] = (0, 0, 0)
-    identity: str = ""
+    rmse: Mapping[str, float] = field(default_factory=dict)  # of the predictions of the ensemble
+    pixels: tuple[int, int, int] = (0, 0, 0)  # with a good fit, with caution, without a value
+    identity: str = ""  # digest of its frames and of how they were characterised
 
     @property
     def title(self) -> str:
@@ -45,35 +36,20 @@ class RunFacts:
 
 @dataclass(frozen=True)
 class ArrayRow:
-    """One array of the store in two runs.
+    """One array of the store in two runs."""
 
-    Attributes:
-        name: its path in the store.
-        state: how it compares.
-        counts: whether a change of it is a change of the results.
-        dtype: of the first run (of the second where it is new).
-        shape: the same.
-        n_values: values compared.
-        n_different: values that differ at all.
-        n_beyond: values that differ by more than rounding.
-        largest: largest absolute difference, in the array's unit.
-        scale: largest absolute value.
-        sha256: digests of the values of both, empty where there are none.
-        why: in words, where shapes or types differ.
-    """
-
-    name: str
+    name: str  # its path in the store
     state: State
-    counts: bool
-    dtype: str
-    shape: tuple[int, ...]
+    counts: bool  # whether a change of it is a change of the results
+    dtype: str  # of the first run, of the second where it is new
+    shape: tuple[int, ...]  # the same
     n_values: int = 0
-    n_different: int = 0
-    n_beyond: int = 0
-    largest: float = 0.0
-    scale: float = 0.0
-    sha256: tuple[str, str] = ("", "")
-    why: str = ""
+    n_different: int = 0  # values that differ at all
+    n_beyond: int = 0  # values that differ by more than rounding
+    largest: float = 0.0  # largest absolute difference, in the array's unit
+    scale: float = 0.0  # largest absolute value
+    sha256: tuple[str, str] = ("", "")  # digests of the values of both, empty where there are none
+    why: str = ""  # in words, where shapes or types differ
 
 
 @dataclass(frozen=True)
@@ -98,39 +74,24 @@ class DefectChange:
 
 @dataclass(frozen=True)
 class Pair:
-    """A run compared with the first one, or with the one before it in the history.
-
-    Attributes:
-        since: what the first of them is to the second.
-        same_data: both come from the same frames.
-        arrays: every array of the results; empty where the frames differ.
-        maps: map to its difference; empty where the shapes differ.
-        reasons: map to why it changed, for runs on different frames.
-        transitions: quality (good, caution, no value) of one by quality of the other: numbers of pixels.
-        settings, versions: those that differ, of versions those of programs and algorithms.
-        changes: what changed, one sentence each.
-        defects: pixels with other defects in the other run.
-        n_changed: pixels with other defects, or of which a value changed beyond its limit.
-        n_compared: these, and those with a good fit in both.
-        limits: beyond which something counts as changed; empty: beyond its errors.
-    """
+    """A run compared with the first one, or with the one before it in the history."""
 
     one: RunFacts
     other: RunFacts
-    since: Literal["reference", "last run"]
-    same_data: bool
-    arrays: Sequence[ArrayRow] = ()
-    maps: Mapping[str, MapDifference] = field(default_factory=dict)
-    reasons: Mapping[str, Reasons] = field(default_factory=dict)
-    transitions: Sequence[Sequence[int]] = ()
-    settings: Sequence[Setting] = ()
-    versions: Sequence[Setting] = ()
+    since: Literal["reference", "last run"]  # what the first of them is to the second
+    same_data: bool  # both come from the same frames
+    arrays: Sequence[ArrayRow] = ()  # every array of the results; empty where the frames differ
+    maps: Mapping[str, MapDifference] = field(default_factory=dict)  # empty where the shapes differ
+    reasons: Mapping[str, Reasons] = field(default_factory=dict)  # map to why it changed
+    transitions: Sequence[Sequence[int]] = ()  # pixels by the quality of one and of the other
+    settings: Sequence[Setting] = ()  # those that differ
+    versions: Sequence[Setting] = ()  # of programs and algorithms that differ
     changed: bool = False
-    changes: Sequence[str] = ()
-    defects: Sequence[DefectChange] = ()
-    n_changed: int = 0
-    n_compared: int = 0
-    limits: Mapping[str, float | str] = field(default_factory=dict)
+    changes: Sequence[str] = ()  # what changed, one sentence each
+    defects: Sequence[DefectChange] = ()  # pixels with other defects in the other run
+    n_changed: int = 0  # pixels with other defects, or of which a value changed beyond its limit
+    n_compared: int = 0  # these, and those with a good fit in both
+    limits: Mapping[str, float | str] = field(default_factory=dict)  # of changes; empty: errors
 
     @property
     def key(self) -> str:
@@ -144,21 +105,13 @@ HistoryRow = Mapping[str, str]
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs against the first of them.
+    """Runs against the first of them."""
 
-    Attributes:
-        runs: the first, the others in the order given, and the one before the last in the history.
-        pairs: the first with each of the others, and the one before the last with the last.
-        tolerance: relative difference that counts as rounding.
-        history: of all runs that were ever compared with the first, a row for each.
-        rate: false-discovery rate at which pixels count as moved.
-    """
-
-    runs: Sequence[RunFacts]
-    pairs: Sequence[Pair]
-    tolerance: float
-    history: Sequence[HistoryRow] = ()
-    rate: float = 0.01
+    runs: Sequence[RunFacts]  # the first, the others as given, and the one before the last in the history
+    pairs: Sequence[Pair]  # the first with each of the others, and the one before the last with the last
+    tolerance: float  # relative difference that counts as rounding
+    history: Sequence[HistoryRow] = ()  # of all runs that were ever compared with the first, a row for each
+    rate: float = 0.01  # false-discovery rate at which pixels count as moved
 
     @property
     def changed(self) -> bool:

@@ -54,43 +54,26 @@ _FEWEST_CODES = 8
 
 
 def reasons_in(status: NDArray[np.integer[Any]]) -> list[tuple[FitStatus, str, int]]:
-    """Return each reason for caution or failure in status words, gravest first: bit, sentence, pixels.
-
-    A pixel with several reasons counts for each of them.
-    """
+    """Return each reason for caution or failure, gravest first: bit, sentence, pixels that have it."""
     counts = [(bit, text, int(np.count_nonzero(status & int(bit)))) for bit, text in MEANINGS.items()]
     return [row for row in counts if row[2]]
 
 
 @dataclass(frozen=True)
 class PixelFit:
-    """Histogram and fit of one shown pixel.
+    """Histogram and fit of one shown pixel."""
 
-    Attributes:
-        label: why the pixel is shown, e.g. ``"low read noise, high exposure"``.
-        y, x: position on the sensor; for ready-made histograms ``y = 0`` and ``x`` is the channel.
-        origin: DN of ``counts[0]``.
-        counts: number of frames at each DN, shape (n_bins,).
-        parameters: ``quanta_exposure`` (e-), ``conversion_gain`` (e-/DN), ``bias`` (DN),
-            ``read_noise_dn`` (DN) and ``read_noise_e`` (e-); NaN where the fit failed.
-        stderr: standard errors under the same names; may lack some.
-        status: words of ``fit_status``; empty if all is well.
-        goodness_p: probability of a larger chi-square if the model holds; NaN if unknown.
-        channel: whether it is a channel of ready-made histograms.
-        mass: probability of each DN under a model with effects; None where the PCD was fitted.
-    """
-
-    label: str
-    y: int
-    x: int
-    origin: int
-    counts: NDArray[np.integer[Any]]
-    parameters: Mapping[str, float]
-    stderr: Mapping[str, float] = field(default_factory=dict)
-    status: str = ""
-    goodness_p: float = float("nan")
-    channel: bool = False
-    mass: FloatArray | None = None
+    label: str  # why the pixel is shown, such as ``low read noise``
+    y: int  # row on the sensor; 0 for ready-made histograms
+    x: int  # column, or channel
+    origin: int  # DN of ``counts[0]``
+    counts: NDArray[np.integer[Any]]  # number of frames at each DN, (n_bins,)
+    parameters: Mapping[str, float]  # of the PCD, and ``read_noise_e``, in stored units; NaN: no fit
+    stderr: Mapping[str, float] = field(default_factory=dict)  # errors under the same names; may lack some
+    status: str = ""  # words of ``fit_status``; empty if all is well
+    goodness_p: float = float("nan")  # probability of a larger chi-square if the model holds; NaN if unknown
+    channel: bool = False  # whether it is a channel of ready-made histograms
+    mass: FloatArray | None = None  # of each DN under a model with effects; None where the PCD was fitted
 
     @property
     def place(self) -> str:
@@ -128,17 +111,11 @@ class DiscrepancyData:
 
 @dataclass(frozen=True)
 class Sample:
-    """One exposure of the sensor.
-
-    Attributes:
-        kind: ``exposed``, or ``bias`` for frames without electrons.
-        x: integration time or light level; None where it is not on the line.
-        n_frames: frames of a pixel.
-    """
+    """One exposure of the sensor."""
 
     name: str
-    kind: str
-    x: float | None
+    kind: str  # exposed, or bias for frames without electrons
+    x: float | None  # integration time or light level; None where it is not on the line
     n_frames: int
 
 
@@ -146,18 +123,14 @@ class Sample:
 class Samples:
     """Several exposures of the same pixels that were fitted together.
 
-    Attributes:
-        samples: in their order.
-        against: what their exposures are drawn against: integration_time, light_level or none.
-        arrays: ``quanta_exposure``, ``mean``, ``variance``, ``linearity_residual``, (sample, y, x);
-            ``linearity_p`` (y, x); any may lack.
-        shown: place of the one whose H the maps and the first screen show.
+    Arrays are ``quanta_exposure``, ``mean``, ``variance``, ``linearity_residual``, (sample, y, x), and
+    ``linearity_p`` (y, x); any may lack.
     """
 
     samples: tuple[Sample, ...]
-    against: str
+    against: str  # what exposures are drawn against: integration_time, light_level or none
     arrays: Arrays
-    shown: int = 0
+    shown: int = 0  # place of the one whose H the maps and the first screen show
 
     @property
     def on_line(self) -> list[int]:
@@ -169,82 +142,50 @@ class Samples:
 class ReportData:
     """All that a report shows.
 
-    Attributes:
-        kind: what made the charge: dark, light or unknown.
-        shape: ``(ny, nx)`` of the sensor or region; ``(1, n_channels)`` for ready-made histograms.
-        n_frames: frames per pixel, or None if pixels differ or it is unknown.
-        integration_time: seconds, or None.
-        camera: name, serial number and temperature of the sensor as the files say; empty where they do not.
-        maps: ``name`` and ``name_stderr`` of ``variables.py`` group ``maps`` (y, x); NaN where a fit failed.
-        fit: ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... (y, x).
-        pixels: the shown pixels.
-        ensemble: arrays of group ``ensemble``.
-        ensemble_facts: numbers that go with them: ``rmse`` (mapping), ``n_frames``, ``error_rate``, ...
-        component_cases: name of each row of ``ensemble["component_variance"]``: the parameters held constant.
-        moments: rows ``{name, quantity, unit, predicted, observed, stderr}`` of Appendix A; the last two are
-            None for terms that data do not show.
-        truth: true maps of simulated data.
-        overscan: ``bias`` and ``read_noise_dn`` of the pixels without electrons, (y, x), NaN elsewhere.
-        overscan_facts: ``frame_variance`` and ``row_variance`` there, DN^2.
-        channel_names: names of the channels of ready-made histograms.
-        outlier_sigmas: robust standard deviations beyond which a pixel is an outlier.
-        allowed_failed: fraction of pixels without a value that is accepted.
-        run: identity of the run: name, started, host, versions, seed, ...
-        inputs: one mapping per input file: name, size, hash, ...
-        stages: one mapping per stage: ``stage``, ``state``, ``seconds``, ``cpu_seconds``,
-            ``peak_memory_bytes``, ``units``, ``notes``.
-        misfits: what the maps say of the goodness of fit: ``tested``, ``misfits``, ``false_discovery_rate``,
-            ``worst`` (rows of ``y``, ``x``, ``chi2``, ``dof``, ``p``, ``q``), ``pixels_with_outliers``.
-        intervals: by quantity the ends of its profile intervals, (y, x) each, where they were asked for.
-        interval_level: probability that these cover the truth.
-        missing: part (maps, charge_rate, ensemble, nuced, electrons, components, methods) to the reason of
-            its absence.
-        discrepancy: what the model is missing, or None where nobody looked.
-        defects: pixels that are not ordinary; None without a fit.
-        quick_look: checks of rows, columns, frames, neighbours, lags and codes; None without a fit.
-        stability: figures of frames, rows and columns, made of sums as large as several maps; may be empty.
-        inspector: returns maps and pixels to look at in the browser, which are asked for last; or None.
-        methods: content of ``methods.json``, or None where nobody compared.
-        plan: frames that precisions need, or None where no pixel has a value.
-        samples: the exposures of a run whose input is several samples, or None.
+    Maps are ``name`` and ``name_stderr`` of ``variables.py`` (y, x), NaN where a fit failed; beside them are
+    ``fit_status``, ``likelihood_gap``, ``goodness_p``, ... of the fit. Moments (Appendix A) have ``name``,
+    ``quantity``, ``unit``, ``predicted``, ``observed``, ``stderr`` (None where data do not show it). Misfits
+    are ``tested``, ``misfits``, ``false_discovery_rate``, ``worst`` (rows of ``y``, ``x``, ``chi2``, ``dof``,
+    ``p``, ``q``), ``pixels_with_outliers``. A stage has ``stage``, ``state``, ``seconds``, ``cpu_seconds``,
+    ``peak_memory_bytes``, ``units``, ``notes``.
     """
 
     title: str
-    shape: tuple[int, int]
-    kind: str = "unknown"
-    n_frames: int | None = None
-    integration_time: float | None = None
-    camera: str = ""
+    shape: tuple[int, int]  # (ny, nx) of the sensor or region; (1, n_channels) for ready-made histograms
+    kind: str = "unknown"  # what made the charge: dark, light or unknown
+    n_frames: int | None = None  # frames per pixel, or None if pixels differ or it is unknown
+    integration_time: float | None = None  # s
+    camera: str = ""  # name, serial number and temperature of the sensor as the files say
     maps: Mapping[str, FloatArray] = field(default_factory=dict)
     fit: Arrays = field(default_factory=dict)
     criteria: Criteria = field(default_factory=Criteria)
-    pixels: Sequence[PixelFit] = ()
-    ensemble: Arrays = field(default_factory=dict)
-    ensemble_facts: Mapping[str, Any] = field(default_factory=dict)
-    component_cases: Sequence[str] = ()
+    pixels: Sequence[PixelFit] = ()  # the shown pixels
+    ensemble: Arrays = field(default_factory=dict)  # arrays of group ``ensemble``
+    ensemble_facts: Mapping[str, Any] = field(default_factory=dict)  # ``rmse``, ``n_frames``, ...
+    component_cases: Sequence[str] = ()  # the parameters held constant by row of ``component_variance``
     moments: Sequence[Mapping[str, Any]] = ()
-    truth: Mapping[str, FloatArray] = field(default_factory=dict)
-    overscan: Mapping[str, FloatArray] = field(default_factory=dict)
-    overscan_facts: Mapping[str, float] = field(default_factory=dict)
-    channel_names: Sequence[str] = ()
-    outlier_sigmas: float = 6.0
-    allowed_failed: float = 0.1
+    truth: Mapping[str, FloatArray] = field(default_factory=dict)  # of simulated data
+    overscan: Mapping[str, FloatArray] = field(default_factory=dict)  # of pixels without electrons
+    overscan_facts: Mapping[str, float] = field(default_factory=dict)  # variances of frames and rows, DN^2
+    channel_names: Sequence[str] = ()  # of ready-made histograms
+    outlier_sigmas: float = 6.0  # robust standard deviations beyond which a pixel is an outlier
+    allowed_failed: float = 0.1  # fraction of pixels without a value that is accepted
     config_yaml: str = ""
-    run: Mapping[str, Any] = field(default_factory=dict)
-    inputs: Sequence[Mapping[str, Any]] = ()
+    run: Mapping[str, Any] = field(default_factory=dict)  # name, started, host, versions, ...
+    inputs: Sequence[Mapping[str, Any]] = ()  # of each input file name, size, hash, ...
     stages: Sequence[Mapping[str, Any]] = ()
     misfits: Mapping[str, Any] = field(default_factory=dict)
     intervals: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    interval_level: float = 0.6827
-    missing: Mapping[str, str] = field(default_factory=dict)
-    discrepancy: DiscrepancyData | None = None
-    defects: Defects | None = None
-    quick_look: QuickLook | None = None
-    stability: Sequence[Figure] = ()
-    inspector: Callable[[], InspectorData] | None = None
-    methods: Mapping[str, Any] | None = None
-    plan: Mapping[str, Any] | None = None
-    samples: Samples | None = None
+    interval_level: float = 0.6827  # probability that profile intervals cover the truth
+    missing: Mapping[str, str] = field(default_factory=dict)  # part to the reason of its absence
+    discrepancy: DiscrepancyData | None = None  # what the model is missing, or None where nobody looked
+    defects: Defects | None = None  # pixels that are not ordinary; None without a fit
+    quick_look: QuickLook | None = None  # None without a fit
+    stability: Sequence[Figure] = ()  # figures made of sums as large as several maps
+    inspector: Callable[[], InspectorData] | None = None  # maps and pixels to look at, asked for last
+    methods: Mapping[str, Any] | None = None  # content of ``methods.json``, if any
+    plan: Mapping[str, Any] | None = None  # frames that precisions need, if a pixel has a value
+    samples: Samples | None = None  # the exposures of a run whose input is several samples
     regions: Mapping[str, Region] = field(default_factory=dict)
     _summaries: dict[tuple[str, bool], MapSummary] = field(default_factory=dict, init=False, repr=False)
     _errors: dict[tuple[str, bool], float | None] = field(default_factory=dict, init=False, repr=False)
@@ -351,10 +292,7 @@ class ReportData:
         return self._ordered[name]
 
     def summary(self, name: str, *, with_flagged: bool = False) -> MapSummary:
-        """Describe a map by order statistics, of all pixels with a value or of those without a flag.
-
-        This is done once: the map is large, and many ask.
-        """
+        """Describe a map, once, by order statistics of all pixels with a value or of unflagged ones."""
         if (name, with_flagged) not in self._summaries:
             self._summaries[name, True] = self._summaries[name, False] = self._summarised(self.ordered(name))
             if self.flagged.any():

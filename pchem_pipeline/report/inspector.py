@@ -60,28 +60,19 @@ class Bars:
 
 @dataclass(frozen=True)
 class PackedMap:
-    """A map in few bytes.
+    """A map in few bytes."""
 
-    Attributes:
-        scale: how codes stand for values.
-        n_odd: values outside the range of the codes, at the end of ``data`` as indices and float32.
-        data: gzip of the low bytes, the high bytes, ``n_odd`` uint32 and ``n_odd`` float32, little-endian.
-        bars: its histogram; None where the codes are fine enough.
-    """
-
-    scale: Scale
-    n_odd: int
-    data: bytes
-    bars: Bars | None = None
+    scale: Scale  # how codes stand for values
+    n_odd: int  # values outside the range of the codes, at the end of ``data`` as indices and float32
+    data: bytes  # gzip of low bytes, high bytes, ``n_odd`` uint32 and ``n_odd`` float32, little-endian
+    bars: Bars | None = None  # its histogram; None where the codes are fine enough
 
 
 def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0) -> Scale:
-    """Choose the range and the step of a map's codes.
+    """Choose the range and the step of a map's codes; NaN and infinities are left out.
 
-    Args:
-        values: any shape; NaN and infinities are left out. Integers keep a step of 1.
-        step: wanted step, in the unit of the map; 0: a 64th of the robust standard deviation.
-        coarse: factor on the step, for maps that must be smaller.
+    The wanted step is in the unit of the map (0: a 64th of the robust standard deviation; of integers it is
+    1), ``coarse`` a factor on it, for maps that must be smaller.
     """
     flat = np.asarray(values).ravel()
     if flat.dtype.kind in "iub" and flat.size:
@@ -107,12 +98,12 @@ def choose_scale(values: NDArray[Any], *, step: float = 0.0, coarse: float = 1.0
     return Scale(float(first) - shift * wide, wide, log)
 
 
-def some_of(values: NDArray[Any], enough: int = 65_537) -> NDArray[Any]:
+def some_of(values: NDArray[Any]) -> NDArray[Any]:
     """Return the values of a flat array, of many every k-th: enough for a quantile that only sets a scale.
 
     k is odd: no column of a sensor is left out for good.
     """
-    return values[:: max(values.size // enough, 1) | 1]
+    return values[:: max(values.size // 65_537, 1) | 1]
 
 
 def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
@@ -120,7 +111,11 @@ def pack_map(values: NDArray[Any], scale: Scale) -> PackedMap:
     flat = np.asarray(values).ravel()
     place = _places(flat, scale)
     bars = None if flat.dtype.kind in "iub" else _bars(place)
-    codes = _codes(place, flat).astype("<u2")
+    np.rint(place, out=place)
+    place += _FIRST
+    np.clip(place, _BELOW, _ABOVE, out=place)
+    place[~np.isfinite(flat) | np.isnan(place)] = _NONE
+    codes = place.astype("<u2")
     outside = (codes == _BELOW) | (codes == _ABOVE)
     if scale.log:  # zeros, which may be many, need no place in the list
         outside &= flat != 0
@@ -145,20 +140,10 @@ def _places(values: NDArray[Any], scale: Scale) -> FloatArray:
     return place
 
 
-def _codes(place: FloatArray, values: NDArray[Any]) -> FloatArray:
-    """Return the code of each value from its place, which is changed."""
-    np.rint(place, out=place)
-    place += _FIRST
-    np.clip(place, _BELOW, _ABOVE, out=place)
-    place[~np.isfinite(values) | np.isnan(place)] = _NONE
-    return place
-
-
 def _bars(place: FloatArray) -> Bars | None:
     """Return the histogram over the bulk of a map's places; None where codes are narrow enough to be bars.
 
-    The axis is that of the script: from the 1st to the 99th percentile and 0.3 of it beyond, where there are
-    values; those beyond it are in no bar.
+    Its axis is the script's: from the 1st to the 99th percentile, and 0.3 of it beyond where values are.
     """
     known = Ordered.of(some_of(place))
     if known.size < 2:
@@ -211,27 +196,16 @@ def pack_counts(
 
 @dataclass(frozen=True)
 class MapEntry:
-    """A map that the inspector can show.
+    """A map that the inspector can show."""
 
-    Attributes:
-        path: ``group/name`` of the stored array.
-        label: words for the list of maps.
-        unit: unit as the store writes it.
-        sentence: the array's own sentence.
-        kind: ``value``, ``stderr``, ``bits`` (each bit has a word) or ``words`` (each number has one).
-        words: number or bit to words, for the last two.
-        packed: the map; None where it is not in the file or where ``same_as`` says it all.
-        same_as: path of a map that this one is a multiple of, and the factor.
-    """
-
-    path: str
-    label: str
-    unit: str
-    sentence: str
-    kind: str = "value"
-    words: Mapping[int, str] = field(default_factory=dict)
-    packed: PackedMap | None = None
-    same_as: tuple[str, float] | None = None
+    path: str  # ``group/name`` of the stored array
+    label: str  # words for the list of maps
+    unit: str  # as the store writes it
+    sentence: str  # the array's own sentence
+    kind: str = "value"  # value, stderr, bits (each bit has a word) or words (each number has one)
+    words: Mapping[int, str] = field(default_factory=dict)  # number or bit to words
+    packed: PackedMap | None = None  # None where it is not in the file or ``same_as`` says it all
+    same_as: tuple[str, float] | None = None  # path of a map that this one is a multiple of, and factor
 
 
 class Notable(NamedTuple):
@@ -244,42 +218,25 @@ class Notable(NamedTuple):
 
 @dataclass(frozen=True)
 class PixelSample:
-    """Pixels that are in the file in full.
+    """Pixels that are in the file in full."""
 
-    Attributes:
-        index: ``y * nx + x`` of each, shape (n,).
-        exact: path of a map to its values at these pixels, shape (n,).
-        origin: DN of the first bin of each histogram, shape (n,).
-        counts: their histograms.
-        deciding: parameters that decide electron numbers, where these are not the fitted ones: (4, n).
-        masses: probability of each bin under a model with effects, of as many of the first pixels.
-        reasons: why pixels are here, those of the even sample excepted.
-    """
-
-    index: IntArray
-    exact: Mapping[str, FloatArray]
-    origin: IntArray
-    counts: list[NDArray[np.integer[Any]]]
-    deciding: FloatArray | None = None
-    masses: list[FloatArray] = field(default_factory=list)
-    reasons: Sequence[Notable] = ()
+    index: IntArray  # ``y * nx + x`` of each, (n,)
+    exact: Mapping[str, FloatArray]  # path of a map to its values at these pixels, (n,)
+    origin: IntArray  # DN of the first bin of each histogram, (n,)
+    counts: list[NDArray[np.integer[Any]]]  # their histograms
+    deciding: FloatArray | None = None  # parameters (4, n) that decide numbers, if not the fitted ones
+    masses: list[FloatArray] = field(default_factory=list)  # of bins, with effects, of the first pixels
+    reasons: Sequence[Notable] = ()  # why pixels are here, those of the even sample excepted
 
 
 @dataclass(frozen=True)
 class InspectorData:
-    """All that the inspector holds.
+    """All that the inspector holds: maps in the order of the list, and pixels in full."""
 
-    Attributes:
-        maps: in the order of the list; those not packed are shown by ``pchem view`` only.
-        sample: the pixels in full.
-        kept_to: how true the packed maps are: a part of a standard error, in words.
-        command: what shows every pixel.
-    """
-
-    maps: tuple[MapEntry, ...]
+    maps: tuple[MapEntry, ...]  # those not packed are shown by ``pchem view`` only
     sample: PixelSample
-    kept_to: str
-    command: str
+    kept_to: str  # how true the packed maps are: a part of a standard error, in words
+    command: str  # what shows every pixel
 
 
 #: The part of the policy that forbids every connection, and that of a page which ``pchem view`` serves.
@@ -310,10 +267,7 @@ _GROUPS = {
 
 
 def embedded(data: ReportData) -> dict[str, Any] | None:
-    """Return the inspector's part of the page: ``facts`` as JSON, ``blobs`` of data by id, the ``script``.
-
-    None where the run has nothing to inspect.
-    """
+    """Return the inspector's ``facts`` as JSON, ``blobs`` of data by id, and ``script``; None without."""
     if data.inspector is None:
         return None
     shown = data.inspector()

@@ -28,10 +28,7 @@ _SIGNIFICANT = 0.005
 
 
 def doubtful_peaks(counts: NDArray[np.integer], electrons: FloatArray) -> list[Interval]:
-    """Return peaks of few samples of histograms (n, B): each alone, and with all above it.
-
-    The place of every code is in e-, shape (n, B).
-    """
+    """Return peaks of few samples: each alone, and with all above it; codes are at ``electrons``, (n, B)."""
     peaks: list[Interval] = [(None, 0.5)]
     for k in range(1, _last(electrons) + 1):
         peaks += [(k - 0.5, k + 0.5), (k - 0.5, None)]
@@ -80,13 +77,8 @@ def find_residuals(
     """Return where on the comb are too many or too few samples, the most significant first.
 
     The codes of all pixels are sorted into cells by their place on the comb; each p-value counts all cells.
-
-    Args:
-        seen: samples, shape (n, B).
-        expected: the same under the model.
-        origin: DN of bin 0, shape (n,).
-        parameters: (H, g, mu, sigma) of the pixels, shape (n, 4).
-        peaks: that were set aside; they come first, and their codes are in no other cell.
+    Peaks that were set aside come first, and their codes are in no other cell. Samples are (n, B) from the DN
+    ``origin`` on, (n,); parameters are (H, g, mu, sigma), (n, 4).
     """
     electrons = electrons_of(origin, seen.shape[1], parameters[:, 1], parameters[:, 2])
     gain, bias = float(np.median(parameters[:, 1])), float(np.median(parameters[:, 2]))
@@ -112,14 +104,7 @@ def find_residuals(
             f"{'more' if z[i] > 0 else 'fewer'} samples than expected {place_words(*ends[i])} "
             f"(DN {dn[0]} to {dn[1]}: {o[i]:.3g} seen, {e[i]:.3g} expected)"
         )
-        numbers = {
-            "z": z[i],
-            "p": p[i],
-            "seen": o[i],
-            "expected": e[i],
-            "share_of_gap": deviance[i] / deviance.sum(),
-        }
-        found.append(
-            Place.of("code.smooth", sentence=words, dn=dn, **{k: float(v) for k, v in numbers.items()})
-        )
+        share = float(deviance[i] / deviance.sum())
+        numbers = {"p": float(p[i]), "seen": float(o[i]), "expected": float(e[i]), "share_of_gap": share}
+        found.append(Place.of("code.smooth", float(z[i]), sentence=words, dn=dn, **numbers))
     return found

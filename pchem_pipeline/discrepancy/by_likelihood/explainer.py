@@ -7,26 +7,37 @@ simulation is needed to name them.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import special
 
-from pchem_pipeline.discrepancy.build_verdict import Added, Fitted
-from pchem_pipeline.discrepancy.by_likelihood.additions import AddedSets
+from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.discrepancy.build_verdict import (
+    LARGEST_REST,
+    LEAVES_TOO_MUCH,
+    Added,
+    Addition,
+    Fitted,
+    largest_pulls,
+)
+from pchem_pipeline.discrepancy.by_likelihood.comb import find_residuals
 from pchem_pipeline.discrepancy.by_likelihood.gap import on_all_codes
 from pchem_pipeline.discrepancy.by_likelihood.members import Member, find_members
 from pchem_pipeline.discrepancy.by_likelihood.observed import ObservedHistograms, SampleHistograms
-from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, explain
+from pchem_pipeline.discrepancy.by_likelihood.search import Explanation, Named, explain
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison
 from pchem_pipeline.discrepancy.by_simulation.candidates.candidates import candidate_classes
+from pchem_pipeline.discrepancy.by_simulation.sensor.maps import changes
 from pchem_pipeline.discrepancy.effort import Effort
 from pchem_pipeline.discrepancy.gap import Gap
 from pchem_pipeline.discrepancy.null import CONVINCING, Measured, NullModel, as_matrix
 from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.discrepancy.skeleton import Explainer, Prepared, no_progress, search
-from pchem_pipeline.discrepancy.verdict import Discrepancy
+from pchem_pipeline.discrepancy.verdict import Candidate, Discrepancy, Place, Pull, Rival
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.registry import effect_classes
@@ -83,29 +94,18 @@ def find_in_histograms(
 
 @dataclass
 class HistogramExplainer(Explainer[Explanation]):
-    """Distinguishes effects in histograms.
+    """Distinguishes effects in histograms."""
 
-    Attributes:
-        prepared: the histograms, split, and replicates of the model.
-        sets: fits sets of effects to the train part, and scores them by the test part.
-        whole: fits them to both, and scores them by the final part.
-        bare: fits the rows without any effects.
-        members: the candidates.
-        effects: of the model, those added included.
-        final: the fit of the final model to train and test part.
-        found: what the search found, for the final part; None: nothing.
-    """
-
-    prepared: Prepared
+    prepared: Prepared  # the histograms, split, and replicates of the model
     observed: ObservedHistograms
-    sets: SetComparison
-    whole: SetComparison
-    bare: SetComparison
+    sets: SetComparison  # fits sets of effects to the train part, and scores them by the test part
+    whole: SetComparison  # fits them to both, and scores them by the final part
+    bare: SetComparison  # fits the rows without any effects
     rng: np.random.Generator
-    members: Sequence[Member]
-    effects: tuple[Effect, ...]
-    final: FittedSet
-    found: AddedSets | None = None
+    members: Sequence[Member]  # the candidates
+    effects: tuple[Effect, ...]  # of the model, those added included
+    final: FittedSet  # the fit of the final model to train and test part
+    found: Explanation | None = None  # what the search found; None: nothing
 
     @classmethod
     def begin(
@@ -170,7 +170,7 @@ class HistogramExplainer(Explainer[Explanation]):
         rise, error = found.rise
         if not disagreed and (not found.named or rise < max(CONVINCING, CLEAR * error)):
             return None
-        self.found = AddedSets(found, self.whole)
+        self.found = found
         return found if found.named else None
 
     def add(self, explanation: Explanation, null: NullModel) -> NullModel:
@@ -181,17 +181,117 @@ class HistogramExplainer(Explainer[Explanation]):
 
     def close(self, before: Gap, null: NullModel, disagreed: bool) -> Added:
         """Fit train and test part together with each effect, and measure the gap on the final part."""
-        if self.found is None:
+        found, first, z = self.found, self.prepared.first, self.prepared.z
+        if found is None:
             return Added((), before)
-        nulls = self.prepared.first, null
-        added, self.final = self.found.close(before, nulls, self.prepared.z, disagreed)
-        self.effects = along_chain(self.sets.present, [each.effect for each in added.additions])
-        return added
+        pulls = [each.pulls(z.both, splits=2) for each in (first, null)]
+        moved = largest_pulls(first.names, pulls[0], pulls[0], pulls[1])
+        gap, fitted, start = before, self.whole.plain, found.best.fit.parameters
+        additions: list[Addition] = []
+        for named in found.named:
+            extended = self.compared.fit((*fitted.members, named.member), start)
+            after, rivals = self._gap(extended), self._rivals(named, fitted, start)
+            additions.append(_addition(named, (gap, after), (fitted, extended), rivals, moved))
+            gap, fitted = after, extended
+        left = "" if found.rest <= LARGEST_REST or gap.at_floor else LEAVES_TOO_MUCH
+        self.final = fitted
+        self.effects = along_chain(self.sets.present, [each.effect for each in additions])
+        return Added(
+            additions=tuple(replace(each, against=left or each.against) for each in additions),
+            after=gap,
+            stand_ins=found.stand_ins,
+            residuals=self._residuals(found) if disagreed or not gap.at_floor else (),
+            set_aside=found.set_aside,
+        )
 
     def fitted(self, model: tuple[Effect, ...]) -> Fitted:
         """Return the parameters of the rows looked at, NaN elsewhere, shape (1, n) or (n, J)."""
-        code = None if self.found is None else self.found.codes(self.final, self.observed.evidence)
+        code = None if self.found is None else self._codes()
         return Fitted(self.observed.maps(self.final.fit.parameters), code)
+
+    @functools.cached_property
+    def compared(self) -> SetComparison:
+        """The same as ``whole``, without the codes that were set aside."""
+        return self.whole if self.found is None else replace(self.whole, kept=self.found.kept)
+
+    def _gap(self, fitted: FittedSet) -> Gap:
+        """Return the gap of a fit; codes set aside keep the plain law, and nothing of theirs is closed."""
+        masses = on_all_codes(fitted.log_masses, self.compared.kept, self.whole.plain.log_masses)
+        return self.whole.gap(replace(fitted, log_masses=masses))
+
+    def _rivals(self, named: Named, before: FittedSet, start: FloatArray) -> tuple[Rival, ...]:
+        """Return what could stand in the place of an effect, refitted, with its gap, the best first."""
+        found = []
+        for other, behind, error in named.rivals:
+            if any(other.excludes(m) for m in before.members):
+                continue
+            try:
+                gap = self._gap(self.compared.fit((*before.members, other), start))
+            except ValueError:
+                continue
+            why = f"it predicts unseen samples worse, by {-behind:.3g} ± {error:.2g} nats"
+            if other.tag in named.equals:
+                why = "it predicts unseen samples as well: these histograms do not decide"
+            found.append(Rival(effect=other.tag, gap_after=gap.value, behind=behind, why=why))
+        return tuple(found)
+
+    def _expected(self) -> FloatArray:
+        """Return the samples of train and test expected at each code given those in codes that are kept."""
+        counts, kept = self.compared.train.astype(np.float64), self.compared.kept
+        mass = self.compared.problem(self.final.members).masses(self.final.fit.theta, self.final.fit.shared)
+        inside = np.where(kept, mass, 0.0).sum(axis=1, keepdims=True)
+        return np.asarray(mass / inside * np.where(kept, counts, 0.0).sum(axis=1, keepdims=True))
+
+    def _residuals(self, found: Explanation) -> tuple[Place, ...]:
+        """Return the codes that the model does not account for, a peak that was set aside first."""
+        own = self.compared.origin, self.final.fit.parameters, found.set_aside
+        return tuple(find_residuals(self.compared.train.astype(np.float64), self._expected(), *own))
+
+    def _codes(self) -> FloatArray | None:
+        """Return the samples expected at each code of the evidence, or None if it holds other pixels too."""
+        code, train = self.observed.evidence.code, self.compared.train
+        illuminated = self.compared.samples.illuminated(train.shape[0])
+        expected, origin = self._expected()[illuminated], self.compared.origin[illuminated]
+        if self.observed.evidence.maps.usable.sum() != expected.shape[0]:
+            return None
+        at = (origin - code.first)[:, None] + np.arange(expected.shape[1])
+        within, size = (at >= 0) & (at < code.observed.size), code.observed.size
+        found = np.bincount(at[within], expected[within], minlength=size)
+        return np.asarray(found * code.observed.sum() / max(float(train[illuminated].sum()), 1.0))
+
+
+def _addition(
+    named: Named,
+    gaps: tuple[Gap, Gap],
+    fits: tuple[FittedSet, FittedSet],
+    rivals: tuple[Rival, ...],
+    pulls: tuple[Pull, ...],
+) -> Addition:
+    """Return an effect with the gaps and the fits without and with it, and with rivals in its place."""
+    before, after = fits
+    member = after.members[-1]
+    compared = [(member, 0.0, 0.0), *named.rivals]
+    weights = special.softmax([min(score, 0.0) for _, score, _ in compared])
+    return Addition(
+        effect=member.effect,
+        alone=not named.equals,
+        against=member.effect.stuck_words(),
+        candidates=tuple(
+            Candidate.of(each.effect, score, error, float(weight))
+            for (each, score, error), weight in zip(compared, weights, strict=True)
+            if not named.equals or each.tag in (member.tag, *named.equals)
+        ),
+        # of the fit; that of the strength with what the choice of the codes makes of it
+        stderr={
+            name: float(np.hypot(error, named.apart if name == member.effect.strength else 0.0))
+            for name, error in after.stderr(member).items()
+        },
+        before=gaps[0],
+        after=gaps[1],
+        rivals=rivals,
+        pulls=pulls,
+        moved=changes(before.fit.parameters, after.fit.parameters, after.fit.stderr),
+    )
 
 
 def _on_a_line(

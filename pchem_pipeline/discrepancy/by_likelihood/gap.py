@@ -26,14 +26,10 @@ def gap_of(
     share: float,
     kept: BoolArray | bool = True,
 ) -> Gap:
-    """Return the gap of histograms (n, B) from a fit.
+    """Return the gap of histograms (n, B) from a fit with so many parameters.
 
-    Args:
-        counts: histograms.
-        log_masses: of the codes under the fit, given that they are kept, shape (n, B).
-        n_parameters: of the fit.
-        share: ratio of these samples to the fitted ones.
-        kept: codes that are compared, shape (n, B); True: all.
+    ``log_masses`` are those of the codes that are ``kept`` (True: all), given that they are; ``share`` is the
+    ratio of these samples to the fitted ones.
     """
     seen = np.where(kept, counts, 0).astype(np.float64)
     total = np.maximum(seen.sum(axis=1, keepdims=True), 1.0)

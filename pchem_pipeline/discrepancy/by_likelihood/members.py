@@ -30,12 +30,7 @@ _LONGEST_STEP = 50.0  # times the strength of the start
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A fitted field of an effect, as the power in which small effects are linear.
-
-    Attributes:
-        power: the field is ``sign(c) |c| ** (1 / power)``.
-        bounds: of the coordinate.
-    """
+    """A fitted field ``sign(c) |c| ** (1 / power)`` of an effect: small effects are linear in c."""
 
     name: str
     power: float
@@ -165,12 +160,8 @@ def law_of(
 ) -> SampleLaw:
     """Return the law of rows of histograms with the effects present and the members at their coordinates.
 
-    Args:
-        present: effects of the model.
-        members: candidates.
-        shared: coordinates of all members, concatenated.
-        own: (H, g, mu, sigma) of the rows, shape (n, 4).
-        samples: of each pixel; those without electrons get none from effects either.
+    The coordinates ``shared`` are those of all members, concatenated; ``own`` are (H, g, mu, sigma) of the
+    rows, (n, 4). Samples without electrons get none from effects either.
     """
     parts = split_coordinates(members, shared)
     effects = [*present, *(m.at(part) for m, part in zip(members, parts, strict=True))]

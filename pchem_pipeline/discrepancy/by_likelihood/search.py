@@ -22,17 +22,14 @@ _COINCIDE = 0.3  # e-
 
 @dataclass(frozen=True)
 class Named:
-    """An effect of the explanation.
+    """An effect of the explanation, and the rivals that could stand in its place, the best first.
 
-    Attributes:
-        rivals: effects that could stand in its place, the best first, with the gain of the set with each over
-            the chosen one, nats, and its standard error.
-        apart: by how much its strength differs when fewer codes are compared.
+    With each rival is the gain of the set with it over the chosen one, nats, and its standard error.
     """
 
     member: Member
     rivals: tuple[tuple[Member, float, float], ...]
-    apart: float = 0.0
+    apart: float = 0.0  # by how much its strength differs when fewer codes are compared
 
     @property
     def equals(self) -> tuple[str, ...]:
@@ -42,25 +39,15 @@ class Named:
 
 @dataclass(frozen=True)
 class Explanation:
-    """What the search found.
+    """What the search found."""
 
-    Attributes:
-        kept: codes that the gap compares, shape (n, B): all but a peak set aside.
-        set_aside: codes that the fit leaves out.
-        best: the named effects, fitted to the codes that the gap compares.
-        named: its effects, the weightiest first, compared on perhaps fewer codes, perhaps beside others.
-        stand_ins: tags of effects that fit in one view and not in another, for something unknown.
-        rest: share of the gap that is left among the codes on which effects were compared.
-        rise: gain of the set of them over none on these codes, nats, and its standard error.
-    """
-
-    kept: BoolArray
-    set_aside: tuple[Interval, ...]
-    best: FittedSet
-    named: tuple[Named, ...]
-    stand_ins: tuple[str, ...]
-    rest: float
-    rise: tuple[float, float]
+    kept: BoolArray  # codes that the gap compares, (n, B): all but a peak set aside
+    set_aside: tuple[Interval, ...]  # codes that the fit leaves out
+    best: FittedSet  # the named effects, fitted to the codes that the gap compares
+    named: tuple[Named, ...]  # its effects, the weightiest first, each with its rivals
+    stand_ins: tuple[str, ...]  # tags of effects that fit in one view and not in another
+    rest: float  # share of the gap that is left among the codes on which effects were compared
+    rise: tuple[float, float]  # gain of the set over none on these codes, nats, and its standard error
 
 
 def explain(sets: SetComparison, candidates: Sequence[Member]) -> Explanation:

@@ -37,18 +37,12 @@ _SECANT = 0.1  # of the start: where the slope at no effect is taken
 
 @dataclass(frozen=True)
 class FittedSet:
-    """A set of candidates, fitted.
-
-    Attributes:
-        members: at the fitted coordinates.
-        log_masses: of the codes, shape (n, B).
-        score: log-likelihood of the other part, nats.
-    """
+    """A set of candidates at their fitted coordinates; its score is the log-likelihood of the other part."""
 
     members: tuple[Member, ...]
     fit: SharedFit
-    log_masses: FloatArray
-    score: float
+    log_masses: FloatArray  # of the codes, (n, B)
+    score: float  # nats
 
     @property
     def n_parameters(self) -> int:
@@ -77,28 +71,17 @@ class FittedSet:
 
 @dataclass
 class SetComparison:
-    """Fits sets of effects to one part of the samples and scores them on another.
+    """Fits sets of effects to one part of the samples and scores them on another."""
 
-    Attributes:
-        train, test: histograms, shape (n, B); a row for each sample of each pixel.
-        origin: DN of bin 0, shape (n,).
-        kept: codes that count, shape (n, B).
-        present: effects that the model has.
-        start: (H, g, mu, sigma), shape (n, 4).
-        samples: which rows are of one pixel.
-        failed: candidates that could not be fitted, and why; out.
-        effort: counts the masses, and ends the search at its limit.
-    """
-
-    train: IntArray
-    test: IntArray
-    origin: IntArray
-    kept: BoolArray
-    present: tuple[Effect, ...]
-    start: FloatArray
-    samples: Samples = field(default_factory=Samples)
-    failed: dict[str, str] = field(default_factory=dict)
-    effort: Effort = field(default_factory=lambda: Effort(None))
+    train: IntArray  # histograms, (n, B); a row for each sample of each pixel
+    test: IntArray  # the same
+    origin: IntArray  # DN of bin 0, (n,)
+    kept: BoolArray  # codes that count, (n, B)
+    present: tuple[Effect, ...]  # effects that the model has
+    start: FloatArray  # (H, g, mu, sigma), (n, 4)
+    samples: Samples = field(default_factory=Samples)  # which rows are of one pixel
+    failed: dict[str, str] = field(default_factory=dict)  # candidates that could not be fitted, and why; out
+    effort: Effort = field(default_factory=lambda: Effort(None))  # ends the search at its limit
     _known: dict[frozenset[str], FittedSet] = field(default_factory=dict, init=False)
 
     def of(self, rows: slice, start: FloatArray) -> SetComparison:
@@ -269,11 +252,7 @@ def select(
 ) -> FittedSet:
     """Select effects stepwise (Efroymson 1960): one is added, else exchanged, else left out, while that pays.
 
-    Args:
-        sets: fits and scores them.
-        candidates: starts; several may be of one effect.
-        start: a set to begin with; None: no effect.
-        largest: number of effects.
+    Several candidates may be of one effect; ``start`` None: no effect; a set has at most ``largest`` ones.
     """
     best, passed = start or sets.plain, set[frozenset[str]]()
     while best.kinds not in passed:

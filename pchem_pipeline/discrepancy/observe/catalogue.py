@@ -28,23 +28,14 @@ FAMILIES = {
 
 @dataclass(frozen=True)
 class Statistic:
-    """One component of the vector.
+    """One component of the vector."""
 
-    Attributes:
-        name: ``family.what``.
-        channel: charge (electron numbers), readout (residuals), cross (their products) or digital (codes).
-        sentence: meaning of a large positive value.
-        opposite: meaning of a large negative value; empty: ``sentence``, less than the model predicts.
-        map, series: of the evidence in which it shows its place and its frames (:mod:`~..where`); empty:
-            none.
-    """
-
-    name: str
-    channel: str
-    sentence: str
-    opposite: str = ""
-    map: str = ""
-    series: str = ""
+    name: str  # ``family.what``
+    channel: str  # charge (electron numbers), readout (residuals), cross (their products) or digital (codes)
+    sentence: str  # meaning of a large positive value
+    opposite: str = ""  # meaning of a large negative value; empty: less than the model predicts
+    map: str = ""  # of the evidence in which it shows its place (:mod:`~..where`); empty: none
+    series: str = ""  # of the evidence in which it shows its frames; empty: none
 
     @property
     def family(self) -> str:

@@ -204,20 +204,13 @@ def bit_statistics(found: PreviousBits | None) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Repeats:
-    """Lines that are, sample by sample, the one before.
+    """Lines that are, sample by sample, the one before."""
 
-    Attributes:
-        frames: positions of frames equal to the one before.
-        rows_in_time: number of rows of other frames that equal those of the frame before.
-        rows, columns: number of those that equal the row above, and the column on the left.
-        consecutive: number of frames that directly follow another.
-    """
-
-    frames: IntArray
-    rows_in_time: int
-    rows: int
-    columns: int
-    consecutive: int
+    frames: IntArray  # positions of frames equal to the one before
+    rows_in_time: int  # number of rows of other frames that equal those of the frame before
+    rows: int  # number of rows that equal the one above
+    columns: int  # number of columns that equal the one on the left
+    consecutive: int  # number of frames that directly follow another
 
     @classmethod
     def of(cls, frames: CodeArray, numbers: IntArray) -> Repeats:
@@ -235,10 +228,7 @@ class Repeats:
         )
 
     def statistics(self, seen: PixelHistograms, shape: tuple[int, ...]) -> dict[str, float]:
-        """Return the statistics of repeats in frames of a shape (frame, y, x).
-
-        None of lines so short that chance repeats them in a frame.
-        """
+        """Return the statistics of repeats in frames (frame, y, x); none of lines that chance repeats."""
         real = seen.counts.astype(np.float32)
         total = np.maximum(real.sum(axis=1) + seen.outside.sum(axis=1), 1.0)
         # the log of the chance that two samples of a pixel are equal
@@ -282,10 +272,7 @@ def equal_squares(frames: CodeArray) -> IntArray:
 
 
 def square_statistics(frames: CodeArray, seen: PixelHistograms, usable: BoolArray) -> dict[str, float]:
-    """Return the statistic of squares of equal samples; none without squares of usable pixels.
-
-    Given the histograms, frames without an effect are in random order.
-    """
+    """Return the statistic of squares of equal samples; none without squares of usable pixels."""
     counts, origin = seen.counts, seen.origin
     good = usable[1:, 1:] & usable[1:, :-1] & usable[:-1, 1:] & usable[:-1, :-1]
     first = int(origin[usable.ravel()].min(initial=origin.max(initial=0)))

@@ -23,7 +23,7 @@ from pchem_pipeline.discrepancy.observe.digital import GROUP, MOST_SAMPLES, grou
 from pchem_pipeline.discrepancy.observe.sums import FrameBlocks, Samples, pixel_statistics
 from pchem_pipeline.discrepancy.observe.tables import PixelLaws
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.effects.operators.couple import Source
+from pchem_pipeline.effects.operators.couple import ALONG, Source
 
 Spectra = NDArray[np.complexfloating]
 Axes = tuple[int, ...]  # of (frame, y, x)
@@ -38,11 +38,9 @@ _RESOLVED = 0.05  # of the variance of the charge, at least, that its residual d
 class Follows:
     """Sums of products of residuals with the charge of other samples, each in its standard deviation.
 
-    Attributes:
-        products: by frames before, rows and columns from the residual to the charge, the distance 0 in the
-            middle, shape (2, 2 y - 1, 2 x - 1); 0 for a sample with itself.
-        pairs: their number.
-        wider: for each of `SOURCES`, the standard deviation of their sum over that of independent products.
+    Products and their numbers are by frames before, rows and columns from the residual to the charge, the
+    distance 0 in the middle, (2, 2 y - 1, 2 x - 1); 0 for a sample with itself. ``wider``: for each of
+    `SOURCES`, the standard deviation of their sum over that of independent products.
     """
 
     products: FloatArray
@@ -51,7 +49,7 @@ class Follows:
 
     def of(self, source: Source) -> tuple[FloatArray, FloatArray]:
         """Return the products and pairs of single samples, or of all of a row, column or frame."""
-        axes = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}[source]
+        axes = ALONG[source]
         if not axes:
             return self.products, self.pairs
         return self.products.sum(axis=axes, keepdims=True), self.pairs.sum(axis=axes, keepdims=True)
@@ -65,24 +63,15 @@ class Follows:
 
 @dataclass(frozen=True)
 class FollowingSamples:
-    """Frames as residuals and as the charge that these do not hold, each in its standard deviation.
+    """Frames as residuals and as the charge that these do not hold, each in its standard deviation."""
 
-    Attributes:
-        samples: groups of successive frames.
-        inside: pixels whose residuals count, (y, x).
-        mixed: correlation of charge and residual of a sample, (y, x).
-        scale: of what the residual leaves of the charge, 0 where too little, (y, x).
-        exposure, spread: mean and standard deviation of the charge, e-, (y, x).
-        mirrored: axes of (frame, y, x) along which the charge is counted from the other end.
-    """
-
-    samples: Samples
-    inside: BoolArray
-    mixed: Float32Array
-    scale: Float32Array
-    exposure: Float32Array
-    spread: Float32Array
-    mirrored: Axes = ()
+    samples: Samples  # groups of successive frames
+    inside: BoolArray  # pixels whose residuals count, (y, x)
+    mixed: Float32Array  # correlation of charge and residual of a sample, (y, x)
+    scale: Float32Array  # of what the residual leaves of the charge, 0 where too little, (y, x)
+    exposure: Float32Array  # mean of the charge, e-, (y, x)
+    spread: Float32Array  # standard deviation of the charge, e-, (y, x)
+    mirrored: Axes = ()  # axes of (frame, y, x) along which the charge is counted from the other end
 
     @classmethod
     def of(
@@ -164,12 +153,10 @@ class FollowingSamples:
     def by_excess(
         self, place: tuple[int, int, int], columns: tuple[int, int] | None, above: IntArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return ``sum u f`` and ``sum f^2`` of residuals u and of the charge f above some numbers, (n,).
+        """Return ``sum u f`` and ``sum f^2`` of residuals u and of the charge f above some electrons, (n,).
 
-        Args:
-            place: frames, rows and columns from the residual to the charge.
-            columns: first column of residuals that count, and end; None: all.
-            above: electrons, (n,).
+        The place is in frames, rows and columns from the residual to the charge; only residuals of some
+        columns (first, end) count; None: all.
         """
         step, (ny, nx) = -place[0], self.inside.shape
         here, there = self._pairs(place)
@@ -234,8 +221,7 @@ def follow_statistics(
 ) -> dict[str, float]:
     """Return the statistics of residuals that follow the charge of other samples, in space and in time.
 
-    Left out are the samples next to it in the same frame and its own one frame before, which have their own.
-    Arguments as of :meth:`FollowingSamples.of`.
+    Samples next to it in the frame and its own one frame before have statistics of their own.
     """
     prepared = FollowingSamples.of(frames, edges, laws, maps, most=MOST_SAMPLES)
     if prepared is None:

@@ -62,8 +62,7 @@ def largest_normal(values: FloatArray) -> float:
 def largest_power(power: NDArray[np.floating], averaged: int) -> float:
     """Return the normal quantile of the largest of many powers, of any shape.
 
-    Each is the mean of ``averaged`` independent exponential numbers of mean 1 (the periodogram of white
-    noise; the largest of them is Fisher's g-test).
+    Each is the mean of ``averaged`` exponential numbers of mean 1 (Fisher's g-test of a periodogram).
     """
     total = averaged * float(np.max(power))
     tail = float(special.gammaincc(averaged, total))

@@ -103,15 +103,10 @@ def _turned(values: NDArray[Any], lines: Lines) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class _Table:
-    """Likelihood ratios of the codes of pixels, the lines in the place of the rows.
+    """Likelihood ratios of the codes of pixels (see ``compare_rows``), the lines in the place of the rows."""
 
-    Attributes:
-        first: DN of the first code, shape (y, x).
-        ratios: see :func:`~.observe_numba.compare_rows`, shape (y, x, B, 4).
-    """
-
-    first: IntArray
-    ratios: Float32Array
+    first: IntArray  # DN of the first code, (y, x)
+    ratios: Float32Array  # (y, x, B, 4)
 
     @classmethod
     def of(cls, counts: NDArray[Any], origin: IntArray, usable: BoolArray) -> _Table:

@@ -28,18 +28,12 @@ _LEADING = 2  # statistics of a signature that are looked at
 
 @dataclass(frozen=True)
 class SensorWindow:
-    """The rows and columns of a sensor that are looked at; regions are in coordinates of the sensor.
+    """The rows and columns of a sensor that are looked at; regions are in coordinates of the sensor."""
 
-    Attributes:
-        rows, columns: first, and end.
-        shape: rows and columns of the sensor.
-        known: regions of the sensor that a look at all of it found.
-    """
-
-    rows: tuple[int, int]
-    columns: tuple[int, int]
-    shape: tuple[int, int]
-    known: tuple[Region, ...] = ()
+    rows: tuple[int, int]  # first, and end
+    columns: tuple[int, int]  # first, and end
+    shape: tuple[int, int]  # rows and columns of the sensor
+    known: tuple[Region, ...] = ()  # regions of the sensor that a look at all of it found
 
     @classmethod
     def whole(cls, shape: tuple[int, ...]) -> SensorWindow:
@@ -178,10 +172,7 @@ def part_statistics(
     block_frames: int,
     window: SensorWindow | None = None,
 ) -> dict[str, float]:
-    """Return the leading statistics of parts, by ``name@part``; none of a part that cannot be looked at.
-
-    Arguments as in :func:`part_evidence`.
-    """
+    """Return the leading statistics of parts, ``name@part``, where it can be; see :func:`part_evidence`."""
     found: dict[str, float] = {}
     # of all effects, in the order of the catalogue
     wanted = {name for effect in effect_classes().values() for name in effect.signature[:_LEADING]}

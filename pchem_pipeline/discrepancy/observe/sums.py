@@ -27,31 +27,21 @@ _LEAST_NOISE = 0.5  # of the variance of r^2: residuals of hardly two values tel
 class PixelStatistics:
     """Moments of the channels over the samples of each pixel, 0 in unusable ones, (y, x) each.
 
-    Attributes:
-        usable: pixels that count.
-        mode: patterns of what is common to all pixels: H for a change of the exposure, 1 for one of the bias,
-            (2, y, x).
-        variance: of k (e-^2) and r (DN^2), (2, y, x).
-        cross: covariance of k and r, e- DN.
-        factor, shift: weights ``r (factor k + shift)`` whose sum over a frame, less ``gain_offset``, is
-            ``gain_norm`` times the relative deviation of the gain: least squares of r on k / g, what is
-            common to all pixels taken away.
-        gain_variance: variance of that sum in one frame.
-        noise: variance of r^2, in that of r squared: 2 for Gaussian residuals.
-        square: weights of r^2 that measure a common relative change of the noise best.
+    The sum of ``r (factor k + shift)`` over a frame, less ``gain_offset``, is ``gain_norm`` times the
+    relative deviation of the gain: least squares of r on k / g, what is common to all pixels taken away.
     """
 
-    usable: BoolArray
-    mode: FloatArray
-    variance: FloatArray
-    cross: FloatArray
+    usable: BoolArray  # pixels that count
+    mode: FloatArray  # common to all: H for a change of exposure, 1 for one of the bias, (2, y, x)
+    variance: FloatArray  # of k (e-^2) and r (DN^2), (2, y, x)
+    cross: FloatArray  # covariance of k and r, e- DN
     factor: FloatArray
     shift: FloatArray
     gain_offset: float
     gain_norm: float
-    gain_variance: float
-    noise: FloatArray
-    square: FloatArray
+    gain_variance: float  # variance of that sum in one frame
+    noise: FloatArray  # variance of r^2, in that of r squared: 2 for Gaussian residuals
+    square: FloatArray  # weights of r^2 that measure a common relative change of the noise best
 
 
 def blocks_of(numbers: IntArray, block_frames: int) -> IntArray:
@@ -113,12 +103,7 @@ def samples_beyond(
 
 @dataclass(frozen=True)
 class FrameBlocks:
-    """Frames of some rows that come by blocks.
-
-    Attributes:
-        n_frames: number of them.
-        blocks: yields about so many successive frames at a time, (frame, y, x), DN.
-    """
+    """Frames of some rows; ``blocks`` yields about so many successive ones at a time, (frame, y, x), DN."""
 
     n_frames: int
     blocks: Callable[[int], Iterable[CodeArray]]
@@ -146,24 +131,15 @@ def laws_of_frames(frames: CodeArray, maps: PixelMaps) -> PixelLaws:
 
 @dataclass(frozen=True)
 class Samples:
-    """Frames as standardised deviations of their pixels, of both channels.
+    """Frames as standardised deviations of their pixels, of both channels."""
 
-    Attributes:
-        frames: codes (n, y, x), DN.
-        first, last: smallest and largest code of each pixel's table, (y, x).
-        start: row of the first one in ``tables``, (y, x).
-        tables: k and r of each code over their standard deviation, (rows, 2).
-        usable: pixels that count, (y, x).
-        most: samples that are looked at at a time, whole frames.
-    """
-
-    frames: FrameBlocks
-    first: NDArray[np.int32]
-    last: NDArray[np.int32]
-    start: NDArray[np.int32]
-    tables: Float32Array
-    usable: BoolArray
-    most: int = 1 << 20
+    frames: FrameBlocks  # codes (n, y, x), DN
+    first: NDArray[np.int32]  # smallest code of each pixel's table, (y, x)
+    last: NDArray[np.int32]  # largest code of each pixel's table, (y, x)
+    start: NDArray[np.int32]  # row of the first one in ``tables``, (y, x)
+    tables: Float32Array  # k and r of each code over their standard deviation, (rows, 2)
+    usable: BoolArray  # pixels that count, (y, x)
+    most: int = 1 << 20  # samples that are looked at at a time, whole frames
 
     @classmethod
     def of(cls, frames: CodeArray, maps: PixelMaps) -> Samples:

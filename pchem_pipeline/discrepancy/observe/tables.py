@@ -52,19 +52,12 @@ MOMENTS = np.dtype([
 
 @dataclass(frozen=True)
 class PixelHistograms:
-    """Histograms of n pixels.
+    """Histograms of n pixels."""
 
-    Attributes:
-        counts: (n, B).
-        origin: DN of bin 0, (n,).
-        outside: samples below and above the histogram, (n, 2).
-        ends: smallest and largest code of each, DN, (2, n); None: those of the histograms.
-    """
-
-    counts: CodeArray
-    origin: IntArray
-    outside: FloatArray
-    ends: NDArray[np.integer[Any]] | None = None
+    counts: CodeArray  # (n, B)
+    origin: IntArray  # DN of bin 0, (n,)
+    outside: FloatArray  # samples below and above the histogram, (n, 2)
+    ends: NDArray[np.integer[Any]] | None = None  # smallest and largest code, DN, (2, n); None: of counts
 
     @classmethod
     def of(cls, frames: CodeArray) -> PixelHistograms:
@@ -95,23 +88,14 @@ class PixelHistograms:
 
 
 class PixelLaws(NamedTuple):
-    """What the fitted law of n pixels and their histograms give.
+    """What the fitted law of n pixels and their histograms give."""
 
-    Attributes:
-        good: pixels with a law, (n,); all else is meaningless elsewhere.
-        moments: fields of :data:`MOMENTS`, (n,).
-        scores: standardised score, its skewness and its kurtosis excess, (n, 3, N_TESTS).
-        support: first DN, number of codes, first row in ``tables``, (n, 3); (0, 1, 0) where not good.
-        tables: k (e-) and r (DN) of every code of the support, minus their mean over the samples, (rows, 2).
-        codes: sums over all pixels.
-    """
-
-    good: BoolArray
-    moments: NDArray[np.void]
-    scores: FloatArray
-    support: IntArray
-    tables: Float32Array
-    codes: CodeSums
+    good: BoolArray  # pixels with a law, (n,); all else is meaningless elsewhere
+    moments: NDArray[np.void]  # fields of :data:`MOMENTS`, (n,)
+    scores: FloatArray  # standardised score, its skewness and its kurtosis excess, (n, 3, N_TESTS)
+    support: IntArray  # first DN, number of codes, first row in ``tables``, (n, 3); (0, 1, 0) where not good
+    tables: Float32Array  # k (e-) and r (DN) of codes, less their mean over the samples, (rows, 2)
+    codes: CodeSums  # sums over all pixels
 
 
 def pixel_laws(seen: PixelHistograms, parameters: FloatArray, usable: BoolArray) -> PixelLaws:
@@ -174,13 +158,8 @@ def efficient_scores(
 ) -> FloatArray:
     """Compute the standardised efficient scores of the samples, their skewness and kurtosis, (n, 3, N_TESTS).
 
-    NaN where a score has no variance.
-
-    Args:
-        sums: see :func:`~.tables_numba.sum_scores`, (n, N_TESTS, N_TESTS + 3).
-        factors: of the whitening, (n, N_NUISANCE, N_COLUMNS).
-        samples: of each pixel, (n,).
-        exposure: H, e-, (n,).
+    NaN where a score has no variance. The sums are (n, N_TESTS, N_TESTS + 3), see `tables_numba`, the factors
+    of the whitening (n, N_NUISANCE, N_COLUMNS), samples and exposures (H, e-) of each pixel (n,).
     """
     products, (total, third, fourth) = sums[:, :, :N_TESTS], np.moveaxis(sums[:, :, N_TESTS:], 2, 0)
     variance, samples = np.einsum("pii->pi", products), samples[:, None]

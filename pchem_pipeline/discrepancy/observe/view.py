@@ -50,18 +50,11 @@ _CHUNK_SAMPLES = 1 << 16
 
 @dataclass(frozen=True)
 class Correlation:
-    """The correlation of samples at a distance, without what chance makes of it.
+    """The correlation of samples at a distance, without what chance makes of it."""
 
-    Attributes:
-        of_pixels: of each pixel, after removal of the frames' common modes; NaN where one of the two is not
-            usable, (y, x).
-        mean: over all pixels; NaN where there is none.
-        count: pairs of samples of a pixel.
-    """
-
-    of_pixels: FloatArray
-    mean: float
-    count: int
+    of_pixels: FloatArray  # without the frames' common modes; NaN where one of the two is not usable, (y, x)
+    mean: float  # over all pixels; NaN where there is none
+    count: int  # pairs of samples of a pixel
 
     @property
     def deviations(self) -> FloatArray:
@@ -71,31 +64,18 @@ class Correlation:
 
 @dataclass(frozen=True)
 class FrameView:
-    """Sums over a split of n frames in b blocks, and what they are by chance.
+    """Sums over a split of n frames in b blocks, and what they are by chance."""
 
-    Attributes:
-        pixels: moments of the pixels.
-        numbers: frame numbers, (n,).
-        edges: positions of the blocks, (b + 1,).
-        block_frames: frames in a full block.
-        halves: k and r of the left and the right half of each row, (2, 2, n, y).
-        noise: weighted sums of r^2 of each row, less their mean, (n, y).
-        columns: the sums :data:`OF_LINES` of each column, (3, n, x).
-        gain: relative deviation of the gain of each frame, (n,).
-        blocks: sums of k and r in each block, (b, 2, y, x).
-        products: means of :data:`PRODUCTS` after removal of the frames' common modes, (y, x) each.
-    """
-
-    pixels: sums.PixelStatistics
-    numbers: IntArray
-    edges: IntArray
-    block_frames: int
-    halves: FloatArray
-    noise: FloatArray
-    columns: FloatArray
-    gain: FloatArray
-    blocks: FloatArray
-    products: dict[str, FloatArray]
+    pixels: sums.PixelStatistics  # moments of the pixels
+    numbers: IntArray  # frame numbers, (n,)
+    edges: IntArray  # positions of the blocks, (b + 1,)
+    block_frames: int  # frames in a full block
+    halves: FloatArray  # k and r of the left and the right half of each row, (2, 2, n, y)
+    noise: FloatArray  # weighted sums of r^2 of each row, less their mean, (n, y)
+    columns: FloatArray  # the sums :data:`OF_LINES` of each column, (3, n, x)
+    gain: FloatArray  # relative deviation of the gain of each frame, (n,)
+    blocks: FloatArray  # sums of k and r in each block, (b, 2, y, x)
+    products: dict[str, FloatArray]  # means of :data:`PRODUCTS` without the frames' common modes, (y, x) each
 
     @classmethod
     def of(

@@ -33,12 +33,7 @@ _AROUND = 7  # frequencies along rows and columns whose median is the noise of t
 
 @dataclass(frozen=True)
 class Waves:
-    """Waves across rows and columns.
-
-    Attributes:
-        found: those that stand out, the one whose phase runs on first.
-        z: of the spectrum.
-    """
+    """Waves across rows and columns that stand out, one whose phase runs on first; z of the spectrum."""
 
     found: tuple[Wave, ...]
     z: dict[str, float]
@@ -52,10 +47,7 @@ class Waves:
 def waves_across(
     frames: CodeArray, numbers: IntArray, laws: PixelLaws, maps: PixelMaps, inside: BoolArray | None = None
 ) -> Waves:
-    """Look for waves in the residuals of frames (frame, y, x) with these numbers in the run, increasing.
-
-    Only pixels ``inside`` are looked at, (y, x); None: all.
-    """
+    """Look for waves in the residuals of frames (frame, y, x), of pixels ``inside``, (y, x); None: all."""
     ny, nx = maps.usable.shape
     some = numbers - numbers[0] < max(_MOST_SAMPLES // maps.usable.size, 1)
     numbers = numbers[some]

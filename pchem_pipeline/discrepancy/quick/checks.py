@@ -19,43 +19,27 @@ if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect
 
 Level = Literal["good", "note", "caution", "serious"]
+GRAVEST_FIRST: tuple[Level, ...] = ("serious", "caution", "note", "good")
 
 
 @dataclass(frozen=True)
 class Check:
-    """One check.
+    """One check."""
 
-    Attributes:
-        name: row_noise, lag, ...
-        title: the disturbance, a noun.
-        p: p-value of this check alone.
-        size: estimate; the root of a variance is 0 if the variance is negative.
-        unit: unit of the size: DN, LSB, or 1 for correlations and shares.
-        limit: size found in 19 of 20 runs like this one; NaN if unknown.
-        where: rows, columns, frames or codes concerned, in words; empty for all.
-        region: part of the sensor, as in ``model.effects``; None: uniform.
-        advice: consequence for the results, and the cure.
-        level: severity; "good" if not significant.
-        p_global: p-value corrected for the number of checks.
-        in_model: whether the fitted model has such an effect.
-        size_e: the size in electrons, if it is in DN.
-        share: the size over the read noise, if it is in DN.
-    """
-
-    name: str
-    title: str
-    p: float
-    size: float
-    unit: str
-    limit: float = math.nan
-    where: str = ""
-    region: dict[str, Any] | None = None
-    advice: str = ""
-    level: Level = "good"
-    p_global: float = math.nan
-    in_model: bool = False
-    size_e: float = math.nan
-    share: float = math.nan
+    name: str  # row_noise, lag, ..
+    title: str  # the disturbance, a noun
+    p: float  # p-value of this check alone
+    size: float  # estimate; the root of a variance is 0 if the variance is negative
+    unit: str  # unit of the size: DN, LSB, or 1 for correlations and shares
+    limit: float = math.nan  # size found in 19 of 20 runs like this one; NaN if unknown
+    where: str = ""  # rows, columns, frames or codes concerned, in words; empty for all
+    region: dict[str, Any] | None = None  # part of the sensor, as in ``model.effects``; None: uniform
+    advice: str = ""  # consequence for the results, and the cure
+    level: Level = "good"  # severity; "good" if not significant
+    p_global: float = math.nan  # p-value corrected for the number of checks
+    in_model: bool = False  # whether the fitted model has such an effect
+    size_e: float = math.nan  # the size in electrons, if it is in DN
+    share: float = math.nan  # the size over the read noise, if it is in DN
 
     @property
     def found(self) -> bool:
@@ -152,25 +136,18 @@ def check_of(name: str, p: float, size: float, *, how: str = "", **rest: Any) ->
 
 @dataclass(frozen=True)
 class QuickLook:
-    """All checks of a run, in the order in which they were made.
-
-    Attributes:
-        missing: checks that were not made, and why.
-        samples: frames x pixels of the checks.
-        command: command for a full search.
-    """
+    """All checks of a run, in the order in which they were made."""
 
     checks: tuple[Check, ...]
-    missing: dict[str, str] = field(default_factory=dict)
-    samples: int = 0
-    command: str = ""
+    missing: dict[str, str] = field(default_factory=dict)  # checks that were not made, and why
+    samples: int = 0  # frames x pixels of the checks
+    command: str = ""  # command for a full search
 
     @property
     def found(self) -> tuple[Check, ...]:
         """Return the significant checks, the most severe first."""
-        order = ("serious", "caution", "note", "good")
         beyond = [check for check in self.checks if check.found]
-        return tuple(sorted(beyond, key=lambda check: (order.index(check.level), check.p)))
+        return tuple(sorted(beyond, key=lambda check: (GRAVEST_FIRST.index(check.level), check.p)))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON; unknown numbers are NaN."""
@@ -189,18 +166,17 @@ def graded(checks: list[Check], gain: float, read_noise: float, model: Sequence[
     Given are the median gain, e-/DN, the median read noise, DN, and the effects of the fitted model.
     """
     shown = {name for effect in model for name in effect.signature}
-    found = []
-    for check in checks:
-        in_dn = check.unit == "DN"
-        done = replace(
+    found = [
+        replace(
             check,
             p_global=look_elsewhere(check.p, len(checks)),
             in_model=any(re.fullmatch(KINDS[check.name].signs, name) for name in shown),
-            size_e=check.size * gain if in_dn else math.nan,
-            share=check.size / read_noise if in_dn else math.nan,
+            size_e=check.size * gain if check.unit == "DN" else math.nan,
+            share=check.size / read_noise if check.unit == "DN" else math.nan,
         )
-        found.append(replace(done, level=_level(done)))
-    return tuple(found)
+        for check in checks
+    ]
+    return tuple(replace(check, level=_level(check)) for check in found)
 
 
 def _level(check: Check) -> Level:

@@ -48,21 +48,13 @@ _POOR = 6.0
 
 @dataclass(frozen=True)
 class CodeSample:
-    """Histograms of some pixels, with the fit of each.
+    """Histograms of some pixels, with the fit of each."""
 
-    Attributes:
-        counts: samples at each DN, (n, bin).
-        origin: DN of bin 0, (n,).
-        parameters: H, g, mu, sigma (with quantisation), (n, 4), all finite.
-        joint: they come from a joint fit of several exposures, and are taken as they are.
-        limits: first and last code of the ADC that the fit knows, DN; None: none.
-    """
-
-    counts: CodeArray
-    origin: NDArray[np.integer[Any]]
-    parameters: FloatArray
-    joint: bool = False
-    limits: tuple[int, int] | None = None
+    counts: CodeArray  # samples at each DN, (n, bin)
+    origin: NDArray[np.integer[Any]]  # DN of bin 0, (n,)
+    parameters: FloatArray  # H, g, mu, sigma (with quantisation), (n, 4), all finite
+    joint: bool = False  # they come from a joint fit of several exposures, and are taken as they are
+    limits: tuple[int, int] | None = None  # first and last code of the ADC that the fit knows, DN; None: none
 
     def of(self, some: NDArray[Any] | slice) -> CodeSample:
         """Return some of the pixels."""

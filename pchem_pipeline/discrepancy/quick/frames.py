@@ -36,10 +36,7 @@ def normal_p(z: float, *, two_sided: bool = False) -> float:
 
 
 def series_checks(mean: FloatArray) -> list[Check]:
-    """Return the checks of the frames' means over the same pixels, DN, (n,).
-
-    White frame noise passes all of them.
-    """
+    """Return the checks of the frames' means over the same pixels, DN, (n,); white noise passes them."""
     n = mean.size
     if n < FEWEST_FRAMES:
         return []

@@ -55,8 +55,7 @@ def quick_look(
 ) -> QuickLook:
     """Return the checks of a run, of those of its sums and codes (histograms of some pixels) that there are.
 
-    The pixels were fitted with the effects of the model. ``missing``: parts that are not looked at, and why;
-    ``command``: for a full search.
+    ``model``: effects of the fit; ``missing``: parts not looked at, and why; ``command``: for a search.
     """
     checks: list[Check] = []
     usable = maps.usable

@@ -29,26 +29,15 @@ _LINES_AT_ONCE = 1 << 12
 
 @dataclass(frozen=True)
 class Lines:
-    """Sums over lines (rows, or columns within a group of rows) of some frames, and moments of their pixels.
+    """Sums over lines (rows, or columns in a group of rows) of some frames, and moments of their pixels."""
 
-    Attributes:
-        sums: of the lines in each frame, (frame, line), DN.
-        starts: first frame of each block of frames, (b,).
-        freedom: frames less blocks.
-        variance: sum of the variances of a line's pixels, (line,), DN^2.
-        pairs: sum over ordered pairs of pixels of the line, neighbours left out, of the product of their
-            variances, (line,), DN^4.
-        neighbours: sum of the covariances of pixels next to each other along the line, (line,), DN^2.
-        length: pixels of each line that vary: excluded ones do not.
-    """
-
-    sums: NDArray[np.signedinteger]
-    starts: IntArray
-    freedom: float
-    variance: FloatArray
-    pairs: FloatArray
-    neighbours: FloatArray
-    length: IntArray
+    sums: NDArray[np.signedinteger]  # of the lines in each frame, (frame, line), DN
+    starts: IntArray  # first frame of each block of frames, (b,)
+    freedom: float  # frames less blocks
+    variance: FloatArray  # sum of the variances of a line's pixels, (line,), DN^2
+    pairs: FloatArray  # sum of products of variances over ordered pairs of no neighbours, (line,), DN^4
+    neighbours: FloatArray  # sum of the covariances of neighbours along the line, (line,), DN^2
+    length: IntArray  # pixels of each line that vary: excluded ones do not
 
     @property
     def n_pairs(self) -> FloatArray:
@@ -88,38 +77,23 @@ class Lines:
 
 @dataclass(frozen=True)
 class StackSums:
-    """Summaries of a stack, as the stage ``histogram`` makes them; of a long run those of some blocks.
+    """Summaries of a stack, as the stage ``histogram`` makes them; of a long run those of some blocks."""
 
-    Attributes:
-        numbers: of the frames that the sums are of, odd ones left out, increasing, (n,).
-        n_blocks: blocks of the stack.
-        lengths: frames of each block whose sums are at hand, (b,).
-        block_sum, block_sum_square: of each pixel, (b, y, x), DN, DN^2.
-        row_sum: of the frames of these blocks, (frame, y), DN.
-        column_blocks: which of these blocks have column sums at hand, increasing.
-        column_sum: of the frames of those, sums over groups of rows, (frame, group, x), DN.
-        all_means, all_variances: of all frames of the stack, over all pixels, DN, DN^2.
-        lag: covariance of successive frames within all blocks, (y, x), DN^2.
-        next_x, next_y: covariance with the next pixel along x and y, NaN without one.
-        odd: frames by kind: empty, copied, far.
-        spectrum: of the first frames over rows and columns, see `FrameSpectrum.line`.
-    """
-
-    numbers: IntArray
-    n_blocks: int
-    lengths: IntArray
-    block_sum: IntArray
-    block_sum_square: IntArray
-    row_sum: IntArray
-    column_blocks: IntArray
-    column_sum: NDArray[np.signedinteger]
-    all_means: FloatArray
-    all_variances: FloatArray
-    lag: FloatArray
-    next_x: FloatArray
-    next_y: FloatArray
-    odd: dict[str, IntArray] = field(default_factory=dict)
-    spectrum: Mapping[str, float] = field(default_factory=dict)
+    numbers: IntArray  # of the frames that the sums are of, odd ones left out, increasing, (n,)
+    n_blocks: int  # blocks of the stack
+    lengths: IntArray  # frames of each block whose sums are at hand, (b,)
+    block_sum: IntArray  # of each pixel, (b, y, x), DN
+    block_sum_square: IntArray  # of each pixel, (b, y, x), DN^2
+    row_sum: IntArray  # of the frames of these blocks, (frame, y), DN
+    column_blocks: IntArray  # which of these blocks have column sums at hand, increasing
+    column_sum: NDArray[np.signedinteger]  # of their frames, over groups of rows, (frame, group, x), DN
+    all_means: FloatArray  # of all frames of the stack, over all pixels, DN
+    all_variances: FloatArray  # the same, DN^2
+    lag: FloatArray  # covariance of successive frames within all blocks, (y, x), DN^2
+    next_x: FloatArray  # covariance with the next pixel along x, NaN without one
+    next_y: FloatArray  # the same along y
+    odd: dict[str, IntArray] = field(default_factory=dict)  # frames by kind: empty, copied, far
+    spectrum: Mapping[str, float] = field(default_factory=dict)  # of the first frames: `FrameSpectrum.line`
 
     @property
     def n_frames(self) -> int:
@@ -238,18 +212,12 @@ def _lines(
 
 @dataclass(frozen=True)
 class CellMap:
-    """Clipped sums over cells of a map of the sensor whose pixels are N(0, 1) where nothing is wrong.
+    """Clipped sums over cells of a map of the sensor whose pixels are N(0, 1) where nothing is wrong."""
 
-    Attributes:
-        rows, columns: edges of the cells, pixels.
-        sums: of the values, (cell y, cell x).
-        counts: pixels that have one.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    sums: FloatArray
-    counts: FloatArray
+    rows: IntArray  # edges of the cells, pixels
+    columns: IntArray  # edges of the cells, pixels
+    sums: FloatArray  # of the values, (cell y, cell x)
+    counts: FloatArray  # pixels that have one
 
     @classmethod
     def empty(cls, shape: tuple[int, int]) -> CellMap:

@@ -25,15 +25,9 @@ from pchem_pipeline.model.law.pcd import pcd_posterior
 
 
 class ExposureProfile(NamedTuple):
-    """Relative deviation of the exposure of each frame from its mean, and its shot noise.
+    """Relative deviation of the exposure of each numbered frame from the mean, (n,), and its shot noise."""
 
-    Attributes:
-        frames: frame numbers, shape (n,).
-        deviation: estimates, no unit, shape (n,).
-        variance: their variance if the exposure is constant, one for all.
-    """
-
-    frames: FloatArray
+    frames: IntArray
     deviation: FloatArray
     variance: float
 
@@ -52,25 +46,18 @@ def exposure_profile(evidence: Evidence) -> ExposureProfile | None:
     if not (variance > 0 and exposure > 0):
         return None
     deviation = np.asarray(time.frame_charge, np.float64) * (exposure / variance)
-    return ExposureProfile(time.frames.astype(np.float64), deviation, 1.0 / variance)
+    return ExposureProfile(time.frames.astype(np.int64), deviation, 1.0 / variance)
 
 
 class BlockCharge(NamedTuple):
-    """Deviations of the block means of the usable pixels' charge, the part common to all of them taken away.
+    """Deviations of the block means of the usable pixels' charge, without what is common to all of them."""
 
-    Attributes:
-        start, length: first frame and number of frames of each block, shape (b,).
-        deviation: e- of exposure (the slope Var(k) / H taken out), shape (b, n).
-        variance: of a single frame, e-^2 of exposure, shape (n,).
-        y, x: rows and columns of the pixels, shape (n,).
-    """
-
-    start: FloatArray
-    length: FloatArray
-    deviation: FloatArray
-    variance: FloatArray
-    y: IntArray
-    x: IntArray
+    start: FloatArray  # first frame of each block, (b,)
+    length: FloatArray  # number of frames of each block, (b,)
+    deviation: FloatArray  # e- of exposure (the slope Var(k) / H taken out), (b, n)
+    variance: FloatArray  # of a single frame, e-^2 of exposure, (n,)
+    y: IntArray  # rows of the pixels, (n,)
+    x: IntArray  # columns of the pixels, (n,)
 
 
 def block_charge(evidence: Evidence) -> BlockCharge | None:

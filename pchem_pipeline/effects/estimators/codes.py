@@ -49,8 +49,7 @@ def usable_codes(code: CodeResiduals, *, most: int = 1 << 12) -> tuple[IntArray,
 def few_shifts(residuals: FloatArray, expected: FloatArray) -> FloatArray | None:
     """Return shifts of the edges, DN, shape (codes + 1,), if a few of them explain all that is rough.
 
-    One edge after the other, the one that lowers chi2 the most (matching pursuit); None if the residuals ask
-    for more than a few, or for none.
+    One edge after the other (matching pursuit); None if residuals ask for more than a few, or for none.
     """
     if residuals.size < 2:
         return None  # no edge between two codes
@@ -159,19 +158,12 @@ class Stitch:
 
 @dataclass(frozen=True)
 class CurveResponse:
-    """What a small deviation of the transfer curve leaves in the counts per code.
+    """What a small deviation of the transfer curve leaves in the counts per code."""
 
-    Attributes:
-        edges: lower edges of the codes and the upper one of the last, DN, (codes + 1,).
-        response: standard errors per DN of deviation at each edge, (codes, codes + 1).
-        residuals: those seen, standard errors, (codes,).
-        expected: counts per code, (codes,).
-    """
-
-    edges: FloatArray
-    response: FloatArray
-    residuals: FloatArray
-    expected: FloatArray
+    edges: FloatArray  # lower edges of the codes and the upper one of the last, DN, (codes + 1,)
+    response: FloatArray  # standard errors per DN of deviation at each edge, (codes, codes + 1)
+    residuals: FloatArray  # those seen, standard errors, (codes,)
+    expected: FloatArray  # counts per code, (codes,)
 
     @classmethod
     def of(cls, evidence: Evidence) -> CurveResponse | None:

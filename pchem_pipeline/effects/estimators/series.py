@@ -41,23 +41,14 @@ _FAR_BELOW = 25.0  # of the criterion, below the best: not to be considered
 
 
 class TimeProfile(NamedTuple):
-    """A time profile that a series may follow.
+    """A time profile that a series may follow."""
 
-    Attributes:
-        shape: straight line, exponential approach to the end, or broken line.
-        size: value at the end less that at the start; of a broken line its range.
-        criterion: deviance with the price of the coefficients (Bayesian information criterion).
-        gain: by how much the deviance is below that of a constant.
-        path: nodes of a broken line at equal distances along the run, in units of the size.
-        settling_fraction: time constant of an approach, lengths of the run.
-    """
-
-    shape: Literal["linear", "settling", "path"]
-    size: float
-    criterion: float
-    gain: float
-    path: tuple[float, ...] = ()
-    settling_fraction: float = 0.2
+    shape: Literal["linear", "settling", "path"]  # line, exponential approach to the end, broken line
+    size: float  # value at the end less that at the start; of a broken line its range
+    criterion: float  # deviance with the price of the coefficients (Bayesian information criterion)
+    gain: float  # by how much the deviance is below that of a constant
+    path: tuple[float, ...] = ()  # nodes of a broken line, evenly spaced along the run, in units of the size
+    settling_fraction: float = 0.2  # time constant of an approach, lengths of the run
 
     def exceeds_chance(self) -> bool:
         """Return whether it lowers the deviance by more than chance does, by three standard deviations."""
@@ -156,12 +147,7 @@ _WAVES = (0, 12)
 
 @dataclass(frozen=True)
 class Steps:
-    """Levels of one series.
-
-    Attributes:
-        starts: where each level begins, the first at 0, shape (s,).
-        levels: shape (s,), with mean 0 over the series.
-    """
+    """Levels of one series, with mean 0 over it, and where each begins, the first at 0, (s,) both."""
 
     starts: IntArray
     levels: FloatArray
@@ -304,12 +290,7 @@ _STEPS = 200  # of EM; levels that are as far apart as the noise is wide take so
 
 
 class Levels(NamedTuple):
-    """Values and how often each is taken.
-
-    Attributes:
-        values: shape (k,), rising.
-        shares: sum to 1, shape (k,).
-    """
+    """Rising values and how often each is taken, (k,) both; the shares sum to 1."""
 
     values: FloatArray
     shares: FloatArray
@@ -318,10 +299,6 @@ class Levels(NamedTuple):
     def rms(self) -> float:
         """Standard deviation."""
         return float(np.sqrt(self.shares @ (self.values - self.shares @ self.values) ** 2))
-
-    def loglik(self, seen: FloatArray, variance: float) -> float:
-        """Return the log-likelihood of what is seen, shape (n,), with normal noise of this variance."""
-        return float(_log_density(self, seen, variance)[0].sum())
 
 
 def few_levels(seen: FloatArray, variance: float) -> Levels | None:
@@ -335,11 +312,11 @@ def few_levels(seen: FloatArray, variance: float) -> Levels | None:
     best, criterion = None, -0.5 * seen.size * (math.log(2.0 * math.pi * total) + whole / total) - 0.5 * price
     for k in range(2, _MOST_LEVELS + 1):
         levels = _fitted(seen, variance, k)
-        now = levels.loglik(seen, variance) - (k - 0.5) * price
-        if now <= criterion and best is not None:
-            break
+        now = float(_log_density(levels, seen, variance)[0].sum()) - (k - 0.5) * price
         if now > criterion:
             best, criterion = levels, now
+        elif best is not None:
+            break
     return best
 
 
@@ -376,22 +353,13 @@ _FRAME_LIKE = 5
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a spectrum.
+    """A line of a spectrum."""
 
-    Attributes:
-        amplitude: of the sine in the means, DN.
-        along: cycles per row (column).
-        per_frame: cycles per frame; 0 for an incoherent line.
-        phase: of the sine at row (column) 0 of frame 0, rad; 0 for an incoherent line.
-        excess: how far its power stands out: log of the inverse chance of such a power, less the log of the
-            number of places where it could have been.
-    """
-
-    amplitude: float
-    along: float
-    per_frame: float
-    phase: float
-    excess: float
+    amplitude: float  # of the sine in the means, DN
+    along: float  # cycles per row (column)
+    per_frame: float  # cycles per frame; 0 for an incoherent line
+    phase: float  # of the sine at row (column) 0 of frame 0, rad; 0 for an incoherent line
+    excess: float  # logarithm of the inverse chance of such a power at any of the places
 
 
 def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:

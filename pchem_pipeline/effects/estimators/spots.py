@@ -50,8 +50,7 @@ def spot_to_window(
 ) -> dict[str, float]:
     """Return a spot as it is on some rows and columns that are taken for a sensor of their own.
 
-    By ``centre_y``, ``centre_x``, ``radius`` and ``peak_e`` of an effect on a sensor of ``shape`` (rows,
-    columns); ranges as in `to_window`.
+    By its fields ``centre_y``, ``centre_x``, ``radius`` and ``peak_e``; ranges as in `to_window`.
     """
     centre, size = (spot["centre_y"], spot["centre_x"]), (rows[1] - rows[0], columns[1] - columns[0])
     # the brightest of these pixels is the one nearest to the centre
@@ -107,8 +106,7 @@ def best_spot(
 ) -> Spot | None:
     """Return the spot that fits amplitudes in the cells of a grid best; None if none is positive.
 
-    On a sensor of this shape, with standard errors ``noise``, infinite without pixels. What is like the
-    ``background`` may be there in any proportion beside the spot.
+    Standard errors ``noise`` are infinite without pixels; any part of the ``background`` may be beside it.
     """
     y, x = ((np.arange(n) + 0.5) * size / n - 0.5 for n, size in zip(amplitude.shape, shape, strict=True))
     inverse = noise**-2.0
@@ -273,23 +271,14 @@ _DARK = 0.05
 
 @dataclass(frozen=True)
 class FadingCells:
-    """Amplitudes of a falling exponential in the cells of a grid over the sensor.
+    """Amplitudes of a falling exponential in the cells of a grid over the sensor."""
 
-    Attributes:
-        decay: time constant, frames.
-        amplitude: e-, less what goes with H, shape (rows, columns); 0 in cells without pixels.
-        noise: standard errors, e-; infinite in cells without pixels.
-        exposure: mean H, e-.
-        score: chi-square of all cells against 0, as a standard normal number.
-        cell: which of them each pixel of the blocks is in, flat, shape (n,).
-    """
-
-    decay: float
-    amplitude: FloatArray
-    noise: FloatArray
-    exposure: FloatArray
-    score: float
-    cell: IntArray
+    decay: float  # time constant, frames
+    amplitude: FloatArray  # e-, less what goes with H, shape (rows, columns); 0 in cells without pixels
+    noise: FloatArray  # standard errors, e-; infinite in cells without pixels
+    exposure: FloatArray  # mean H, e-
+    score: float  # chi-square of all cells against 0, as a standard normal number
+    cell: IntArray  # which of them each pixel of the blocks is in, flat, shape (n,)
 
     @classmethod
     def of(cls, blocks: BlockCharge, exposure: FloatArray, decay: float, grid: int) -> FadingCells:
@@ -361,19 +350,12 @@ def _exponential(blocks: BlockCharge, decay: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class Fading:
-    """How the cells fade.
+    """How the cells fade."""
 
-    Attributes:
-        decay: time constant, frames.
-        slow_decay: of a second, slower part, frames, or None.
-        slow_share: share of the slower part in the first frame.
-        scale: the first frame's amplitude over that of the cells.
-    """
-
-    decay: float
-    slow_decay: float | None
-    slow_share: float
-    scale: float
+    decay: float  # time constant, frames
+    slow_decay: float | None  # of a second, slower part, frames
+    slow_share: float  # of the slower part in the first frame
+    scale: float  # the first frame's amplitude over that of the cells
 
 
 def fading_of(blocks: BlockCharge, cells: FadingCells, n_run: int) -> Fading:

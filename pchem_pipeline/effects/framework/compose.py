@@ -18,15 +18,10 @@ from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
 class AddedExposure(NamedTuple):
-    """Exposure beside H as a discrete mixture over the frames, (j, y, x) each or (j, n) of a list of pixels.
+    """Exposure beside H as a discrete mixture over the frames, (j, y, x) each or (j, n) of some pixels."""
 
-    Attributes:
-        exposure_e: the levels, e- per frame, >= 0.
-        weight: the part of the frames spent at each; the sum over j is 1.
-    """
-
-    exposure_e: FloatArray
-    weight: FloatArray
+    exposure_e: FloatArray  # the levels, e- per frame, >= 0
+    weight: FloatArray  # part of the frames spent at each; the sum over j is 1
 
     def of(self, pixels: BoolArray | NDArray[np.intp] | tuple[slice, ...] | slice) -> AddedExposure:
         """Return that of some pixels: an index, a mask or slices of the axes after the first."""
@@ -95,18 +90,12 @@ def pixel_maps(parameters: Sequence[FloatArray], usable: BoolArray) -> PixelMaps
 
 @dataclass(frozen=True)
 class PixelPlaces:
-    """Where pixels lie on the sensor, and which frames they were seen in.
+    """Where pixels lie on the sensor, and which frames they were seen in."""
 
-    Attributes:
-        rows, columns: of each pixel on the sensor, shape (n,).
-        shape: rows and columns of the sensor.
-        frames: numbers of the frames in the run, shape (frame,); none where they have no order.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    shape: tuple[int, int]
-    frames: IntArray
+    rows: IntArray  # of each pixel on the sensor, (n,)
+    columns: IntArray  # of each pixel on the sensor, (n,)
+    shape: tuple[int, int]  # rows and columns of the sensor
+    frames: IntArray  # numbers of the frames in the run, (frame,); none where they have no order
 
     @classmethod
     def of_block(

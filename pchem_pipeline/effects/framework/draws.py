@@ -158,11 +158,8 @@ def between_grid_points(
 ) -> list[AnyArray]:
     """Return the states of a stationary Markov process at frames, (n,), n >= 1, in order.
 
-    Args:
-        frames: frame numbers.
-        longest: correlation time, frames, > 0: states much farther apart are independent.
-        independent: gives the state at a frame from its stationary law.
-        midpoint: gives that at (frame, the state h frames before, the state h frames after, h).
+    States much farther apart than the ``longest`` correlation time, frames, are ``independent``, drawn from
+    the stationary law; ``midpoint`` gives that at (frame, state h frames before, state h frames after, h).
     """
     step = 1 << int(np.ceil(np.log2(max(_FAR * longest, 1.0))))
     first, last = int(frames.min()), int(frames.max())
@@ -186,12 +183,9 @@ def two_states(
 ) -> FloatArray:
     """Return a Markov chain of two states for each of n traps, 1: full, 0: empty; shape (frame, n).
 
-    Args:
-        frames: frame numbers, at least one.
-        correlation_frames: tau > 0, (n,) or of all: states h frames apart are correlated by exp(-h / tau).
-        occupied: probability that a trap is full, of all or of each, (n,).
-        uniform: gives the uniform numbers of a frame, shape (n,).
-        longest: about the largest correlation time of any trap, whichever are asked for here.
+    States h frames apart are correlated by exp(-h / tau); tau, the ``correlation_frames`` > 0, and the
+    probability that a trap is ``occupied`` are of all or of each, (n,). ``uniform`` gives the uniform numbers
+    of a frame, (n,); ``longest`` is about the largest tau of any trap, whichever are asked for here.
     """
 
     def full_after(state: FloatArray | float, rho: FloatArray) -> FloatArray:

@@ -120,38 +120,27 @@ class Factors(NamedTuple):
 
 
 class SharedOffset(NamedTuple):
-    """An offset that pixels of a frame share.
+    """An offset that pixels of a frame share: of a frame, row or column; of a wave or a readout.
 
-    Attributes:
-        of: what has one offset: a frame, row or column; a wave across the sensor, with a sine and a cosine of
-            its own in each frame; or pixels read one after the other, by noise of spectrum 1/f along them.
-        variance: of the offset, of a wave's sine and of its cosine, in any frame of the camera, DN^2; None:
-            other frames have another one.
-        cycles_per_row, cycles_per_column: of a wave, from row to row and from column to column.
-        taps: column blocks that are read in parallel, row by row, each with a readout's noise of its own.
+    A wave has a sine and a cosine of its own in each frame, a readout noise of spectrum 1/f along pixels that
+    are read one after the other. The variance is that of the offset, of sine and of cosine, in any frame of
+    the camera; None: other frames have another one.
     """
 
     of: Literal["frame", "row", "column", "wave", "readout"]
-    variance: float | None
-    cycles_per_row: float = 0.0
+    variance: float | None  # DN^2
+    cycles_per_row: float = 0.0  # of a wave
     cycles_per_column: float = 0.0
-    taps: int = 1
+    taps: int = 1  # column blocks read in parallel, row by row, each with noise of its own
 
 
 class Replacement(NamedTuple):
-    """A rule: of the samples that exceed a number by more than so much, that number comes out.
+    """A rule: of the samples that exceed a number by more than so much, that number comes out."""
 
-    Attributes:
-        value: the number, DN, shape (frame, y, x).
-        inside: pixels for which the rule holds, shape (y, x).
-        excess: by how much, DN.
-        share: of those samples that is replaced, no unit.
-    """
-
-    value: NDArray[np.integer[Any]]
-    inside: BoolArray
-    excess: int
-    share: float
+    value: NDArray[np.integer[Any]]  # the number, DN, (frame, y, x)
+    inside: BoolArray  # pixels for which the rule holds, (y, x)
+    excess: int  # by how much, DN
+    share: float  # of those samples that is replaced, no unit
 
 
 class Effect(Section):

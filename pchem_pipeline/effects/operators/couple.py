@@ -453,7 +453,7 @@ Source = Literal["sample", "row", "column", "frame"]
 #: Along the rows the columns are counted from the other end, and along the columns the rows.
 Axis = Literal["rows", "columns"]
 AXES: dict[Axis, int] = {"rows": 2, "columns": 1}
-_ALONG: dict[Source, tuple[int, ...]] = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}
+ALONG: dict[Source, tuple[int, ...]] = {"sample": (), "row": (2,), "column": (1,), "frame": (1, 2)}
 _FAR = 8.0  # standard deviations of the charge, and electrons, beyond which there is none
 
 
@@ -477,7 +477,7 @@ class ResponseTerm(Section):
 
     @model_validator(mode="after")
     def _of_the_past(self) -> Self:
-        if self.place[0] > 0 or any(self.place[axis] for axis in _ALONG[self.of]):
+        if self.place[0] > 0 or any(self.place[axis] for axis in ALONG[self.of]):
             raise ValueError("place: give no later frame, and 0 along a row, column or frame")
         if self.of == "sample" and not any(self.place) and not self.mirrored:
             raise ValueError("place: a sample does not follow itself")
@@ -512,7 +512,7 @@ class ResponseTerm(Section):
     def seen(self, charge: FloatArray, exposure: FloatArray) -> FloatArray:
         """Return the charge (frame, y, x) that samples follow, less its mean by the exposure (y, x), e-."""
         charge = np.maximum(charge - self.above, 0.0) - excess_moments(exposure, self.above)[0]
-        axes = _ALONG[self.of]
+        axes = ALONG[self.of]
         sums = np.broadcast_to(charge.sum(axis=axes, keepdims=True), charge.shape) if axes else charge
         if not any(self.place) and not self.mirrored:
             return np.asarray(sums - charge)
@@ -566,7 +566,7 @@ class EmpiricalResponse(Effect, tag="empirical_response"):
     def halo(self) -> int:
         """Return how far across rows samples follow others, px."""
         return max(
-            ALL_ROWS if 1 in _ALONG[term.of] or "columns" in term.mirrored else abs(term.place[1])
+            ALL_ROWS if 1 in ALONG[term.of] or "columns" in term.mirrored else abs(term.place[1])
             for term in self.terms
         )
 
@@ -631,10 +631,7 @@ class EmpiricalResponse(Effect, tag="empirical_response"):
         return found
 
     def sample_law(self, model: SampleLaw, maps: PixelMaps) -> SampleLaw:
-        """Return the law with the variance of what samples follow, of electrons as many as the pixel's own.
-
-        Terms of some columns are left out: see `by_law`.
-        """
+        """Return the law with the variance of what is followed, terms of some columns excepted (`by_law`)."""
         exposure = np.nan_to_num(maps.quanta_exposure)
         power: Any = sum(
             term.number * term.weight**2 * excess_moments(exposure, term.above)[1]

@@ -13,7 +13,6 @@ from pchem_pipeline.effects.estimators.charge_sums import ExposureProfile, expos
 from pchem_pipeline.effects.estimators.common_modes import SIGNIFICANT, responsivity, run_position, successive
 from pchem_pipeline.effects.estimators.series import (
     Levels,
-    TimeProfile,
     along_path,
     coherent_line,
     few_levels,
@@ -112,14 +111,12 @@ class Drift(Effect):
         time = evidence.time
         if time is None or time.frames.size < _FEWEST or not evidence.maps.usable.any():
             return ()
-        position = run_position(time.frames, time.n_run)
-        return [cls.of(profile) for profile in likely_profiles(cls.series(evidence, time), position)]
-
-    @classmethod
-    def of(cls, found: TimeProfile) -> Self:
-        """Return it with a profile that was found, its strength kept within the limits of its field."""
-        fields = {"shape": found.shape, "path": found.path, "settling_fraction": found.settling_fraction}
-        return cls.model_validate({cls.strength: cls.limited(cls.strength, found.size), **fields})
+        found = []
+        for each in likely_profiles(cls.series(evidence, time), run_position(time.frames, time.n_run)):
+            fields = {"shape": each.shape, "path": each.path, "settling_fraction": each.settling_fraction}
+            fields[cls.strength] = cls.limited(cls.strength, each.size)
+            found.append(cls.model_validate(fields))
+        return found
 
 
 class BiasDrift(Drift, OffsetEffect, tag="bias_drift"):
@@ -145,7 +142,6 @@ class BiasDrift(Drift, OffsetEffect, tag="bias_drift"):
         "bias_jumps": "means of the quadrants, frame by frame: jumps are sudden and independent",
         "flicker_noise": "block means of single pixels: 1/f noise is independent, a drift common",
     }
-    #: at 0.09 DN: rising, falling, there and back
     typical_values = (
         {"drift_dn": 0.09},
         {"drift_dn": -0.09},
@@ -217,7 +213,6 @@ class GainDrift(Drift, tag="gain_drift"):
         "signal_dependent_noise": "a repeated run: a drift has a time profile, noise has none",
         "flicker_noise": "dark and bright pixels: a gain drift is proportional to the signal",
     }
-    #: a gain that rises, falls, and does both
     typical_values = (
         {"drift": 0.006},
         {"drift": -0.006},
@@ -489,7 +484,7 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
     @classmethod
     def _sine(cls, profile: ExposureProfile, n_run: int) -> list[Self]:
         """Return a sine at the highest line of the spectrum, if one stands out."""
-        line = coherent_line(profile.deviation[:, None], profile.frames.astype(np.int64), n_run)
+        line = coherent_line(profile.deviation[:, None], profile.frames, n_run)
         if line is None or not 0.0 < line.per_frame < 1.0:
             return []
         rms = min(line.amplitude / 2.0**0.5, 1.0)

@@ -51,7 +51,6 @@ class SpuriousCharge(Effect, tag="spurious_charge"):
         "sums of Poisson electrons are Poisson, so that it is part of H; a series of integration times would "
         "show it (the part of H independent of time)"
     )
-    #: at 0.3 e-
     typical_values = ({"mean_e": 0.3},)
     mean_e: Electrons = Field(
         ge=0, le=1e6, description="mean number of spurious electrons per pixel and frame, e-"
@@ -87,7 +86,6 @@ class ChargeLag(Effect, tag="charge_lag"):
         "in steady light, delayed charge leaves Poisson statistics unchanged; a bright frame followed by "
         "dark ones would show it"
     )
-    #: at a fifth
     typical_values = ({"fraction": 0.2},)
     fraction: Ratio = Field(
         ge=0, le=0.9, description="probability that an electron is delayed by one frame, no unit"
@@ -123,7 +121,6 @@ class ChargeDiffusion(Effect, tag="charge_diffusion"):
         "randomly moved Poisson electrons remain independent and Poisson, only the map of H changes; an "
         "edge, a spot or single X-rays would show it"
     )
-    #: at a fifth
     typical_values = ({"fraction": 0.2},)
     fraction: Ratio = Field(ge=0, le=0.9, description="probability that an electron moves, no unit")
 
@@ -165,7 +162,6 @@ class OpticalCrosstalk(Effect, tag="optical_crosstalk"):
         "exposure_flicker": "distant pixels: correlated by flicker only",
         "cosmic_rays": "longer exposures: tracks are rare and bright, crosstalk is frequent and single",
     }
-    #: at one percent
     typical_values = ({"probability": 0.0112},)
     probability: Ratio = Field(
         ge=0, le=0.5, description="probability that an electron creates one in a neighbour, no unit"

@@ -210,7 +210,6 @@ class NoiseSkew(Effect, tag="noise_skew"):
         "adc_inl": "a sweep of the bias: skewness shifts with the peaks, INL is fixed in DN",
         "rts_noise": "longer runs: RTS noise stays in the same few pixels",
     }
-    #: a tail to high DN and one to low DN
     typical_values = ({"share": 0.4}, {"share": -0.4})
     share: Ratio = Field(
         ge=-1,
@@ -289,7 +288,6 @@ class SignalDependentNoise(Effect, tag="signal_dependent_noise"):
         "overdispersed_counts": "higher exposure: signal-dependent noise widens all peaks above 0 electrons",
         "gain_drift": "a repeated run: a drift has a time profile, noise has none",
     }
-    #: both growths
     typical_values = ({"noise_e": 0.06}, {"noise_e": 0.03, "growth": "linear"})
     noise_e: Electrons = Field(ge=0, description="noise of one electron, e-")
     growth: Literal["root", "linear"] = Field(

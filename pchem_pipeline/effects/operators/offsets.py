@@ -63,10 +63,7 @@ class OffsetEffect(Effect):
         """Return the offsets of a block of frames, DN, with shape (frame, y, x) or 1 along each of them."""
 
     def offset_values(self) -> FloatArray | None:
-        """Return values, DN, that stand, each as likely, for the offset of a pixel in a run.
-
-        None: the offsets are Gaussian, and the strength is their standard deviation.
-        """
+        """Return equally likely values of the offset, DN; None: Gaussian, of the strength's deviation."""
         return None
 
     def apply(self, values: AnyArray, context: EffectContext) -> AnyArray:
@@ -106,13 +103,10 @@ class SharedNoise(OffsetEffect):
 
     What is sampled once for many pixels shifts them all: ``x += n_t`` with ``n_t ~ N(0, s^2)``; the strength
     is s. A pixel's own histogram only broadens, to ``(sigma^2 + s^2)^(1/2)`` DN.
-
-    Attributes:
-        shared_by: what has one offset.
     """
 
     power = 2.0
-    shared_by: ClassVar[Literal["frame", "row", "column"]]
+    shared_by: ClassVar[Literal["frame", "row", "column"]]  # what has one offset
 
     def offsets(self, context: EffectContext) -> FloatArray:
         """Return one offset for each frame, or for each row or column of a frame, DN."""
@@ -157,7 +151,6 @@ class RowNoise(SharedNoise, tag="row_noise"):
         "interpixel_capacitance": "distant pixels of a row: row noise correlates them like neighbours",
         "frame_noise": "row means within a frame: frame noise is common to all",
     }
-    #: at 0.35 DN
     typical_values = ({"row_noise_dn": 0.35},)
     row_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the rows' offsets, DN")
 
@@ -182,7 +175,6 @@ class ColumnNoise(SharedNoise, tag="column_noise"):
         "frame_noise": "column means within a frame: frame noise is common to all",
         "row_noise": "row and column means within a frame: only column means scatter",
     }
-    #: at 0.32 DN
     typical_values = ({"column_noise_dn": 0.32},)
     column_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the columns' offsets, DN")
 
@@ -209,7 +201,6 @@ class FrameNoise(SharedNoise, tag="frame_noise"):
         "periodic_pickup": "spectrum of the frame means of a longer run: pickup is a line, noise is flat",
         "bias_drift": "a longer run: a drift grows with time, noise does not",
     }
-    #: at 0.12 DN
     typical_values = ({"frame_noise_dn": 0.12},)
     frame_noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the frames' offsets, DN")
 
@@ -262,7 +253,6 @@ class ReadoutAlternation(OffsetEffect, tag="readout_alternation"):
         "periodic_pickup": "another frame rate: pickup leaves half the frame rate",
         "frame_noise": "spectrum of the frame means: alternation is a line at half the frame rate",
     }
-    #: at 0.024 DN, with both signs
     typical_values = ({"alternation_dn": 0.024}, {"alternation_dn": -0.024})
     alternation_dn: Dn = Field(
         ge=-1e6, le=1e6, description="offset of even frames, DN; odd frames: the opposite"
@@ -444,7 +434,6 @@ class ReadOrderNoise(OffsetEffect, tag="read_order_noise"):
         "periodic_pickup": "spectrum in readout order: pickup is a line, 1/f noise falls",
         "bias_jumps": "successive frames: 1/f noise is independent",
     }
-    #: at 0.5 DN, of one tap and of several
     typical_values = tuple({"noise_dn": 0.5, "taps": taps} for taps in (1, 4, 2, 8))
     noise_dn: Dn = Field(ge=0, le=1e6, description="standard deviation of the noise, DN")
     taps: Count = Field(

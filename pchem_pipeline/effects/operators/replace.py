@@ -200,7 +200,6 @@ class RepeatedFrames(Effect, tag="repeated_frames"):
         "analog_memory": "successive frames: repeated ones are exactly equal, memory leaves differences",
         "flicker_noise": "successive frames: repeated ones are exactly equal, 1/f noise leaves differences",
     }
-    #: at one frame in a thousand
     typical_values = ({"probability": 1e-3},)
     probability: Ratio = Field(
         default=0.0, ge=0, le=0.5, description="probability that a frame repeats the one before, no unit"
@@ -305,7 +304,6 @@ class RepeatedLines(Effect, tag="repeated_lines"):
         "repeated_frames": "neighbouring lines of a frame, not successive frames, are equal",
         "row_noise": "neighbouring lines: repeated ones are exactly equal, noisy ones not",
     }
-    #: one row, and one column, in a thousand
     typical_values = ({"share": 1e-3}, {"share": 1e-3, "lines": "columns"})
     share: Ratio = Field(ge=0, le=0.5, description="probability that a line repeats the one before, no unit")
     lines: Literal["rows", "columns"] = Field(default="rows", description="which lines")
@@ -375,7 +373,6 @@ class MisplacedLines(Effect, tag="misplaced_lines"):
         "repeated_lines": "neighbouring lines: repeated lines are equal, misplaced ones are not",
         "interpixel_capacitance": "whole lines: capacitance changes all slightly, misplacement single ones",
     }
-    #: rows that change places, come late, and lose a sample, one in a hundred
     typical_values = (
         {"share": 1e-2},
         {"share": 1e-2, "move": "late"},
@@ -502,7 +499,6 @@ class PixelCorrection(Effect, tag="pixel_correction"):
         "optical_crosstalk": "camera corrections switched off: crosstalk stays",
         "clipping": "pixels of different bias: clipping is at one code, a correction at none",
     }
-    #: at 60 DN above the median
     typical_values = ({"threshold_dn": 60},)
     threshold_dn: Code = Field(
         ge=1, le=1 << 20, description="excess over the prediction from which samples are replaced, DN"

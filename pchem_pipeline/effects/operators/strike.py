@@ -81,7 +81,6 @@ class CosmicRays(Effect, tag="cosmic_rays"):
         "rts_noise": "a longer run: RTS noise stays in the same pixels, tracks hit all",
         "branching_counts": "several exposures: tracks are independent of the exposure",
     }
-    #: at one track in 80 frames
     typical_values = ({"tracks_per_frame": 0.012},)
     tracks_per_frame: PerFrame = Field(ge=0, le=100, description="mean number of tracks and clouds per frame")
     length_um: Micrometres = Field(

@@ -37,61 +37,38 @@ _MARGIN = 0.05
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis.
+    """An axis."""
 
-    Attributes:
-        label: with the unit.
-        low, high: its ends; None: those of the marks and a margin.
-        log: logarithmic.
-        linear_to: logarithmic to both sides beyond this, linear between; 0: not so.
-        whole: ticks at whole numbers alone.
-        ticks: places and texts of the ticks; empty: as the renderer finds them.
-        down: its values grow downwards; both ends are given.
-    """
-
-    label: str
-    low: float | None = None
-    high: float | None = None
-    log: bool = False
-    linear_to: float = 0.0
-    whole: bool = False
-    ticks: tuple[tuple[float, str], ...] = ()
-    down: bool = False
+    label: str  # with the unit
+    low: float | None = None  # None: that of the marks and a margin
+    high: float | None = None  # the same
+    log: bool = False  # logarithmic
+    linear_to: float = 0.0  # logarithmic to both sides beyond this, linear between; 0: not so
+    whole: bool = False  # ticks at whole numbers alone
+    ticks: tuple[tuple[float, str], ...] = ()  # places and texts; empty: as the renderer finds them
+    down: bool = False  # its values grow downwards; both ends are given
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mark:
-    """What all marks have.
-
-    Attributes:
-        label: in the legend; on the page its values are shown below it.
-        listed: whether the legend on paper has it too.
-        width: of its line, points (1/72 inch).
-        dash: style of its line.
-        alpha: 1 where nothing shines through.
-    """
+    """What all marks have."""
 
     colour: str = "blue"
-    label: str = ""
-    listed: bool = True
-    width: float = 1.1
-    dash: Dash = "-"
-    alpha: float = 1.0
+    label: str = ""  # in the legend; on the page its values are shown below it
+    listed: bool = True  # whether the legend on paper has it too
+    width: float = 1.1  # of its line, points (1/72 inch)
+    dash: Dash = "-"  # style of its line
+    alpha: float = 1.0  # 1 where nothing shines through
 
 
 @dataclass(frozen=True)
 class Line(Mark):
-    """A curve through points (n,), with a gap where y is NaN.
-
-    Attributes:
-        dots: diameter of a dot at each point, points.
-        step: each value holds half-way to its neighbours.
-    """
+    """A curve through points (n,), with a gap where y is NaN."""
 
     x: Values
     y: Values
-    dots: float = 0.0
-    step: bool = False
+    dots: float = 0.0  # diameter of a dot at each point, points
+    step: bool = False  # each value holds half-way to its neighbours
 
 
 @dataclass(frozen=True)
@@ -123,23 +100,15 @@ class Sticks(Mark):
 
 @dataclass(frozen=True)
 class Points(Mark):
-    """Points (n,).
-
-    Attributes:
-        mark: its shape, as matplotlib calls it; the page's script draws disks, squares and crosses.
-        size: diameter, points.
-        face: colour within an outline, ``none`` of nothing; empty: filled.
-        error: lengths of the error bars below and above, (2, n); None: there are none.
-        cap: length of the bars' ends, points.
-    """
+    """Points (n,)."""
 
     x: Values
     y: Values
-    mark: Shape = "o"
-    size: float = 3.5
-    face: str = ""
-    error: Values | None = None
-    cap: float = 0.0
+    mark: Shape = "o"  # its shape, as matplotlib calls it; the page's script draws disks, squares and crosses
+    size: float = 3.5  # diameter, points
+    face: str = ""  # colour within an outline, ``none`` of nothing; empty: filled
+    error: Values | None = None  # lengths of the error bars below and above, (2, n); None: there are none
+    cap: float = 0.0  # length of the bars' ends, points
 
 
 @dataclass(frozen=True)
@@ -181,29 +150,17 @@ class Words(Mark):
 
 @dataclass(frozen=True)
 class Image(Mark):
-    """A map: the values of pixels (row, column) as colours; of many rows and columns some are drawn.
+    """A map: the values of pixels (row, column) as colours; of many rows and columns some are drawn."""
 
-    Attributes:
-        values: of the pixels, NaN where there is none.
-        x: left and right end on the axis of x.
-        y: end of the first and of the last row on the upright axis.
-        scale: name of a scale of colours, or the colours themselves, one more than edges.
-        ends: values with the first and the last colour, in equal steps between; others have the nearest one.
-        edges: instead of these the values between one colour and the next, rising.
-        bar: places along a bar of the colours, 0 to 1, and their texts; empty: as the renderer finds them.
-        unit: what the bar shows; empty: no bar.
-        whole: ticks of the bar at whole numbers alone.
-    """
-
-    values: Values
-    x: tuple[float, float]
-    y: tuple[float, float]
-    scale: str | tuple[str, ...] = ""
-    ends: tuple[float, float] = (0.0, 1.0)
-    edges: Values | None = None
-    bar: tuple[tuple[float, str], ...] = ()
-    unit: str = ""
-    whole: bool = False
+    values: Values  # of the pixels, NaN where there is none
+    x: tuple[float, float]  # left and right end on the axis of x
+    y: tuple[float, float]  # end of the first and of the last row on the upright axis
+    scale: str | tuple[str, ...] = ""  # name of a scale, or the colours, one more than edges
+    ends: tuple[float, float] = (0.0, 1.0)  # values of the first and the last colour; others have the nearest
+    edges: Values | None = None  # instead of these the values between one colour and the next, rising
+    bar: tuple[tuple[float, str], ...] = ()  # places (0 to 1) and texts along a bar of colours; empty: found
+    unit: str = ""  # what the bar shows; empty: no bar
+    whole: bool = False  # ticks of the bar at whole numbers alone
 
     def shown(self, dots: float) -> tuple[Values, tuple[float, float], tuple[float, float]]:
         """Return the rows and columns that so many dots from left to right can show, and the ends of these.
@@ -231,65 +188,38 @@ class Image(Mark):
 
 @dataclass(frozen=True)
 class Panel:
-    """Marks between two axes.
+    """Marks between two axes."""
 
-    Attributes:
-        y: the upright axis; that of x is the stack's.
-        marks: what is drawn, the lowest first.
-        height: share of the stack.
-        legend: place on paper of a legend of its own; empty: none.
-        columns: of that legend.
-        room: factor by which the upper end of y is raised for it on paper, on a page and in a column.
-        note: small words in a corner.
-        corner: which one.
-        square: one is as long on both axes; the height of its stack follows from its width.
-    """
-
-    y: Axis
-    marks: tuple[Mark, ...]
-    height: float = 1.0
-    legend: str = ""
-    columns: int = 1
-    room: tuple[float, float] = (1.0, 1.0)
-    note: str = ""
-    corner: str = "upper right"
-    square: bool = False
+    y: Axis  # the upright axis; that of x is the stack's
+    marks: tuple[Mark, ...]  # what is drawn, the lowest first
+    height: float = 1.0  # share of the stack
+    legend: str = ""  # place on paper of a legend of its own; empty: none
+    columns: int = 1  # of that legend
+    room: tuple[float, float] = (1.0, 1.0)  # factor on the upper end of y for it, on a page and in a column
+    note: str = ""  # small words in a corner
+    corner: str = "upper right"  # which one
+    square: bool = False  # one is as long on both axes; the height of its stack follows from its width
 
 
 @dataclass(frozen=True)
 class Stack:
-    """Panels over each other that share the axis of x.
+    """Panels over each other that share the axis of x."""
 
-    Attributes:
-        panels: from top to bottom.
-        x: their common axis.
-        title: over the first one; lines that are too long for a width are broken at three blanks.
-        height_mm: on paper.
-        wide: shown only where panels have room side by side.
-    """
-
-    panels: tuple[Panel, ...]
-    x: Axis
-    title: str = ""
-    height_mm: float = 60.0
-    wide: bool = False
+    panels: tuple[Panel, ...]  # from top to bottom
+    x: Axis  # their common axis
+    title: str = ""  # over the first one; lines that are too long for a width are broken at three blanks
+    height_mm: float = 60.0  # on paper
+    wide: bool = False  # shown only where panels have room side by side
 
 
 @dataclass(frozen=True)
 class Chart:
-    """What a figure draws.
+    """What a figure draws."""
 
-    Attributes:
-        stacks: from left to right and from top to bottom, at least one.
-        widths: shares of the columns where stacks have room side by side; one below the other elsewhere.
-        legend: columns of a legend below all on paper, on a page and in a column; 0: none.
-        keys: colours and what they mean, in lines below all.
-    """
-
-    stacks: tuple[Stack, ...]
-    widths: tuple[float, ...] = (1.0,)
-    legend: tuple[int, int] = (0, 0)
-    keys: tuple[tuple[str, str], ...] = ()
+    stacks: tuple[Stack, ...]  # from left to right and from top to bottom, at least one
+    widths: tuple[float, ...] = (1.0,)  # shares of the columns where stacks have room side by side
+    legend: tuple[int, int] = (0, 0)  # its columns below all, on a page and in a column; 0: none
+    keys: tuple[tuple[str, str], ...] = ()  # colours and what they mean, in lines below all
 
     @property
     def still(self) -> bool:

@@ -95,19 +95,12 @@ _COMPRESSION = 4
 
 @dataclass(frozen=True)
 class Look:
-    """How a figure is drawn.
+    """How a figure is drawn."""
 
-    Attributes:
-        width_mm: width; panels stand side by side on a page, one above the other on a column.
-        svg_text: whether text of SVG stays text; else it becomes outlines.
-        dpi: dots per inch that images are drawn for at most.
-        style: style sheet of matplotlib over the package's own, a name or a file; empty: none.
-    """
-
-    width_mm: float = COLUMN_MM
-    svg_text: bool = False
-    dpi: int = 300
-    style: str = ""
+    width_mm: float = COLUMN_MM  # width; panels stand side by side on a page, one above the other on a column
+    svg_text: bool = False  # whether text of SVG stays text; else it becomes outlines
+    dpi: int = 300  # dots per inch that images are drawn for at most
+    style: str = ""  # style sheet of matplotlib over the package's own, a name or a file; empty: none
 
     @property
     def wide(self) -> bool:
@@ -156,8 +149,7 @@ def _in(look: Look) -> Iterator[None]:
 def _lay_out(drawing: Drawing) -> None:
     """Let the layout engine place everything, and leave the drawing without one.
 
-    Nothing is drawn for it. Any engine that is left, one that does nothing too, would make each saving draw
-    the figure twice.
+    Nothing is drawn for it. With any engine left each saving would draw the figure twice.
     """
     engine = drawing.get_layout_engine()
     if engine is None:
@@ -247,9 +239,7 @@ def draw_chart(look: Look, chart: Chart) -> Drawing:
 def draw_panels(given: Any, chart: Chart) -> None:
     """Draw the panels of a chart into axes of another figure, in the style of that figure.
 
-    Args:
-        given: axes, one or an array of any shape: one for each panel, in order.
-        chart: what is drawn.
+    Axes are one or an array of any shape: one for each panel, in order.
 
     Raises:
         ConfigError: they are no axes, or not as many as the chart has panels.
@@ -472,7 +462,11 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
     beside = axes.get_subplotspec()
     columns = 1 if beside is None else beside.get_topmost_subplotspec().get_gridspec().ncols
     values, x, y = mark.shown(look.width_mm / 25.4 * look.dpi / columns)
-    colours = _colours(mark).with_extremes(bad=LIGHT.no_value)
+    if isinstance(mark.scale, str):
+        scale: Colormap = mpl.colormaps[colour_of(mark.scale) or MAP_COLOURS].resampled(SHADES)
+    else:
+        scale = ListedColormap([colour_of(each) for each in mark.scale])
+    colours = scale.with_extremes(bad=LIGHT.no_value)
     low, high = mark.ends
     axes.set_facecolor(LIGHT.no_value)
     # a vector file keeps the pixels as they are, but for more of them than it can show
@@ -489,10 +483,3 @@ def _draw_image(axes: Axes, mark: Image, look: Look) -> None:
             bar.ax.set_yticklabels(texts)
         bar.ax.minorticks_off()
         bar.set_label(mark.unit)
-
-
-def _colours(mark: Image) -> Colormap:
-    """Return the colours of a map."""
-    if isinstance(mark.scale, str):
-        return mpl.colormaps[colour_of(mark.scale) or MAP_COLOURS].resampled(SHADES)
-    return ListedColormap([colour_of(each) for each in mark.scale])

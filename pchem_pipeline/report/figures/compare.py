@@ -63,11 +63,9 @@ def _difference(pair: Pair, name: str, each: MapDifference) -> Figure:
         f"{measured(each.median, each.median_stderr, unit)} ({signed(each.median_z)} sigma of one pixel); "
         f"scatter {short(each.spread_z, 2)} sigma; {count(each.n_changed, 'good pixel')} changed."
     )
-    caption = (
-        "Line: N(0, 1), expected from sampling noise alone."
-        if not pair.same_data
-        else "Both runs use the same frames, so there is no sampling noise."
-    )
+    caption = "Line: N(0, 1), expected from sampling noise alone."
+    if pair.same_data:
+        caption = "Both runs use the same frames, so there is no sampling noise."
     title = f"{label}: {pair.other.label} − {pair.one.label}"
     return Figure(
         f"difference_{name}_{pair.key}",
@@ -102,10 +100,7 @@ def ensembles_figures(runs: Sequence[RunFacts]) -> Iterator[Figure]:
 
 
 def ensemble_tables(runs: Sequence[RunFacts]) -> tuple[DataTable, ...]:
-    """Return the ensembles of runs, raw and after correction where all have it: run, signal, density, error.
-
-    The error is that of counting.
-    """
+    """Return the ensembles of runs, raw and after correction where all have it; errors are of counting."""
     tables = []
     for part, axis, prefix, _, unit, *_ in HALVES:
         if not all(axis in run.ensemble and np.sum(run.ensemble[f"{prefix}counts"]) > 0 for run in runs):

@@ -48,6 +48,8 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
     bars, parts, floor = gap_bars(data.found), families(data.found), data.found.gap.floor
     if not bars:
         return
+    ends = _limits(bars, parts, MICRO * floor)
+    rows = _gap_rows(bars, MICRO * floor, ends)
     words = [
         f"{bar.label} {short(bar.gap)}"
         + (f" ({short(bar.low)} to {short(bar.high)})" if math.isfinite(bar.low + bar.high) else "")
@@ -62,7 +64,7 @@ def gap_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "below the axis. By family of statistics: before and after.",
         f"Gap in micronats (10⁻⁶ nats) per sample: {'; '.join(words)}; floor {micronats(floor)}.",
         _gap_tables(bars, parts, MICRO * floor),
-        _gap_chart(bars, parts, MICRO * floor),
+        Chart((rows, _family_rows(parts, ends)), (1.0, 1.0), (2, 2)) if parts else Chart((rows,)),
         PAGE_MM,
     )
 
@@ -181,13 +183,6 @@ _ROLES: dict[str, tuple[str, Shape]] = {
     "after": ("blue", "D"),
     "runner-up": ("orange", "s"),
 }
-
-
-def _gap_chart(bars: Sequence[GapBar], parts: Sequence[Family], floor: float) -> Chart:
-    """Return the gap before and after against its floor (1e-6 nats), with rivals, and by family."""
-    ends = _limits(bars, parts, floor)
-    rows = _gap_rows(bars, floor, ends)
-    return Chart((rows, _family_rows(parts, ends)), (1.0, 1.0), (2, 2)) if parts else Chart((rows,))
 
 
 def _limits(bars: Sequence[GapBar], parts: Sequence[Family], floor: float) -> tuple[float, float]:

@@ -86,14 +86,13 @@ def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
         return
     origin = data.found.examined.origin
     flagged = [pixel for place in data.found.where for pixel in place.pixels]
-    words = []
-    for each in maps:
-        known = finite(each.z)
-        words.append(
-            f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} "
-            f"(expected 0 and 1), {count(each.outliers, 'pixel')} beyond 5"
-            + (f", mainly in {each.region.describe()}" if each.region is not None else "")
-        )
+    words = [
+        f"{each.title}: mean {known.mean():+.2f}, standard deviation {known.std():.2f} "
+        f"(expected 0 and 1), {count(each.outliers, 'pixel')} beyond 5"
+        + (f", mainly in {each.region.describe()}" if each.region is not None else "")
+        for each in maps
+        for known in [finite(each.z)]
+    ]
     columns = {each.title: each.z for each in maps}
     table = DataTable(columns, dict.fromkeys(columns, "standard deviations"), origin=origin)
     yield Figure(
@@ -113,11 +112,20 @@ def sensor_figures(data: DiscrepancyData) -> Iterator[Figure]:
 
 def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
     """Return the means of rows and columns, and their scatter."""
-    origin = data.found.examined.origin
-    tables = _line_tables(data.arrays, origin)
+    tables: list[DataTable] = []
+    words: list[str] = []
+    stacks: list[Stack] = []
+    for line, first in zip(LINE_WORDS, data.found.examined.origin, strict=True):
+        rms, image = (np.asarray(data.arrays.get(f"{line}_{name}", ())) for name in ("rms", "image"))
+        if rms.size:
+            tables += _line_tables(line, rms, image, first)
+            words.append(_line_text(line, rms))
+            for channel in ("readout", "charge"):
+                shown = image[CHANNELS.index(channel)] if image.size else None
+                stacks.append(_frames(shown, line, channel, first))
+            stacks.append(_scatter(rms, line, first))
     if not tables:
         return
-    words = [_line_text(line, np.asarray(data.arrays[f"{line}_rms"])) for line in _lines(data.arrays)]
     yield Figure(
         "discrepancy_lines",
         "where",
@@ -126,56 +134,38 @@ def line_figures(data: DiscrepancyData) -> Iterator[Figure]:
         "column over all frames, relative to independent pixels (1). Hints: stripes in the readout, row or "
         "column noise; slanted lines, periodic pickup.",
         "Scatter of the means over the frames, relative to independent pixels (1). " + "; ".join(words) + ".",
-        tables,
-        _lines_chart(data.arrays, origin),
+        tuple(tables),
+        Chart(tuple(stacks), (1.0, 1.0, 1.0)),
         PAGE_MM,
     )
 
 
-def _lines(arrays: Arrays) -> list[str]:
-    return [line for line in LINE_WORDS if arrays.get(f"{line}_rms", np.empty(0)).size]
-
-
-def _line_tables(arrays: Arrays, origin: tuple[int, int]) -> tuple[DataTable, ...]:
-    """Return the scatter of each row and column, and their means in the first frames."""
-    tables = []
-    for line in _lines(arrays):
-        axis, first = ("y", origin[0]) if line == "row" else ("x", origin[1])
-        rms, image = np.asarray(arrays[f"{line}_rms"]), arrays.get(f"{line}_image")
-        columns = {axis: first + np.arange(rms.shape[1])}
-        columns |= {f"{each}: rms / expected rms": row for each, row in zip(CHANNELS, rms, strict=False)}
-        tables.append(DataTable(columns, {axis: "pixel"}, f"{line}_scatter"))
-        if image is not None and image.size:
-            means = dict(zip(CHANNELS, image, strict=False))
-            units = dict.fromkeys(means, "standard deviations")
-            tables.append(DataTable(means, units, f"{line}_means", ("frame", f"{axis} (pixel)"), (0, first)))
-    return tuple(tables)
+def _line_tables(line: str, rms: NDArray[Any], image: NDArray[Any], first: int) -> list[DataTable]:
+    """Return the scatter of each row or column, and their means in the first frames."""
+    axis = "y" if line == "row" else "x"
+    columns = {axis: first + np.arange(rms.shape[1])}
+    columns |= {f"{each}: rms / expected rms": row for each, row in zip(CHANNELS, rms, strict=False)}
+    scatter = DataTable(columns, {axis: "pixel"}, f"{line}_scatter")
+    means = dict(zip(CHANNELS, image, strict=False))
+    units = dict.fromkeys(means, "standard deviations")
+    shown = DataTable(means, units, f"{line}_means", ("frame", f"{axis} (pixel)"), (0, first))
+    return [scatter, shown] if image.size else [scatter]
 
 
 def _line_text(line: str, rms: np.ndarray[Any, Any]) -> str:
-    found = []
-    for channel, values in zip(CHANNELS, rms, strict=False):
-        known = finite(values)
-        if known.size:
-            found.append(f"{channel} median {np.median(known):.2f}, largest {known.max():.2f}")
+    channels = zip(CHANNELS, map(finite, rms), strict=False)
+    found = [f"{c} median {np.median(v):.2f}, largest {v.max():.2f}" for c, v in channels if v.size]
     return f"{LINE_WORDS[line]}: {' and '.join(found) or 'not known'}"
 
 
 class PixelMap(NamedTuple):
-    """A statistic of every pixel in sigma, (y, x), with its overall significance.
-
-    Attributes:
-        far: the largest of three departures from N(0, 1), each in its own standard errors: of the mean, of
-            the mean square, and of the number of pixels beyond 5.
-        outliers: pixels beyond 5.
-        region: deviating part of the sensor; None: uniform.
-    """
+    """A statistic of every pixel in sigma, (y, x), with its overall significance."""
 
     title: str
     z: FloatArray
-    far: float
-    outliers: int
-    region: Region | None = None
+    far: float  # departure from N(0, 1), see :func:`_pixel_map`
+    outliers: int  # pixels beyond 5
+    region: Region | None = None  # deviating part of the sensor; None: uniform
 
 
 def regions_of(data: DiscrepancyData) -> dict[str, Region]:
@@ -206,7 +196,7 @@ def _named_maps(arrays: Arrays) -> dict[str, tuple[str, NDArray[Any]]]:
     if "goodness" in arrays:
         found["goodness"] = ("goodness of fit (large: poor)", arrays["goodness"])
     for name, values in zip(SCORES, arrays.get("score", ()), strict=False):
-        found[f"score.{name}"] = (_SCORE_WORDS.get(name, name), values)
+        found[f"score.{name}"] = (_SCORE_WORDS[name], values)
     for array, name, words in (
         ("block_spread", "spread", "block means vary"),
         ("trend", "trend", "block means rise"),
@@ -220,6 +210,7 @@ def _named_maps(arrays: Arrays) -> dict[str, tuple[str, NDArray[Any]]]:
 
 
 def _pixel_map(words: str, values: NDArray[Any], region: Region | None) -> PixelMap:
+    """Return a map with the largest departure of mean, mean square or outliers, in its standard errors."""
     z = np.asarray(values, dtype=np.float64)
     known = finite(z)
     n, outliers = known.size, int((np.abs(known) > BEYOND_DOUBT).sum())
@@ -295,24 +286,12 @@ def _outline(inside: BoolArray, origin: tuple[int, int]) -> Line:
     return Line(xs, ys, colour="ink", width=1.1)
 
 
-def _lines_chart(arrays: Arrays, origin: tuple[int, int]) -> Chart:
-    """Return the means of rows and columns: the first frames as a picture, and the scatter of each line."""
-    stacks = []
-    for line in _lines(arrays):
-        image, first = arrays.get(f"{line}_image"), origin[0 if line == "row" else 1]
-        for channel in ("readout", "charge"):
-            shown = None if image is None else image[CHANNELS.index(channel)]
-            stacks.append(_frames(shown, line, channel, first))
-        stacks.append(_scatter(np.asarray(arrays[f"{line}_rms"]), line, first))
-    return Chart(tuple(stacks), (1.0, 1.0, 1.0))
-
-
 def _frames(image: NDArray[Any] | None, line: str, channel: str, first: int) -> Stack:
     """Return the means of the rows or columns of the first frames as a picture."""
     title, axis = f"{channel}: means of {LINE_WORDS[line]}", "y (pixel)" if line == "row" else "x (pixel)"
     x = Axis("frame (the first ones examined)", whole=True)
     panel = Panel(Axis(axis, whole=True), (), note="not kept")
-    if image is not None and image.size:
+    if image is not None:
         across, down = place_of(image.T.shape, (first, 0))
         mark = Image(image.T, across, down, scale=DIVERGING, ends=(-_LEAST, _LEAST), unit="sigma")
         panel = Panel(Axis(axis, *down, whole=True, down=True), (mark,))

@@ -41,21 +41,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DataTable:
-    """Named columns with units: of n rows, or maps of a sensor (y, x) of one shape.
+    """Named columns with units: of n rows, or maps of a sensor (y, x) of one shape."""
 
-    Attributes:
-        columns: name to values.
-        units: name to unit, of those that have one.
-        part: what of the figure it is, for the name of its file; empty for the main part.
-        index: names of the axes of maps.
-        origin: place of their first value.
-    """
-
-    columns: Mapping[str, Sequence[Any] | NDArray[Any]]
-    units: Mapping[str, str] = field(default_factory=dict)
-    part: str = ""
-    index: tuple[str, str] = ("y (pixel)", "x (pixel)")
-    origin: tuple[int, int] = (0, 0)
+    columns: Mapping[str, Sequence[Any] | NDArray[Any]]  # name to values
+    units: Mapping[str, str] = field(default_factory=dict)  # name to unit, of those that have one
+    part: str = ""  # what of the figure it is, for the name of its file; empty for the main part
+    index: tuple[str, str] = ("y (pixel)", "x (pixel)")  # names of the axes of maps
+    origin: tuple[int, int] = (0, 0)  # place of their first value
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return np.asarray(self.columns[name])
@@ -94,25 +86,16 @@ class DataTable:
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure of a page.
+    """One figure of a page."""
 
-    Attributes:
-        name: name of its files.
-        section: id of the section that shows it.
-        caption: what is drawn and how to read it.
-        alt: what a reader who does not see it should know, with the numbers.
-        tables: its data, the main part first.
-        width_mm: width at which it is saved.
-    """
-
-    name: str
-    section: str
+    name: str  # name of its files
+    section: str  # id of the section that shows it
     title: str
-    caption: str
-    alt: str
-    tables: tuple[DataTable, ...]
+    caption: str  # what is drawn and how to read it
+    alt: str  # what a reader who does not see it should know, with the numbers
+    tables: tuple[DataTable, ...]  # its data, the main part first
     chart: Chart
-    width_mm: float = COLUMN_MM
+    width_mm: float = COLUMN_MM  # width at which it is saved
 
     def __repr__(self) -> str:
         return f"<Figure {self.name}: {self.title}>"

@@ -64,6 +64,9 @@ def method_figures(data: ReportData) -> Iterator[Figure]:
         for method in known
     ]
     crossing = f" {crossing_text(study)}." if study else ""
+    letters = ("(a) ", "(b) ") if study and known else ("", "")
+    stacks = [_study(study, letters[0])] if study else []
+    stacks += [_run(known, letters[1])] if known else []
     yield Figure(
         "methods_gain_error",
         "methods",
@@ -76,7 +79,7 @@ def method_figures(data: ReportData) -> Iterator[Figure]:
         "Errors are clipped at 180 %.",
         f"Root mean square error of the gain on this run's pixels. {'; '.join(words)}.{crossing}",
         _method_tables(study, known),
-        _methods_chart(study, known),
+        Chart(tuple(stacks), (2.3, 1.0) if len(stacks) > 1 else (1.0,)),
         PAGE_MM,
     )
 
@@ -104,13 +107,6 @@ def _numbers(values: Iterable[float | None]) -> FloatArray:
 def percent_text(value: float | None) -> str:
     """Return a share in percent with three digits; a dash where it is not known."""
     return "-" if value is None else f"{100 * value:.3g}"
-
-
-def _methods_chart(study: _Rows, known: _Rows) -> Chart:
-    """Return the error of the gain against the read noise (simulated), and that on the pixels of the run."""
-    if study and known:
-        return Chart((_study(study, "(a) "), _run(known, "(b) ")), (2.3, 1.0))
-    return Chart((_study(study, "") if study else _run(known, ""),))
 
 
 def _study(study: _Rows, letter: str) -> Stack:
@@ -203,13 +199,10 @@ def _crossing(rows: Iterable[tuple[float, float | None, float | None]]) -> float
 def crossing_text(study: _Rows) -> str:
     """Say up to which read noise one-sample PCH-EM beats photon transfer with as many frames."""
     expected, measured = bound_crossing(study), measured_crossing(study)
-    if expected is None and measured is None:
+    both = ((expected, "by the Cramer-Rao bound"), (measured, "on the simulated pixels"))
+    parts = [f"{short(noise, 2)} e- {words}" for noise, words in both if noise is not None]
+    if not parts:
         return "the errors of one-sample PCH-EM and two-sample photon transfer do not cross in this range"
-    parts = []
-    if expected is not None:
-        parts.append(f"{short(expected, 2)} e- by the Cramer-Rao bound")
-    if measured is not None:
-        parts.append(f"{short(measured, 2)} e- on the simulated pixels")
     return (
         "one-sample PCH-EM is more precise in the gain than two-sample photon transfer with the same number "
         f"of frames up to a read noise of {', '.join(parts)}; above it, take several exposures"

@@ -260,21 +260,19 @@ def pair_tables(pair: Pair) -> list[Table]:
 
 
 def _map_table(pair: Pair) -> Table:
-    rows = []
-    for name, each in pair.maps.items():
-        same = "within the limit" if pair.limits else "within sampling noise"
-        reason = pair.reasons.get(name)
-        rows.append(
-            {
-                "map": heading(name),
-                "median": measured(each.median, each.median_stderr) if each.median else "0",
-                "median (σ)": f"{each.median_z:+.3f}".replace("-", "−"),
-                "scatter (σ)": f"{each.spread_z:.3f}",
-                "pixels changed": f"{each.n_changed:,} of {each.n_counted:,}",
-                "largest (σ)": short(each.largest_z),
-                "": "" if reason is None else "changed" if reason else same,
-            }
-        )
+    same = "within the limit" if pair.limits else "within sampling noise"
+    rows = [
+        {
+            "map": heading(name),
+            "median": measured(each.median, each.median_stderr) if each.median else "0",
+            "median (σ)": f"{each.median_z:+.3f}".replace("-", "−"),
+            "scatter (σ)": f"{each.spread_z:.3f}",
+            "pixels changed": f"{each.n_changed:,} of {each.n_counted:,}",
+            "largest (σ)": short(each.largest_z),
+            "": ("changed" if pair.reasons[name] else same) if name in pair.reasons else "",
+        }
+        for name, each in pair.maps.items()
+    ]
     unit_words = (
         "Same frames: sigma is the standard error of one fit."
         if pair.same_data

@@ -375,14 +375,9 @@ PARTS = (
 def finding(data: DiscrepancyData) -> Finding:
     """Return the verdict with its key numbers and remarks."""
     found = data.found
-    return Finding(
-        VERDICT_LEVELS.get(found.verdict, "note"),
-        found.verdict.replace("_", " ").capitalize(),
-        typeset(found.sentence),
-        frames_text(found),
-        key_facts(data),
-        remarks(data),
-    )
+    level, sentence = VERDICT_LEVELS.get(found.verdict, "note"), typeset(found.sentence)
+    facts = key_facts(data), remarks(data)
+    return Finding(level, found.word.capitalize(), sentence, frames_text(found), *facts)
 
 
 def evidence(data: DiscrepancyData, figures: Sequence[Figure]) -> list[Section]:
@@ -488,19 +483,14 @@ def _moved_fact(found: Verdict) -> list[KeyFact]:
     name, largest = max(moved, key=lambda pair: abs(pair[1].in_stderr), default=("", None))
     if largest is None or abs(largest.in_stderr) < _NOT_MOVED:
         return []
-    unit = unit_text(largest.unit)
     small = ", negligible" if abs(largest.in_stderr) < _IMMATERIAL else ""
-    return [
-        KeyFact(
-            f"largest change: {_parameter_name(name)}",
-            f"{_signed(largest.median, 2)} {unit}".strip(),
-            (f"{_signed(largest.in_stderr, 2)} standard errors of one pixel{small}",),
-        )
-    ]
+    value = f"{_signed(largest.median)} {unit_text(largest.unit)}".strip()
+    more = f"{_signed(largest.in_stderr)} standard errors of one pixel{small}"
+    return [KeyFact(f"largest change: {_parameter_name(name)}", value, (more,))]
 
 
-def _signed(value: float, digits: int = 3) -> str:
-    return short(value, digits) if value < 0 or not math.isfinite(value) else f"+{short(value, digits)}"
+def _signed(value: float) -> str:
+    return short(value, 2) if value < 0 or not math.isfinite(value) else f"+{short(value, 2)}"
 
 
 def _chance_fact(found: Verdict) -> list[KeyFact]:
@@ -552,14 +542,12 @@ def _closing(found: Verdict) -> Iterator[Flag]:
     gap = found.gap
     if not (math.isfinite(gap.after) and math.isfinite(gap.floor)):
         return
-    if gap.within_chance:
+    if gap.before <= gap.floor:
         yield Flag("note", "The gap is within sampling noise before, too: only single statistics show it.")
     elif gap.after <= gap.floor and gap.standing_out:
         families = families_words(gap.standing_out)
         yield Flag("caution", f"A significant discrepancy remains in {families}.")
     elif gap.after > gap.floor:
-        left = percent(1.0 - gap.closed_fraction)
         words = f"{micronats(gap.after)} micronats per sample, sampling noise up to {micronats(gap.floor)}"
-        yield Flag(
-            "caution" if found.verdict == "named_in_part" else "note", f"{left} of the gap remains: {words}."
-        )
+        left = f"{percent(1.0 - gap.closed_fraction)} of the gap remains: {words}."
+        yield Flag("caution" if found.verdict == "named_in_part" else "note", left)

@@ -68,15 +68,8 @@ def emva_tables(data: ReportData) -> list[Table]:
             data.maps, data.status, data.kind, defects, data.outlier_sigmas, samples=data.samples
         )
     ]
-    return [
-        Table(
-            "emva1288",
-            "Data sheet quantities of EMVA 1288",
-            f"Flagged {data.noun}s are excluded. As a file: pchem export {data.typed_run} --format emva",
-            rows,
-            "emva",
-        )
-    ]
+    words = f"Flagged {data.noun}s are excluded. As a file: pchem export {data.typed_run} --format emva"
+    return [Table("emva1288", "Data sheet quantities of EMVA 1288", words, rows, "emva")]
 
 
 def emva_rows(

@@ -100,35 +100,21 @@ class Finding:
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a page: its result, tables, figures, further tables.
+    """A section of a page: its result, tables, figures, further tables."""
 
-    Attributes:
-        id: anchor in the page.
-        empty: sentence where there is nothing to show; empty: the section is left out.
-        name: in the table of contents; empty: the title.
-        verdict: what came out.
-        missing: sentences on what is not shown, and why.
-        first: tables above the figures.
-        figures: between these and the others.
-        tables: tables below the figures.
-        kind: of a section of its own kind: the template ``section_<kind>.html.j2`` shows it, as ``section``.
-        content: what that template shows.
-        folded: whether it is closed until somebody opens it.
-    """
-
-    id: str
+    id: str  # anchor in the page
     title: str
     intro: str = ""
-    empty: str = "Not shown: no data in this run."
-    name: str = ""
-    verdict: Finding | None = None
-    missing: Sequence[str] = ()
-    first: Sequence[Table] = ()
-    figures: Sequence[Figure] = ()
-    tables: Sequence[Table] = ()
-    kind: str = ""
-    content: Any = None
-    folded: bool = False
+    empty: str = "Not shown: no data in this run."  # where there is nothing; empty: it is left out
+    name: str = ""  # in the table of contents; empty: the title
+    verdict: Finding | None = None  # what came out
+    missing: Sequence[str] = ()  # sentences on what is not shown, and why
+    first: Sequence[Table] = ()  # tables above the figures
+    figures: Sequence[Figure] = ()  # between these and the others
+    tables: Sequence[Table] = ()  # tables below the figures
+    kind: str = ""  # of its own kind: the template ``section_<kind>.html.j2`` shows it
+    content: Any = None  # what that template shows
+    folded: bool = False  # whether it is closed until somebody opens it
 
     def filled(self, **content: Any) -> Section | None:
         """Return the section with what it shows; without anything it says so, or is None."""

@@ -20,7 +20,7 @@ from pchem_pipeline.report.figures.samples import AXES, slope_of
 from pchem_pipeline.report.inspector import embedded, text_of
 from pchem_pipeline.report.pages.discrepancy import DISCREPANCY_PAGE, evidence, finding
 from pchem_pipeline.report.pages.emva import emva_tables
-from pchem_pipeline.report.pages.page import DrawAll, Drawn, Finding, Section, draw_here, render_page
+from pchem_pipeline.report.pages.page import DrawAll, Finding, Section, draw_here, render_page
 from pchem_pipeline.report.pages.report_json import report_json
 from pchem_pipeline.report.pages.summary import (
     answers,
@@ -185,8 +185,12 @@ def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, st
     sections = _page_sections(data, shown, tables, verdict)
     files = {}
     if data.discrepancy is not None and verdict is not None:
-        parts = evidence(data.discrepancy, others)
-        files[DISCREPANCY_PAGE] = _discrepancy_page(data, verdict, parts, drawn)
+        about = [] if data.shape[0] == 1 else [f"{data.shape[0]} × {data.shape[1]} pixels"]
+        about += [f"{data.n_frames:,} frames"] if data.n_frames else []
+        parts = [Section("verdict", "Verdict", verdict=verdict), *evidence(data.discrepancy, others)]
+        files[DISCREPANCY_PAGE] = render_page(
+            "discrepancy.html.j2", parts, drawn, title=data.title, about=", ".join(about)
+        )
     inspector = embedded(data)
     files["report.json"] = report_json(data)
     files["report.html"] = render_page(
@@ -199,16 +203,6 @@ def render_report(data: ReportData, draw: DrawAll | None = None) -> dict[str, st
         inspector=inspector,
     )
     return files
-
-
-def _discrepancy_page(
-    data: ReportData, verdict: Finding, parts: Sequence[Section], drawn: Mapping[str, Drawn]
-) -> str:
-    about = "" if data.shape[0] == 1 else f"{data.shape[0]} × {data.shape[1]} pixels"
-    if data.n_frames:
-        about += f"{', ' if about else ''}{data.n_frames:,} frames"
-    sections = [Section(id="verdict", title="Verdict", verdict=verdict), *parts]
-    return render_page("discrepancy.html.j2", sections, drawn, title=data.title, about=about)
 
 
 def citation(data: ReportData) -> dict[str, str]:

@@ -137,19 +137,16 @@ def _samples(data: ReportData) -> dict[str, Any] | None:
     """Return what each exposure has of its own; None for a run of one."""
     if data.samples is None:
         return None
-    rows = []
-    for i, sample in enumerate(data.samples.samples):
-        row: dict[str, Any] = {
-            "name": sample.name,
-            "bias": sample.kind == "bias",
-            "x": sample.x,
-            "n_frames": sample.n_frames,
+    arrays = data.samples.arrays
+    names = [name for name in ("quanta_exposure", "linearity_residual") if name in arrays]
+    rows = [
+        {"name": sample.name, "bias": sample.kind == "bias", "x": sample.x, "n_frames": sample.n_frames}
+        | {
+            name: dict(zip(("median", "median_stderr"), middle(arrays[name][i]), strict=False))
+            for name in names
         }
-        for name in ("quanta_exposure", "linearity_residual"):
-            if name in data.samples.arrays:
-                centre, error, *_ = middle(data.samples.arrays[name][i])
-                row[name] = {"median": centre, "median_stderr": error}
-        rows.append(row)
+        for i, sample in enumerate(data.samples.samples)
+    ]
     return {"against": data.samples.against, "rows": rows}
 
 

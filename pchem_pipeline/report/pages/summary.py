@@ -21,7 +21,7 @@ from pchem_pipeline.base.wording import (
     symbol,
     typeset,
 )
-from pchem_pipeline.discrepancy.quick.checks import Check, Level, QuickLook
+from pchem_pipeline.discrepancy.quick.checks import GRAVEST_FIRST, Check, Level, QuickLook
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
 from pchem_pipeline.model.checks.map_parts import Parts
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, FitStatus, flags_of, words_of
@@ -60,9 +60,8 @@ def criteria(data: ReportData) -> list[Criterion]:
         if data.has_values(name):
             median, (_, words, unit) = data.summary(name).median, symbol(name)
             shown, within = f"{short(median, 4)} {unit}", f"{low:g} to {high:g} {unit}"
-            found.append(
-                Criterion(f"medians.{name}", f"median {words}", shown, within, low <= median <= high)
-            )
+            met, words = low <= median <= high, f"median {words}"
+            found.append(Criterion(f"medians.{name}", words, shown, within, met))
     return found
 
 
@@ -76,10 +75,6 @@ def _read_noise(data: ReportData) -> _Found:
 def _failed(data: ReportData) -> _Found:
     pixels = pixel_counts(data)
     return pixels.failed / max(pixels.total, 1), f"{data.noun}s without a value"
-
-
-def _flagged_share(data: ReportData) -> _Found:
-    return float(data.flagged.mean()), f"flagged {data.noun}s"
 
 
 def _hot(data: ReportData) -> _Found:
@@ -120,7 +115,7 @@ def _gain_spread(data: ReportData) -> _Found:
 _MEASURES: dict[str, tuple[Callable[[ReportData], _Found], Callable[[float], str]]] = {
     "read_noise_e": (_read_noise, lambda value: f"{short(value)} e⁻"),
     "failed_pixels": (_failed, percent),
-    "flagged_pixels": (_flagged_share, percent),
+    "flagged_pixels": (lambda data: (float(data.flagged.mean()), f"flagged {data.noun}s"), percent),
     "hot_pixels": (_hot, percent),
     "outlying_pixels": (_outlying, percent),
     "gain_nonuniformity": (_gain_spread, percent),
@@ -222,10 +217,7 @@ def pixel_counts(data: ReportData) -> PixelCounts:
 
 
 def key_numbers(data: ReportData, *, with_flagged: bool = False) -> list[KeyNumber]:
-    """Return the numbers of the first screen, of all pixels with a value or of those without a flag.
-
-    If most are flagged, nothing is said of the others.
-    """
+    """Return the numbers of the first screen, of all pixels or of unflagged ones, if these are not few."""
     if data.mostly_flagged and not with_flagged:
         return []
     found = []
@@ -299,8 +291,7 @@ def flags(data: ReportData) -> list[Flag]:
 
 def gravest_first(found: Iterable[Flag]) -> list[Flag]:
     """Return remarks by their level, the gravest first."""
-    order = ("serious", "caution", "note", "good")
-    return sorted(found, key=lambda flag: order.index(flag.level))
+    return sorted(found, key=lambda flag: GRAVEST_FIRST.index(flag.level))
 
 
 def _levels(data: ReportData) -> Iterator[Flag]:
@@ -523,10 +514,7 @@ def _as_sentence(text: str) -> str:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to a question: a word, the reason in a sentence, and the criteria that it rests on, if any.
-
-    ``level`` is the class of the style sheet.
-    """
+    """The answer to a question: a word, the reason in a sentence, and the criteria it rests on, if any."""
 
     question: str
     level: Level
@@ -555,9 +543,8 @@ def _sensor(data: ReportData) -> Answer:
         text = f"Most {data.noun}s are flagged: the data do not fix their gain and read noise."
         return Answer(question, "serious", "Unknown", text, kept)
     missed = [each for each in judged if not each.met]
-    limits = "; ".join(
-        f"{each.words} {each.found} (limit {each.limit.removeprefix('≤ ')})" for each in missed
-    )
+    words = (f"{each.words} {each.found} (limit {each.limit.removeprefix('≤ ')})" for each in missed)
+    limits = "; ".join(words)
     met = f"all {len(judged)} criteria pass" if judged else "no limits are set (report.criteria)"
     share = "All" if pixels.failed == 0 else f"{percent(pixels.fitted, pixels.total)} of"
     text = f"{share} {count(pixels.total, data.noun)} have a value; {limits or met}."
@@ -567,10 +554,8 @@ def _sensor(data: ReportData) -> Answer:
         noisy = data.summary("read_noise_e").median > _TOO_NOISY
         word = "Too noisy to count electrons" if noisy else "Too noisy"
         return Answer(question, "caution", word, text, judged)
-    if data.often_flagged:
-        return Answer(question, "caution", "Partly known", text, judged)
-    if missed:
-        return Answer(question, "caution", "Mostly", text, judged)
+    if data.often_flagged or missed:
+        return Answer(question, "caution", "Partly known" if data.often_flagged else "Mostly", text, judged)
     return Answer(question, "good", "Yes", text, judged)
 
 
@@ -581,8 +566,7 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
     about = [flag for flag in remarks if flag.about == "results"]
     doubts: tuple[tuple[Level, str], ...] = (("serious", "No"), ("caution", "With caution"))
     for level, word in doubts:
-        texts = [flag.text for flag in about if flag.level == level]
-        if texts:
+        if texts := [flag.text for flag in about if flag.level == level]:
             more = f" ({len(texts) - 1} more below)" if len(texts) > 1 else ""
             return Answer(question, level, word, f"{texts[0]}{more}")
     passed = sum(flag.level == "good" for flag in about)
@@ -592,10 +576,8 @@ def _belief(data: ReportData, remarks: list[Flag]) -> Answer:
         looked, yes = _not_looked_for(data), "No problem found by the quick checks"
     pixels = pixel_counts(data)
     if pixels.failed > data.allowed_failed * pixels.total:
-        word = f"For the {data.noun}s with a value"
-        return Answer(
-            question, "caution", word, f"{checks}; {count(pixels.failed, data.noun)} without a value.{looked}"
-        )
+        text = f"{checks}; {count(pixels.failed, data.noun)} without a value.{looked}"
+        return Answer(question, "caution", f"For the {data.noun}s with a value", text)
     return Answer(question, "good", yes, f"{checks}.{looked}")
 
 
@@ -635,10 +617,8 @@ def next_steps(data: ReportData) -> list[Step]:
         return [Step(f"pchem run {RUN}", "finish the run")]
     step = data.code_step
     if step > 1 and not step & (step - 1):
-        why = (
-            f"set input.bit_shift: {step.bit_length() - 1} in the YAML (left-justified samples) and run again"
-        )
-        return [Step(f"pchem run {RUN}", why)]
+        shift = f"set input.bit_shift: {step.bit_length() - 1} in the YAML"
+        return [Step(f"pchem run {RUN}", f"{shift} (left-justified samples) and run again")]
     if data.failed.all():
         return [
             Step(

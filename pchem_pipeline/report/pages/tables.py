@@ -114,12 +114,8 @@ def _regions(data: ReportData) -> Table:
         for name, region in data.regions.items()
         for found in [data.in_region(name)]
     ]
-    return Table(
-        "regions",
-        "Regions",
-        "Median of each parameter with its standard error, in the parts of the sensor of report.regions.",
-        rows,
-    )
+    words = "Median of each parameter with its standard error, in the parts of the sensor of report.regions."
+    return Table("regions", "Regions", words, rows)
 
 
 def _overscan(data: ReportData) -> Table:
@@ -537,8 +533,6 @@ def method_tables(data: ReportData) -> list[Table]:
     rows = [dict(zip_longest(_HEADS, row, fillvalue="")) for row in method_rows(result)]
     remarks = " ".join(f"{capitalised(remark)}." for remark in result["remarks"])
     verdict = f"{capitalised(crossing_text(result['study']))}." if result["study"] else ""
-    caption = (
-        f"The same {result['pixels']:,} {data.noun}s for every method; errors against {against}. "
-        f"{verdict} {remarks}"
-    )
-    return [Table("methods-table", "Methods", caption.strip().replace(" e-", " e⁻"), rows, "methods")]
+    pixels = f"The same {result['pixels']:,} {data.noun}s for every method; errors against {against}."
+    caption = f"{pixels} {verdict} {remarks}".strip().replace(" e-", " e⁻")
+    return [Table("methods-table", "Methods", caption, rows, "methods")]

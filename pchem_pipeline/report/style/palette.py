@@ -23,25 +23,12 @@ _SHADES = (
 
 @dataclass(frozen=True)
 class Palette:
-    """Colours of one figure.
+    """Colours of one figure; those without a remark are of lines and marks."""
 
-    Attributes:
-        ink: main lines.
-        paper: background.
-        edge: axes.
-        faint: small notes.
-        blue, vermilion, green, orange, sky, purple, yellow: lines and marks.
-        bars: areas of histograms.
-        band: 2 sigma of sampling noise.
-        grid: lines of a grid.
-        no_value: pixels without a value in maps, outside the range of ``MAP_COLOURS`` in hue and saturation.
-        mark: what the verdict points to.
-    """
-
-    ink: str = "#000000"
-    paper: str = "#FFFFFF"
-    edge: str = "#333333"
-    faint: str = "#444444"
+    ink: str = "#000000"  # main lines
+    paper: str = "#FFFFFF"  # background
+    edge: str = "#333333"  # axes
+    faint: str = "#444444"  # small notes
     blue: str = "#0072B2"
     vermilion: str = "#D55E00"
     green: str = "#009E73"
@@ -49,11 +36,11 @@ class Palette:
     sky: str = "#56B4E9"
     purple: str = "#CC79A7"
     yellow: str = "#F0E442"
-    bars: str = "#B8B8B8"
-    band: str = "#E6E6E6"
-    grid: str = "#DDDDDD"
-    no_value: str = "#D9D9D9"
-    mark: str = "#F0E442"
+    bars: str = "#B8B8B8"  # areas of histograms
+    band: str = "#E6E6E6"  # 2 sigma of sampling noise
+    grid: str = "#DDDDDD"  # lines of a grid
+    no_value: str = "#D9D9D9"  # pixels without a value in maps, outside the range of ``MAP_COLOURS`` in hue
+    mark: str = "#F0E442"  # what the verdict points to
 
 
 LIGHT = Palette()

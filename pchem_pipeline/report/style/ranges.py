@@ -20,29 +20,18 @@ DECADES = 30.0
 
 @dataclass(frozen=True)
 class DisplayRange:
-    """What part of the values is drawn, and how.
-
-    Attributes:
-        low, high: ends of the axis.
-        n_outside: finite values beyond the ends, which are not drawn.
-        n_missing: values that are NaN or infinite.
-        logarithmic: whether the drawn part spans decades.
-    """
+    """What part of the values is drawn, between the ends of the axis."""
 
     low: float
     high: float
-    n_outside: int
-    n_missing: int
-    logarithmic: bool
+    n_outside: int  # finite values beyond the ends, which are not drawn
+    n_missing: int  # values that are NaN or infinite
+    logarithmic: bool  # whether the drawn part spans decades
 
     def remark(self) -> str:
         """Return a note on what is not drawn, e.g. ``3 outside the axis; 5 without a value``."""
-        parts = []
-        if self.n_outside:
-            parts.append(f"{self.n_outside:,} outside the axis")
-        if self.n_missing:
-            parts.append(f"{self.n_missing:,} without a value")
-        return "; ".join(parts)
+        counts = ((self.n_outside, "outside the axis"), (self.n_missing, "without a value"))
+        return "; ".join(f"{n:,} {words}" for n, words in counts if n)
 
 
 def finite(values: NDArray[Any]) -> FloatArray:
