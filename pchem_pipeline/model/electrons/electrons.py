@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
+from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.model.electrons import electrons_numba
-from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR, CodeTables, PixelLaws, SampleNumbers
+from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR, CodeTables, Numbers, PixelLaws
 from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
 from pchem_pipeline.model.law.mass import code_ranges
 from pchem_pipeline.model.law.parameters import Parameters, columns_of, usable_pixels
@@ -80,64 +80,13 @@ class KnownPixels:
         return np.where(known, np.minimum(low, first), first), np.where(known, np.maximum(high, last), last)
 
 
-@dataclass(frozen=True)
-class Numbers:
-    """Electron numbers of samples, each array (frame, y, x).
-
-    Attributes:
-        number: the most probable one; the largest value of the type where a pixel has no parameters.
-        probability: that it is right; empty where the tables have none.
-        expected: E[k | x], e-; empty where it was not asked for.
-    """
-
-    number: NDArray[np.unsignedinteger[Any]]
-    probability: Float32Array
-    expected: Float32Array
-
-
-@dataclass(frozen=True)
-class Outcomes:
-    """What the estimated electron numbers should show.
-
-    Attributes:
-        estimated: sum over pixels of P(k~ = k), shape (n_k,); divide by the number of pixels for the mass.
-        error: P(k~ != K) of each pixel, shape (n,).
-    """
-
-    estimated: FloatArray
-    error: FloatArray
-
-
-@dataclass(frozen=True)
-class NumberTables:
-    """What each code of each pixel says of the electron number.
-
-    Attributes:
-        shape: of the pixels.
-        first: first code of each pixel, shape (n,).
-        start: place of its first code in the tables, shape (n + 1,).
-        number: most probable number at each code; the largest value of the type: none.
-        mass: P(code); empty where it was not asked for.
-        right: P(code, and the number is right); likewise.
-        expected: E[k | x], e-; likewise.
-    """
-
-    shape: tuple[int, ...]
-    first: IntArray
-    start: IntArray
-    number: NDArray[np.unsignedinteger[Any]]
-    mass: FloatArray
-    right: FloatArray
-    expected: Float32Array
+class NumberTables(CodeTables):
+    """What each code of each pixel says of the electron number."""
 
     @property
     def missing(self) -> int:
         """What stands for no number."""
         return int(np.iinfo(self.number.dtype).max)
-
-    @property
-    def _tables(self) -> CodeTables:
-        return CodeTables(self.first, self.start, self.number, self.mass, self.right, self.expected)
 
     def convert(
         self, frames: NDArray[np.unsignedinteger[Any]], *, expected: bool = False, lift: int = 0
@@ -153,12 +102,10 @@ class NumberTables:
         number = np.empty((n_frames, n), self.number.dtype)
         probability = np.empty((n_frames, n) if self.mass.size else (0, 0), np.float32)
         mean = np.empty((n_frames, n) if expected else (0, 0), np.float32)
-        lifted = self._tables._replace(first=self.first + lift)
-        out = SampleNumbers(number, probability, mean)
+        lifted, out = self._replace(first=self.first + lift), Numbers(number, probability, mean)
         electrons_numba.convert_frames(frames.reshape(n_frames, n), lifted, self.missing, out)
-        shape = (n_frames, *self.shape)
-        details = (each.reshape(shape) if each.size else each for each in (probability, mean))
-        return Numbers(number.reshape(shape), *details)
+        details = (each.reshape(frames.shape) if each.size else each for each in (probability, mean))
+        return Numbers(number.reshape(frames.shape), *details)
 
     def tally(
         self, counts: NDArray[np.integer[Any]], origin: NDArray[np.integer[Any]], n_k: int
@@ -169,35 +116,18 @@ class NumberTables:
         """
         out = np.zeros(n_k + 1, np.int64)
         first = np.asarray(origin, np.int64)
-        electrons_numba.count_numbers(kernel_counts(counts), first, self._tables, self.missing, out)
+        electrons_numba.count_numbers(kernel_counts(counts), first, self, self.missing, out)
         return out[:-1], int(out[-1])
 
-    def outcomes(self, n_k: int) -> Outcomes:
-        """Return the probability of each estimated number k < n_k and of an error; of detailed tables."""
+    def outcomes(self, n_k: int) -> tuple[FloatArray, FloatArray]:
+        """Return the sum over pixels of P(k~ = k), (n_k,), and P(k~ != K) of each, (n,); of detailed tables.
+
+        k~ is the estimated number, K the true one.
+        """
         pixel = np.repeat(np.arange(self.first.size), np.diff(self.start))
         right = np.bincount(pixel, self.right, self.first.size)
         estimated = np.bincount(self.number, self.mass, n_k)[:n_k]
-        return Outcomes(np.asarray(estimated, np.float64), np.asarray(1.0 - right))
-
-
-@dataclass(frozen=True)
-class ErrorTally:
-    """Estimated against true electron numbers.
-
-    Attributes:
-        n_samples: samples compared.
-        by_size: samples with |k~ - K| = 0, 1, 2, ... (the last entry: and more).
-        signed: sum of k~ - K.
-    """
-
-    n_samples: int
-    by_size: IntArray
-    signed: int
-
-    def __add__(self, other: ErrorTally) -> ErrorTally:
-        """Return the tally of both sets of samples."""
-        n, signed = self.n_samples + other.n_samples, self.signed + other.signed
-        return ErrorTally(n, self.by_size + other.by_size, signed)
+        return np.asarray(estimated, np.float64), np.asarray(1.0 - right)
 
 
 def number_type(largest: float) -> np.dtype[Any]:
@@ -237,16 +167,19 @@ def number_tables(
     expected = np.empty(mass.size, np.float32)
     missing = int(np.iinfo(dtype).max)
     weights = np.full(n, NO_PRIOR) if prior is None else np.ascontiguousarray(prior.ravel(), np.float64)
-    tables = CodeTables(first, start, number, mass, right, expected)
+    tables = NumberTables(first, start, number, mass, right, expected)
     electrons_numba.fill_tables(tables, parts, weights, pixels.kernel_inputs(), missing - 1, missing)
-    return NumberTables(minimum.shape, first, start, number.astype(dtype, copy=False), mass, right, expected)
+    return tables._replace(number=number.astype(dtype, copy=False))
 
 
 def compare_electron_numbers(
-    estimated: NDArray[np.uint16], true: NDArray[np.uint16], n_sizes: int = 8
-) -> ErrorTally:
-    """Compare estimated with true electron numbers of any shape, by sizes of error, where estimated."""
+    estimated: NDArray[np.uint16], true: NDArray[np.uint16], n_sizes: int
+) -> tuple[IntArray, int]:
+    """Compare estimated with true electron numbers, k~ and K, of any shape, where there is an estimate.
+
+    Returns:
+        Samples with |k~ - K| = 0, 1, 2, ..., the last one: and more, shape (n_sizes,); sum of k~ - K.
+    """
     known = estimated != NO_NUMBER
     off = estimated[known].astype(np.int64) - true[known]
-    sizes = np.bincount(np.minimum(np.abs(off), n_sizes - 1), minlength=n_sizes)
-    return ErrorTally(off.size, sizes, int(off.sum()))
+    return np.bincount(np.minimum(np.abs(off), n_sizes - 1), minlength=n_sizes), int(off.sum())
