@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,21 +10,6 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from pchem_pipeline.base.arrays import FloatArray
-
-
-@dataclass(frozen=True)
-class ChiSquare:
-    """Sum of squared normalised residuals.
-
-    Attributes:
-        value: chi-square.
-        dof: bins that entered it.
-        p: probability of a larger one if the model holds; NaN without bins.
-    """
-
-    value: float
-    dof: int
-    p: float
 
 
 def central_window(counts: NDArray[np.integer[Any]]) -> slice:
@@ -59,12 +43,13 @@ def normalised_residuals(data: FloatArray, model: FloatArray, variance: FloatArr
 
 def chi_square(
     data: FloatArray, model: FloatArray, variance: FloatArray, counts: NDArray[np.integer[Any]]
-) -> ChiSquare:
+) -> dict[str, float]:
     """Return Pearson's chi-square of an ensemble histogram with the binomial variance of its pixels.
 
     Over those of the n bins with at least 10 samples. The bins of one pixel are slightly anticorrelated, so
-    the sum is not exactly chi-square; with many bins the difference is small.
+    the sum is not exactly chi-square; with many bins the difference is small. As ``value``, the number of
+    bins ``dof``, and ``p``, the probability of a larger one if the model holds; NaN without bins.
     """
     use = (counts >= 10) & (variance > 0)
     value, dof = float(np.sum((data[use] - model[use]) ** 2 / variance[use])), int(use.sum())
-    return ChiSquare(value, dof, float(chdtrc(dof, value)) if dof else math.nan)
+    return {"value": value, "dof": dof, "p": float(chdtrc(dof, value)) if dof else math.nan}

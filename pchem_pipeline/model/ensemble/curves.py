@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -108,8 +107,8 @@ def _agreement(
         found[f"{prefix}noise_floor"] = noise_floor(noise, window)
         if f"{curve}stderr" in arrays:
             model_error[curve.rstrip("_")] = noise_floor(arrays[f"{curve}stderr"] ** 2, window)
-        fit = chi_square(data, arrays[f"{curve}exact"], noise, arrays[f"{prefix}counts"])
-        fits[f"{prefix}chi_square"] = asdict(fit)
+        counts = arrays[f"{prefix}counts"]
+        fits[f"{prefix}chi_square"] = chi_square(data, arrays[f"{curve}exact"], noise, counts)
     (n, n_all), all_data = totals.samples, arrays["density_all"]
     found_all = {f"epcd_{way}": rmse(all_data, arrays[f"epcd_{way}"], windows[0]) for way in _WAYS}
     found_all["noise_floor"] = found["noise_floor"] * math.sqrt(n / n_all)
@@ -159,9 +158,4 @@ def components(pixels: UsablePixels, mass: FloatArray, weight: FloatArray) -> Ar
     The pixels are all with a value, weighted as :func:`bias_weight` says.
     """
     shown = max(2, int(np.flatnonzero(mass >= _SMALLEST_COMPONENT)[-1]) + 1)
-    widths = component_widths(pixels, min(shown, mass.size), weight)
-    return {
-        "component_mean": widths.mean,
-        "component_variance": widths.variance,
-        "nuced_component_variance": widths.nuced_variance,
-    }
+    return component_widths(pixels, min(shown, mass.size), weight)

@@ -24,12 +24,11 @@ from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.electrons.electrons import compare_electron_numbers
 from pchem_pipeline.model.electrons.error_rates import error_rates
-from pchem_pipeline.model.ensemble.components import COMPONENT_CASES, bias_weight
+from pchem_pipeline.model.ensemble.components import COMPONENT_CASES, bias_weight, moment_rows
 from pchem_pipeline.model.ensemble.curves import components, curves
 from pchem_pipeline.model.ensemble.curves import electron_numbers as electron_numbers_of
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_axis
 from pchem_pipeline.model.ensemble.error_sample import WANTED, PixelErrors
-from pchem_pipeline.model.ensemble.moments import moment_rows
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
 from pchem_pipeline.model.fit.status import flags_of
