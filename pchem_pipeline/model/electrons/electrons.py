@@ -36,7 +36,7 @@ class KnownPixels:
     Attributes:
         parameters: (H, g, mu, sigma), each of the shape of the pixels; NaN where there are none.
         law: of the samples of the pixels in C order.
-        satellites: amplitude (e-) and weight of their free satellites; None: those of the parameters, if any.
+        satellites: amplitude (e-) and weight of their free satellites; None: none.
     """
 
     parameters: Parameters
@@ -60,7 +60,7 @@ class KnownPixels:
         columns = columns_of(self.parameters)
         n = len(columns)
         columns[np.isnan(self.exposure)] = np.nan
-        return PixelLaws(columns, satellites_of(self.parameters, self.satellites, n), pack([self.law], n))
+        return PixelLaws(columns, satellites_of(self.satellites, n), pack([self.law], n))
 
     def codes(
         self, counts: NDArray[np.integer[Any]] | None = None, origin: NDArray[np.integer[Any]] | None = None

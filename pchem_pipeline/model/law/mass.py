@@ -35,7 +35,7 @@ def code_ranges(
     n = columns.shape[0]
     columns[~usable_pixels(*columns.T)] = np.nan
     reach = np.empty((n, 2), np.int64)
-    mass_numba.find_reach(columns, satellites_of(maps, satellites, n), pack([model], n), reach)
+    mass_numba.find_reach(columns, satellites_of(satellites, n), pack([model], n), reach)
     return reach[:, 0], reach[:, 1]
 
 
@@ -75,8 +75,7 @@ def sample_mass(
         model: the law.
         maps: (H, g, mu, sigma) of n pixels (flattened where they are maps).
         codes: successive whole DN, shape (n_codes,) for all pixels alike or (n, n_codes).
-        satellites: ``satellite_amplitude_e`` and ``satellite_weight`` of the pixels; by default those of
-            ``maps`` where it has any, else none.
+        satellites: amplitude (e-) and weight of the pixels' free satellites; None: none.
         smallest: masses below it may be 0; 1e-50 takes a fraction of the time of all, 1e-17 less again.
 
     Returns:
@@ -95,9 +94,7 @@ def sample_mass(
         first = np.array(np.broadcast_to(wanted[:, 0], (n,)))
         stage = EXACT if smallest < 1e-50 else NEAR if smallest < 1e-17 else CORE
         none = np.empty((0, 4, out.shape[1]))
-        mass_numba.mass_tile(
-            first, columns, satellites_of(maps, satellites, n), pack([model], n), stage, out, none
-        )
+        mass_numba.mass_tile(first, columns, satellites_of(satellites, n), pack([model], n), stage, out, none)
     return out
 
 
@@ -114,7 +111,7 @@ def sample_slopes(
     mass, slopes = np.full((n, n_codes), np.nan), np.full((n, 4, n_codes), np.nan)
     start = np.ascontiguousarray(first, np.int64)
     law = pack([model], n)
-    mass_numba.mass_tile(start, columns, satellites_of(maps, None, n), law, NEAR, mass, slopes)
+    mass_numba.mass_tile(start, columns, satellites_of(None, n), law, NEAR, mass, slopes)
     return mass, slopes
 
 
