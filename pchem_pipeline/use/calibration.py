@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.model.law.parameters import PixelParameters, usable_pixels
+from pchem_pipeline.model.law.pcd import nearest_pcd
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
 from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, number_tables
-from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.law.parameters import columns_of
+from pchem_pipeline.model.law.pcd import nearest_pcd
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,15 @@ from pchem_pipeline.model.errors.fisher import expected_scores
 from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
 from pchem_pipeline.model.fit import engine, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, Limits
-from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
-from pchem_pipeline.model.fit.guard import expected_counts, far_samples, fit_guarded, leave_out
+from pchem_pipeline.model.fit.guard import (
+    Interval,
+    electrons_of,
+    expected_counts,
+    far_samples,
+    fit_guarded,
+    inside,
+    leave_out,
+)
 from pchem_pipeline.model.fit.profile import Moments, Profile, moments_along_bias
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings

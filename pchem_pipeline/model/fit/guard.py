@@ -1,9 +1,9 @@
-"""The tail guard: samples that the model does not expect at all leave the likelihood.
+"""Samples that leave the likelihood: codes that are set aside, and what the tail guard finds.
 
-The guarded log-likelihood of a pixel is ``sum_i c_i max(log f(x_i), log(floor / N))``: where fewer than
-``floor`` frames per DN are expected, a sample costs the same wherever it lies, so it moves nothing. At a
-maximum that is the likelihood of the other samples, found by leaving these out and fitting again until the
-set of them stays.
+The tail guard leaves out samples that the model does not expect at all. Its log-likelihood of a pixel is
+``sum_i c_i max(log f(x_i), log(floor / N))``: where fewer than ``floor`` frames per DN are expected, a sample
+costs the same wherever it lies, so it moves nothing. At a maximum that is the likelihood of the other
+samples, found by leaving these out and fitting again until the set of them stays.
 """
 
 from __future__ import annotations
@@ -27,10 +27,27 @@ from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 Pixels = NDArray[np.intp]
+#: Limits of codes that are set aside on a pixel's comb, e-; None: no limit.
+Interval = tuple[float | None, float | None]
 
 _MOST_PASSES = 8
 # attempts: without what the fit of all samples does not expect, without the ends, without what a gap cuts off
 _EXPECTED, _ENDS, _CORE, _N_ATTEMPTS = range(4)
+
+
+def electrons_of(origin: NDArray[np.integer], width: int, gain: FloatArray, bias: FloatArray) -> FloatArray:
+    """Return the place ``(x - mu) g`` of every code on its pixel's comb, e-, shape (n, width)."""
+    codes = np.asarray(origin, np.int64)[:, None] + np.arange(width)
+    return np.asarray((codes - bias[:, None]) * gain[:, None])
+
+
+def inside(intervals: Sequence[Interval], electrons: FloatArray) -> BoolArray:
+    """Return which places on the comb lie in one of the intervals."""
+    found = np.zeros(electrons.shape, np.bool_)
+    for low, high in intervals:
+        above = electrons >= (-np.inf if low is None else low)
+        found |= above & (electrons < (np.inf if high is None else high))
+    return found
 
 
 def far_samples(given: Histograms) -> tuple[IntArray, BoolArray]:

@@ -21,7 +21,7 @@ from pchem_pipeline.effects.framework.compose import AddedExposure, PixelPlaces,
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.model.errors.fisher import correlations
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.excluding_codes import Interval
+from pchem_pipeline.model.fit.guard import Interval
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED

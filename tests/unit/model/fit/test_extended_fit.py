@@ -9,11 +9,11 @@ from helpers.drawn_pixels import codes, histograms
 from helpers.extended_reference import LAWS
 from scipy.optimize import root
 
-from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.pcd import nearest_pcd
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FIRST, N_CODES, FRAMES = 40, 330, 4000

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.checks.residuals import (
+from pchem_pipeline.model.ensemble.curves import (
     central_window,
     chi_square,
     noise_floor,
