@@ -14,7 +14,7 @@ from pchem_pipeline.commands.apply.characterisation import check_run, read_calib
 from pchem_pipeline.config.load import make_config, write_config, yaml_text
 from pchem_pipeline.frames.formats.map_files import read_image, write_npz
 from pchem_pipeline.run.sensor import SensorInfo
-from pchem_pipeline.simulate.scene import with_scene
+from pchem_pipeline.simulate.chain import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.store.run_store import RunStore

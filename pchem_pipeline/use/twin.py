@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.simulate.chain import frames_per_block, simulate_block
-from pchem_pipeline.simulate.scene import with_scene
+from pchem_pipeline.model.errors.expected_information import covariance_from
+from pchem_pipeline.simulate.chain import frames_per_block, simulate_block, with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import Defect, TruthMaps
 
@@ -96,9 +96,7 @@ def redrawn(
     Maps are (H, g, mu, sigma), (y, x) each, with standard errors (4, y, x) and correlations as in
     :func:`~pchem_pipeline.use.calibration.covariance_of`.
     """
-    matrix = np.broadcast_to(np.eye(4), (*stderr.shape[1:], 4, 4)).copy()
-    for place, (i, j) in enumerate([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
-        matrix[..., i, j] = matrix[..., j, i] = np.nan_to_num(correlation[..., place])
+    matrix = covariance_from(np.ones((*stderr.shape[1:], 4)), np.nan_to_num(correlation))
     values, vectors = np.linalg.eigh(matrix)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     normal = np.random.default_rng(seed).standard_normal((*stderr.shape[1:], 4))

@@ -9,8 +9,7 @@ from pchem_pipeline.discrepancy.quick.codes import CodeSample
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
-from pchem_pipeline.model.histogram.moved_frames import MovedFrames
-from pchem_pipeline.model.histogram.odd_frames import frame_scores, left_out, odd_frames
+from pchem_pipeline.model.histogram.odd_frames import MovedFrames, frame_scores, left_out, odd_frames
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
-from pchem_pipeline.model.errors.fisher import covariance_from
+from pchem_pipeline.model.errors.expected_information import covariance_from
 from pchem_pipeline.model.law.parameters import UsablePixels
 
 #: Pixels of ordinary errors that are taken of a sensor. The variances that they add scatter by 1.4 times the

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.errors.expected_information import inverse_information
-from pchem_pipeline.model.errors.fisher import expected_scores
+from pchem_pipeline.model.errors.expected_information import expected_scores, inverse_information
 from pchem_pipeline.model.law.parameters import columns_of
 
 #: Standard errors by which rounding may bias the density's estimates before it is said (or mended).

@@ -14,8 +14,7 @@ from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.units import FEW_STEP
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.errors import information_numba
-from pchem_pipeline.model.errors.expected_information import inverse_information
-from pchem_pipeline.model.errors.fisher import expected_scores
+from pchem_pipeline.model.errors.expected_information import expected_scores, inverse_information
 from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
 from pchem_pipeline.model.fit import engine, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, Limits

@@ -6,7 +6,7 @@ import numpy as np
 
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
-from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
+from pchem_pipeline.model.errors.expected_information import CORRELATION_PAIRS
 from pchem_pipeline.model.fit.status import FitStatus, moves_gain
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.store.run_store import RunStore

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.frames.stream import Block, Rows
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
-from pchem_pipeline.model.histogram.moved_frames import MovedFrames
+from pchem_pipeline.model.histogram.odd_frames import MovedFrames
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
