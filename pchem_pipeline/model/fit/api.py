@@ -156,14 +156,17 @@ def likelihood_moments(
         frames = counts.sum(axis=1, dtype=np.int64) * (1.0 - outlier_share)
         cells = biased_by_rounding([*known[:, :4].T], frames)
     free = np.zeros((len(known), 2)) if satellites is None else np.nan_to_num(satellites)
-    parts = []
+    n = len(known)
+    found = Moments(np.full((n, 4, 4), np.nan), np.zeros((n, 2)), np.full((n, 2, 4), np.nan))
     for pixels in (np.flatnonzero(~cells), np.flatnonzero(cells)):
         if pixels.size:
             batch = _Batch([counts[pixels]], [origin[pixels]], [False], settings, adc_limits, None, None)
             given = SampleLaw() if law is None else law.of(pixels)
             own = batch.between_limits(given) if cells[pixels[0]] else None
-            parts.append((pixels, batch.moments(known[pixels], outlier_share[pixels], own, free[pixels])))
-    return Moments.joined(len(known), parts)
+            part = batch.moments(known[pixels], outlier_share[pixels], own, free[pixels])
+            for whole, values in zip(found, part, strict=True):
+                whole[pixels] = values
+    return found
 
 
 def satellite_threshold(law: SampleLaw) -> float:

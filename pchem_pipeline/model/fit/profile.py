@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +26,7 @@ _FARTHEST = 60.0  # roots from the maximum
 _LEAST_VARIANCE = 1e-12  # DN^2
 
 
-@dataclass(frozen=True)
-class Moments:
+class Moments(NamedTuple):
     """What a likelihood says of how far estimates may be from the truth.
 
     Attributes:
@@ -41,15 +39,6 @@ class Moments:
     covariance: FloatArray
     rival_weight: FloatArray
     rivals: FloatArray
-
-    @classmethod
-    def joined(cls, n: int, parts: Iterable[tuple[NDArray[np.intp], Moments]]) -> Moments:
-        """Return the moments of n pixels, put together from those of some of them each."""
-        found = cls(np.full((n, 4, 4), np.nan), np.zeros((n, 2)), np.full((n, 2, 4), np.nan))
-        for pixels, part in parts:
-            for each in fields(cls):
-                getattr(found, each.name)[pixels] = getattr(part, each.name)
-        return found
 
 
 class Profile:
