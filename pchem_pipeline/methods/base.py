@@ -18,7 +18,7 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray, IntegerArray
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.model.law.pcd import log_pcd
@@ -53,7 +53,7 @@ class Sample:
         origin: DN of bin 0, shape (n,).
     """
 
-    counts: NDArray[np.integer]
+    counts: IntegerArray
     origin: IntArray
 
     def moments(self) -> SampleMoments:

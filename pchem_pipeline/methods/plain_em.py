@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import FloatArray, IndexArray, IntArray, IntegerArray
 from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, Sample
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.fit import engine, tile_numba
@@ -87,7 +86,7 @@ def closed_form_start(sample: Sample) -> FloatArray:
     return sample.likeliest(starting_points(sample.counts, sample.origin))
 
 
-def starting_points(counts: NDArray[np.integer], origin: NDArray[np.integer]) -> FloatArray:
+def starting_points(counts: IntegerArray, origin: IntegerArray) -> FloatArray:
     """Return two starting points (H, g, mu, sigma) of every pixel, shape (n, 2, 4); NaN where there is none.
 
     The empirical characteristic function of a PCD, ``phi(f) = mean exp(2 pi i f x)``, has
@@ -112,7 +111,7 @@ def starting_points(counts: NDArray[np.integer], origin: NDArray[np.integer]) ->
     return out
 
 
-def _highest_lobe(counts: FloatArray, origin: NDArray[np.integer]) -> FloatArray:
+def _highest_lobe(counts: FloatArray, origin: IntegerArray) -> FloatArray:
     """Compute (H, g, mu, sigma) from the highest side lobe of the characteristic function."""
     shares = counts / counts.sum(axis=1, keepdims=True)
     bins = np.arange(counts.shape[1])
@@ -169,7 +168,7 @@ def run_em(
 
 
 def _em_step(
-    pixel: NDArray[np.intp], x: FloatArray, share: FloatArray, theta: FloatArray, only_light: bool
+    pixel: IndexArray, x: FloatArray, share: FloatArray, theta: FloatArray, only_light: bool
 ) -> FloatArray:
     """Return (H, g, mu, sigma) after one EM step, eqs. (update_eqns); NaN where it is not defined.
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.use.calibration import Calibration
 from pchem_pipeline.use.overscan import Overscan
@@ -351,9 +351,7 @@ class _Readout:
         return float(np.fft.irfft(variance / (1.0 + variance * each), self.size // self.taps)[0])
 
 
-def estimate_offsets(
-    frames: NDArray[np.unsignedinteger[Any]], reference: Reference, modes: CommonModes
-) -> Offsets:
+def estimate_offsets(frames: CodeArray, reference: Reference, modes: CommonModes) -> Offsets:
     """Return the most probable offsets of whole frames (frame, y, x), DN: of rows, columns, waves, readouts.
 
     The posterior mode of normal offsets under the mixture of all pixels of the line (best linear prediction

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray, IndexArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.errors.expected_information import covariance_from
@@ -38,9 +38,7 @@ class Twin:
         effects = ", ".join(effect.tag for effect in self.settings.effects) or "none"
         return f"<Twin: {rows} x {columns} pixels; effects: {effects}; frames(scene, n) simulates>"
 
-    def frames(
-        self, scene: float | FloatArray | None = None, n: int = 100, *, seed: int = 1
-    ) -> NDArray[np.unsignedinteger[Any]]:
+    def frames(self, scene: float | FloatArray | None = None, n: int = 100, *, seed: int = 1) -> CodeArray:
         """Return n frames of a scene.
 
         Args:
@@ -156,7 +154,7 @@ def _patterns(values: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatA
 
 def _blocks(
     old: tuple[int, int], new: tuple[int, int], rng: np.random.Generator
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+) -> tuple[IndexArray, IndexArray]:
     """Return from which pixel each new one takes what is left of its maps: blocks from random places."""
     y, x = np.empty(new, np.intp), np.empty(new, np.intp)
     height, width = (min(_BLOCK, side) for side in old)

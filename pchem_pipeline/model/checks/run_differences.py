@@ -119,9 +119,8 @@ class MapDifference:
 
 
 ValuesAndErrors = tuple[FloatArray, FloatArray]
-Places = IntArray
 #: The p-values of :func:`common_fit_p` of pixels (y, x).
-CommonFit = Callable[[Places, Places], FloatArray]
+CommonFit = Callable[[IntArray, IntArray], FloatArray]
 
 
 def compare_maps(

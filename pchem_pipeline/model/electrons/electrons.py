@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import CodeArray, FloatArray, IndexArray, IntArray, IntegerArray
 from pchem_pipeline.model.electrons import electrons_numba
 from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR, CodeTables, Numbers, PixelLaws
 from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
@@ -43,7 +43,7 @@ class KnownPixels:
     law: SampleLaw
     satellites: tuple[ArrayLike, ArrayLike] | None = None
 
-    def of(self, pixels: NDArray[np.intp]) -> KnownPixels:
+    def of(self, pixels: IndexArray) -> KnownPixels:
         """Return some of the pixels, by their places in C order."""
         own = self.satellites
         some = None if own is None else (np.asarray(own[0])[pixels], np.asarray(own[1])[pixels])
@@ -63,7 +63,7 @@ class KnownPixels:
         return PixelLaws(columns, satellites_of(self.satellites, n), pack([self.law], n))
 
     def codes(
-        self, counts: NDArray[np.integer[Any]] | None = None, origin: NDArray[np.integer[Any]] | None = None
+        self, counts: IntegerArray | None = None, origin: IntegerArray | None = None
     ) -> tuple[IntArray, IntArray]:
         """Return the first and last code that pixels show, DN, shape (n,); none without parameters.
 
@@ -88,9 +88,7 @@ class NumberTables(CodeTables):
         """What stands for no number."""
         return int(np.iinfo(self.number.dtype).max)
 
-    def convert(
-        self, frames: NDArray[np.unsignedinteger[Any]], *, expected: bool = False, lift: int = 0
-    ) -> Numbers:
+    def convert(self, frames: CodeArray, *, expected: bool = False, lift: int = 0) -> Numbers:
         """Return the electron numbers of samples; none for codes that are not in the table of their pixel.
 
         Args:
@@ -107,9 +105,7 @@ class NumberTables(CodeTables):
         details = (each.reshape(frames.shape) if each.size else each for each in (probability, mean))
         return Numbers(number.reshape(frames.shape), *details)
 
-    def tally(
-        self, counts: NDArray[np.integer[Any]], origin: NDArray[np.integer[Any]], n_k: int
-    ) -> tuple[IntArray, int]:
+    def tally(self, counts: IntegerArray, origin: IntegerArray, n_k: int) -> tuple[IntArray, int]:
         """Return the samples of each electron number k < n_k, and how many have a larger one.
 
         The histograms have the shape (n, n_bins), the DN of bin 0 the shape (n,).
@@ -136,8 +132,8 @@ def number_type(largest: float) -> np.dtype[Any]:
 
 
 def number_tables(
-    minimum: NDArray[np.integer[Any]],
-    maximum: NDArray[np.integer[Any]],
+    minimum: IntegerArray,
+    maximum: IntegerArray,
     prior: FloatArray | None,
     pixels: KnownPixels,
     *,

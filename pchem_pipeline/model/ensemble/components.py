@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IntegerArray
 from pchem_pipeline.model.ensemble.ensemble import poisson_sums
 from pchem_pipeline.model.ensemble.totals import EnsembleTotals
 from pchem_pipeline.model.law.parameters import UsablePixels
@@ -88,7 +88,7 @@ def predicted_moments(pixels: UsablePixels, weight: FloatArray | None = None) ->
     }
 
 
-def moment_errors(pixels: UsablePixels, n_frames: int | NDArray[np.integer[Any]]) -> dict[str, float]:
+def moment_errors(pixels: UsablePixels, n_frames: int | IntegerArray) -> dict[str, float]:
     """Standard errors of the sample moments of the ensemble, the pixels given.
 
     A pixel's samples have variance v = sigma^2 + H/g^2, third central moment H/g^3 and fourth 3 v^2 + H/g^4.

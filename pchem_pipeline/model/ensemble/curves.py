@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IntegerArray
 from pchem_pipeline.model.ensemble.components import component_widths
 from pchem_pipeline.model.ensemble.ensemble import electron_pmf
 from pchem_pipeline.model.ensemble.ensemble_binned import (
@@ -117,7 +117,7 @@ def _agreement(
     }
 
 
-def central_window(counts: NDArray[np.integer[Any]]) -> slice:
+def central_window(counts: IntegerArray) -> slice:
     """Return the bins that hold the central 99.9 % of the counts, shape (n,), which are not all zero.
 
     A few hot pixels stretch the axis over thousands of empty bins; an RMSE over all of them would shrink with
@@ -147,7 +147,7 @@ def normalised_residuals(data: FloatArray, model: FloatArray, variance: FloatArr
 
 
 def chi_square(
-    data: FloatArray, model: FloatArray, variance: FloatArray, counts: NDArray[np.integer[Any]]
+    data: FloatArray, model: FloatArray, variance: FloatArray, counts: IntegerArray
 ) -> dict[str, float]:
     """Return Pearson's chi-square of an ensemble histogram with the binomial variance of its pixels.
 

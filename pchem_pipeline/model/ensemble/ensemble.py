@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import FloatArray, IntArray, IntegerArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
 from pchem_pipeline.model.ensemble import ensemble_numba
@@ -191,8 +191,8 @@ def _mass_slopes(law: SampleLaw, pixels: UsablePixels, first: IntArray, n_codes:
 
 
 def tally(
-    counts: NDArray[np.integer[Any]],
-    origin: NDArray[np.integer[Any]],
+    counts: IntegerArray,
+    origin: IntegerArray,
     pixels: UsablePixels,
     dn: DnAxis,
     nuced: NucedAxis | None = None,

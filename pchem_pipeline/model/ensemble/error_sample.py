@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray, IntegerArray
 from pchem_pipeline.model.errors.expected_information import covariance_from
 from pchem_pipeline.model.law.parameters import UsablePixels
 
@@ -47,7 +46,7 @@ class PixelErrors:
         """Return those of some pixels."""
         return PixelErrors(self.stderr[pixels], self.correlation[pixels], self.place[pixels], self.share)
 
-    def sampled(self, pixels: UsablePixels, samples: NDArray[np.integer]) -> tuple[BoolArray, FloatArray]:
+    def sampled(self, pixels: UsablePixels, samples: IntegerArray) -> tuple[BoolArray, FloatArray]:
         """Return which pixels are taken, (n,), and their covariances, each times the pixels it stands for.
 
         The parameters of the pixels are given, and the number of samples behind each, shape (n,).
@@ -57,7 +56,7 @@ class PixelErrors:
         covariance = covariance_from(self.stderr[some], self.correlation[some])
         return some, covariance / chance[some, None, None]
 
-    def _badness(self, pixels: UsablePixels, samples: NDArray[np.integer]) -> FloatArray:
+    def _badness(self, pixels: UsablePixels, samples: IntegerArray) -> FloatArray:
         """Return how many times larger than ordinary the variances are."""
         exposure, gain, _, sigma = pixels.maps
         noise = sigma**2

@@ -7,10 +7,9 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, IntArray, IntegerArray
 from pchem_pipeline.base.units import FEW_STEP
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.errors import information_numba
@@ -36,8 +35,6 @@ from pchem_pipeline.model.law.inputs import kernel_counts, pack
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-Counts = NDArray[np.integer]
-
 #: EM steps before the first Newton step, of several samples; the start of one is good enough without.
 _WARM_UP = 2
 # Frames and degrees of freedom below which it matters that merging bins for the chi-square test hides part of
@@ -54,10 +51,10 @@ _NO_FIT = FitStatus.NO_DATA | FitStatus.TOO_FEW_BINS
 
 
 def fit_histograms(
-    counts: Counts | Sequence[Counts],
-    origin: Counts | Sequence[Counts],
-    under: Counts | None = None,
-    over: Counts | None = None,
+    counts: IntegerArray | Sequence[IntegerArray],
+    origin: IntegerArray | Sequence[IntegerArray],
+    under: IntegerArray | None = None,
+    over: IntegerArray | None = None,
     *,
     dark: Sequence[bool] | None = None,
     law: SampleLaw | Sequence[SampleLaw] | None = None,
@@ -123,8 +120,8 @@ def fit_histograms(
 
 
 def likelihood_moments(
-    counts: Counts,
-    origin: Counts,
+    counts: IntegerArray,
+    origin: IntegerArray,
     known: FloatArray,
     outlier_share: FloatArray,
     *,
@@ -181,7 +178,7 @@ def satellite_threshold(law: SampleLaw) -> float:
     return 0.5 * float(chdtri(1.0, min(1.0, 2.0 * law.free_satellite_alarm / trials)))
 
 
-def _check(samples: Sequence[Counts], origins: Sequence[Counts], dark: Sequence[bool]) -> None:
+def _check(samples: Sequence[IntegerArray], origins: Sequence[IntegerArray], dark: Sequence[bool]) -> None:
     if not samples or all(dark):
         raise ValueError("no sample has electrons")
     if len(samples) != len(origins) or len(samples) != len(dark):
@@ -202,13 +199,13 @@ class _Batch:
 
     def __init__(
         self,
-        samples: Sequence[Counts],
-        origins: Sequence[Counts],
+        samples: Sequence[IntegerArray],
+        origins: Sequence[IntegerArray],
         dark: Sequence[bool],
         settings: FitSettings,
         adc_limits: tuple[int, int] | None,
-        under: Counts | None,
-        over: Counts | None,
+        under: IntegerArray | None,
+        over: IntegerArray | None,
     ) -> None:
         together = np.concatenate(samples, axis=1) if len(samples) > 1 else samples[0]
         counts = kernel_counts(together)
@@ -303,7 +300,7 @@ class _Batch:
         near: FloatArray,
         *,
         gaps: FloatArray | None = None,
-        pixels: NDArray[np.intp] | None = None,
+        pixels: IndexArray | None = None,
         warm: bool = False,
         scan: bool = False,
     ) -> FitResult:
@@ -328,7 +325,7 @@ class _Batch:
         self.given.mask[some] = given.mask
         return self._result(answers, cells=True, adjust=adjust, pixels=some)
 
-    def _given_of(self, some: NDArray[np.intp]) -> Histograms:
+    def _given_of(self, some: IndexArray) -> Histograms:
         """Return copies of the histograms of some pixels."""
         counts, places, origin, dark, mask = self.given
         return Histograms(counts[some], places, origin[some], dark, mask[some])
@@ -348,14 +345,14 @@ class _Batch:
         search = engine.cells_search(starts.amplitudes.size > 0) if cells else engine.density_search()
         tools = engine.likelihood(cells), engine.climb(), search, engine.regression_basis()
 
-        def fit(pixels: NDArray[np.intp], quick: bool) -> None:
+        def fit(pixels: IndexArray, quick: bool) -> None:
             answers.parameters[pixels] = np.nan
             answers.covariance[pixels] = np.nan
             # a few at a time: a signal is heard between kernels only
             for some in np.array_split(pixels, pixels.size // 1024 + 1):
                 fit_tile(given, some, packed, starts, limits._replace(quick=quick), *tools, answers)
 
-        def expect(pixels: NDArray[np.intp], gone: FloatArray) -> FloatArray:
+        def expect(pixels: IndexArray, gone: FloatArray) -> FloatArray:
             satellites = answers.out[pixels][:, [search_numba.AMPLITUDE, search_numba.SATELLITE_WEIGHT]]
             own = laws if cells else None
             return expected_counts(given, pixels, own, answers.parameters[pixels], satellites, gone)
@@ -470,7 +467,7 @@ class _Batch:
     # -- what they found
 
     def _result(
-        self, answers: Answers, *, cells: bool, adjust: bool, pixels: NDArray[np.intp] | None = None
+        self, answers: Answers, *, cells: bool, adjust: bool, pixels: IndexArray | None = None
     ) -> FitResult:
         """Add to the status words what the loop over the pixels does not know, and blank what failed."""
         some = np.arange(self.n) if pixels is None else pixels
@@ -519,7 +516,7 @@ class _Batch:
 
     def _freedom(
         self,
-        pixels: NDArray[np.intp],
+        pixels: IndexArray,
         words: IntArray,
         frames: FloatArray,
         parameters: FloatArray,

@@ -12,9 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, IntArray, IntegerArray
 from pchem_pipeline.model.arithmetic.robust import chi_square
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.fit import guard_numba
@@ -26,7 +25,6 @@ from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-Pixels = NDArray[np.intp]
 #: Limits of codes that are set aside on a pixel's comb, e-; None: no limit.
 Interval = tuple[float | None, float | None]
 
@@ -35,7 +33,7 @@ _MOST_PASSES = 8
 _EXPECTED, _ENDS, _CORE, _N_ATTEMPTS = range(4)
 
 
-def electrons_of(origin: NDArray[np.integer], width: int, gain: FloatArray, bias: FloatArray) -> FloatArray:
+def electrons_of(origin: IntegerArray, width: int, gain: FloatArray, bias: FloatArray) -> FloatArray:
     """Return the place ``(x - mu) g`` of every code on its pixel's comb, e-, shape (n, width)."""
     codes = np.asarray(origin, np.int64)[:, None] + np.arange(width)
     return np.asarray((codes - bias[:, None]) * gain[:, None])
@@ -60,7 +58,7 @@ def far_samples(given: Histograms) -> tuple[IntArray, BoolArray]:
 
 def expected_counts(
     given: Histograms,
-    pixels: Pixels,
+    pixels: IndexArray,
     laws: Sequence[SampleLaw] | None,
     parameters: FloatArray,
     satellites: FloatArray,
@@ -96,7 +94,7 @@ def expected_counts(
     return found
 
 
-def leave_out(given: Histograms, pixels: Pixels, outside: BoolArray) -> tuple[FloatArray, BoolArray]:
+def leave_out(given: Histograms, pixels: IndexArray, outside: BoolArray) -> tuple[FloatArray, BoolArray]:
     """Leave out the samples of m pixels in the bins ``outside``, (m, all bins), and count all others.
 
     The mask of the histograms is updated; what is set aside stays so.
@@ -112,8 +110,8 @@ def leave_out(given: Histograms, pixels: Pixels, outside: BoolArray) -> tuple[Fl
 
 
 def fit_guarded(
-    fit: Callable[[Pixels, bool], None],
-    expect: Callable[[Pixels, FloatArray], FloatArray],
+    fit: Callable[[IndexArray, bool], None],
+    expect: Callable[[IndexArray, FloatArray], FloatArray],
     given: Histograms,
     limits: Limits,
     answers: Answers,
@@ -163,8 +161,8 @@ def fit_guarded(
 class _Guard:
     """What the tail guard knows of n pixels, and works with; see :func:`fit_guarded`."""
 
-    fit: Callable[[Pixels, bool], None]
-    expect: Callable[[Pixels, FloatArray], FloatArray]
+    fit: Callable[[IndexArray, bool], None]
+    expect: Callable[[IndexArray, FloatArray], FloatArray]
     given: Histograms
     limits: Limits
     ends: IntArray  # of the bins that no gap cuts off, shape (n, J, 2)
@@ -175,12 +173,12 @@ class _Guard:
     passes: IntArray  # fits of the attempt
     place: IntArray  # in ``whole``; -1: not there
 
-    def keep(self, pixels: Pixels) -> None:
+    def keep(self, pixels: IndexArray) -> None:
         """Keep the answers of pixels of which all samples were fitted."""
         self.whole = Answers._make(each[pixels] for each in self.answers)
         self.place[pixels] = np.arange(pixels.size)
 
-    def fit_again(self, pixels: Pixels) -> None:
+    def fit_again(self, pixels: IndexArray) -> None:
         """Fit what the mask leaves of pixels, all of whose samples are not fitted twice."""
         known = (self.place[pixels] >= 0) & (self.gone[pixels] == 0)
         spent = self.answers.words[pixels[known], EVALUATIONS]
@@ -193,12 +191,12 @@ class _Guard:
             if some.size:
                 self.fit(some, quickly)
 
-    def _cut(self, pixels: Pixels) -> BoolArray:
+    def _cut(self, pixels: IndexArray) -> BoolArray:
         """Return which pixels have just had their ends, or what a gap cuts off, left out."""
         cut = (self.attempt[pixels] == _ENDS) | (self.attempt[pixels] == _CORE)
         return np.asarray(cut & (self.passes[pixels] == 0))
 
-    def suspicious(self, pixels: Pixels) -> BoolArray:
+    def suspicious(self, pixels: IndexArray) -> BoolArray:
         """Return which fits may have been led by outliers: by single samples or as a whole."""
         out = self.answers.out[pixels]
         fitted = np.isfinite(self.answers.parameters[pixels]).all(axis=1) & np.isfinite(out[:, OUTLYING])
@@ -206,7 +204,7 @@ class _Guard:
         misfit = (_scores(self.answers)[pixels] > BEYOND_DOUBT) & (not self.limits.cells)
         return np.asarray(fitted & ((out[:, OUTLYING] > 0) | misfit))
 
-    def begin(self, pixels: Pixels, far: BoolArray) -> Pixels:
+    def begin(self, pixels: IndexArray, far: BoolArray) -> IndexArray:
         """Leave out what the next attempt says, or the first that leaves out few enough; return pixels."""
         begun = [pixels[:0]]
         while pixels.size:
@@ -227,7 +225,7 @@ class _Guard:
             pixels = pixels[~few]
         return np.concatenate(begun)
 
-    def _outside(self, pixels: Pixels, attempt: int) -> BoolArray:
+    def _outside(self, pixels: IndexArray, attempt: int) -> BoolArray:
         """Return which bins an attempt leaves out: both ends, what a gap cuts off, or none."""
         counts = self.given.counts[pixels]
         outside = np.zeros(counts.shape, np.bool_)
@@ -244,13 +242,13 @@ class _Guard:
                 outside[:, part] = (upto <= cut) | (total - before <= cut)
         return outside
 
-    def _leave_out_unexpected(self, pixels: Pixels) -> BoolArray:
+    def _leave_out_unexpected(self, pixels: IndexArray) -> BoolArray:
         """Leave out the samples that the last fit does not expect; tell where these are others."""
         outside = self.expect(pixels, self.gone[pixels]) < self.limits.floor
         self.gone[pixels], changed = leave_out(self.given, pixels, outside)
         return changed
 
-    def check(self, pixels: Pixels, far: BoolArray) -> tuple[Pixels, Pixels]:
+    def check(self, pixels: IndexArray, far: BoolArray) -> tuple[IndexArray, IndexArray]:
         """Settle the fits that stand; return those that another pass may settle, and those that none will."""
         answers, last = self.answers, self.attempt[pixels] == _N_ATTEMPTS
         lost = pixels[last & far[pixels] & self.suspicious(pixels)]
@@ -269,7 +267,7 @@ class _Guard:
         more = (self.passes[pixels] < _MOST_PASSES) & self._few(pixels)
         return pixels[more], np.concatenate([stuck, pixels[~more]])
 
-    def _few(self, pixels: Pixels) -> BoolArray:
+    def _few(self, pixels: IndexArray) -> BoolArray:
         total = self.given.counts[pixels].sum(axis=1, dtype=np.float64)
         return np.asarray(self.gone[pixels] <= self.limits.most_outliers * total)
 

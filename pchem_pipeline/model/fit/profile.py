@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit import engine, profile_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
@@ -80,9 +79,9 @@ class Profile:
 
     def _climb(
         self,
-        pixels: NDArray[np.intp],
+        pixels: IndexArray,
         theta: FloatArray,
-        place: NDArray[np.intp] | int | None = None,
+        place: IndexArray | int | None = None,
         tied: BoolArray | bool = False,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Climb from theta, one parameter fixed; see :func:`.profile_numba.climb_tile`."""
@@ -98,7 +97,7 @@ class Profile:
         )
         return found, loglik, covariance
 
-    def _direction(self, pixels: NDArray[np.intp], target: NDArray[np.intp]) -> FloatArray:
+    def _direction(self, pixels: IndexArray, target: IndexArray) -> FloatArray:
         """Return the change of all coordinates per standard error of a parameter; the last is ``sigma g``."""
         n, m = self._n, np.arange(pixels.size)
         tied, place = target == n + 3, np.minimum(target, n + LOG_VARIANCE)

@@ -19,9 +19,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray, IntegerArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.mass import LEAST_SEEN, sample_mass, sample_slopes, score_and_information
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -132,7 +131,7 @@ class SharedProblem:
         samples: which rows are of one pixel.
     """
 
-    counts: NDArray[np.integer]
+    counts: IntegerArray
     origin: IntArray
     kept: BoolArray
     law: Law

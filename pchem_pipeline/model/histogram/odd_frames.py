@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, special, stats
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from pchem_pipeline.base.wording import short
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.histogram.spectrum import MOST_SAMPLES
@@ -206,7 +204,7 @@ class MovedFrames:
         )
         self._known = True
 
-    def add(self, frames: NDArray[np.unsignedinteger[Any]]) -> None:
+    def add(self, frames: CodeArray) -> None:
         """Compare the next frames, (frame, y, x), of the same rows each."""
         step = max(FEWEST_FRAMES, MOST_SAMPLES // max(frames[0].size, 1))
         for part in (frames[t : t + step] for t in range(0, len(frames), step)):
@@ -216,7 +214,7 @@ class MovedFrames:
                 self._compare(part.reshape(len(part), -1))
             self._n += len(part)
 
-    def _compare(self, frames: NDArray[np.unsignedinteger[Any]]) -> None:
+    def _compare(self, frames: CodeArray) -> None:
         """Add the frames, (frame, pixel), that fit better if they have moved."""
         u = frames.astype(np.float32)
         u -= self._mean

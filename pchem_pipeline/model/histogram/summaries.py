@@ -10,19 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from pchem_pipeline.model.histogram.count_numba import update_range
 from pchem_pipeline.model.histogram.summaries_numba import add_products, sum_lines
 
 #: Rows in a group: column sums are taken over it, and neighbour products stay inside.
 ROW_GROUP = 64
-
-_Frames = NDArray[np.unsignedinteger[Any]]
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ class OpenSums:
     covariances: FloatArray
 
 
-def line_sums(frames: _Frames) -> LineSums:
+def line_sums(frames: CodeArray) -> LineSums:
     """Return the sums along rows and columns of frames (frame, y, x), whole groups of rows from the top."""
     n_frames, ny, nx = frames.shape
     row_sum, row_sum_square = np.empty((2, n_frames, ny), np.int64)
@@ -141,7 +138,7 @@ class SummaryAccumulator:
         covariances[2, ROW_GROUP - 1 :: ROW_GROUP] = covariances[2, -1] = 0.0  # no pair across the border
         return OpenSums(np.concatenate([self._sums, ends]), covariances)
 
-    def add(self, frames: _Frames) -> list[BlockSums]:
+    def add(self, frames: CodeArray) -> list[BlockSums]:
         """Take frames (frame, y, x), any number of them, and return the blocks that they complete."""
         done = []
         while len(frames):
@@ -159,7 +156,7 @@ class SummaryAccumulator:
         down[ROW_GROUP - 1 :: ROW_GROUP] = down[-1] = np.nan
         return done, CovarianceMaps(lag, right, down)
 
-    def exchange(self, pieces: Iterable[_Frames], kept: BoolArray) -> BlockSums:
+    def exchange(self, pieces: Iterable[CodeArray], kept: BoolArray) -> BlockSums:
         """Leave frames of a closed block out of the covariances; return the block's sums without them.
 
         Args:
@@ -177,7 +174,7 @@ class SummaryAccumulator:
         self._freedom += after._freedom - before._freedom
         return done[-1]
 
-    def _add_part(self, frames: _Frames) -> None:
+    def _add_part(self, frames: CodeArray) -> None:
         """Add frames that all belong to the open block."""
         if self._in_block == 0:
             self._reference[:] = self._before[:] = frames[0]
@@ -189,7 +186,7 @@ class SummaryAccumulator:
         self._before[:] = frames[-1]
         self._in_block += frames.shape[0]
 
-    def _is_narrow(self, frames: _Frames) -> BoolArray:
+    def _is_narrow(self, frames: CodeArray) -> BoolArray:
         """Return for each row whether sums of products over the frames fit into 32 bits, (y,)."""
         low, high = self._before.astype(frames.dtype), self._before.astype(frames.dtype)
         update_range(frames, low, high)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IntegerArray
 from pchem_pipeline.model.law import electron_laws_numba
 from pchem_pipeline.model.law.cells_numba import Law
 from pchem_pipeline.model.law.sample_law import CountLaw, SampleLaw
@@ -94,7 +94,7 @@ def satellites_of(satellites: tuple[ArrayLike, ArrayLike] | None, n: int) -> Flo
     return np.nan_to_num(found)
 
 
-def kernel_counts(counts: NDArray[np.integer]) -> NDArray[np.integer]:
+def kernel_counts(counts: IntegerArray) -> IntegerArray:
     """Return histograms in the one type that the kernels are compiled for.
 
     Machine code for another type would round differently in the last bit. Only counts beyond 32 bits keep a

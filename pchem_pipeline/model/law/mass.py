@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import FloatArray, IndexArray, IntArray, IntegerArray
 from pchem_pipeline.model.law import mass_numba
 from pchem_pipeline.model.law.cells_numba import CORE, EXACT, NEAR
 from pchem_pipeline.model.law.inputs import pack, satellites_of
@@ -41,7 +41,7 @@ def code_ranges(
 
 def parts_of_similar_width(
     model: SampleLaw, maps: Parameters, limits: tuple[int, int] | None = None
-) -> Iterator[tuple[NDArray[np.intp], IntArray, int]]:
+) -> Iterator[tuple[IndexArray, IntArray, int]]:
     """Give pixels in parts whose codes take little memory: those with as many codes come together.
 
     Of all codes, or those between limits, DN. Pixels without usable parameters are in no part.
@@ -99,7 +99,7 @@ def sample_mass(
 
 
 def sample_slopes(
-    model: SampleLaw, maps: Parameters, first: NDArray[np.integer], n_codes: int
+    model: SampleLaw, maps: Parameters, first: IntegerArray, n_codes: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return the probability of successive codes down to 1e-50, (n, n_codes), and its slopes.
 
@@ -118,8 +118,8 @@ def sample_slopes(
 def sample_parabolas(
     model: SampleLaw,
     maps: Parameters,
-    counts: NDArray[np.integer],
-    origin: NDArray[np.integer],
+    counts: IntegerArray,
+    origin: IntegerArray,
     replaced: ReplacedSamples | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return log-likelihood, its slopes and Fisher's information of every pixel, NaN without parameters.
@@ -151,7 +151,7 @@ def sample_parabolas(
 
 
 def score_and_information(
-    log_slopes: FloatArray, mass: FloatArray, counts: NDArray[np.integer]
+    log_slopes: FloatArray, mass: FloatArray, counts: IntegerArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the slopes of the log-likelihood of histograms, and Fisher's information of as many samples.
 

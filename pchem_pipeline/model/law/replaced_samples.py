@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, IntegerArray
 
 
 @dataclass(frozen=True)
@@ -28,16 +27,11 @@ class ReplacedSamples:
 
     stays: FloatArray
     comes: FloatArray
-    excess: NDArray[np.integer]
+    excess: IntegerArray
 
     @classmethod
     def by(
-        cls,
-        values: NDArray[np.integer],
-        excess: NDArray[np.integer],
-        share: FloatArray,
-        first: NDArray[np.integer],
-        n_codes: int,
+        cls, values: IntegerArray, excess: IntegerArray, share: FloatArray, first: IntegerArray, n_codes: int
     ) -> ReplacedSamples:
         """Return it by a sample of what stands in for each pixel.
 
@@ -57,7 +51,7 @@ class ReplacedSamples:
         # no sample lies beyond the codes
         return cls(stays, comes, np.minimum(excess, n_codes))
 
-    def of(self, pixels: NDArray[np.intp] | BoolArray | slice) -> ReplacedSamples:
+    def of(self, pixels: IndexArray | BoolArray | slice) -> ReplacedSamples:
         """Return it for some of the pixels."""
         return ReplacedSamples(self.stays[pixels], self.comes[pixels], self.excess[pixels])
 

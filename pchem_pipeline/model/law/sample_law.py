@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray
 
 CountLaw = Literal["poisson", "negative_binomial", "borel", "trapped", "lost"]
 #: A number of all pixels, or one of each, shape (n,).
@@ -114,7 +114,7 @@ class SampleLaw:
         names = [each.name for each in fields(self)]
         return all(np.array_equal(getattr(self, name), getattr(plain, name)) for name in names)
 
-    def of(self, pixels: NDArray[np.intp] | BoolArray | slice) -> SampleLaw:
+    def of(self, pixels: IndexArray | BoolArray | slice) -> SampleLaw:
         """Return the law of some of the pixels (an index, a mask or a slice along n)."""
         rows = {name: getattr(self, name) for name in (*_PER_PIXEL, *self._differing())}
         return replace(self, **{name: row[pixels] for name, row in rows.items() if row.shape[0] != 1})
@@ -125,7 +125,7 @@ class SampleLaw:
         return own + tuple(name for name in (*_TABLES, "edge_shift") if getattr(self, name).ndim == 2)
 
     @classmethod
-    def joined(cls, parts: Sequence[tuple[NDArray[np.intp], SampleLaw]], n: int) -> SampleLaw:
+    def joined(cls, parts: Sequence[tuple[IndexArray, SampleLaw]], n: int) -> SampleLaw:
         """Return the law of n pixels from the pixels and the law of each group; a pixel is in one group.
 
         Raises:
@@ -370,7 +370,7 @@ def _plain(name: str, value: Any) -> Any:
     return np.nan if value is None and name.startswith("clip") else value
 
 
-def _rows(name: str, parts: Sequence[tuple[NDArray[np.intp], NDArray[Any]]], n: int) -> NDArray[Any]:
+def _rows(name: str, parts: Sequence[tuple[IndexArray, NDArray[Any]]], n: int) -> NDArray[Any]:
     """Return a row for each of n pixels from those of groups, as long as the longest."""
     values = [each[None] if name in _TABLES and each.ndim == 1 else each for _, each in parts]
     most = max((each.shape[1] for each in values if each.ndim == 2), default=None)
@@ -385,7 +385,7 @@ def _rows(name: str, parts: Sequence[tuple[NDArray[np.intp], NDArray[Any]]], n: 
     return found
 
 
-def _joined_edges(parts: Sequence[tuple[NDArray[np.intp], SampleLaw]], n: int) -> dict[str, Any]:
+def _joined_edges(parts: Sequence[tuple[IndexArray, SampleLaw]], n: int) -> dict[str, Any]:
     """Return the shifts of the code edges of groups of pixels, from one code on."""
     laws = [law for _, law in parts]
     first = laws[0]
@@ -401,9 +401,7 @@ def _joined_edges(parts: Sequence[tuple[NDArray[np.intp], SampleLaw]], n: int) -
     return {"edge_first": low, "edge_shift": shifts}
 
 
-def _joined_satellites(
-    laws: Sequence[SampleLaw], pixels: Sequence[NDArray[np.intp]], n: int
-) -> dict[str, Any]:
+def _joined_satellites(laws: Sequence[SampleLaw], pixels: Sequence[IndexArray], n: int) -> dict[str, Any]:
     """Return which free satellites groups of pixels look for, and which pixels do."""
     looking = [law for law in laws if law.free_satellites]
     if not looking:

@@ -10,11 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import gammaln
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import FloatArray, IntArray, IntegerArray
 from pchem_pipeline.model.law import telegraph_numba
 
 # rise of the log-likelihood, nats, that the first and the second process must bring; pixels of constant
@@ -60,7 +59,7 @@ class Telegraph:
 class _Series:
     """The samples of a pixel, and their law given the exposure."""
 
-    def __init__(self, samples: NDArray[np.integer], frames: IntArray, pixel: FloatArray) -> None:
+    def __init__(self, samples: IntegerArray, frames: IntArray, pixel: FloatArray) -> None:
         exposure, gain, bias, sigma = (float(v) for v in pixel)
         codes, place = np.unique(samples, return_inverse=True)
         self.samples = np.ascontiguousarray(place, np.int64)
@@ -114,9 +113,7 @@ def added_of(step: FloatArray) -> FloatArray:
     return np.asarray(((states[:, None] >> np.arange(step.size)) & 1) @ step)
 
 
-def transitions(
-    share: FloatArray, tau: FloatArray, gaps: NDArray[np.integer]
-) -> tuple[FloatArray, FloatArray]:
+def transitions(share: FloatArray, tau: FloatArray, gaps: IntegerArray) -> tuple[FloatArray, FloatArray]:
     """Return the probabilities of the states, (s,), and from each to each over gaps, (g, s, s).
 
     Over a gap, frames, each process keeps its state with its correlation, of time tau, frames, or takes one
@@ -131,7 +128,7 @@ def transitions(
     return start, moves
 
 
-def find_telegraph(samples: NDArray[np.integer], frames: IntArray, pixel: FloatArray) -> Telegraph | None:
+def find_telegraph(samples: IntegerArray, frames: IntArray, pixel: FloatArray) -> Telegraph | None:
     """Return how a pixel's exposure blinks, or None where a constant one explains the samples as well.
 
     The samples, DN, have increasing frame numbers; the pixel is (H, g, mu, sigma), H the mean exposure.

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray, IntegerArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.status import FAILED, FitStatus, words_of
 from pchem_pipeline.model.maps.ordered import Ordered
@@ -121,14 +120,14 @@ def electron_shifts(
     return m, probability
 
 
-def quality_map(fit_status: NDArray[np.integer[Any]], conversion_gain: FloatArray) -> NDArray[np.uint8]:
+def quality_map(fit_status: IntegerArray, conversion_gain: FloatArray) -> NDArray[np.uint8]:
     """Grade the pixels: ``GOOD``, ``CAUTION`` (any bit in the status) or ``NO_VALUE`` (NaN)."""
     quality = np.where(fit_status == 0, GOOD, CAUTION).astype(np.uint8)
     quality[((fit_status & int(FAILED)) != 0) | ~np.isfinite(conversion_gain)] = NO_VALUE
     return quality
 
 
-def status_counts(fit_status: NDArray[np.integer[Any]]) -> dict[str, int]:
+def status_counts(fit_status: IntegerArray) -> dict[str, int]:
     """Count the pixels with each reason, by its name in lower case, ``"ok"`` first; words of any shape."""
     counts = {words_of(bit): int(np.count_nonzero(fit_status & int(bit))) for bit in FitStatus if bit}
     return {"ok": int(np.count_nonzero(fit_status == 0))} | counts
