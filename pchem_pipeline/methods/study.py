@@ -17,7 +17,7 @@ from pchem_pipeline.methods.base import PixelSamples, Sample, methods
 from pchem_pipeline.methods.compare import bounds, compare
 from pchem_pipeline.methods.photon_transfer import gain_variance
 from pchem_pipeline.methods.settings import MethodsSettings
-from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.mass import draw_histograms
 
 #: Exposures of the samples in units of H, by what a method needs; frames are shared evenly.
 SHARES: dict[str, tuple[float, ...]] = {

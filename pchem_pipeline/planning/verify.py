@@ -17,7 +17,7 @@ from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, flags_of
-from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.mass import draw_histograms
 from pchem_pipeline.planning.targets import Point, Target
 
 _PIXELS = 200  # simulated for a number of frames; 5 % of them have a standard error of 1.5 %

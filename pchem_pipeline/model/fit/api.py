@@ -13,8 +13,12 @@ from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, IntArr
 from pchem_pipeline.base.units import FEW_STEP
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.errors import information_numba
-from pchem_pipeline.model.errors.expected_information import expected_scores, inverse_information
-from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
+from pchem_pipeline.model.errors.expected_information import (
+    biased_by_rounding,
+    expected_scores,
+    inverse_information,
+    rounding_may_matter,
+)
 from pchem_pipeline.model.fit import engine, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, Limits
 from pchem_pipeline.model.fit.guard import (

@@ -1,13 +1,15 @@
-"""The mass of codes under any law of a pixel's samples, its slopes, and the parabola of a likelihood."""
+"""The mass of codes under any law of a pixel's samples, its slopes, likelihoods and drawn histograms."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IndexArray, IntArray, IntegerArray
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law import mass_numba
 from pchem_pipeline.model.law.cells_numba import CORE, EXACT, NEAR
 from pchem_pipeline.model.law.inputs import pack, satellites_of
@@ -161,3 +163,39 @@ def score_and_information(
     expected = mass * counts.sum(axis=1, keepdims=True)
     score = np.einsum("nab,nb->na", log_slopes, counts)
     return score, (log_slopes * expected[:, None]) @ log_slopes.transpose(0, 2, 1)
+
+
+class DrawnHistograms(NamedTuple):
+    """Counts (n, B), DN of bin 0 (n,), and the true (H, g, mu, sigma), shape (n, 4)."""
+
+    counts: NDArray[np.uint32]
+    origin: IntArray
+    truth: FloatArray
+
+
+def draw_histograms(
+    rng: np.random.Generator,
+    quanta_exposure: ArrayLike,
+    conversion_gain: ArrayLike,
+    bias: ArrayLike,
+    read_noise_e: ArrayLike,
+    n_frames: int,
+) -> DrawnHistograms:
+    """Draw a histogram of every pixel from the exact mass of eq. (PCD_RV_definition), rounding included.
+
+    The parameters are H >= 0, e-, g, e-/DN, mu, DN, and s_e with quantisation, e-, scalars or of shape (n,).
+
+    Raises:
+        ValueError: the read noise is below that of the rounding.
+    """
+    given = [np.asarray(a, np.float64) for a in (quanta_exposure, conversion_gain, bias, read_noise_e)]
+    exposure, gain, offset, noise = (np.ravel(a) for a in np.broadcast_arrays(*given))
+    if (noise**2 < QUANTISATION_VARIANCE * gain**2).any():
+        raise ValueError("the read noise is below the rounding noise")
+    origin = np.floor(offset - 9 * noise / gain).astype(np.int64) - 1
+    width = np.ceil((exposure + 11 * np.sqrt(exposure) + 12 * (exposure > 0) + 18 * noise) / gain) + 3
+    x = origin[:, None] + np.arange(int(width.max()))
+    truth = [exposure, gain, offset, noise / gain]
+    mass = sample_mass(SampleLaw(), truth, x, smallest=1e-50)
+    counts = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True))
+    return DrawnHistograms(counts.astype(np.uint32), origin, np.stack(truth, axis=1))

@@ -27,8 +27,7 @@ from pchem_pipeline.model.electrons.error_rates import error_rates
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES, bias_weight, moment_rows
 from pchem_pipeline.model.ensemble.curves import components, curves
 from pchem_pipeline.model.ensemble.curves import electron_numbers as electron_numbers_of
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_axis
-from pchem_pipeline.model.ensemble.error_sample import WANTED, PixelErrors
+from pchem_pipeline.model.ensemble.ensemble import ERROR_PIXELS, DnAxis, PixelErrors, electron_pmf, nuced_axis
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
 from pchem_pipeline.model.fit.status import flags_of
@@ -292,7 +291,7 @@ def _errors(fit: Arrays, tile: Tile, shape: tuple[int, int]) -> PixelErrors | No
     stderr = [fit[f"{name}_stderr"].ravel() for name in PARAMETERS]
     correlation = fit["correlation"]
     place = (np.arange(tile.y0, tile.y1)[:, None] * shape[1] + np.arange(tile.x0, tile.x1)).ravel()
-    share = min(1.0, WANTED / math.prod(shape))
+    share = min(1.0, ERROR_PIXELS / math.prod(shape))
     return PixelErrors(np.stack(stderr, axis=1), correlation.reshape(place.size, -1), place, share)
 
 

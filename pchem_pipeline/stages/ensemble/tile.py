@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
-from pchem_pipeline.model.ensemble.ensemble import curve_errors, mass_sums, tally
-from pchem_pipeline.model.ensemble.error_sample import PixelErrors
+from pchem_pipeline.model.ensemble.ensemble import PixelErrors, curve_errors, mass_sums, tally
 from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
 from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.parameters import UsablePixels

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray
 from pchem_pipeline.base.variables import PARAMETERS, VARIABLES
-from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding
+from pchem_pipeline.model.errors.expected_information import LARGEST_BIAS, biased_by_rounding
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus
 from pchem_pipeline.model.law.parameters import usable_pixels
 from pchem_pipeline.run.fingerprint import setting_values

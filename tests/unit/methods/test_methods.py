@@ -12,7 +12,7 @@ from pchem_pipeline.methods.peak_valley import comb, read_noise_of_valley
 from pchem_pipeline.methods.plain_em import run_em
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
-from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.mass import draw_histograms
 
 
 def sample(exposure, noise=0.3, n_pixels=3, n_frames=3000, seed=1, gain=1 / 11):

@@ -12,8 +12,7 @@ from pchem_pipeline.model.ensemble.components import (
     moment_errors,
     predicted_moments,
 )
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors
-from pchem_pipeline.model.ensemble.error_sample import PixelErrors
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, PixelErrors, curve_errors
 from pchem_pipeline.model.errors.expected_information import covariance_from
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw

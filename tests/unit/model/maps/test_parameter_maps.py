@@ -6,7 +6,7 @@ import pytest
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FitStatus
-from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.mass import draw_histograms
 from pchem_pipeline.model.maps.maps import (
     CAUTION,
     GOOD,
