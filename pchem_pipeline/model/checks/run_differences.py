@@ -90,7 +90,8 @@ class MapDifference:
         median: median of the difference over the pixels that count.
         median_stderr: its standard error.
         median_z: median of ``z`` over them.
-        margin: change that is allowed in standard errors, (ny, nx).
+        limit: change that is allowed, in the unit of the map; 0: none.
+        margin: the same in standard errors, (ny, nx).
         beyond_z: median of ``z`` less the margin, towards where the values moved.
         spread_z: robust standard deviation of ``z`` over them; 1 where chance alone acts.
         n_counted: pixels that count: good fits in both.
@@ -106,6 +107,7 @@ class MapDifference:
     median: float
     median_stderr: float
     median_z: float
+    limit: float
     margin: FloatArray
     beyond_z: float
     spread_z: float
@@ -227,6 +229,7 @@ def _difference(
         median=whole.median,
         median_stderr=whole.median_stderr,
         median_z=core.median,
+        limit=most,
         margin=margin,
         beyond_z=beyond,
         spread_z=core.robust_sd,

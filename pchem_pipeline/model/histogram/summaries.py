@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,49 +21,6 @@ from pchem_pipeline.model.histogram.summaries_numba import add_products, sum_lin
 
 #: Rows in a group: column sums are taken over it, and neighbour products stay inside.
 ROW_GROUP = 64
-
-
-@dataclass(frozen=True)
-class LineSums:
-    """Sums along the lines of each frame.
-
-    Attributes:
-        row_sum: DN, (frame, y).
-        row_sum_square: DN^2, (frame, y).
-        column_sum: DN, sums over `ROW_GROUP` rows, (frame, row_group, x).
-    """
-
-    row_sum: IntArray
-    row_sum_square: IntArray
-    column_sum: NDArray[np.int32]
-
-
-@dataclass(frozen=True)
-class BlockSums:
-    """Sums of each pixel over a block of frames.
-
-    Attributes:
-        block_sum: DN, (y, x).
-        block_sum_square: DN^2, (y, x).
-    """
-
-    block_sum: IntArray
-    block_sum_square: IntArray
-
-
-@dataclass(frozen=True)
-class CovarianceMaps:
-    """Covariances within blocks, averaged over the blocks, DN^2; NaN where there is no pair.
-
-    Attributes:
-        lag1_covariance: with the next frame, (y, x); unbiased (zero) for independent frames.
-        neighbour_covariance_x: with the pixel at x + 1, (y, x); NaN in the last column.
-        neighbour_covariance_y: with the pixel at y + 1, (y, x); NaN in the last row of each group.
-    """
-
-    lag1_covariance: FloatArray
-    neighbour_covariance_x: FloatArray
-    neighbour_covariance_y: FloatArray
 
 
 @dataclass(frozen=True)
@@ -79,13 +37,17 @@ class OpenSums:
     covariances: FloatArray
 
 
-def line_sums(frames: CodeArray) -> LineSums:
-    """Return the sums along rows and columns of frames (frame, y, x), whole groups of rows from the top."""
+def line_sums(frames: CodeArray) -> dict[str, NDArray[Any]]:
+    """Return the sums along rows and columns of frames (frame, y, x), whole groups of rows from the top.
+
+    By name ``row_sum``, DN, and ``row_sum_square``, DN^2, (frame, y), and ``column_sum``, DN, over
+    `ROW_GROUP` rows, (frame, row_group, x).
+    """
     n_frames, ny, nx = frames.shape
     row_sum, row_sum_square = np.empty((2, n_frames, ny), np.int64)
     column_sum = np.zeros((n_frames, -(-ny // ROW_GROUP), nx), np.int32)
     sum_lines(frames, ROW_GROUP, row_sum, row_sum_square, column_sum)
-    return LineSums(row_sum, row_sum_square, column_sum)
+    return {"row_sum": row_sum, "row_sum_square": row_sum_square, "column_sum": column_sum}
 
 
 def block_starts(n_frames: int, block_frames: int) -> IntArray:
@@ -109,7 +71,13 @@ def frame_statistics(
 
 
 class SummaryAccumulator:
-    """Block sums and covariances of the pixels of some rows, while the frames come in."""
+    """Block sums and covariances of the pixels of some rows, while the frames come in.
+
+    Sums of a block are ``block_sum``, DN, and ``block_sum_square``, DN^2, (y, x). Covariances within blocks,
+    averaged over these, DN^2, (y, x), NaN where there is no pair: ``lag1_covariance`` with the next frame,
+    unbiased (zero) for independent frames; ``neighbour_covariance_x`` with the pixel at x + 1, and
+    ``neighbour_covariance_y`` with that at y + 1 of the same group.
+    """
 
     def __init__(self, shape: tuple[int, int], block_frames: int) -> None:
         """Begin with no frames of some rows (from the top of a group) and columns."""
@@ -138,7 +106,7 @@ class SummaryAccumulator:
         covariances[2, ROW_GROUP - 1 :: ROW_GROUP] = covariances[2, -1] = 0.0  # no pair across the border
         return OpenSums(np.concatenate([self._sums, ends]), covariances)
 
-    def add(self, frames: CodeArray) -> list[BlockSums]:
+    def add(self, frames: CodeArray) -> list[dict[str, IntArray]]:
         """Take frames (frame, y, x), any number of them, and return the blocks that they complete."""
         done = []
         while len(frames):
@@ -148,15 +116,15 @@ class SummaryAccumulator:
                 done.append(self._close_block())
         return done
 
-    def finish(self) -> tuple[list[BlockSums], CovarianceMaps]:
+    def finish(self) -> tuple[list[dict[str, IntArray]], dict[str, FloatArray]]:
         """Return the last block, if it was incomplete, and the covariances over all blocks."""
         done = [self._close_block()] if self._in_block else []
         lag, right, down = self._covariances / self._freedom if self._freedom else self._covariances * np.nan
         right[:, -1] = np.nan
         down[ROW_GROUP - 1 :: ROW_GROUP] = down[-1] = np.nan
-        return done, CovarianceMaps(lag, right, down)
+        return done, {"lag1_covariance": lag, "neighbour_covariance_x": right, "neighbour_covariance_y": down}
 
-    def exchange(self, pieces: Iterable[CodeArray], kept: BoolArray) -> BlockSums:
+    def exchange(self, pieces: Iterable[CodeArray], kept: BoolArray) -> dict[str, IntArray]:
         """Leave frames of a closed block out of the covariances; return the block's sums without them.
 
         Args:
@@ -165,7 +133,8 @@ class SummaryAccumulator:
         """
         shape, n = self._reference.shape, int(kept.sum())
         before, after = SummaryAccumulator(shape, kept.size), SummaryAccumulator(shape, max(n, 1))
-        done, at = [BlockSums(*np.zeros((2, *shape), np.int64))], 0
+        nothing, at = np.zeros(shape, np.int64), 0
+        done = [{"block_sum": nothing, "block_sum_square": nothing}]
         for piece in pieces:
             before.add(piece)
             done += after.add(piece[kept[at : at + len(piece)]])
@@ -194,7 +163,7 @@ class SummaryAccumulator:
         largest = np.maximum(reach, np.append(reach[1:], 0))
         return np.asarray(frames.shape[0] * reach * largest < np.iinfo(np.int32).max)
 
-    def _close_block(self) -> BlockSums:
+    def _close_block(self) -> dict[str, IntArray]:
         """Turn the sums of the open block into block sums and covariances, and begin the next."""
         n = self._in_block
         plain, square, lag, right, down = self._sums.astype(np.float64)
@@ -211,4 +180,4 @@ class SummaryAccumulator:
         squares = self._sums[1] + 2 * reference * self._sums[0] + n * reference**2
         self._sums[:] = 0
         self._in_block = 0
-        return BlockSums(total, squares)
+        return {"block_sum": total, "block_sum_square": squares}

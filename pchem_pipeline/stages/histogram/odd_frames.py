@@ -18,7 +18,7 @@ from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, Summar
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
-from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
+from pchem_pipeline.stages.histogram.arrays import MAPS, with_block_length
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import Tile, equal_rows
 
@@ -121,8 +121,8 @@ def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) 
             frames = block * length, min((block + 1) * length, n_frames)
             with FrameStream(source, [rows], FRAMES_AT_ONCE, frames=frames) as stream:
                 done = sums.exchange((piece for _, (piece,) in stream), kept[slice(*frames)])
-            for name, values in vars(done).items():
+            for name, values in done.items():
                 store.write(f"summary/{name}", (slice(block, block + 1), *band[1:]), values[None])
         _, covariances = sums.finish()
-        for name in COVARIANCES:
-            store.write(f"summary/{name}", band[1:], getattr(covariances, name))
+        for name, values in covariances.items():
+            store.write(f"summary/{name}", band[1:], values)

@@ -139,6 +139,7 @@ def test_a_median_counts_where_it_is_significantly_beyond_its_limit(limit):
     jumped[0, :10] += 2.0 + 8.0 * np.sqrt(2.0)
     found = compared((np.full(SHAPE, 100.0), error), (jumped, error), limit=limit)
     assert 9 <= found.n_changed <= 11
+    assert found.limit == pytest.approx(2.0)
 
 
 def test_unchanged_nights_alarm_at_the_stated_rate():
