@@ -9,32 +9,17 @@ every frame is read once.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import Arrays, BoolArray, CodeArray, FloatArray, IntArray
 from pchem_pipeline.model.histogram.count_numba import update_range
 from pchem_pipeline.model.histogram.summaries_numba import add_products, sum_lines
 
 #: Rows in a group: column sums are taken over it, and neighbour products stay inside.
 ROW_GROUP = 64
-
-
-@dataclass(frozen=True)
-class OpenSums:
-    """The sums of a time block that is not whole yet, and of the covariances so far.
-
-    Attributes:
-        sums: of d = DN - reference: d, d^2, d times that of the frame before, of x + 1, of y + 1; then the
-            reference and the DN of the last frame; (7, y, x).
-        covariances: sums over the closed blocks: lag 1, x + 1, y + 1; DN^2, (3, y, x).
-    """
-
-    sums: IntArray
-    covariances: FloatArray
 
 
 def line_sums(frames: CodeArray) -> dict[str, NDArray[Any]]:
@@ -90,21 +75,27 @@ class SummaryAccumulator:
         self._freedom = 0
 
     @classmethod
-    def resumed(cls, state: OpenSums, n_frames: int, block_frames: int) -> SummaryAccumulator:
+    def resumed(cls, state: Arrays, n_frames: int, block_frames: int) -> SummaryAccumulator:
         """Go on after ``n_frames`` frames with what `open_sums` returned then."""
-        self = cls(state.sums.shape[1:], block_frames)
+        sums, covariances = state["open_sums"], state["open_covariances"]
+        self = cls(sums.shape[1:], block_frames)
         closed, self._in_block = divmod(n_frames, block_frames)
         self._freedom = closed * (block_frames - 1)
-        self._sums[...], self._covariances[...] = state.sums[:5], state.covariances
-        self._reference[...], self._before[...] = state.sums[5:]
+        self._sums[...], self._covariances[...] = sums[:5], covariances
+        self._reference[...], self._before[...] = sums[5:]
         return self
 
-    def open_sums(self) -> OpenSums:
-        """Return all that is needed to go on later; to be taken before `finish`."""
+    def open_sums(self) -> dict[str, NDArray[Any]]:
+        """Return what is needed to go on later with a block that is not whole; to be taken before `finish`.
+
+        ``open_sums`` are of d = DN - reference: d, d^2, d times that of the frame before, of x + 1, of y + 1;
+        then the reference and the DN of the last frame; (7, y, x). ``open_covariances`` are sums over the
+        closed blocks: lag 1, x + 1, y + 1; DN^2, (3, y, x).
+        """
         ends = np.stack([self._reference, self._before]).astype(np.int64)
         covariances = self._covariances.copy()
         covariances[2, ROW_GROUP - 1 :: ROW_GROUP] = covariances[2, -1] = 0.0  # no pair across the border
-        return OpenSums(np.concatenate([self._sums, ends]), covariances)
+        return {"open_sums": np.concatenate([self._sums, ends]), "open_covariances": covariances}
 
     def add(self, frames: CodeArray) -> list[dict[str, IntArray]]:
         """Take frames (frame, y, x), any number of them, and return the blocks that they complete."""

@@ -22,12 +22,11 @@ from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistog
 from pchem_pipeline.model.histogram.odd_frames import MovedFrames
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
-from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator, line_sums
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.stages.histogram.arrays import with_block_length
 
 _ALONG_TIME = ("block_sum", "block_sum_square", "row_sum", "row_sum_square", "column_sum")
-_OPEN = ("open_sums", "open_covariances")
 
 
 class _AlongTime:
@@ -149,9 +148,8 @@ class _BandCounter:
         self._histograms = HistogramAccumulator.resumed(held, self._shape[0])
         if self._summaries is None:
             return
-        state = OpenSums(*map(opened.at(region, "summary").__getitem__, _OPEN))
         length = self._settings.block_length(n_frames)
-        self._summaries = SummaryAccumulator.resumed(state, n_frames, length)
+        self._summaries = SummaryAccumulator.resumed(opened.at(region, "summary"), n_frames, length)
         blocks = n_frames // length
         if self._rows.start == 0:
             known = opened.attributes("summary")
@@ -200,7 +198,7 @@ class _BandCounter:
                 each.flush()
             summary = opened.at(region, "summary")
             summary.update(covariances)
-            summary.update(zip(_OPEN, vars(state).values(), strict=True))
+            summary.update(state)
         for name, values in vars(histograms.finish()).items():
             # file by file: of each that is written there are copies in memory
             step = opened.file_shape(f"histogram/{name}")[1]
