@@ -30,7 +30,7 @@ from pchem_pipeline.model.fit.guard import (
     inside,
     leave_out,
 )
-from pchem_pipeline.model.fit.profile import Moments, Profile, moments_along_bias
+from pchem_pipeline.model.fit.profile import Moments, Profile
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus, with_rivals_named
@@ -110,12 +110,15 @@ def fit_histograms(
     _check(samples, origins, dark)
     batch = _Batch(samples, origins, dark, settings, adc_limits, under, over)
     laws = None if law is None else batch.between_limits(law)
-    near = None if isinstance(start, FitResult) else start
-    if laws is not None and near is not None:
-        found = batch.fit_cells(laws, near, warm=True)
+    if not (laws is None or start is None or isinstance(start, FitResult)):
+        found = batch.fit_cells(laws, start, warm=True)
         batch.by_cells[:] = True
     else:
-        plain = batch.resume(_shaped(start, -1)) if isinstance(start, FitResult) else batch.fit_density(near)
+        if isinstance(start, FitResult):
+            plain = _shaped(start, -1)
+            batch.leave_out_again(plain.columns, plain.outlier_share, None, np.zeros((batch.n, 2)))
+        else:
+            plain = batch.fit_density(start)
         batch.set_aside(plain, excluding)
         found = batch.refine(plain, laws)
     if settings.intervals == "profile":
@@ -241,11 +244,6 @@ class _Batch:
         laws = [SampleLaw()] * self.n_samples
         return self._result(self._fit(self.given, laws, starts, self.limits(None)), cells=False, adjust=True)
 
-    def resume(self, plain: FitResult) -> FitResult:
-        """Leave out the samples that a fit with the density left out; return it."""
-        self.leave_out_again(plain.columns, plain.outlier_share, None, np.zeros((self.n, 2)))
-        return plain
-
     def leave_out_again(
         self,
         columns: FloatArray,
@@ -279,7 +277,7 @@ class _Batch:
         """Fit again with the cells what the law or the settings ask for, from a fit with the density."""
         words, possible = plain.fit_status, (plain.fit_status & int(_NO_FIT)) == 0
         scan = laws is None and not (self.given.mask == SET_ASIDE).any()
-        chosen = laws or self.neutral()
+        chosen = laws or self.between_limits(SampleLaw())
         if not scan:
             wanted = ((words & int(FAILED)) == 0) | (self._at_limits(chosen) & possible)
         elif self.settings.likelihood == "auto":
@@ -323,8 +321,9 @@ class _Batch:
         )
         limits = self.limits(own, warm=warm, scan=scan)
         adjust = all(each.neutral for each in own)
-        if not adjust:
-            _count_near(given)
+        if not adjust:  # another law may expect samples that the PCD did not: satellite peaks, tails
+            connected = np.flatnonzero(~far_samples(given)[1])
+            leave_out(given, connected, np.zeros((connected.size, given.counts.shape[1]), np.bool_))
         answers = self._fit(given, own, starts, limits)
         self.given.mask[some] = given.mask
         return self._result(answers, cells=True, adjust=adjust, pixels=some)
@@ -376,7 +375,7 @@ class _Batch:
         self.leave_out_again(columns, outlier_share, laws, satellites)
         law, limits = pack(laws or [SampleLaw()], self.n), self.limits(laws)
         reach = np.where(known[:, 4] < _RIVAL_GAP, _RIVAL_REACH, 0.0)
-        return moments_along_bias(Profile(self.given, law, limits, columns, satellites), columns, reach)
+        return Profile(self.given, law, limits, columns, satellites).moments(columns, reach)
 
     # -- what they are told
 
@@ -401,10 +400,6 @@ class _Batch:
             quick=False,
             sandwich=settings.errors == "sandwich",
         )
-
-    def neutral(self) -> list[SampleLaw]:
-        """Return the law of the PCD between the limits of the ADC."""
-        return self.between_limits(SampleLaw())
 
     def between_limits(self, law: SampleLaw | Sequence[SampleLaw]) -> list[SampleLaw]:
         """Return laws without limits between those of the ADC, but in pixels with samples beyond them."""
@@ -562,22 +557,13 @@ class _Batch:
             some = np.flatnonzero(fitted & (self.by_cells == cells))
             if some.size == 0:
                 continue
-            chosen = (laws or self.neutral()) if cells else [SampleLaw()] * self.n_samples
+            chosen = (laws or self.between_limits(SampleLaw())) if cells else [SampleLaw()] * self.n_samples
             satellites = np.stack([found.satellite_amplitude_e[some], found.satellite_weight[some]], axis=1)
             law = pack([each.of(some) for each in chosen], some.size)
             limits = self.limits(chosen if cells else None)
             near = Profile(self._given_of(some), law, limits, found.columns[some], np.nan_to_num(satellites))
             ends[some] = near.ends(quantile_of(self.settings.interval_level))
         return ends
-
-
-def _count_near(given: Histograms) -> None:
-    """Count samples again that a fit with the PCD did not expect, but for those that a gap cuts off.
-
-    Another law may expect them: satellite peaks, tails.
-    """
-    near = np.flatnonzero(~far_samples(given)[1])
-    leave_out(given, near, np.zeros((near.size, given.counts.shape[1]), np.bool_))
 
 
 def _reshapes(law: SampleLaw) -> bool:

@@ -146,7 +146,8 @@ def fit_guarded(
     fit(np.flatnonzero(~far | resumed), False)
     good = (_scores(answers) <= BEYOND_DOUBT) | limits.cells
     suspicious = ~far & ~resumed & guard.suspicious(everything)
-    guard.keep(np.flatnonzero(suspicious))
+    guard.whole = Answers._make(each[suspicious] for each in answers)
+    guard.place[suspicious] = np.arange(np.count_nonzero(suspicious))
     answers.out[~far & ~suspicious & ~resumed, OUTLYING] = 0.0
     guard.attempt[:] = np.where(resumed | far | ~good, _EXPECTED, _EXPECTED - 1)
     again, stuck = guard.check(np.flatnonzero(resumed), far)
@@ -172,11 +173,6 @@ class _Guard:
     attempt: IntArray
     passes: IntArray  # fits of the attempt
     place: IntArray  # in ``whole``; -1: not there
-
-    def keep(self, pixels: IndexArray) -> None:
-        """Keep the answers of pixels of which all samples were fitted."""
-        self.whole = Answers._make(each[pixels] for each in self.answers)
-        self.place[pixels] = np.arange(pixels.size)
 
     def fit_again(self, pixels: IndexArray) -> None:
         """Fit what the mask leaves of pixels, all of whose samples are not fitted twice."""

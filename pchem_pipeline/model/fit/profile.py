@@ -172,7 +172,7 @@ class Profile:
         ends[pixels, target, side] = np.where(reached, values[np.arange(pixels.size), target], np.nan)
         return ends
 
-    def along_bias(self, reach: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _along_bias(self, reach: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Find the best other parameters at biases on both sides, ``reach`` e- in any case, shape (n,).
 
         Returns:
@@ -204,6 +204,31 @@ class Profile:
                     break
         return found, across, heights
 
+    def moments(self, parameters: FloatArray, reach: FloatArray) -> Moments:
+        """Return the moments of the likelihood over the parameters, along the profile of the bias.
+
+        About parameters at the maximum, shape (n, J + 3), NaN where there is none. Another maximum may lie
+        within ``reach`` on either side, e-, shape (n,).
+        """
+        size = parameters.shape[1]
+        found, across, heights = self._along_bias(reach)
+        walked = heights > -np.inf
+        # Laplace's volume across the bias would multiply this; Jeffreys' prior across divides by it
+        weight = np.exp(np.minimum(heights, _DEEPEST))
+        off = np.where(walked[:, :, None], found - parameters[:, None], 0.0)
+        electrons = off[:, :, size - 2] * parameters[:, None, size - 3]
+        here, beside = abs(electrons) < 0.5, (electrons <= -0.5, electrons >= 0.5)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            own = np.where(here, weight, 0.0)
+            own /= own.sum(axis=1, keepdims=True)
+            rest = np.stack([np.where(side, weight, 0.0) for side in beside], axis=1)
+            share = rest.sum(axis=2) / weight.sum(axis=1, keepdims=True)
+            rest /= rest.sum(axis=2, keepdims=True)
+        covariance = np.einsum("nt,nti,ntj->nij", own, off, off) + np.einsum("nt,ntij->nij", own, across)
+        covariance[~walked[:, _MOST]] = np.nan
+        rivals = parameters[:, None] + np.einsum("nst,nti->nsi", np.nan_to_num(rest), off)
+        return Moments(covariance, np.nan_to_num(share), rivals)
+
     def _natural(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (H_1 ... H_J, g, mu, sigma), and their slopes in (H_1 ... H_J, 1/g, mu, v), (m, J + 3)."""
         n = self._n
@@ -213,31 +238,3 @@ class Profile:
         slope[:, n + STEP], slope[:, n + LOG_VARIANCE] = -(gain**2), 0.5 * variance / sigma
         exposure = np.where(self._given.dark, 0.0, np.exp(theta[:, :n]))
         return np.column_stack([exposure, gain, theta[:, n + BIAS], sigma]), slope
-
-
-def moments_along_bias(fits: Profile, parameters: FloatArray, reach: FloatArray) -> Moments:
-    """Return the moments of the likelihood over the parameters, along the profile of the bias.
-
-    Args:
-        fits: the likelihood about these.
-        parameters: at the maximum, shape (n, J + 3); NaN where there is none.
-        reach: distance on either side within which another maximum may lie, e-, shape (n,).
-    """
-    size = parameters.shape[1]
-    found, across, heights = fits.along_bias(reach)
-    walked = heights > -np.inf
-    # Laplace's volume across the bias would multiply this; Jeffreys' prior of what is across divides by it
-    weight = np.exp(np.minimum(heights, _DEEPEST))
-    off = np.where(walked[:, :, None], found - parameters[:, None], 0.0)
-    electrons = off[:, :, size - 2] * parameters[:, None, size - 3]
-    here, beside = abs(electrons) < 0.5, (electrons <= -0.5, electrons >= 0.5)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        own = np.where(here, weight, 0.0)
-        own /= own.sum(axis=1, keepdims=True)
-        rest = np.stack([np.where(side, weight, 0.0) for side in beside], axis=1)
-        share = rest.sum(axis=2) / weight.sum(axis=1, keepdims=True)
-        rest /= rest.sum(axis=2, keepdims=True)
-    covariance = np.einsum("nt,nti,ntj->nij", own, off, off) + np.einsum("nt,ntij->nij", own, across)
-    covariance[~walked[:, _MOST]] = np.nan
-    rivals = parameters[:, None] + np.einsum("nst,nti->nsi", np.nan_to_num(rest), off)
-    return Moments(covariance, np.nan_to_num(share), rivals)

@@ -97,16 +97,13 @@ def frame_scores(row_sum: IntArray, row_sum_square: IntArray, columns: int) -> F
     sums, squares = row_sum[some], row_sum_square[some]
     away = sums - np.median(sums, axis=0)
     away -= np.median(away, axis=1)[:, None]
-    level, spread = (_normal_scores(each) for each in (away, squares - sums * (sums / columns)))
+    # normal quantiles of ranks, equal values at their mean rank
+    ranks = (stats.rankdata(each, axis=0) for each in (away, squares - sums * (sums / columns)))
+    level, spread = (np.asarray(special.ndtri(each / (len(each) + 1))) for each in ranks)
     n_parts, found = min(_PARTS, sums.shape[1] // _PART_ROWS), [spread]
     if n_parts > 1:
         found += [part for each in (level, spread) for part in np.array_split(each, n_parts, axis=1)]
     return np.stack([each.sum(axis=1) / np.sqrt(each.shape[1]) for each in found])
-
-
-def _normal_scores(values: FloatArray) -> FloatArray:
-    """Return the normal quantiles of ranks along the first axis, equal values at their mean rank."""
-    return np.asarray(special.ndtri(stats.rankdata(values, axis=0) / (len(values) + 1)))
 
 
 def chance_of_copies(row_variance: FloatArray, n_frames: int) -> float:

@@ -116,13 +116,11 @@ class SampleLaw:
 
     def of(self, pixels: IndexArray | BoolArray | slice) -> SampleLaw:
         """Return the law of some of the pixels (an index, a mask or a slice along n)."""
-        rows = {name: getattr(self, name) for name in (*_PER_PIXEL, *self._differing())}
+        rows = {name: getattr(self, name) for name in (*_PER_PIXEL, *_NUMBERS, *_TABLES, "edge_shift")}
+        for name in rows.keys() - _PER_PIXEL:  # a row of each pixel only in laws that were joined
+            if np.ndim(rows[name]) < (1 if name in _NUMBERS else 2):
+                del rows[name]
         return replace(self, **{name: row[pixels] for name, row in rows.items() if row.shape[0] != 1})
-
-    def _differing(self) -> tuple[str, ...]:
-        """Return the fields that have one number for all pixels in other laws, and here a row of each."""
-        own = tuple(name for name in _NUMBERS if isinstance(getattr(self, name), np.ndarray))
-        return own + tuple(name for name in (*_TABLES, "edge_shift") if getattr(self, name).ndim == 2)
 
     @classmethod
     def joined(cls, parts: Sequence[tuple[IndexArray, SampleLaw]], n: int) -> SampleLaw:
