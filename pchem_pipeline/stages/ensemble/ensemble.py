@@ -22,8 +22,7 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
-from pchem_pipeline.model.electrons.electrons import compare_electron_numbers
-from pchem_pipeline.model.electrons.error_rates import error_rates
+from pchem_pipeline.model.electrons.electrons import compare_electron_numbers, error_rates
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES, bias_weight, moment_rows
 from pchem_pipeline.model.ensemble.curves import components, curves
 from pchem_pipeline.model.ensemble.curves import electron_numbers as electron_numbers_of

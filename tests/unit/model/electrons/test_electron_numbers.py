@@ -10,9 +10,9 @@ from pchem_pipeline.model.electrons.electrons import (
     NO_NUMBER,
     KnownPixels,
     compare_electron_numbers,
+    errors_of_numbers,
     number_tables,
 )
-from pchem_pipeline.model.electrons.error_rates import errors_of_numbers
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.pcd import thresholds
 from pchem_pipeline.model.law.sample_law import SampleLaw
