@@ -10,8 +10,6 @@ from scipy.special import chdtrc
 
 from pchem_pipeline.base.arrays import FloatArray
 
-#: Slope and offset of the exposures over the light level.
-LEVEL_MAPS = ("charge_per_level", "dark_signal")
 _REWEIGHTINGS = 2
 _MOST_RESCALED = 100.0  # no variance is trusted to change by more
 
@@ -47,23 +45,22 @@ def exposure_line(
     line, spread = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
     residual, sd, chi2 = np.full((n, n_samples), np.nan), np.full((n, n_samples), np.nan), np.full(n, np.nan)
     good = np.flatnonzero(np.isfinite(quanta_exposure).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
-    if good.size:
-        exposure, own = quanta_exposure[good], covariance[good]
-        fitted = exposure
-        for _ in range(1 + _REWEIGHTINGS):
-            errors = own.copy()
-            change = (_rescaling(exposure, fitted) - 1.0) * own_variance[good]
-            errors[:, np.arange(n_samples), np.arange(n_samples)] += change
-            inverse = np.linalg.inv(errors)
-            weighted = np.einsum("jp,njk->npk", design, inverse)
-            bend = np.linalg.inv(weighted @ design)
-            solution = np.einsum("npq,nqk,nk->np", bend, weighted, exposure)
-            fitted = solution @ design.T
-        rest = exposure - fitted
-        line[good], spread[good], residual[good] = solution, bend, rest
-        rest_square = np.diagonal(errors, axis1=1, axis2=2) - np.einsum("jp,npq,jq->nj", design, bend, design)
-        sd[good] = np.sqrt(np.maximum(rest_square, 0.0)) if n_samples > 2 else 0.0
-        chi2[good] = np.einsum("nj,njk,nk->n", rest, inverse, rest)
+    exposure, own = quanta_exposure[good], covariance[good]
+    fitted = exposure
+    for _ in range(1 + _REWEIGHTINGS):
+        errors = own.copy()
+        change = (_rescaling(exposure, fitted) - 1.0) * own_variance[good]
+        errors[:, np.arange(n_samples), np.arange(n_samples)] += change
+        inverse = np.linalg.inv(errors)
+        weighted = np.einsum("jp,njk->npk", design, inverse)
+        bend = np.linalg.inv(weighted @ design)
+        solution = np.einsum("npq,nqk,nk->np", bend, weighted, exposure)
+        fitted = solution @ design.T
+    rest = exposure - fitted
+    line[good], spread[good], residual[good] = solution, bend, rest
+    rest_square = np.diagonal(errors, axis1=1, axis2=2) - np.einsum("jp,npq,jq->nj", design, bend, design)
+    sd[good] = np.sqrt(np.maximum(rest_square, 0.0)) if n_samples > 2 else 0.0
+    chi2[good] = np.einsum("nj,njk,nk->n", rest, inverse, rest)
     dof = n_samples - 2
     p = np.asarray(chdtrc(dof, chi2)) if dof > 0 else np.full(n, np.nan)
     left = {"linearity_residual": residual, "linearity_residual_stderr": sd}
@@ -84,7 +81,7 @@ def line_map_names(against: str, rate: str) -> tuple[str, ...]:
     """
     if against == "none":
         return ()
-    return (rate, "spurious_charge") if against == "integration_time" else LEVEL_MAPS
+    return (rate, "spurious_charge") if against == "integration_time" else ("charge_per_level", "dark_signal")
 
 
 def own_variance(covariance: FloatArray) -> FloatArray:
@@ -100,14 +97,13 @@ def own_variance(covariance: FloatArray) -> FloatArray:
     shared[bound, 2, 2] = 1.0
     own = np.full((n, j), np.nan)
     good = np.flatnonzero(np.isfinite(shared).all(axis=(1, 2)))
-    if good.size:
-        # the parameters have scales of their own: the matrix of correlations is inverted
-        scale = np.sqrt(np.diagonal(shared[good], axis1=1, axis2=2))
-        correlation = shared[good] / (scale[:, :, None] * scale[:, None, :])
-        weights = across[good] / scale[:, None, :]
-        explained = np.einsum("nja,nab,njb->nj", weights, np.linalg.inv(correlation), weights)
-        diagonal = np.diagonal(covariance[good, :j, :j], axis1=1, axis2=2)
-        own[good] = np.maximum(diagonal - explained, 0.0)
+    # the parameters have scales of their own: the matrix of correlations is inverted
+    scale = np.sqrt(np.diagonal(shared[good], axis1=1, axis2=2))
+    correlation = shared[good] / (scale[:, :, None] * scale[:, None, :])
+    weights = across[good] / scale[:, None, :]
+    explained = np.einsum("nja,nab,njb->nj", weights, np.linalg.inv(correlation), weights)
+    diagonal = np.diagonal(covariance[good, :j, :j], axis1=1, axis2=2)
+    own[good] = np.maximum(diagonal - explained, 0.0)
     return own
 
 
