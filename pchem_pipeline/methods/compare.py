@@ -49,14 +49,10 @@ def compare(
     skip_errors: Sequence[str] = (),
     only: Sequence[str] | None = None,
 ) -> list[MethodResult]:
-    """Run the methods on the same pixels.
+    """Run the methods, or some by name, on the samples of the same pixels, the characterised one first.
 
-    Args:
-        pixels: the pixels' samples, the characterised one first.
-        reference: (H, g, mu, sigma) that is held for true, shape (n, 4), NaN where nothing is known; or None.
-        settings: of the iterative methods.
-        skip_errors: methods whose errors mean nothing, since the reference is theirs.
-        only: names of methods to run; all by default.
+    The reference is (H, g, mu, sigma) that is held for true, shape (n, 4), NaN where nothing is known;
+    ``skip_errors`` are methods whose errors mean nothing, since it is theirs.
     """
     return [
         _run(method, pixels, None if name in skip_errors else reference, settings)

@@ -75,14 +75,9 @@ def frames_simulated(
 ) -> float:
     """Compute the frames in total with which simulated pixels reach the targets, to 10 %, by bisection.
 
-    Args:
-        targets: what is wanted.
-        point: the pixel; its own exposure does not matter.
-        exposures: H of the samples, e-; 0 for bias frames.
-        shares: of the frames that each has, adding up to 1.
-        bound: frames by the Cramer-Rao bound; fewer are not tried.
-        most: the result is infinite where so many are too few.
-        every_flag: whether flags count that do not concern what is wanted.
+    The samples have H, e-, 0 for bias frames (that of the point does not matter), and shares of the frames
+    that add up to 1. Fewer frames than the Cramer-Rao bound are not tried; infinite where the most are too
+    few. ``every_flag``: flags count that do not concern what is wanted, too.
     """
 
     def reached(frames: float) -> bool:

@@ -23,12 +23,9 @@ def robust_sd(values: ArrayLike, centre: ArrayLike | None = None, *, axis: int) 
 def robust_sd(
     values: ArrayLike, centre: ArrayLike | None = None, *, axis: int | None = None
 ) -> float | FloatArray:
-    """Return ``1.4826 median |v - centre|``, the standard deviation of a normal law.
+    """Return ``1.4826 median |v - centre|``, the standard deviation of a normal law, NaN where a value is.
 
-    Args:
-        values: any shape; NaN where any of them is.
-        centre: of the law; None: the median.
-        axis: along which; None: of all values, a float.
+    About the median, or a given centre; of all values a float, or along an axis.
     """
     seen = np.asarray(values, np.float64)
     middle = np.median(seen, axis=axis, keepdims=True) if centre is None else np.asarray(centre)
@@ -68,10 +65,8 @@ def false_discovery(probability: NDArray[np.floating[Any]]) -> FloatArray:
 def chi_square(value: ArrayLike, mean: ArrayLike, variance: ArrayLike | None = None) -> FloatArray:
     """Return the normal deviate of a sum of squares, whose cube root is nearly normal (Wilson-Hilferty 1931).
 
-    Args:
-        value: the sum.
-        mean: its expectation (the degrees of freedom where the squares have variance 1), above 0.
-        variance: its variance; twice the mean if None.
+    The mean, above 0, is its expectation (the degrees of freedom where the squares have variance 1); the
+    variance is twice the mean if it is not given.
     """
     mu = np.asarray(mean, np.float64)
     spread = 2.0 * mu if variance is None else np.asarray(variance, np.float64)

@@ -97,10 +97,7 @@ class NumberTables(CodeTables):
     def convert(self, frames: CodeArray, *, expected: bool = False, lift: int = 0) -> Numbers:
         """Return the electron numbers of samples; none for codes that are not in the table of their pixel.
 
-        Args:
-            frames: codes, shape (frame, y, x).
-            expected: whether the mean is wanted, too.
-            lift: by which the codes were raised.
+        The codes, (frame, y, x), were raised by ``lift``; the mean is there if it is ``expected``.
         """
         n_frames, n = frames.shape[0], self.first.size
         number = np.empty((n_frames, n), self.number.dtype)
@@ -192,15 +189,10 @@ def error_rates(totals: EnsembleTotals, pixels: UsablePixels, true: UsablePixels
 
     ``expected_error_rate_from_truth`` is that of data of the true parameters decided with the fitted ones;
     ``least_error_rate`` that of numbers decided with the true ones. Frames that the fit has seen err slightly
-    less than new ones.
+    less than new ones. Numbers for the attributes of the group; none where nothing was compared.
 
-    Args:
-        totals: the sums over all tiles.
-        pixels: fitted parameters of all pixels with a value.
-        true: true parameters of the same pixels, or None where they are not known or not all there is.
-
-    Returns:
-        Numbers for the attributes of the group; none where nothing was compared.
+    Fitted parameters are of all pixels with a value; true ones of the same pixels, None where they are not
+    known or not all there is.
     """
     compared = totals.count("compared")
     if not compared:

@@ -119,15 +119,9 @@ def moment_rows(
 ) -> list[dict[str, Any]]:
     """Return the moments of Appendix A, from the maps and from the data; terms have nothing to be observed.
 
-    Where extended, mean and variance are those of the model's masses, and what effects and limits add to the
-    variance of the parameters is a term of its own.
-
-    Args:
-        totals: the sums.
-        pixels: the pixels.
-        per_pixel: samples of each pixel.
-        weight: of each pixel in Var(mu), see :func:`bias_weight`.
-        extended: whether the model holds effects, or samples lie at the limits of the codes.
+    Where ``extended`` (the model holds effects, or samples lie at the limits of the codes), mean and variance
+    are those of the model's masses, and what this adds to the variance of the parameters is a term of its own.
+    Of each pixel the number of samples is given, and the weight in Var(mu), see :func:`bias_weight`.
     """
     predicted, errors = predicted_moments(pixels, weight), moment_errors(pixels, per_pixel)
     observed = _moments_of(totals, "share", "nuced_")

@@ -40,14 +40,8 @@ def curves(
 ) -> tuple[Arrays, dict[str, Any]]:
     """Return the densities, raw and NUCed, and how well they agree with the data.
 
-    Args:
-        totals: the sums over all tiles.
-        pixels: all pixels with a value.
-        settings: the section ``ensemble``.
-        limits: first and last code, DN, that show what is beyond them; None: no samples there.
-
-    Returns:
-        Arrays of the group ``ensemble``, and numbers for its attributes.
+    As arrays of the group ``ensemble``, and numbers for its attributes. The pixels are all with a value; the
+    first and last code, DN, show what is beyond these limits; None: no samples there.
     """
     axes, bins = totals.axes, settings.parameter_bins
     width = axes.nuced.width

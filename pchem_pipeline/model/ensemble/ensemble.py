@@ -99,13 +99,10 @@ def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None) 
 
     A pixel's NUCed values lie on a lattice of pitch g. A bin of width w holds ``floor(w/g)`` or one more
     of its points: a noise on the histogram that no number of frames removes, smallest where w is a whole
-    multiple of the typical g.
+    multiple of the typical g: the median g, unless a width, e-, is given.
 
-    Args:
-        pixels: the pixels.
-        dn: axis of the raw data; the NUCed axis reaches no further than it does for the 1st to 99th
-            percentile of g and mu, so that one strange gain cannot stretch it.
-        width: bin width, e-; None: the median g.
+    The axis reaches no further than the raw one does for the 1st to 99th percentile of g and mu, so that one
+    strange gain cannot stretch it.
     """
     gain, bias = pixels.conversion_gain, pixels.bias
     bin_width = float(np.median(gain)) if width is None else width
@@ -127,13 +124,8 @@ def mass_sums(
     show, lattice and all: each DN of a pixel lies at ``(x - mu) g`` and falls into one bin as a whole (eq.
     partial_ensemble_dist, before the lattice is smoothed over).
 
-    Args:
-        mass: of successive codes, one pixel after the other.
-        first: first code of each pixel, DN, shape (n,).
-        start: place of its mass, shape (n + 1,).
-        pixels: the n pixels.
-        dn: axis of the raw prediction; it should hold all of the data.
-        nuced: axis of the NUCed prediction.
+    The masses are of successive codes, one pixel after the other, from the first code of each, DN, (n,), at
+    the place ``start``, (n + 1,). The raw axis should hold all of the data.
     """
     end = np.minimum(start[1:], start[:-1] + dn.start + dn.size - first)
     codes = np.maximum(first, dn.start), start[:-1] + np.maximum(dn.start - first, 0), end
@@ -269,10 +261,8 @@ def tally(
 def electron_pmf(quanta_exposure: FloatArray, n_k: int, share: FloatArray | None = None) -> FloatArray:
     """Return the mass of the ensemble electron number (Hendrickson et al. 2023, eq. K_ensemble_pmf), (n_k,).
 
-    Args:
-        quanta_exposure: H of each pixel, or of each bin of the map's histogram, e-, shape (n,).
-        n_k: number of masses, for k = 0 .. n_k - 1.
-        share: part of the pixels that each H stands for, shape (n,), adding up to 1; None: equal parts.
+    H, e-, (n,), is of each pixel, or of each bin of the map's histogram with its share of the pixels, (n,),
+    adding up to 1; None: equal shares.
     """
     exposure = np.asarray(quanta_exposure, np.float64)
     weights = np.full(exposure.size, 1.0 / exposure.size) if share is None else share

@@ -166,12 +166,8 @@ def within_limits(
 ) -> FloatArray:
     """Return a density of the raw ensemble with the mass beyond the limits of the codes at these.
 
-    Args:
-        curve: of an unlimited ADC, :func:`epcd_dependent` or :func:`epcd_independent`.
-        pixels: as of the curve.
-        dn: likewise.
-        bins: likewise.
-        limits: first and last code, DN; those at an end of ``dn`` count. None: no limits.
+    The curve, :func:`epcd_dependent` or :func:`epcd_independent`, is of an unlimited ADC; of its first and
+    last code, DN, those at an end of ``dn`` count. None: no limits.
     """
     low, high = (False, False) if limits is None else (dn.start <= limits[0], dn.start + dn.size > limits[1])
     below = 0

@@ -64,15 +64,11 @@ def expected_counts(
     satellites: FloatArray,
     left_out: FloatArray,
 ) -> FloatArray:
-    """Return the samples expected in each occupied bin of some pixels, shape (m, all bins).
+    """Return the samples expected in each occupied bin of m pixels, shape (m, all bins).
 
-    Args:
-        given: histograms.
-        pixels: m places.
-        laws: of the samples, the cells integrated; None: the density of the PCD.
-        parameters: (H_1 ... H_J, g, mu, sigma) of these, shape (m, J + 3).
-        satellites: amplitude (e-) and weight of their free satellites, shape (m, 2).
-        left_out: samples that the likelihood of these parameters left out, shape (m,).
+    Under laws of the samples, the cells integrated, or the density of the PCD (None): with (H_1 ... H_J, g,
+    mu, sigma), (m, J + 3), amplitude (e-) and weight of free satellites, (m, 2), and the number of samples
+    that the likelihood of these parameters left out, (m,).
     """
     counts, kept = given.counts[pixels], given.mask[pixels] != SET_ASIDE
     counts = counts if kept.all() else np.where(kept, counts, 0)

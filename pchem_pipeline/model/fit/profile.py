@@ -52,14 +52,10 @@ class Profile:
     def __init__(
         self, given: Histograms, law: Law, limits: Limits, parameters: FloatArray, satellites: FloatArray
     ) -> None:
-        """Climb to the maximum near the fit of each pixel.
+        """Climb to the maximum near the fit of each pixel, codes left out by the tail guard not counted.
 
-        Args:
-            given: histograms; codes left out by the tail guard do not count.
-            law: of the samples.
-            limits: of the search.
-            parameters: (H_1 ... H_J, g, mu, sigma) of the fit, shape (n, J + 3); NaN where there is none.
-            satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n, 2).
+        The fit is (H_1 ... H_J, g, mu, sigma), shape (n, J + 3), NaN where there is none, with amplitude (e-)
+        and weight of the pixels' free satellites, shape (n, 2).
         """
         self._given, self._law, self._limits = given, law, limits
         self._n, self._amplitudes = given.dark.size, np.ascontiguousarray(satellites[:, 0])

@@ -118,9 +118,7 @@ class SummaryAccumulator:
     def exchange(self, pieces: Iterable[CodeArray], kept: BoolArray) -> dict[str, IntArray]:
         """Leave frames of a closed block out of the covariances; return the block's sums without them.
 
-        Args:
-            pieces: all frames of the block, (frame, y, x), one after the other.
-            kept: which of them stay, (frame,).
+        The pieces are all frames of the block, (frame, y, x), of which some are kept, (frame,).
         """
         shape, n = self._reference.shape, int(kept.sum())
         before, after = SummaryAccumulator(shape, kept.size), SummaryAccumulator(shape, max(n, 1))

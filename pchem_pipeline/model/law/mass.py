@@ -126,12 +126,7 @@ def sample_parabolas(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return log-likelihood, its slopes and Fisher's information of every pixel, NaN without parameters.
 
-    Args:
-        model: the law.
-        maps: (H, g, mu, sigma) of n pixels.
-        counts: histograms, shape (n, B), any unsigned type.
-        origin: DN of bin 0, shape (n,).
-        replaced: what becomes of the samples, at the codes of the histograms; None: nothing.
+    Of histograms, (n, B), with the DN of bin 0, (n,), whose samples may have been replaced.
 
     Returns:
         Nats, shape (n,), samples of less than 1e-50 as of that; slopes in log H, 1/g, mu and log sigma_R^2,

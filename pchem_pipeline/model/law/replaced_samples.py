@@ -33,14 +33,9 @@ class ReplacedSamples:
     def by(
         cls, values: IntegerArray, excess: IntegerArray, share: FloatArray, first: IntegerArray, n_codes: int
     ) -> ReplacedSamples:
-        """Return it by a sample of what stands in for each pixel.
+        """Return it by a sample of what stands in for each pixel: y, DN, shape (frame, n).
 
-        Args:
-            values: y, DN, shape (frame, n).
-            excess: t of each pixel, DN, shape (n,).
-            share: s of each pixel, no unit, shape (n,).
-            first: first code of each pixel, DN, shape (n,).
-            n_codes: number of codes.
+        With t, DN, and s of each pixel, (n,), for so many codes from the first of each on, DN, (n,).
         """
         n_frames, n = values.shape
         stays, comes = np.empty((n, n_codes)), np.empty((n, n_codes))

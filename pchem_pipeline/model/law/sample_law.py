@@ -147,13 +147,8 @@ class SampleLaw:
         """Return the law of pixels of which a share of the samples follows another law, the others this one.
 
         Noise and exposures become mixtures, which is exact; so are outliers. Of all other numbers the mean is
-        taken: right to first order in what the laws differ by, which holds for what is weak.
-
-        Args:
-            other: the law of the share; both are of the same n pixels.
-            share: 0 to 1.
-            noise_dn2: analog noise sigma_R^2 of the pixels, DN^2, shape (n,).
-            step_dn: 1/g, DN per electron, shape (n,).
+        taken: right to first order in what the laws differ by, which holds for what is weak. Both are of the
+        same n pixels, with analog noise sigma_R^2, DN^2, (n,), and steps 1/g, DN per electron, (n,).
 
         Raises:
             ValueError: the laws differ in their limits of the scale.

@@ -143,16 +143,11 @@ def summarise(
     """Describe a map by order statistics alone.
 
     The standard error of the median is half the distance between the order statistics ``sqrt(n)/2`` ranks to
-    either side: the median's rank has that standard deviation, whatever the distribution.
+    either side: the median's rank has that standard deviation, whatever the distribution. Outliers lie beyond
+    so many ``1.4826 MAD`` of the median. All is NaN where no pixel has a value.
 
-    Args:
-        values: the map, NaN where there is no value; or its values in order.
-        left_out: pixels whose values do not count, same shape; None: none, or done already.
-        percentiles: in %.
-        outlier_sigmas: outliers lie beyond so many ``1.4826 MAD`` of the median.
-
-    Returns:
-        The summary; NaN throughout where no pixel has a value.
+    A map is NaN where there is no value, and pixels of the same shape may be left out; or its values come in
+    order, without these. Percentiles are in %.
     """
     ordered = Ordered.of(values, left_out)
     n, missing, without = ordered.size, ordered.n_missing, ordered.n_left_out
