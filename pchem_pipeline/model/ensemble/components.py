@@ -120,7 +120,7 @@ def moment_rows(
     """Return the moments of Appendix A, from the maps and from the data; terms have nothing to be observed.
 
     Where ``extended`` (the model holds effects, or samples lie at the limits of the codes), mean and variance
-    are those of the model's masses, and what this adds to the variance of the parameters is a term of its own.
+    are those of the model's masses, and what this adds to the variance of parameters is a term of its own.
     Of each pixel the number of samples is given, and the weight in Var(mu), see :func:`bias_weight`.
     """
     predicted, errors = predicted_moments(pixels, weight), moment_errors(pixels, per_pixel)

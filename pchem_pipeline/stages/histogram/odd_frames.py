@@ -123,5 +123,5 @@ def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) 
             for name, values in done.items():
                 store.write(f"summary/{name}", (slice(block, block + 1), *band), values[None])
         _, covariances = sums.finish()
-        for name, values in covariances.items():
-            store.write(f"summary/{name}", band, values)
+        for name, covariance in covariances.items():
+            store.write(f"summary/{name}", band, covariance)
