@@ -30,9 +30,6 @@ class Calibration(PixelParameters):
 
     Attributes:
         quanta_exposure: H of the characterisation, e-, shape (y, x), as the other maps; NaN without a fit.
-        conversion_gain: g, e-/DN.
-        bias: mu, DN.
-        read_noise_dn: sigma, quantisation included, DN.
         covariance: of the estimates of (g, mu, sigma), shape (y, x, 3, 3).
         fit_status: word of each pixel.
         law: of the samples of all pixels in C order.

@@ -20,7 +20,7 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE
 from pchem_pipeline.model.electrons import electrons_numba
 from pchem_pipeline.model.electrons.electrons_numba import NO_PRIOR, CodeTables, Numbers, PixelLaws
-from pchem_pipeline.model.ensemble.totals import EnsembleTotals
+from pchem_pipeline.model.ensemble.ensemble import EnsembleTotals
 from pchem_pipeline.model.law.inputs import kernel_counts, pack, satellites_of
 from pchem_pipeline.model.law.mass import code_ranges
 from pchem_pipeline.model.law.parameters import Parameters, UsablePixels, columns_of, usable_pixels

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntegerArray
-from pchem_pipeline.model.ensemble.ensemble import poisson_sums
-from pchem_pipeline.model.ensemble.totals import EnsembleTotals
+from pchem_pipeline.model.ensemble.ensemble import EnsembleTotals, poisson_sums
 from pchem_pipeline.model.law.parameters import UsablePixels
 
 #: Expected number of samples of k electrons, in one frame of all pixels, below which their tails decide.
@@ -163,12 +162,8 @@ def component_widths(
 
     Under the weights ``e^{-H} H^k`` (eq. EPCD_alt_form), ``Var(E|K_e=k) = E(sigma^2) + Var(mu) + 2 k
     Cov(mu, 1/g) + k^2 Var(1/g)``. Holding g, mu or sigma^2 at the mean of its map removes its terms
-    (sigma^2 leaves its mean); holding H makes the weights equal.
-
-    Args:
-        pixels: the pixels; where all have H = 0 there is no component k > 0, and its moments are NaN.
-        n_k: number of components, k = 0 .. n_k - 1.
-        weight: of each pixel, shape (n,), see :func:`bias_weight`; None: all the same.
+    (sigma^2 leaves its mean); holding H makes the weights equal. Each pixel has a weight, (n,), see
+    :func:`bias_weight`; None: all the same. Where all have H = 0, moments of components k > 0 are NaN.
 
     Returns:
         ``component_mean``, E(E|K_e=k), DN, shape (n_k,); ``component_variance``, DN^2, shape (16, n_k), rows

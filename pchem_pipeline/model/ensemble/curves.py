@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 
 from pchem_pipeline.base.arrays import FloatArray, IntegerArray
 from pchem_pipeline.model.ensemble.components import component_widths
-from pchem_pipeline.model.ensemble.ensemble import electron_pmf
+from pchem_pipeline.model.ensemble.ensemble import MODEL_ERRORS, EnsembleTotals, electron_pmf
 from pchem_pipeline.model.ensemble.ensemble_binned import (
     electron_pmf_binned,
     epcd_dependent,
@@ -22,7 +22,6 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
     within_limits,
 )
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
-from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleTotals
 from pchem_pipeline.model.law.parameters import UsablePixels
 
 #: Components are shown up to the electron number whose mass is above this.

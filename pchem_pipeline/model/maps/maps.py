@@ -60,14 +60,9 @@ def derived_maps(
     2023, Sec. IV). The analog read noise is ``sigma_R = g sqrt(sigma^2 - 1/12)`` (below eq. X_density): NaN
     where the estimate is below rounding alone.
 
-    Args:
-        parameters: the four maps by name (``variables.PARAMETERS``), each of one shape.
-        covariance: covariance of (H, g, mu, sigma), shape (..., 4, 4).
-        integration_time: t_int, s; None leaves out the rate.
-        rate: name of H / t_int: ``charge_rate``, in the dark ``dark_current``.
-
-    Returns:
-        ``read_noise_e``, ``analog_read_noise_e`` and the rate, each with ``<name>_stderr``.
+    From the four maps by name (``variables.PARAMETERS``) and the covariance of (H, g, mu, sigma), shape
+    (..., 4, 4), to ``read_noise_e``, ``analog_read_noise_e`` and the ``rate``, ``charge_rate`` or in the dark
+    ``dark_current``, each with ``<name>_stderr``; without an integration time, s, there is no rate.
     """
     gain, sigma = parameters["conversion_gain"], parameters["read_noise_dn"]
     analog_variance = sigma**2 - QUANTISATION_VARIANCE

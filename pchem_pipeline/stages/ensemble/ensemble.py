@@ -26,9 +26,17 @@ from pchem_pipeline.model.electrons.electrons import compare_electron_numbers, e
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES, bias_weight, moment_rows
 from pchem_pipeline.model.ensemble.curves import components, curves
 from pchem_pipeline.model.ensemble.curves import electron_numbers as electron_numbers_of
-from pchem_pipeline.model.ensemble.ensemble import ERROR_PIXELS, DnAxis, PixelErrors, electron_pmf, nuced_axis
+from pchem_pipeline.model.ensemble.ensemble import (
+    ERROR_PIXELS,
+    ERROR_SIZES,
+    DnAxis,
+    EnsembleAxes,
+    EnsembleTotals,
+    PixelErrors,
+    electron_pmf,
+    nuced_axis,
+)
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
-from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
 from pchem_pipeline.model.fit.status import flags_of
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels

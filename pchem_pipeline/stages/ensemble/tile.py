@@ -15,8 +15,14 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
-from pchem_pipeline.model.ensemble.ensemble import PixelErrors, curve_errors, mass_sums, tally
-from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
+from pchem_pipeline.model.ensemble.ensemble import (
+    MODEL_ERRORS,
+    EnsembleAxes,
+    PixelErrors,
+    curve_errors,
+    mass_sums,
+    tally,
+)
 from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
