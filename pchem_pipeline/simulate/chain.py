@@ -22,7 +22,6 @@ from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane
-from pchem_pipeline.simulate.chain_numba import SampleKeys, draw_rows
 from pchem_pipeline.simulate.streams import (
     KeyedStreams,
     make_key,
@@ -31,6 +30,7 @@ from pchem_pipeline.simulate.streams import (
     to_words,
     uniform_pair,
 )
+from pchem_pipeline.simulate.streams_numba import SampleKeys, draw_rows
 from pchem_pipeline.simulate.truth import Defect, TruthMaps
 
 if TYPE_CHECKING:

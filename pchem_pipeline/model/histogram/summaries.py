@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, BoolArray, CodeArray, FloatArray, IntArray
-from pchem_pipeline.model.histogram.count_numba import update_range
-from pchem_pipeline.model.histogram.summaries_numba import add_products, sum_lines
+from pchem_pipeline.model.histogram.count_numba import add_products, sum_lines, update_range
 
 #: Rows in a group: column sums are taken over it, and neighbour products stay inside.
 ROW_GROUP = 64
