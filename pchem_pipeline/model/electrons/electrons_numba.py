@@ -12,14 +12,15 @@ from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE, SMALLEST_MASS
 from pchem_pipeline.model.law.cells_numba import Law, cells_of
-from pchem_pipeline.model.law.levels_numba import (
+from pchem_pipeline.model.law.mass_numba import (
     fill_level,
+    known_theta,
     number_mass,
     number_range,
+    pixel_scratch,
     place_codes,
     share_scratch,
 )
-from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
 from pchem_pipeline.model.law.pixel_numba import OWN
 
 #: Exposure that stands for a prior in which all electron numbers are alike.
