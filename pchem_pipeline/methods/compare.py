@@ -215,33 +215,25 @@ def study_point(point: StudyPoint, settings: MethodsSettings) -> dict[str, Any]:
 
     Methods that give one gain to the whole sensor are left out: they average over pixels.
     """
+    exposure, gain, n = point.quanta_exposure, point.conversion_gain, point.n_frames
     found: dict[str, dict[str, Any]] = {}
-    for number, (needs, exposures) in enumerate(SHARES.items()):
-        names = [n for n, m in methods().items() if m.needs == needs and not m.sensor_wide]
+    for number, (needs, shares) in enumerate(SHARES.items()):
+        names = [name for name, m in methods().items() if m.needs == needs and not m.sensor_wide]
         rng = np.random.default_rng([point.seed, number, round(1e6 * point.read_noise_e)])
-        frames = max(point.n_frames // len(exposures), 4)
+        frames = max(n // len(shares), 4)
         bias = 100.0 + rng.random(point.n_pixels)  # pixels differ in where a DN begins
-        noise = max(point.read_noise_e, point.conversion_gain * np.sqrt(QUANTISATION_VARIANCE))
-        drawn = [
-            draw_histograms(rng, share * point.quanta_exposure, point.conversion_gain, bias, noise, frames)
-            for share in exposures
-        ]
+        noise = max(point.read_noise_e, gain * np.sqrt(QUANTISATION_VARIANCE))
+        drawn = [draw_histograms(rng, share * exposure, gain, bias, noise, frames) for share in shares]
         pixels = PixelSamples(tuple(Sample(one.counts, one.origin) for one in drawn))
         results = compare(pixels, drawn[0].truth, settings, only=names)
         found |= {result.facts["name"]: result.facts for result in results}
+    # the smallest relative errors of g, and that of photon transfer
+    one = bounds((exposure,), point.read_noise_e, gain, (n,))[1]
+    both = bounds((exposure, 0.0), point.read_noise_e, gain, (n / 2, n / 2))[1]
+    transfer = np.sqrt(gain_variance(exposure, 0.0, point.read_noise_e, n / 2, n / 2))
+    least = {"one sample": one, "a dark and a bright sample": both, "photon_transfer": transfer}
     return {
         "read_noise_e": point.read_noise_e,
-        "bounds": _gain_bounds(point),
+        "bounds": {name: plain(value) for name, value in least.items()},
         "methods": {name: found[name] for name in methods() if name in found},
     }
-
-
-def _gain_bounds(point: StudyPoint) -> dict[str, float | None]:
-    """Return the smallest relative errors of g: one sample, dark and bright, and photon transfer's own."""
-    exposure, noise = point.quanta_exposure, point.read_noise_e
-    gain, n = point.conversion_gain, point.n_frames
-    one = bounds((exposure,), noise, gain, (n,))[1]
-    both = bounds((exposure, 0.0), noise, gain, (n / 2, n / 2))[1]
-    transfer = np.sqrt(gain_variance(exposure, 0.0, noise, n / 2, n / 2))
-    found = {"one sample": one, "a dark and a bright sample": both, "photon_transfer": transfer}
-    return {name: plain(value) for name, value in found.items()}
