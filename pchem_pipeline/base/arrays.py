@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
+#: Whole numbers of any size: counts, origins.
+IntegerArray = NDArray[np.integer[Any]]
+#: Places in other arrays.
+IndexArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 #: Samples of frames or their counts: unsigned, of any size.
 CodeArray = NDArray[np.unsignedinteger[Any]]

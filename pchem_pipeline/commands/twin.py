@@ -15,7 +15,7 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.frames.formats.map_files import read_image, write_npz
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.target import Target
-from pchem_pipeline.simulate.scene import with_scene
+from pchem_pipeline.simulate.chain import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.stages.fit.fitted_model import fitted_effects
 from pchem_pipeline.store.run_store import RunStore

@@ -18,7 +18,7 @@ from typing import ClassVar, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray, IntegerArray
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS
 from pchem_pipeline.model.law.pcd import log_pcd
@@ -44,26 +44,6 @@ class SampleMoments(NamedTuple):
     fourth: FloatArray
 
 
-def sample_moments(counts: NDArray[np.integer], origin: NDArray[np.integer]) -> SampleMoments:
-    """Return the unbiased estimates of the first four cumulants (k-statistics, Fisher 1929).
-
-    Of histograms, shape (n, B), with the DN of bin 0, shape (n,). Values are centred on the mean first, so
-    that a large bias costs no digits.
-    """
-    weights = np.asarray(counts, np.float64)
-    bins = np.arange(weights.shape[1], dtype=np.float64)
-    n = weights.sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        centre = weights @ bins / n
-        residual = bins - centre[:, None]
-        second, third, fourth = (np.einsum("ij,ij->i", weights, residual**power) for power in (2, 3, 4))
-        variance = np.where(n > 1, second / (n - 1), np.nan)
-        skew = np.where(n > 2, n * third / ((n - 1) * (n - 2)), np.nan)
-        top = n * (n + 1) * fourth - 3 * (n - 1) * second**2
-        kurtosis = np.where(n > 3, top / ((n - 1) * (n - 2) * (n - 3)), np.nan)
-    return SampleMoments(n, np.asarray(origin, np.float64) + centre, variance, skew, kurtosis)
-
-
 @dataclass(frozen=True)
 class Sample:
     """Histograms of n pixels at one exposure.
@@ -73,12 +53,26 @@ class Sample:
         origin: DN of bin 0, shape (n,).
     """
 
-    counts: NDArray[np.integer]
+    counts: IntegerArray
     origin: IntArray
 
     def moments(self) -> SampleMoments:
-        """Return the unbiased moments of every pixel."""
-        return sample_moments(self.counts, self.origin)
+        """Return the unbiased estimates of the first four cumulants (k-statistics, Fisher 1929).
+
+        Values are centred on the mean first, so that a large bias costs no digits.
+        """
+        weights = np.asarray(self.counts, np.float64)
+        bins = np.arange(weights.shape[1], dtype=np.float64)
+        n = weights.sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            centre = weights @ bins / n
+            residual = bins - centre[:, None]
+            second, third, fourth = (np.einsum("ij,ij->i", weights, residual**power) for power in (2, 3, 4))
+            variance = np.where(n > 1, second / (n - 1), np.nan)
+            skew = np.where(n > 2, n * third / ((n - 1) * (n - 2)), np.nan)
+            top = n * (n + 1) * fourth - 3 * (n - 1) * second**2
+            kurtosis = np.where(n > 3, top / ((n - 1) * (n - 2) * (n - 3)), np.nan)
+        return SampleMoments(n, np.asarray(self.origin, np.float64) + centre, variance, skew, kurtosis)
 
     def likeliest(self, candidates: FloatArray) -> FloatArray:
         """Return for every pixel the likeliest (H, g, mu, sigma), shape (n, 4), NaN where there is none.

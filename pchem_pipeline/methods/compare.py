@@ -1,16 +1,25 @@
-"""Run every method on the same pixels and say how far it is from what is known, beside the bound."""
+"""Run every method on the same pixels and say how far it is from what is known, beside the bound.
+
+Also how the error of the gain grows with the read noise, on simulated pixels. There all methods are given the
+same number of frames: one sample has all of them, a dark and a bright sample half each, a series (dark, half
+and full exposure) a third each.
+"""
 
 from __future__ import annotations
 
 import functools
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.plain import plain
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.methods.base import Method, PixelSamples, Sample, methods
+from pchem_pipeline.methods.photon_transfer import gain_variance
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.errors.expected_information import (
@@ -18,11 +27,18 @@ from pchem_pipeline.model.errors.expected_information import (
     inverse_information,
     shared_information,
 )
+from pchem_pipeline.model.law.mass import draw_histograms
 
 #: What is compared: (H, g, read noise) relative, the bias in electrons.
 COMPARED = ("quanta_exposure", "conversion_gain", "bias", "read_noise_e")
 #: Errors of a parameter over the pixels, JSON data.
 Errors = dict[str, float | None]
+#: Exposures of the samples in units of H, by what a method needs; frames are shared evenly.
+SHARES: dict[str, tuple[float, ...]] = {
+    "one sample": (1.0,),
+    "a dark and a bright sample": (1.0, 0.0),
+    "a series of samples": (1.0, 0.0, 0.5),
+}
 
 
 class MethodResult(NamedTuple):
@@ -49,14 +65,10 @@ def compare(
     skip_errors: Sequence[str] = (),
     only: Sequence[str] | None = None,
 ) -> list[MethodResult]:
-    """Run the methods on the same pixels.
+    """Run the methods, or some by name, on the samples of the same pixels, the characterised one first.
 
-    Args:
-        pixels: the pixels' samples, the characterised one first.
-        reference: (H, g, mu, sigma) that is held for true, shape (n, 4), NaN where nothing is known; or None.
-        settings: of the iterative methods.
-        skip_errors: methods whose errors mean nothing, since the reference is theirs.
-        only: names of methods to run; all by default.
+    The reference is (H, g, mu, sigma) that is held for true, shape (n, 4), NaN where nothing is known;
+    ``skip_errors`` are methods whose errors mean nothing, since it is theirs.
     """
     return [
         _run(method, pixels, None if name in skip_errors else reference, settings)
@@ -175,3 +187,53 @@ def bounds(exposures: tuple[float, ...], noise: float, gain: float, frames: tupl
     both = covariance[1, 1] + 2 * covariance[1, 3] + covariance[3, 3]
     relative = covariance[0, 0] / exposures[0] ** 2
     return np.asarray(np.sqrt([relative, covariance[1, 1], covariance[2, 2], both]))
+
+
+@dataclass(frozen=True)
+class StudyPoint:
+    """Where and with what to simulate.
+
+    Attributes:
+        read_noise_e: s_e, e-, quantisation included.
+        quanta_exposure: H of the bright sample, e-.
+        conversion_gain: g, e-/DN.
+        n_frames: frames of a pixel, all samples together.
+        n_pixels: pixels to simulate.
+        seed: of the random numbers.
+    """
+
+    read_noise_e: float
+    quanta_exposure: float
+    conversion_gain: float
+    n_frames: int
+    n_pixels: int
+    seed: int
+
+
+def study_point(point: StudyPoint, settings: MethodsSettings) -> dict[str, Any]:
+    """Return errors of all methods at one read noise, and the bounds there, as plain data.
+
+    Methods that give one gain to the whole sensor are left out: they average over pixels.
+    """
+    exposure, gain, n = point.quanta_exposure, point.conversion_gain, point.n_frames
+    found: dict[str, dict[str, Any]] = {}
+    for number, (needs, shares) in enumerate(SHARES.items()):
+        names = [name for name, m in methods().items() if m.needs == needs and not m.sensor_wide]
+        rng = np.random.default_rng([point.seed, number, round(1e6 * point.read_noise_e)])
+        frames = max(n // len(shares), 4)
+        bias = 100.0 + rng.random(point.n_pixels)  # pixels differ in where a DN begins
+        noise = max(point.read_noise_e, gain * np.sqrt(QUANTISATION_VARIANCE))
+        drawn = [draw_histograms(rng, share * exposure, gain, bias, noise, frames) for share in shares]
+        pixels = PixelSamples(tuple(Sample(one.counts, one.origin) for one in drawn))
+        results = compare(pixels, drawn[0].truth, settings, only=names)
+        found |= {result.facts["name"]: result.facts for result in results}
+    # the smallest relative errors of g, and that of photon transfer
+    one = bounds((exposure,), point.read_noise_e, gain, (n,))[1]
+    both = bounds((exposure, 0.0), point.read_noise_e, gain, (n / 2, n / 2))[1]
+    transfer = np.sqrt(gain_variance(exposure, 0.0, point.read_noise_e, n / 2, n / 2))
+    least = {"one sample": one, "a dark and a bright sample": both, "photon_transfer": transfer}
+    return {
+        "read_noise_e": point.read_noise_e,
+        "bounds": {name: plain(value) for name, value in least.items()},
+        "methods": {name: found[name] for name in methods() if name in found},
+    }

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IntegerArray
 from pchem_pipeline.methods.base import Estimates, Method, PixelSamples, no_estimates
 from pchem_pipeline.methods.plain_em import closed_form_start
 from pchem_pipeline.methods.settings import MethodsSettings
@@ -56,7 +55,7 @@ class PeakValley(Method):
         return Estimates.where(out, {"fewer than two peaks": ~resolved, "no valley between the peaks": flat})
 
 
-def comb(counts: NDArray[np.integer], spacing: float, width: float) -> tuple[float, float, float, float]:
+def comb(counts: IntegerArray, spacing: float, width: float) -> tuple[float, float, float, float]:
     """Return distance and first place of the peaks, bins, H, and the height of a valley over its peaks.
 
     A peak counts where it is above the valley beside it by three times the scatter of the smoothed counts.

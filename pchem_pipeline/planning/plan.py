@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.planning.frames import best_exposure, frames_needed, precision
 from pchem_pipeline.planning.split import Split, best_samples, best_split, split_frames
-from pchem_pipeline.planning.targets import Point, Target
+from pchem_pipeline.planning.targets import Point, Target, best_exposure, frames_needed, precision
 from pchem_pipeline.planning.verify import frames_simulated
 
 #: Without so much knowledge of the gain, one Gaussian fits as well.

@@ -17,7 +17,7 @@ from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, flags_of
-from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.mass import draw_histograms
 from pchem_pipeline.planning.targets import Point, Target
 
 _PIXELS = 200  # simulated for a number of frames; 5 % of them have a standard error of 1.5 %
@@ -75,14 +75,9 @@ def frames_simulated(
 ) -> float:
     """Compute the frames in total with which simulated pixels reach the targets, to 10 %, by bisection.
 
-    Args:
-        targets: what is wanted.
-        point: the pixel; its own exposure does not matter.
-        exposures: H of the samples, e-; 0 for bias frames.
-        shares: of the frames that each has, adding up to 1.
-        bound: frames by the Cramer-Rao bound; fewer are not tried.
-        most: the result is infinite where so many are too few.
-        every_flag: whether flags count that do not concern what is wanted.
+    The samples have H, e-, 0 for bias frames (that of the point does not matter), and shares of the frames
+    that add up to 1. Fewer frames than the Cramer-Rao bound are not tried; infinite where the most are too
+    few. ``every_flag``: flags count that do not concern what is wanted, too.
     """
 
     def reached(frames: float) -> bool:

@@ -4,22 +4,24 @@ Hendrickson et al., eq. PCD_RV_definition: ``X = round((K + R) / g + mu)``, ``K 
 ``R ~ N(0, sigma_R^2)``. Rounding is to the nearest whole DN (halves to even), and what the ADC cannot express
 ends at 0 or at 2**bit_depth - 1: that cut always happens, with or without effects.
 
-The numbers go plane by plane; an effect of no strength changes nothing, not even the last bit, and one with a
+A scene is what the sensor looks at: an exposure of all pixels, an image, or a sequence of images. The numbers
+go plane by plane; an effect of no strength changes nothing, not even the last bit, and one with a
 region nothing elsewhere.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.effects.framework.context import EffectContext
-from pchem_pipeline.effects.framework.effect import Plane
-from pchem_pipeline.simulate.chain_numba import SampleKeys, draw_rows
+from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.simulate.streams import (
     KeyedStreams,
     make_key,
@@ -28,15 +30,13 @@ from pchem_pipeline.simulate.streams import (
     to_words,
     uniform_pair,
 )
+from pchem_pipeline.simulate.streams_numba import SampleKeys, draw_rows
+from pchem_pipeline.simulate.truth import Defect, TruthMaps
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
-    from pchem_pipeline.effects.framework.effect import Effect
     from pchem_pipeline.simulate.settings import SimulateSettings
-    from pchem_pipeline.simulate.truth import TruthMaps
 
 _BYTES_PER_SAMPLE = 8  # of a block: digital and electron numbers
 _SAMPLES_AT_ONCE = 1 << 19
@@ -214,3 +214,48 @@ def _frozen(values: NDArray[Any]) -> NDArray[Any]:
     view = values.view()
     view.flags.writeable = False
     return view
+
+
+class _Sequence(Effect):
+    """Frame n sees image n; after the last one the sequence begins anew. For pixels that see anything."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+
+    tag: Literal["scene"] = "scene"
+    plane: ClassVar[Plane] = Plane.EXPOSURE
+    images: FloatArray
+
+    def apply(self, values: NDArray[Any], context: EffectContext) -> NDArray[Any]:
+        """Return the exposure (frame, y, x), e-."""
+        seen = self.images[context.frames % len(self.images)][:, context.rows]
+        return np.where(context.truth["quanta_exposure"] > 0.0, seen, 0.0)
+
+
+def with_scene(
+    truth: TruthMaps, settings: SimulateSettings, scene: float | FloatArray
+) -> tuple[TruthMaps, SimulateSettings]:
+    """Return the sensor and its settings when it looks at a scene.
+
+    A number, an image (y, x), or a sequence (image, y, x), e- per frame: all of the exposure, the dark one
+    included. Dead and stuck pixels see nothing.
+
+    Raises:
+        ConfigError: its shape is not the sensor's, or a value is impossible.
+    """
+    values = np.asarray(scene, np.float64)
+    if values.ndim not in (0, 2, 3) or (values.ndim and values.shape[-2:] != truth.shape):
+        raise ConfigError(
+            f"scene of shape {values.shape}, but the sensor has {truth.shape}; give a number, an image of "
+            "that shape, or a sequence of such images"
+        )
+    if not (np.isfinite(values) & (values >= 0.0)).all():
+        raise ConfigError("scene: negative exposure; give 0 or more e- in each pixel")
+    sees = (truth.defect != Defect.DEAD) & (truth.defect != Defect.STUCK)
+    if values.ndim < 3:
+        return replace(truth, quanta_exposure=np.where(sees, values, 0.0)), settings
+    mean = np.maximum(values.mean(axis=0), np.finfo(np.float64).tiny)
+    effects = (_Sequence(images=values), *settings.effects)
+    return (
+        replace(truth, quanta_exposure=np.where(sees, mean, 0.0)),
+        settings.model_copy(update={"effects": effects}),
+    )

@@ -16,6 +16,13 @@ from pchem_pipeline.store.remote_path import local_path
 ParameterName = Literal[
     "quanta_exposure", "dark_current", "conversion_gain", "dn_per_electron", "bias", "analog_read_noise_e"
 ]
+#: The ways to give each of the four parameters.
+_WAYS = (
+    ("quanta_exposure", "dark_current"),
+    ("dn_per_electron", "conversion_gain"),
+    ("bias",),
+    ("analog_read_noise_e",),
+)
 
 
 class Correlation(Section):
@@ -105,7 +112,7 @@ class ParameterSettings(Section):
 
     @model_validator(mode="after")
     def _each_given_once(self) -> Self:
-        for first, second in (("quanta_exposure", "dark_current"), ("dn_per_electron", "conversion_gain")):
+        for first, second in _WAYS[:2]:
             if (getattr(self, first) is None) == (getattr(self, second) is None):
                 raise ValueError(f"give exactly one of {first} and {second}, and null for the other")
         if self.dead_fraction + self.stuck_fraction + self.hot_pixels.fraction > 1:
@@ -126,15 +133,7 @@ class ParameterSettings(Section):
 
     def given(self) -> dict[str, Distribution]:
         """Return the four distributions given, in the order exposure, gain, bias, read noise."""
-        names = (
-            ("quanta_exposure", "dark_current"),
-            ("dn_per_electron", "conversion_gain"),
-            ("bias",),
-            ("analog_read_noise_e",),
-        )
-        return {
-            name: getattr(self, name) for ways in names for name in ways if getattr(self, name) is not None
-        }
+        return {name: own for ways in _WAYS for name in ways if (own := getattr(self, name)) is not None}
 
     def copula(self) -> list[list[float]]:
         """Return the correlation matrix of the normals behind the four parameters, in the order of `given`.

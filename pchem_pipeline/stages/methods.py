@@ -17,9 +17,8 @@ from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.errors import ConfigError, InputError, StoreError, quoted
 from pchem_pipeline.base.variables import PARAMETERS
 from pchem_pipeline.methods.base import PixelSamples, Sample, methods
-from pchem_pipeline.methods.compare import compare
+from pchem_pipeline.methods.compare import StudyPoint, compare, study_point
 from pchem_pipeline.methods.settings import MethodsSettings
-from pchem_pipeline.methods.study import StudyPoint, study_point
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED
 from pchem_pipeline.run.sensor import SensorInfo
 from pchem_pipeline.run.stage import Named, StageContext

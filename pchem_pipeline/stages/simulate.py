@@ -27,9 +27,8 @@ from pchem_pipeline.frames.registry import reader_class
 from pchem_pipeline.frames.writing import write_frames
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 from pchem_pipeline.run.stage import Named, StageContext
-from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block
+from pchem_pipeline.simulate.chain import dn_dtype, frames_per_block, simulate_block, with_scene
 from pchem_pipeline.simulate.maps import draw_truth
-from pchem_pipeline.simulate.scene import with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import TruthMaps
 from pchem_pipeline.store.files import in_storage

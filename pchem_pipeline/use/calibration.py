@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.model.law.parameters import PixelParameters, usable_pixels
+from pchem_pipeline.model.law.pcd import nearest_pcd
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 if TYPE_CHECKING:
@@ -30,9 +30,6 @@ class Calibration(PixelParameters):
 
     Attributes:
         quanta_exposure: H of the characterisation, e-, shape (y, x), as the other maps; NaN without a fit.
-        conversion_gain: g, e-/DN.
-        bias: mu, DN.
-        read_noise_dn: sigma, quantisation included, DN.
         covariance: of the estimates of (g, mu, sigma), shape (y, x, 3, 3).
         fit_status: word of each pixel.
         law: of the samples of all pixels in C order.

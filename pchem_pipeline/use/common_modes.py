@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray
 from pchem_pipeline.base.errors import PchEmError
 from pchem_pipeline.use.calibration import Calibration
 from pchem_pipeline.use.overscan import Overscan
@@ -90,12 +90,6 @@ class CommonModes:
         parts = np.ones((1, *overscan.bias.shape), np.bool_)
         return cls(("frame_noise", "row_noise"), parts, variances, in_noise=overscan.shared_variance)
 
-    def turns(self, shape: tuple[int, int]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return ``exp(2 pi i f y)`` of rows and columns, whose product is a wave: (wave, y), (wave, x)."""
-        turn = 2j * np.pi
-        rows, columns = (turn * self.waves[:, axis, None] * np.arange(shape[axis]) for axis in (0, 1))
-        return np.exp(rows), np.exp(columns)
-
 
 def _check(effect: Effect, shared: SharedOffset) -> None:
     """Refuse what an effect of another package may say: an unknown kind, or an impossible variance."""
@@ -124,7 +118,7 @@ class Offsets:
 
     def of_samples(self, modes: CommonModes, rows: slice = slice(None)) -> Float32Array:
         """Return the offset of each sample of some rows, DN, shape (frame, y, x)."""
-        design, n = _Design.of(modes), len(self.rows)
+        design, n = _Design(modes), len(self.rows)
         waves = self.waves if len(self.waves) else np.zeros((n, 0, 2))
         readout = self.readout[:, rows] if self.readout.size else np.zeros(n)
         lines = (design.of_lines(self.rows[t], self.columns[t], waves[t], rows) for t in range(n))
@@ -176,18 +170,16 @@ class _Design:
     """
 
     modes: CommonModes
-    down: FloatArray  # cosine and sine of each wave down the rows, shape (wave, y, 2)
-    along: FloatArray  # along the columns, shape (wave, x, 2)
 
-    @classmethod
-    def of(cls, modes: CommonModes) -> _Design:
-        turns = modes.turns(modes.parts.shape[1:])
-        return cls(modes, *(np.stack([turn.real, turn.imag], axis=2) for turn in turns))
-
-    @property
-    def parts_of_waves(self) -> IntArray:
-        """Number of the part of each wave."""
-        return self.modes.waves[:, 3].astype(np.int64)
+    @cached_property
+    def waves(self) -> list[tuple[int, FloatArray, FloatArray]]:
+        """Part of each wave, and its cosine and sine down the rows, (y, 2), and along the columns, (x, 2)."""
+        found, places = [], [np.arange(n) for n in self.modes.parts.shape[1:]]
+        for *cycles, _, part in self.modes.waves:
+            y, x = (np.exp(2j * np.pi * f * place) for f, place in zip(cycles, places, strict=True))
+            down, along = (np.stack([turn.real, turn.imag], axis=1) for turn in (y, x))
+            found.append((int(part), down, along))
+        return found
 
     @cached_property
     def readouts(self) -> list[_Readout]:
@@ -237,7 +229,7 @@ class _Design:
         found = np.zeros(parts.shape[1:])
         for mask, row, column in zip(parts, rows, columns, strict=True):
             found += mask * (row[some, None] + column)
-        for part, (c, s), down, along in zip(self.parts_of_waves, waves, self.down, self.along, strict=True):
+        for (part, down, along), (c, s) in zip(self.waves, waves, strict=True):
             found += parts[part] * (down[some] @ np.array([[c, s], [s, -c]]) @ along.T)
         return found
 
@@ -248,7 +240,7 @@ class _Design:
             some = mask * values
             rows = some.sum(axis=1)
             parts += [rows.sum(keepdims=True), rows, some.sum(axis=0)]
-        for part, down, along in zip(self.parts_of_waves, self.down, self.along, strict=True):
+        for part, down, along in self.waves:
             (cc, cs), (sc, ss) = down.T @ (self.modes.parts[part] * values) @ along
             parts.append(np.array([cc - ss, sc + cs]))
         lines = np.concatenate([np.zeros(0), *parts]) * self._scales
@@ -276,7 +268,7 @@ class _Design:
 
     def left(self, weight: FloatArray) -> FloatArray:
         """Return the variance of a sample's offset that stays unknown, on the median line, DN^2, (part,)."""
-        parts, waves = self.modes.parts, self.parts_of_waves
+        parts, waves = self.modes.parts, self.modes.waves[:, 3].astype(np.int64)
         of_frame, of_row, of_column = self.modes.variances.T
         known = parts * weight
         # what a row says of itself, and then of its frame
@@ -359,9 +351,7 @@ class _Readout:
         return float(np.fft.irfft(variance / (1.0 + variance * each), self.size // self.taps)[0])
 
 
-def estimate_offsets(
-    frames: NDArray[np.unsignedinteger[Any]], reference: Reference, modes: CommonModes
-) -> Offsets:
+def estimate_offsets(frames: CodeArray, reference: Reference, modes: CommonModes) -> Offsets:
     """Return the most probable offsets of whole frames (frame, y, x), DN: of rows, columns, waves, readouts.
 
     The posterior mode of normal offsets under the mixture of all pixels of the line (best linear prediction
@@ -369,7 +359,7 @@ def estimate_offsets(
     """
     from pchem_pipeline.model.law.pcd import pcd_posterior  # loads compiled loops
 
-    design, step, bias, sigma = _Design.of(modes), reference.step, reference.bias, reference.sigma
+    design, step, bias, sigma = _Design(modes), reference.step, reference.bias, reference.sigma
     known = np.ascontiguousarray(np.where(np.isfinite(sigma), reference.scene, np.nan))
     expansions = 4 if (known > 0.0).any() else 0  # without electrons the means tell all
     found = []

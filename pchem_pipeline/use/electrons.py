@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import Float32Array, FloatArray
+from pchem_pipeline.base.arrays import CodeArray, Float32Array, FloatArray
 from pchem_pipeline.use.calibration import Calibration
 
 
 def electrons(
-    frames: NDArray[np.unsignedinteger[Any]],
+    frames: CodeArray,
     calibration: Calibration,
     offsets: Float32Array | None = None,
     room: Float32Array | None = None,
@@ -35,7 +34,7 @@ def electrons(
     return out
 
 
-def add_up(frames: NDArray[np.unsignedinteger[Any]], offsets: Float32Array, sums: FloatArray) -> None:
+def add_up(frames: CodeArray, offsets: Float32Array, sums: FloatArray) -> None:
     """Add x to the sums of pixels, where there are offsets b also x^2, x - b and its square; see its range.
 
     ``sums``, shape (6, y, x), are x, x^2, x - b, its square (they stay where there are no offsets), and the
@@ -54,9 +53,7 @@ def add_up(frames: NDArray[np.unsignedinteger[Any]], offsets: Float32Array, sums
         sums[3] += value * value
 
 
-def whole_parts(
-    frames: NDArray[np.unsignedinteger[Any]], offsets: Float32Array, parts: int, lift: int
-) -> NDArray[np.uint32]:
+def whole_parts(frames: CodeArray, offsets: Float32Array, parts: int, lift: int) -> NDArray[np.uint32]:
     """Return ``x - b`` in whole parts of a DN, ``lift`` DN higher so that none is negative.
 
     Of frames and their offsets b, DN, (frame, y, x), with so many ``parts`` in a DN.

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import CodeArray, FloatArray, IntArray, IntegerArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.normal_numba import REACH
 from pchem_pipeline.model.fit import engine, profile_numba
@@ -101,10 +99,7 @@ class ExposurePool:
 
 
 def mean_signal(
-    counts: NDArray[np.unsignedinteger[Any]],
-    origin: NDArray[np.integer[Any]],
-    calibration: Calibration,
-    parts: int = 1,
+    counts: CodeArray, origin: IntegerArray, calibration: Calibration, parts: int = 1
 ) -> FloatArray:
     """Return H from the mean of the samples, e-, shape (y, x): unbiased, and below 0 by chance."""
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -125,13 +120,7 @@ class _Known:
     satellites: FloatArray  # amplitude (e-) and weight of free satellites, shape (n, 2)
 
     @classmethod
-    def of(
-        cls,
-        counts: NDArray[np.unsignedinteger[Any]],
-        origin: NDArray[np.integer[Any]],
-        calibration: Calibration,
-        parts: int,
-    ) -> _Known:
+    def of(cls, counts: CodeArray, origin: IntegerArray, calibration: Calibration, parts: int) -> _Known:
         """Return codes sorted by how far they lie above a whole DN, as if mu were lower by that in each."""
         n, width = counts.shape
         whole, aside = np.divmod(origin.astype(np.int64) + parts // 2, parts)
@@ -197,10 +186,7 @@ class _Known:
 
 
 def estimate_exposure(
-    counts: NDArray[np.unsignedinteger[Any]],
-    origin: NDArray[np.integer[Any]],
-    calibration: Calibration,
-    parts: int = 1,
+    counts: CodeArray, origin: IntegerArray, calibration: Calibration, parts: int = 1
 ) -> ExposureMaps:
     """Return the exposure of largest likelihood, with g, mu and sigma held at their estimates.
 

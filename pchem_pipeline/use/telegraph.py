@@ -9,15 +9,13 @@ apart, the jump where they are.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
+from pchem_pipeline.base.arrays import CodeArray, Float32Array, FloatArray, IntArray, IntegerArray
 from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables, number_tables
-from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.law.parameters import columns_of
+from pchem_pipeline.model.law.pcd import nearest_pcd
 
 
 @dataclass(frozen=True)
@@ -39,8 +37,8 @@ class TelegraphJumps:
     @classmethod
     def of(
         cls,
-        minimum: NDArray[np.integer[Any]],
-        maximum: NDArray[np.integer[Any]],
+        minimum: IntegerArray,
+        maximum: IntegerArray,
         prior: FloatArray | None,
         known: KnownPixels,
         parts: int = 1,
@@ -79,7 +77,7 @@ class TelegraphJumps:
         left = read * (1.0 - 2.0 * expected(slope)) + amplitude**2 * variance - explained
         return cls(some, tables, mean.astype(np.float32), np.sqrt(np.maximum(left, 0.0)))
 
-    def subtract(self, electrons: Float32Array, codes: NDArray[np.unsignedinteger[Any]], lift: int) -> None:
+    def subtract(self, electrons: Float32Array, codes: CodeArray, lift: int) -> None:
         """Take the jumps from frames (frame, y, x), e-, whose codes, raised by ``lift``, are given."""
         n = len(electrons)
         own = codes.reshape(n, -1)[:, self.pixels].astype(np.int64) - (self.tables.first + lift)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray, IndexArray
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
-from pchem_pipeline.simulate.chain import frames_per_block, simulate_block
-from pchem_pipeline.simulate.scene import with_scene
+from pchem_pipeline.model.errors.expected_information import covariance_from
+from pchem_pipeline.simulate.chain import frames_per_block, simulate_block, with_scene
 from pchem_pipeline.simulate.settings import SimulateSettings
 from pchem_pipeline.simulate.truth import Defect, TruthMaps
 
@@ -38,9 +38,7 @@ class Twin:
         effects = ", ".join(effect.tag for effect in self.settings.effects) or "none"
         return f"<Twin: {rows} x {columns} pixels; effects: {effects}; frames(scene, n) simulates>"
 
-    def frames(
-        self, scene: float | FloatArray | None = None, n: int = 100, *, seed: int = 1
-    ) -> NDArray[np.unsignedinteger[Any]]:
+    def frames(self, scene: float | FloatArray | None = None, n: int = 100, *, seed: int = 1) -> CodeArray:
         """Return n frames of a scene.
 
         Args:
@@ -96,9 +94,7 @@ def redrawn(
     Maps are (H, g, mu, sigma), (y, x) each, with standard errors (4, y, x) and correlations as in
     :func:`~pchem_pipeline.use.calibration.covariance_of`.
     """
-    matrix = np.broadcast_to(np.eye(4), (*stderr.shape[1:], 4, 4)).copy()
-    for place, (i, j) in enumerate([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]):
-        matrix[..., i, j] = matrix[..., j, i] = np.nan_to_num(correlation[..., place])
+    matrix = covariance_from(np.ones((*stderr.shape[1:], 4)), np.nan_to_num(correlation))
     values, vectors = np.linalg.eigh(matrix)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     normal = np.random.default_rng(seed).standard_normal((*stderr.shape[1:], 4))
@@ -158,7 +154,7 @@ def _patterns(values: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatA
 
 def _blocks(
     old: tuple[int, int], new: tuple[int, int], rng: np.random.Generator
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+) -> tuple[IndexArray, IndexArray]:
     """Return from which pixel each new one takes what is left of its maps: blocks from random places."""
     y, x = np.empty(new, np.intp), np.empty(new, np.intp)
     height, width = (min(_BLOCK, side) for side in old)

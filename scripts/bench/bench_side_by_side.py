@@ -105,7 +105,7 @@ def optimisers(counts: NDArray[np.uint16], origin: NDArray[np.int32]) -> dict[st
     """Return the CPU seconds a pixel of general optimisers on histograms, from the same starts as ours."""
     from bench_fit import Drawn, cpu, scipy_fit
 
-    from pchem_pipeline.model.fit.starts import starting_points
+    from pchem_pipeline.methods.plain_em import starting_points
     from pchem_pipeline.model.law.pcd import log_pcd
 
     pixels = Drawn(counts, origin.astype(np.int64), np.ones((len(counts), 4)))

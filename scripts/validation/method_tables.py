@@ -20,8 +20,8 @@ READ_NOISES = (0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.6, 0.8, 1.0)
 
 def method_table(exposure: float, options: argparse.Namespace) -> None:
     """Print errors, biases, failures and times at one exposure."""
+    from pchem_pipeline.methods.compare import StudyPoint, study_point
     from pchem_pipeline.methods.settings import MethodsSettings
-    from pchem_pipeline.methods.study import StudyPoint, study_point
     from pchem_pipeline.report.figures.methods import crossing_text
 
     points = [

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 import numpy as np  # noqa: E402
 from helpers.plain_law import pcd_mass  # noqa: E402
 
-from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_bias  # noqa: E402
+from pchem_pipeline.model.errors.expected_information import biased_by_rounding, rounding_bias  # noqa: E402
 from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
 from pchem_pipeline.model.fit.settings import FitSettings  # noqa: E402
 

@@ -9,8 +9,7 @@ from pchem_pipeline.discrepancy.quick.codes import CodeSample
 from pchem_pipeline.discrepancy.quick.sums import StackSums
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.model.histogram.count import histogram_frames
-from pchem_pipeline.model.histogram.moved_frames import MovedFrames
-from pchem_pipeline.model.histogram.odd_frames import frame_scores, left_out, odd_frames
+from pchem_pipeline.model.histogram.odd_frames import MovedFrames, frame_scores, left_out, odd_frames
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
 from pchem_pipeline.model.histogram.summaries import (
     ROW_GROUP,
@@ -43,10 +42,10 @@ def stack(
 def sums_of(frames: Array, block: int = 256) -> StackSums:
     """The summaries as the stage ``histogram`` makes them; odd frames are in none of the sums."""
     lines = line_sums(frames)
-    mean, variance = frame_statistics(lines.row_sum, lines.row_sum_square, frames.shape[2])
+    mean, variance = frame_statistics(lines["row_sum"], lines["row_sum_square"], frames.shape[2])
     _, digest = np.unique([hash(frame.tobytes()) for frame in frames], return_inverse=True)
-    level = np.median(lines.row_sum - np.median(lines.row_sum, axis=0), axis=1) / frames.shape[2]
-    scores = frame_scores(lines.row_sum, lines.row_sum_square, frames.shape[2])
+    level = np.median(lines["row_sum"] - np.median(lines["row_sum"], axis=0), axis=1) / frames.shape[2]
+    scores = frame_scores(lines["row_sum"], lines["row_sum_square"], frames.shape[2])
     moved = MovedFrames()
     for part in np.array_split(frames[:, :ROW_GROUP], -(-len(frames) // 256)):
         moved.add(part)
@@ -66,16 +65,16 @@ def sums_of(frames: Array, block: int = 256) -> StackSums:
         numbers,
         starts.size,
         np.diff(np.append(starts, n)),
-        np.stack([each.block_sum for each in blocks]),
-        np.stack([each.block_sum_square for each in blocks]),
-        lines.row_sum,
+        np.stack([each["block_sum"] for each in blocks]),
+        np.stack([each["block_sum_square"] for each in blocks]),
+        lines["row_sum"],
         np.arange(starts.size),
-        lines.column_sum,
+        lines["column_sum"],
         mean,
         variance,
-        covariances.lag1_covariance,
-        covariances.neighbour_covariance_x,
-        covariances.neighbour_covariance_y,
+        covariances["lag1_covariance"],
+        covariances["neighbour_covariance_x"],
+        covariances["neighbour_covariance_y"],
         odd,
         spectrum.line(),
     )

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, nuced_axis
-from pchem_pipeline.model.ensemble.totals import EnsembleAxes
+from pchem_pipeline.model.ensemble.ensemble import DnAxis, EnsembleAxes, nuced_axis
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw

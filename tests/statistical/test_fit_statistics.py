@@ -5,8 +5,8 @@ import pytest
 from helpers.drawn_pixels import draw
 from helpers.em_trace import em_trace
 
+from pchem_pipeline.methods.plain_em import starting_points
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.starts import starting_points
 from pchem_pipeline.model.law.pcd import log_pcd
 
 

@@ -15,7 +15,7 @@ from pchem_pipeline.model.errors.expected_information import (
     inverse_information,
     shared_information,
 )
-from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.mass import draw_histograms
 
 GAIN, N = 1 / 11, 4000
 

@@ -21,7 +21,8 @@ from pchem_pipeline.use.common_modes import Offsets, Reference, estimate_offsets
 from pchem_pipeline.use.electrons import add_up, electrons, read_stderr, whole_parts, with_its_errors
 
 if TYPE_CHECKING:
-    from pchem_pipeline.model.electrons.electrons import KnownPixels, Numbers, NumberTables
+    from pchem_pipeline.model.electrons.electrons import KnownPixels, NumberTables
+    from pchem_pipeline.model.electrons.electrons_numba import Numbers
     from pchem_pipeline.model.histogram.count import RowHistograms
     from pchem_pipeline.use.telegraph import TelegraphJumps
 
@@ -272,4 +273,4 @@ def _lookups(
         ends[0], ends[1], prior, known, dtype=job.number_type, parts=job.parts, detailed=True
     )
     share = np.repeat(calibration.right_bias.ravel(), np.diff(found.start))
-    return _Tables(known, prior, calibration.right_bias, replace(found, right=found.right * share)), jumps
+    return _Tables(known, prior, calibration.right_bias, found._replace(right=found.right * share)), jumps

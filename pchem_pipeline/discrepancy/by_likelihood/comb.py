@@ -16,7 +16,7 @@ from scipy import special
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.discrepancy.verdict import Place
-from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
+from pchem_pipeline.model.fit.guard import Interval, electrons_of, inside
 
 _RESOLVED = 0.3  # e-: read noise above which there are no valleys
 _HALF_PEAK = 0.25  # e-: half width of what counts as a peak

@@ -13,7 +13,7 @@ from pchem_pipeline.discrepancy.by_likelihood.comb import doubtful_peaks, valley
 from pchem_pipeline.discrepancy.by_likelihood.members import FARTHEST, Member
 from pchem_pipeline.discrepancy.by_likelihood.sets import FittedSet, SetComparison, select
 from pchem_pipeline.model.arithmetic.significance import CLEAR
-from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
+from pchem_pipeline.model.fit.guard import Interval, electrons_of, inside
 
 _PAYS = 0.5  # of the gap: more must go with a peak that is set aside
 _PEAKS_TRIED = 3

@@ -464,11 +464,11 @@ class DarkCurrentRts(Effect, tag="dark_current_rts"):
 
         Each is fitted by itself, whatever the mean step of all: with up to two defects and their own steps.
         """
-        from pchem_pipeline.model.law.telegraph import Telegraph, find_telegraph
+        from pchem_pipeline.model.law.telegraph import find_telegraph
 
         if self.fraction == 0 or self.step_e == 0:
             return None
-        found: dict[tuple[int, int], Telegraph] = {}
+        found: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
         good = maps.usable
         for y in np.flatnonzero(good.any(axis=1)):
             row = np.ascontiguousarray(frames[:, y].T)
@@ -479,12 +479,12 @@ class DarkCurrentRts(Effect, tag="dark_current_rts"):
         # where most of them seem to blink, it is something else
         if not 0 < len(found) <= _FEW_PIXELS * good.size:
             return None
-        levels = max(telegraph.added.size for telegraph in found.values())
+        levels = max(added.size for added, _ in found.values())
         exposure, weight = np.zeros((levels, *good.shape)), np.zeros((levels, *good.shape))
         weight[0] = 1.0
-        for place, telegraph in found.items():
-            own = (slice(telegraph.added.size), *place)
-            exposure[own], weight[own] = telegraph.added, telegraph.weight
+        for place, (added, share) in found.items():
+            own = (slice(added.size), *place)
+            exposure[own], weight[own] = added, share
         return AddedExposure(exposure, weight)
 
     def details(self) -> tuple[str, ...]:

@@ -13,7 +13,8 @@ read noise found so, its likelihood gap is too small, its read noise too high, o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,8 +53,7 @@ class _Prior:
         return self.centre + share * (values - self.centre)
 
 
-@dataclass(frozen=True)
-class Judged:
+class Judged(NamedTuple):
     """What the judgement looks at, of n pixels, NaN where there is no value.
 
     Attributes:
@@ -69,7 +69,7 @@ class Judged:
     @classmethod
     def join(cls, parts: Sequence[Judged]) -> Judged:
         """Return the pixels of several parts."""
-        return cls(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(cls)))
+        return cls(*map(np.concatenate, zip(*parts, strict=True)))
 
     @property
     def known(self) -> BoolArray:
@@ -78,7 +78,7 @@ class Judged:
 
     def of(self, pixels: BoolArray | slice) -> Judged:
         """Return some of the pixels."""
-        return Judged(self.noise[pixels], self.stderr[pixels], self.gap[pixels])
+        return Judged(*(each[pixels] for each in self))
 
     def looseness(self) -> tuple[FloatArray, FloatArray]:
         """Return the logarithm of ``8 pi^2 s_e stderr(s_e)``, and its standard error.

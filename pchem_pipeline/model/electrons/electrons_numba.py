@@ -12,14 +12,15 @@ from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.model.arithmetic.limits import NEGLIGIBLE, SMALLEST_MASS
 from pchem_pipeline.model.law.cells_numba import Law, cells_of
-from pchem_pipeline.model.law.levels_numba import (
+from pchem_pipeline.model.law.mass_numba import (
     fill_level,
+    known_theta,
     number_mass,
     number_range,
+    pixel_scratch,
     place_codes,
     share_scratch,
 )
-from pchem_pipeline.model.law.mass_numba import known_theta, pixel_scratch
 from pchem_pipeline.model.law.pixel_numba import OWN
 
 #: Exposure that stands for a prior in which all electron numbers are alike.
@@ -46,7 +47,7 @@ class CodeTables(NamedTuple):
     Attributes:
         first: first code of each pixel, shape (n,).
         start: place of it in the tables; the last element is their length, shape (n + 1,).
-        number: the most probable one.
+        number: the most probable one; the largest value of the type: none.
         mass: P(code); empty: not wanted.
         right: P(code, and the number is right); likewise.
         expected: E[k | x], e-; likewise, and NaN where the law expects no such code.
@@ -60,8 +61,14 @@ class CodeTables(NamedTuple):
     expected: Float32Array
 
 
-class SampleNumbers(NamedTuple):
-    """What samples say of the electron number, shape (frame, n) each; the last two may be empty."""
+class Numbers(NamedTuple):
+    """Electron numbers of samples, each array of the shape of the frames.
+
+    Attributes:
+        number: the most probable one; the largest value of the type where a pixel has no parameters.
+        probability: that it is right; empty where the tables have none.
+        expected: E[k | x], e-; empty where it was not asked for.
+    """
 
     number: NDArray[Any]
     probability: Float32Array
@@ -133,7 +140,7 @@ def fill_tables(
 
 
 @kernel
-def convert_frames(frames: NDArray[Any], tables: CodeTables, missing: int, out: SampleNumbers) -> None:
+def convert_frames(frames: NDArray[Any], tables: CodeTables, missing: int, out: Numbers) -> None:
     """Look every code, shape (frame, n), up in the table of its pixel; one that is not there is missing."""
     first, start, number, mass, right, expected = tables
     with_probability, with_expected = out.probability.size > 0, out.expected.size > 0

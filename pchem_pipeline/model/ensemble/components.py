@@ -5,14 +5,13 @@ Hendrickson et al. 2023, appendices sec:ensemble_dist_moments (A) and sec:ensemb
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.model.ensemble.ensemble import poisson_sums
+from pchem_pipeline.base.arrays import FloatArray, IntegerArray
+from pchem_pipeline.model.ensemble.ensemble import EnsembleTotals, poisson_sums
 from pchem_pipeline.model.law.parameters import UsablePixels
 
 #: Expected number of samples of k electrons, in one frame of all pixels, below which their tails decide.
@@ -28,46 +27,19 @@ COMPONENT_CASES: tuple[tuple[str, ...], ...] = tuple(
 )
 
 
-@dataclass(frozen=True)
-class EnsembleMoments:
-    """Moments of the ensemble and the terms that they consist of (Appendix A).
-
-    Attributes:
-        mean: E(E), DN.
-        variance: Var(E), DN^2.
-        nuced_mean: E(E'), e-.
-        nuced_variance: Var(E'), e-^2.
-        variance_of_bias: Var(mu), DN^2.
-        variance_of_signal: Var(H/g), DN^2.
-        mean_read_variance: E(sigma^2), DN^2.
-        mean_shot_variance: E(H/g^2), DN^2.
-        bias_signal_covariance: Cov(mu, H/g), DN^2; it enters the variance twice.
-    """
-
-    mean: float
-    variance: float
-    nuced_mean: float
-    nuced_variance: float
-    variance_of_bias: float
-    variance_of_signal: float
-    mean_read_variance: float
-    mean_shot_variance: float
-    bias_signal_covariance: float
-
-
-@dataclass(frozen=True)
-class Components:
-    """Mean and width of the components ``E | K_e = k`` (Appendix B).
-
-    Attributes:
-        mean: E(E|K_e=k), DN, shape (n_k,).
-        variance: Var(E|K_e=k), DN^2, shape (16, n_k), rows in the order of ``COMPONENT_CASES``.
-        nuced_variance: Var(E'|K_e=k), e-^2, shape (n_k,).
-    """
-
-    mean: FloatArray
-    variance: FloatArray
-    nuced_variance: FloatArray
+#: Name, quantity and unit of each row; effects stand in that of an extended model only.
+_MOMENTS = (
+    ("mean", "mean of the raw ensemble", "DN"),
+    ("variance", "variance of the raw ensemble", "DN2"),
+    ("variance_of_bias", "of which variance of the bias", "DN2"),
+    ("variance_of_signal", "of which variance of H/g", "DN2"),
+    ("mean_read_variance", "of which read noise", "DN2"),
+    ("mean_shot_variance", "of which shot noise", "DN2"),
+    ("bias_signal_covariance", "of which twice the covariance of bias and H/g", "DN2"),
+    ("effects", "of which effects and limits of the codes", "DN2"),
+    ("nuced_mean", "mean of the NUCed ensemble", "e-"),
+    ("nuced_variance", "variance of the NUCed ensemble", "e-2"),
+)
 
 
 def bias_weight(likelihood_gap: FloatArray) -> FloatArray:
@@ -84,8 +56,8 @@ def bias_weight(likelihood_gap: FloatArray) -> FloatArray:
     return np.asarray(weight if weight.any() else np.ones_like(weight))
 
 
-def predicted_moments(pixels: UsablePixels, weight: FloatArray | None = None) -> EnsembleMoments:
-    """Mean and variance of the EPCD and the NUCed EPCD from the parameters.
+def predicted_moments(pixels: UsablePixels, weight: FloatArray | None = None) -> dict[str, float]:
+    """Mean and variance of the EPCD and the NUCed EPCD from the parameters, and their terms, by name.
 
     Hendrickson et al. 2023, Appendix A: ``E(E) = E(mu) + E(H/g)`` and ``Var(E) = Var(mu) + Var(H/g) +
     E(sigma^2) + E(H/g^2) + 2 Cov(mu, H/g)``; for the NUCed ensemble ``E(H)`` and ``Var(H) + E(H) +
@@ -102,20 +74,20 @@ def predicted_moments(pixels: UsablePixels, weight: FloatArray | None = None) ->
     mean_bias = np.average(bias, weights=weight)
     open_square = (bias - mean_bias) ** 2 - 0.25 * (1.0 - weight**2) / gain**2
     of_bias = max(float(np.average(open_square, weights=weight)), 0.0)
-    return EnsembleMoments(
-        mean=float(bias.mean() + signal.mean()),
-        variance=sum(terms) + 2.0 * covariance,
-        nuced_mean=float(exposure.mean()),
-        nuced_variance=float(exposure.var() + exposure.mean() + np.mean(pixels.read_noise_e**2)),
-        variance_of_bias=of_bias,
-        variance_of_signal=terms[1],
-        mean_read_variance=terms[2],
-        mean_shot_variance=terms[3],
-        bias_signal_covariance=covariance,
-    )
+    return {
+        "mean": float(bias.mean() + signal.mean()),
+        "variance": sum(terms) + 2.0 * covariance,
+        "nuced_mean": float(exposure.mean()),
+        "nuced_variance": float(exposure.var() + exposure.mean() + np.mean(pixels.read_noise_e**2)),
+        "variance_of_bias": of_bias,
+        "variance_of_signal": terms[1],
+        "mean_read_variance": terms[2],
+        "mean_shot_variance": terms[3],
+        "bias_signal_covariance": 2.0 * covariance,
+    }
 
 
-def moment_errors(pixels: UsablePixels, n_frames: int | NDArray[np.integer[Any]]) -> dict[str, float]:
+def moment_errors(pixels: UsablePixels, n_frames: int | IntegerArray) -> dict[str, float]:
     """Standard errors of the sample moments of the ensemble, the pixels given.
 
     A pixel's samples have variance v = sigma^2 + H/g^2, third central moment H/g^3 and fourth 3 v^2 + H/g^4.
@@ -136,17 +108,66 @@ def moment_errors(pixels: UsablePixels, n_frames: int | NDArray[np.integer[Any]]
     return dict(zip(("mean", "variance", "nuced_mean", "nuced_variance"), errors, strict=True))
 
 
-def component_widths(pixels: UsablePixels, n_k: int, weight: FloatArray | None = None) -> Components:
-    """Mean and variance of the components of the EPCD, in the sixteen cases of Appendix B.
+def moment_rows(
+    totals: EnsembleTotals,
+    pixels: UsablePixels,
+    per_pixel: int | NDArray[Any],
+    weight: FloatArray,
+    *,
+    extended: bool = False,
+) -> list[dict[str, Any]]:
+    """Return the moments of Appendix A, from the maps and from the data; terms have nothing to be observed.
+
+    Where ``extended`` (the model holds effects, or samples lie at the limits of the codes), mean and variance
+    are those of the model's masses, and what this adds to the variance of parameters is a term of its own.
+    Of each pixel the number of samples is given, and the weight in Var(mu), see :func:`bias_weight`.
+    """
+    predicted, errors = predicted_moments(pixels, weight), moment_errors(pixels, per_pixel)
+    observed = _moments_of(totals, "share", "nuced_")
+    if extended:
+        of_law = _moments_of(totals, "pcd", "nuced_predicted_")
+        predicted |= of_law | {"effects": of_law["variance"] - predicted["variance"]}
+    return [
+        {
+            "name": name,
+            "quantity": quantity,
+            "unit": unit,
+            "predicted": predicted[name],
+            "observed": observed.get(name),
+            "stderr": errors.get(name),
+        }
+        for name, quantity, unit in _MOMENTS
+        if extended or name != "effects"
+    ]
+
+
+def _moments_of(totals: EnsembleTotals, name: str, prefix: str) -> dict[str, float]:
+    """Return mean and variance, raw and NUCed, of what lies along the raw axis and of its NUCed sums."""
+    share, dn = totals.mean(name), totals.axes.dn.dn
+    whole = share.sum()
+    mean = float(share @ dn / whole)
+    nuced_mean, square = (float(totals.mean(f"{prefix}{of}")[0] / whole) for of in ("sum", "sum_square"))
+    return {
+        "mean": mean,
+        "variance": float(share @ (dn - mean) ** 2 / whole),
+        "nuced_mean": nuced_mean,
+        "nuced_variance": square - nuced_mean**2,
+    }
+
+
+def component_widths(
+    pixels: UsablePixels, n_k: int, weight: FloatArray | None = None
+) -> dict[str, FloatArray]:
+    """Mean and variance of the components ``E | K_e = k`` of the EPCD, in the sixteen cases of Appendix B.
 
     Under the weights ``e^{-H} H^k`` (eq. EPCD_alt_form), ``Var(E|K_e=k) = E(sigma^2) + Var(mu) + 2 k
     Cov(mu, 1/g) + k^2 Var(1/g)``. Holding g, mu or sigma^2 at the mean of its map removes its terms
-    (sigma^2 leaves its mean); holding H makes the weights equal.
+    (sigma^2 leaves its mean); holding H makes the weights equal. Each pixel has a weight, (n,), see
+    :func:`bias_weight`; None: all the same. Where all have H = 0, moments of components k > 0 are NaN.
 
-    Args:
-        pixels: the pixels; where all have H = 0 there is no component k > 0, and its moments are NaN.
-        n_k: number of components, k = 0 .. n_k - 1.
-        weight: of each pixel, shape (n,), see :func:`bias_weight`; None: all the same.
+    Returns:
+        ``component_mean``, E(E|K_e=k), DN, shape (n_k,); ``component_variance``, DN^2, shape (16, n_k), rows
+        in the order of ``COMPONENT_CASES``; ``nuced_component_variance``, Var(E'|K_e=k), e-^2, shape (n_k,).
     """
     exposure, gain, bias, sigma = pixels.maps
     step = 1.0 / gain
@@ -164,7 +185,7 @@ def component_widths(pixels: UsablePixels, n_k: int, weight: FloatArray | None =
         for row, case in enumerate(COMPONENT_CASES):
             chosen = constant_h if "H" in case else weighted
             variance[row, k] = _case_variance(chosen, case, k, float(constant_h[0]))
-    return Components(mean, variance, nuced)
+    return {"component_mean": mean, "component_variance": variance, "nuced_component_variance": nuced}
 
 
 def _weighted_moments(exposure: FloatArray, table: FloatArray, weight: FloatArray, n_k: int) -> FloatArray:

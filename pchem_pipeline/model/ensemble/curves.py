@@ -4,22 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
-from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.model.checks.residuals import (
-    central_window,
-    chi_square,
-    noise_floor,
-    normalised_residuals,
-    rmse,
-)
+from pchem_pipeline.base.arrays import FloatArray, IntegerArray
 from pchem_pipeline.model.ensemble.components import component_widths
-from pchem_pipeline.model.ensemble.ensemble import electron_pmf
+from pchem_pipeline.model.ensemble.ensemble import MODEL_ERRORS, EnsembleTotals, electron_pmf
 from pchem_pipeline.model.ensemble.ensemble_binned import (
     electron_pmf_binned,
     epcd_dependent,
@@ -29,7 +22,6 @@ from pchem_pipeline.model.ensemble.ensemble_binned import (
     within_limits,
 )
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
-from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleTotals
 from pchem_pipeline.model.law.parameters import UsablePixels
 
 #: Components are shown up to the electron number whose mass is above this.
@@ -47,14 +39,8 @@ def curves(
 ) -> tuple[Arrays, dict[str, Any]]:
     """Return the densities, raw and NUCed, and how well they agree with the data.
 
-    Args:
-        totals: the sums over all tiles.
-        pixels: all pixels with a value.
-        settings: the section ``ensemble``.
-        limits: first and last code, DN, that show what is beyond them; None: no samples there.
-
-    Returns:
-        Arrays of the group ``ensemble``, and numbers for its attributes.
+    As arrays of the group ``ensemble``, and numbers for its attributes. The pixels are all with a value; the
+    first and last code, DN, show what is beyond these limits; None: no samples there.
     """
     axes, bins = totals.axes, settings.parameter_bins
     width = axes.nuced.width
@@ -108,8 +94,8 @@ def _agreement(
         found[f"{prefix}noise_floor"] = noise_floor(noise, window)
         if f"{curve}stderr" in arrays:
             model_error[curve.rstrip("_")] = noise_floor(arrays[f"{curve}stderr"] ** 2, window)
-        fit = chi_square(data, arrays[f"{curve}exact"], noise, arrays[f"{prefix}counts"])
-        fits[f"{prefix}chi_square"] = asdict(fit)
+        counts = arrays[f"{prefix}counts"]
+        fits[f"{prefix}chi_square"] = chi_square(data, arrays[f"{curve}exact"], noise, counts)
     (n, n_all), all_data = totals.samples, arrays["density_all"]
     found_all = {f"epcd_{way}": rmse(all_data, arrays[f"epcd_{way}"], windows[0]) for way in _WAYS}
     found_all["noise_floor"] = found["noise_floor"] * math.sqrt(n / n_all)
@@ -122,6 +108,49 @@ def _agreement(
         "rmse_window_dn": [int(arrays["dn"][i]) for i in ends[0]],
         "rmse_window_electrons": [float(arrays["electrons"][i]) for i in ends[1]],
     }
+
+
+def central_window(counts: IntegerArray) -> slice:
+    """Return the bins that hold the central 99.9 % of the counts, shape (n,), which are not all zero.
+
+    A few hot pixels stretch the axis over thousands of empty bins; an RMSE over all of them would shrink with
+    the length of the axis.
+    """
+    cumulative = np.cumsum(counts)
+    tail = 0.0005 * cumulative[-1]
+    first = int(np.searchsorted(cumulative, tail, side="right"))
+    last = int(np.searchsorted(cumulative, cumulative[-1] - tail, side="left"))
+    return slice(first, max(last, first) + 1)
+
+
+def rmse(data: FloatArray, model: FloatArray, window: slice = slice(None)) -> float:
+    """Return the root mean square difference between two densities, (n,), in their unit."""
+    return math.sqrt(float(np.mean((data[window] - model[window]) ** 2)))
+
+
+def noise_floor(variance: FloatArray, window: slice = slice(None)) -> float:
+    """Return the RMSE that counting alone causes, from the variance of the density of each bin, (n,)."""
+    return math.sqrt(float(np.mean(variance[window])))
+
+
+def normalised_residuals(data: FloatArray, model: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return ``(data - model) / sqrt(variance)``; NaN where the variance is zero."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(variance > 0, (data - model) / np.sqrt(variance), np.nan)
+
+
+def chi_square(
+    data: FloatArray, model: FloatArray, variance: FloatArray, counts: IntegerArray
+) -> dict[str, float]:
+    """Return Pearson's chi-square of an ensemble histogram with the binomial variance of its pixels.
+
+    Over those of the n bins with at least 10 samples. The bins of one pixel are slightly anticorrelated, so
+    the sum is not exactly chi-square; with many bins the difference is small. As ``value``, the number of
+    bins ``dof``, and ``p``, the probability of a larger one if the model holds; NaN without bins.
+    """
+    use = (counts >= 10) & (variance > 0)
+    value, dof = float(np.sum((data[use] - model[use]) ** 2 / variance[use])), int(use.sum())
+    return {"value": value, "dof": dof, "p": float(chdtrc(dof, value)) if dof else math.nan}
 
 
 def electron_numbers(
@@ -159,9 +188,4 @@ def components(pixels: UsablePixels, mass: FloatArray, weight: FloatArray) -> Ar
     The pixels are all with a value, weighted as :func:`bias_weight` says.
     """
     shown = max(2, int(np.flatnonzero(mass >= _SMALLEST_COMPONENT)[-1]) + 1)
-    widths = component_widths(pixels, min(shown, mass.size), weight)
-    return {
-        "component_mean": widths.mean,
-        "component_variance": widths.variance,
-        "nuced_component_variance": widths.nuced_variance,
-    }
+    return component_widths(pixels, min(shown, mass.size), weight)

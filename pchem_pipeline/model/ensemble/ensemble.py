@@ -1,4 +1,4 @@
-"""The ensemble of pixels: exact mean of the pixels' PCDs, and the data on the same axes.
+"""The ensemble of pixels: exact mean of the pixels' PCDs, the data on the same axes, and sums over tiles.
 
 The ensemble PCD is ``f_E(x) = E_theta f_X(x | theta)`` (Hendrickson et al. 2023, eq. full_ensemble_dist).
 With one parameter vector per pixel that expectation is the mean over the pixels; nothing need be binned.
@@ -9,20 +9,54 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray, IntegerArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
 from pchem_pipeline.model.ensemble import ensemble_numba
+from pchem_pipeline.model.errors.expected_information import covariance_from
 from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.mass import parts_of_similar_width, sample_mass, sample_slopes
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
+
+#: Pixels of ordinary errors that are taken of a sensor. The variances that they add scatter by 1.4 times the
+#: mean: 16,384 give the standard error of a curve to 0.6 % of itself (4 % at its ends, where few add much).
+ERROR_PIXELS = 1 << 14
+#: Sum over the four parameters of their variances over those of resolved peaks: what half of the pixels of a
+#: sensor with a read noise of 0.3 e- stay below.
+_ORDINARY = 20.0
+#: Places that follow each other by this part of a cycle are spread as evenly as can be.
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+#: Sizes of error of the electron numbers told apart; the last one is: and more.
+ERROR_SIZES = 8
+
+_INTEGERS = (
+    "pixels",
+    "excluded",
+    "outside",
+    "outside_all",
+    "nuced_outside",
+    "electrons_beyond",
+    "compared",
+    "signed_error",
+)
+_FLOATS = (
+    "nuced_sum",
+    "nuced_sum_square",
+    "nuced_predicted_sum",
+    "nuced_predicted_sum_square",
+    "error",
+    "error_variance",
+)
+#: Variances of the predictions by the errors of the maps.
+MODEL_ERRORS = ("pcd_error", "nuced_error")
 
 
 @dataclass(frozen=True)
@@ -64,6 +98,75 @@ class NucedAxis:
 
 
 @dataclass(frozen=True)
+class EnsembleAxes:
+    """The axes of the ensemble, and where each sum stands in the rows of a tile.
+
+    Attributes:
+        dn: DN of the raw ensemble.
+        nuced: bins of the NUCed ensemble.
+        n_k: number of electron numbers.
+    """
+
+    dn: DnAxis
+    nuced: NucedAxis
+    n_k: int
+
+    @cached_property
+    def integers(self) -> dict[str, slice]:
+        """Place of each tally in the row of integers."""
+        lengths = {"counts": self.dn.size, "counts_all": self.dn.size, "nuced_counts": self.nuced.size}
+        lengths |= {"electron_counts": self.n_k, "error_sizes": ERROR_SIZES}
+        return _places(lengths | dict.fromkeys(_INTEGERS, 1))
+
+    @cached_property
+    def floats(self) -> dict[str, slice]:
+        """Place of each sum in the row of floats."""
+        lengths = dict.fromkeys(("pcd", "pcd_variance", "share", "share_all"), self.dn.size)
+        lengths |= dict.fromkeys(("nuced", "nuced_variance", "nuced_share"), self.nuced.size)
+        lengths |= dict.fromkeys(("electron_share", "electron_expected"), self.n_k)
+        lengths |= dict(zip(MODEL_ERRORS, (self.dn.size, self.nuced.size), strict=True))
+        return _places(lengths | dict.fromkeys(_FLOATS, 1))
+
+
+def _places(lengths: dict[str, int]) -> dict[str, slice]:
+    ends = np.cumsum(list(lengths.values())).tolist()
+    return {name: slice(end - size, end) for (name, size), end in zip(lengths.items(), ends, strict=True)}
+
+
+@dataclass(frozen=True)
+class EnsembleTotals:
+    """The sums over all tiles.
+
+    Attributes:
+        axes: axes of the ensemble.
+        integers: total of the rows of integers.
+        floats: total of the rows of floats.
+        samples: chosen frames of a pixel, all frames of a pixel; (1, 1) for ready-made histograms.
+    """
+
+    axes: EnsembleAxes
+    integers: IntArray
+    floats: FloatArray
+    samples: tuple[int, int]
+
+    def count(self, name: str) -> int:
+        """Return a tally that is one number."""
+        return int(self.integers[self.axes.integers[name]][0])
+
+    def counts(self, name: str) -> IntArray:
+        """Return a tally along an axis."""
+        return self.integers[self.axes.integers[name]]
+
+    def mean(self, name: str) -> FloatArray:
+        """Return the mean over the pixels of a sum."""
+        return self.floats[self.axes.floats[name]] / self.count("pixels")
+
+    def variance(self, name: str) -> FloatArray:
+        """Return the variance of the mean over the pixels, from the sum of the pixels' variances."""
+        return self.mean(name) / self.count("pixels")
+
+
+@dataclass(frozen=True)
 class AxisSums:
     """Sums over pixels on the two axes, of predicted masses or of samples.
 
@@ -89,13 +192,10 @@ def nuced_axis(pixels: UsablePixels, dn: DnAxis, *, width: float | None = None) 
 
     A pixel's NUCed values lie on a lattice of pitch g. A bin of width w holds ``floor(w/g)`` or one more
     of its points: a noise on the histogram that no number of frames removes, smallest where w is a whole
-    multiple of the typical g.
+    multiple of the typical g: the median g, unless a width, e-, is given.
 
-    Args:
-        pixels: the pixels.
-        dn: axis of the raw data; the NUCed axis reaches no further than it does for the 1st to 99th
-            percentile of g and mu, so that one strange gain cannot stretch it.
-        width: bin width, e-; None: the median g.
+    The axis reaches no further than the raw one does for the 1st to 99th percentile of g and mu, so that one
+    strange gain cannot stretch it.
     """
     gain, bias = pixels.conversion_gain, pixels.bias
     bin_width = float(np.median(gain)) if width is None else width
@@ -117,13 +217,8 @@ def mass_sums(
     show, lattice and all: each DN of a pixel lies at ``(x - mu) g`` and falls into one bin as a whole (eq.
     partial_ensemble_dist, before the lattice is smoothed over).
 
-    Args:
-        mass: of successive codes, one pixel after the other.
-        first: first code of each pixel, DN, shape (n,).
-        start: place of its mass, shape (n + 1,).
-        pixels: the n pixels.
-        dn: axis of the raw prediction; it should hold all of the data.
-        nuced: axis of the NUCed prediction.
+    The masses are of successive codes, one pixel after the other, from the first code of each, DN, (n,), at
+    the place ``start``, (n + 1,). The raw axis should hold all of the data.
     """
     end = np.minimum(start[1:], start[:-1] + dn.start + dn.size - first)
     codes = np.maximum(first, dn.start), start[:-1] + np.maximum(dn.start - first, 0), end
@@ -156,6 +251,54 @@ def weighted_mass(pixels: UsablePixels, dn: DnAxis, share: FloatArray) -> FloatA
         mass = share[some, None] * sample_mass(law, pixels.of(some), codes, smallest=1e-17)
         out += np.bincount((codes - dn.start).ravel(), mass.ravel(), dn.size + n_codes)[: dn.size]
     return out
+
+
+@dataclass(frozen=True)
+class PixelErrors:
+    """Errors of the maps of n pixels, of which some stand for all where their variances are summed.
+
+    A standard error need not be known to better than a per cent of itself, so of a large sensor some pixels
+    are enough: each is taken with a known probability and counts for its inverse (Horvitz and Thompson 1952),
+    the more probably the larger its errors are, so that the few that fit badly do not decide by chance.
+
+    Attributes:
+        stderr: of (H, g, mu, sigma), shape (n, 4); NaN where not known.
+        correlation: of the estimates, shape (n, 6).
+        place: number of each pixel on the sensor, shape (n,): which ones are taken depends on no tile.
+        share: of ordinary pixels that is taken.
+    """
+
+    stderr: FloatArray
+    correlation: FloatArray
+    place: IntArray
+    share: float = 1.0
+
+    def of(self, pixels: BoolArray | IntArray) -> PixelErrors:
+        """Return those of some pixels."""
+        return PixelErrors(self.stderr[pixels], self.correlation[pixels], self.place[pixels], self.share)
+
+    def sampled(self, pixels: UsablePixels, samples: IntegerArray) -> tuple[BoolArray, FloatArray]:
+        """Return which pixels are taken, (n,), and their covariances, each times the pixels it stands for.
+
+        The parameters of the pixels are given, and the number of samples behind each, shape (n,).
+        """
+        chance = np.clip(self.share * self._badness(pixels, samples), self.share, 1.0)
+        some = self.place * _GOLDEN % 1.0 < chance
+        covariance = covariance_from(self.stderr[some], self.correlation[some])
+        return some, covariance / chance[some, None, None]
+
+    def _badness(self, pixels: UsablePixels, samples: IntegerArray) -> FloatArray:
+        """Return how many times larger than ordinary the variances are."""
+        exposure, gain, _, sigma = pixels.maps
+        noise = sigma**2
+        per_sample = (
+            1.0 / np.maximum(exposure, 1e-3),
+            exposure * (1.0 + exposure) / (gain**4 * noise),
+            1.0 / noise,
+            2.0 / noise,
+        )
+        known = np.nan_to_num(self.stderr**2, posinf=0.0)
+        return np.asarray(samples / _ORDINARY * np.sum(known.T * np.stack(per_sample), axis=0))
 
 
 def curve_errors(
@@ -191,8 +334,8 @@ def _mass_slopes(law: SampleLaw, pixels: UsablePixels, first: IntArray, n_codes:
 
 
 def tally(
-    counts: NDArray[np.integer[Any]],
-    origin: NDArray[np.integer[Any]],
+    counts: IntegerArray,
+    origin: IntegerArray,
     pixels: UsablePixels,
     dn: DnAxis,
     nuced: NucedAxis | None = None,
@@ -211,10 +354,8 @@ def tally(
 def electron_pmf(quanta_exposure: FloatArray, n_k: int, share: FloatArray | None = None) -> FloatArray:
     """Return the mass of the ensemble electron number (Hendrickson et al. 2023, eq. K_ensemble_pmf), (n_k,).
 
-    Args:
-        quanta_exposure: H of each pixel, or of each bin of the map's histogram, e-, shape (n,).
-        n_k: number of masses, for k = 0 .. n_k - 1.
-        share: part of the pixels that each H stands for, shape (n,), adding up to 1; None: equal parts.
+    H, e-, (n,), is of each pixel, or of each bin of the map's histogram with its share of the pixels, (n,),
+    adding up to 1; None: equal shares.
     """
     exposure = np.asarray(quanta_exposure, np.float64)
     weights = np.full(exposure.size, 1.0 / exposure.size) if share is None else share

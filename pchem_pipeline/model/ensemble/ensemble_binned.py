@@ -137,17 +137,13 @@ def _inverted(
         t = 2 * np.pi * order / period
         noise = np.sinc(t / (2 * np.pi)) * (np.exp(-0.5 * np.multiply.outer(t**2, spread)) @ variances.share)
         offset = np.exp(1j * np.multiply.outer(t, biases.values[0] - origin)) @ biases.share
-        product = noise * offset * _electrons_in_dn(t, exposures, gains)
+        # of K/g for independent H and g
+        phase = np.exp(1j * np.multiply.outer(t, 1.0 / gains.values[0])) - 1.0
+        by_gain = np.exp(np.multiply.outer(phase, exposures.values[0])) @ exposures.share
+        product = noise * offset * (by_gain @ gains.share)
         # frequencies beyond the sampling of the DN grid fold onto it, and those below zero are conjugates
         np.add.at(folded, order % period, np.where(order == 0, 0.5, 1.0) * product)
     return origin, 2.0 * np.fft.fft(folded).real / period
-
-
-def _electrons_in_dn(t: FloatArray, exposures: Cells, gains: Cells) -> NDArray[np.complex128]:
-    """Return the characteristic function of K/g at ``t`` for independent H and g."""
-    phase = np.exp(1j * np.multiply.outer(t, 1.0 / gains.values[0])) - 1.0
-    by_gain = np.exp(np.multiply.outer(phase, exposures.values[0])) @ exposures.share
-    return np.asarray(by_gain @ gains.share)
 
 
 def _period(exposures: Cells, gains: Cells, biases: Cells, variances: Cells, dn: DnAxis) -> tuple[int, int]:
@@ -170,12 +166,8 @@ def within_limits(
 ) -> FloatArray:
     """Return a density of the raw ensemble with the mass beyond the limits of the codes at these.
 
-    Args:
-        curve: of an unlimited ADC, :func:`epcd_dependent` or :func:`epcd_independent`.
-        pixels: as of the curve.
-        dn: likewise.
-        bins: likewise.
-        limits: first and last code, DN; those at an end of ``dn`` count. None: no limits.
+    The curve, :func:`epcd_dependent` or :func:`epcd_independent`, is of an unlimited ADC; of its first and
+    last code, DN, those at an end of ``dn`` count. None: no limits.
     """
     low, high = (False, False) if limits is None else (dn.start <= limits[0], dn.start + dn.size > limits[1])
     below = 0

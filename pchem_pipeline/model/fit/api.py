@@ -7,21 +7,30 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, IntArray, IntegerArray
 from pchem_pipeline.base.units import FEW_STEP
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.errors import information_numba
-from pchem_pipeline.model.errors.expected_information import inverse_information
-from pchem_pipeline.model.errors.fisher import expected_scores
-from pchem_pipeline.model.errors.rounding import biased_by_rounding, rounding_may_matter
+from pchem_pipeline.model.errors.expected_information import (
+    biased_by_rounding,
+    expected_scores,
+    inverse_information,
+    rounding_may_matter,
+)
 from pchem_pipeline.model.fit import engine, search_numba, tile_numba
 from pchem_pipeline.model.fit.climb_numba import ALIASED_STEP, Limits
-from pchem_pipeline.model.fit.excluding_codes import Interval, electrons_of, inside
-from pchem_pipeline.model.fit.guard import expected_counts, far_samples, fit_guarded, leave_out
-from pchem_pipeline.model.fit.profile import Moments, Profile, moments_along_bias
+from pchem_pipeline.model.fit.guard import (
+    Interval,
+    electrons_of,
+    expected_counts,
+    far_samples,
+    fit_guarded,
+    inside,
+    leave_out,
+)
+from pchem_pipeline.model.fit.profile import Moments, Profile
 from pchem_pipeline.model.fit.result import FitResult, quantile_of
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FitStatus, with_rivals_named
@@ -29,8 +38,6 @@ from pchem_pipeline.model.fit.tile_numba import Answers, Histograms, Starts
 from pchem_pipeline.model.law.inputs import kernel_counts, pack
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
-
-Counts = NDArray[np.integer]
 
 #: EM steps before the first Newton step, of several samples; the start of one is good enough without.
 _WARM_UP = 2
@@ -48,10 +55,10 @@ _NO_FIT = FitStatus.NO_DATA | FitStatus.TOO_FEW_BINS
 
 
 def fit_histograms(
-    counts: Counts | Sequence[Counts],
-    origin: Counts | Sequence[Counts],
-    under: Counts | None = None,
-    over: Counts | None = None,
+    counts: IntegerArray | Sequence[IntegerArray],
+    origin: IntegerArray | Sequence[IntegerArray],
+    under: IntegerArray | None = None,
+    over: IntegerArray | None = None,
     *,
     dark: Sequence[bool] | None = None,
     law: SampleLaw | Sequence[SampleLaw] | None = None,
@@ -103,12 +110,15 @@ def fit_histograms(
     _check(samples, origins, dark)
     batch = _Batch(samples, origins, dark, settings, adc_limits, under, over)
     laws = None if law is None else batch.between_limits(law)
-    near = None if isinstance(start, FitResult) else start
-    if laws is not None and near is not None:
-        found = batch.fit_cells(laws, near, warm=True)
+    if not (laws is None or start is None or isinstance(start, FitResult)):
+        found = batch.fit_cells(laws, start, warm=True)
         batch.by_cells[:] = True
     else:
-        plain = batch.resume(_shaped(start, -1)) if isinstance(start, FitResult) else batch.fit_density(near)
+        if isinstance(start, FitResult):
+            plain = _shaped(start, -1)
+            batch.leave_out_again(plain.columns, plain.outlier_share, None, np.zeros((batch.n, 2)))
+        else:
+            plain = batch.fit_density(start)
         batch.set_aside(plain, excluding)
         found = batch.refine(plain, laws)
     if settings.intervals == "profile":
@@ -117,8 +127,8 @@ def fit_histograms(
 
 
 def likelihood_moments(
-    counts: Counts,
-    origin: Counts,
+    counts: IntegerArray,
+    origin: IntegerArray,
     known: FloatArray,
     outlier_share: FloatArray,
     *,
@@ -150,14 +160,17 @@ def likelihood_moments(
         frames = counts.sum(axis=1, dtype=np.int64) * (1.0 - outlier_share)
         cells = biased_by_rounding([*known[:, :4].T], frames)
     free = np.zeros((len(known), 2)) if satellites is None else np.nan_to_num(satellites)
-    parts = []
+    n = len(known)
+    found = Moments(np.full((n, 4, 4), np.nan), np.zeros((n, 2)), np.full((n, 2, 4), np.nan))
     for pixels in (np.flatnonzero(~cells), np.flatnonzero(cells)):
         if pixels.size:
             batch = _Batch([counts[pixels]], [origin[pixels]], [False], settings, adc_limits, None, None)
             given = SampleLaw() if law is None else law.of(pixels)
             own = batch.between_limits(given) if cells[pixels[0]] else None
-            parts.append((pixels, batch.moments(known[pixels], outlier_share[pixels], own, free[pixels])))
-    return Moments.joined(len(known), parts)
+            part = batch.moments(known[pixels], outlier_share[pixels], own, free[pixels])
+            for whole, values in zip(found, part, strict=True):
+                whole[pixels] = values
+    return found
 
 
 def satellite_threshold(law: SampleLaw) -> float:
@@ -172,7 +185,7 @@ def satellite_threshold(law: SampleLaw) -> float:
     return 0.5 * float(chdtri(1.0, min(1.0, 2.0 * law.free_satellite_alarm / trials)))
 
 
-def _check(samples: Sequence[Counts], origins: Sequence[Counts], dark: Sequence[bool]) -> None:
+def _check(samples: Sequence[IntegerArray], origins: Sequence[IntegerArray], dark: Sequence[bool]) -> None:
     if not samples or all(dark):
         raise ValueError("no sample has electrons")
     if len(samples) != len(origins) or len(samples) != len(dark):
@@ -193,13 +206,13 @@ class _Batch:
 
     def __init__(
         self,
-        samples: Sequence[Counts],
-        origins: Sequence[Counts],
+        samples: Sequence[IntegerArray],
+        origins: Sequence[IntegerArray],
         dark: Sequence[bool],
         settings: FitSettings,
         adc_limits: tuple[int, int] | None,
-        under: Counts | None,
-        over: Counts | None,
+        under: IntegerArray | None,
+        over: IntegerArray | None,
     ) -> None:
         together = np.concatenate(samples, axis=1) if len(samples) > 1 else samples[0]
         counts = kernel_counts(together)
@@ -230,11 +243,6 @@ class _Batch:
         starts = Starts(known, gaps, np.empty(0), np.ones(1, np.bool_))
         laws = [SampleLaw()] * self.n_samples
         return self._result(self._fit(self.given, laws, starts, self.limits(None)), cells=False, adjust=True)
-
-    def resume(self, plain: FitResult) -> FitResult:
-        """Leave out the samples that a fit with the density left out; return it."""
-        self.leave_out_again(plain.columns, plain.outlier_share, None, np.zeros((self.n, 2)))
-        return plain
 
     def leave_out_again(
         self,
@@ -269,7 +277,7 @@ class _Batch:
         """Fit again with the cells what the law or the settings ask for, from a fit with the density."""
         words, possible = plain.fit_status, (plain.fit_status & int(_NO_FIT)) == 0
         scan = laws is None and not (self.given.mask == SET_ASIDE).any()
-        chosen = laws or self.neutral()
+        chosen = laws or self.between_limits(SampleLaw())
         if not scan:
             wanted = ((words & int(FAILED)) == 0) | (self._at_limits(chosen) & possible)
         elif self.settings.likelihood == "auto":
@@ -294,7 +302,7 @@ class _Batch:
         near: FloatArray,
         *,
         gaps: FloatArray | None = None,
-        pixels: NDArray[np.intp] | None = None,
+        pixels: IndexArray | None = None,
         warm: bool = False,
         scan: bool = False,
     ) -> FitResult:
@@ -313,13 +321,14 @@ class _Batch:
         )
         limits = self.limits(own, warm=warm, scan=scan)
         adjust = all(each.neutral for each in own)
-        if not adjust:
-            _count_near(given)
+        if not adjust:  # another law may expect samples that the PCD did not: satellite peaks, tails
+            connected = np.flatnonzero(~far_samples(given)[1])
+            leave_out(given, connected, np.zeros((connected.size, given.counts.shape[1]), np.bool_))
         answers = self._fit(given, own, starts, limits)
         self.given.mask[some] = given.mask
         return self._result(answers, cells=True, adjust=adjust, pixels=some)
 
-    def _given_of(self, some: NDArray[np.intp]) -> Histograms:
+    def _given_of(self, some: IndexArray) -> Histograms:
         """Return copies of the histograms of some pixels."""
         counts, places, origin, dark, mask = self.given
         return Histograms(counts[some], places, origin[some], dark, mask[some])
@@ -339,14 +348,14 @@ class _Batch:
         search = engine.cells_search(starts.amplitudes.size > 0) if cells else engine.density_search()
         tools = engine.likelihood(cells), engine.climb(), search, engine.regression_basis()
 
-        def fit(pixels: NDArray[np.intp], quick: bool) -> None:
+        def fit(pixels: IndexArray, quick: bool) -> None:
             answers.parameters[pixels] = np.nan
             answers.covariance[pixels] = np.nan
             # a few at a time: a signal is heard between kernels only
             for some in np.array_split(pixels, pixels.size // 1024 + 1):
                 fit_tile(given, some, packed, starts, limits._replace(quick=quick), *tools, answers)
 
-        def expect(pixels: NDArray[np.intp], gone: FloatArray) -> FloatArray:
+        def expect(pixels: IndexArray, gone: FloatArray) -> FloatArray:
             satellites = answers.out[pixels][:, [search_numba.AMPLITUDE, search_numba.SATELLITE_WEIGHT]]
             own = laws if cells else None
             return expected_counts(given, pixels, own, answers.parameters[pixels], satellites, gone)
@@ -366,7 +375,7 @@ class _Batch:
         self.leave_out_again(columns, outlier_share, laws, satellites)
         law, limits = pack(laws or [SampleLaw()], self.n), self.limits(laws)
         reach = np.where(known[:, 4] < _RIVAL_GAP, _RIVAL_REACH, 0.0)
-        return moments_along_bias(Profile(self.given, law, limits, columns, satellites), columns, reach)
+        return Profile(self.given, law, limits, columns, satellites).moments(columns, reach)
 
     # -- what they are told
 
@@ -391,10 +400,6 @@ class _Batch:
             quick=False,
             sandwich=settings.errors == "sandwich",
         )
-
-    def neutral(self) -> list[SampleLaw]:
-        """Return the law of the PCD between the limits of the ADC."""
-        return self.between_limits(SampleLaw())
 
     def between_limits(self, law: SampleLaw | Sequence[SampleLaw]) -> list[SampleLaw]:
         """Return laws without limits between those of the ADC, but in pixels with samples beyond them."""
@@ -461,7 +466,7 @@ class _Batch:
     # -- what they found
 
     def _result(
-        self, answers: Answers, *, cells: bool, adjust: bool, pixels: NDArray[np.intp] | None = None
+        self, answers: Answers, *, cells: bool, adjust: bool, pixels: IndexArray | None = None
     ) -> FitResult:
         """Add to the status words what the loop over the pixels does not know, and blank what failed."""
         some = np.arange(self.n) if pixels is None else pixels
@@ -510,7 +515,7 @@ class _Batch:
 
     def _freedom(
         self,
-        pixels: NDArray[np.intp],
+        pixels: IndexArray,
         words: IntArray,
         frames: FloatArray,
         parameters: FloatArray,
@@ -552,22 +557,13 @@ class _Batch:
             some = np.flatnonzero(fitted & (self.by_cells == cells))
             if some.size == 0:
                 continue
-            chosen = (laws or self.neutral()) if cells else [SampleLaw()] * self.n_samples
+            chosen = (laws or self.between_limits(SampleLaw())) if cells else [SampleLaw()] * self.n_samples
             satellites = np.stack([found.satellite_amplitude_e[some], found.satellite_weight[some]], axis=1)
             law = pack([each.of(some) for each in chosen], some.size)
             limits = self.limits(chosen if cells else None)
             near = Profile(self._given_of(some), law, limits, found.columns[some], np.nan_to_num(satellites))
             ends[some] = near.ends(quantile_of(self.settings.interval_level))
         return ends
-
-
-def _count_near(given: Histograms) -> None:
-    """Count samples again that a fit with the PCD did not expect, but for those that a gap cuts off.
-
-    Another law may expect them: satellite peaks, tails.
-    """
-    near = np.flatnonzero(~far_samples(given)[1])
-    leave_out(given, near, np.zeros((near.size, given.counts.shape[1]), np.bool_))
 
 
 def _reshapes(law: SampleLaw) -> bool:

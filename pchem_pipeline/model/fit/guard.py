@@ -1,9 +1,9 @@
-"""The tail guard: samples that the model does not expect at all leave the likelihood.
+"""Samples that leave the likelihood: codes that are set aside, and what the tail guard finds.
 
-The guarded log-likelihood of a pixel is ``sum_i c_i max(log f(x_i), log(floor / N))``: where fewer than
-``floor`` frames per DN are expected, a sample costs the same wherever it lies, so it moves nothing. At a
-maximum that is the likelihood of the other samples, found by leaving these out and fitting again until the
-set of them stays.
+The tail guard leaves out samples that the model does not expect at all. Its log-likelihood of a pixel is
+``sum_i c_i max(log f(x_i), log(floor / N))``: where fewer than ``floor`` frames per DN are expected, a sample
+costs the same wherever it lies, so it moves nothing. At a maximum that is the likelihood of the other
+samples, found by leaving these out and fitting again until the set of them stays.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, IntArray, IntegerArray
 from pchem_pipeline.model.arithmetic.robust import chi_square
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
 from pchem_pipeline.model.fit import guard_numba
@@ -26,11 +25,27 @@ from pchem_pipeline.model.law.pcd import pcd
 from pchem_pipeline.model.law.pixel_numba import COUNTED, LEFT_OUT, SET_ASIDE
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
-Pixels = NDArray[np.intp]
+#: Limits of codes that are set aside on a pixel's comb, e-; None: no limit.
+Interval = tuple[float | None, float | None]
 
 _MOST_PASSES = 8
 # attempts: without what the fit of all samples does not expect, without the ends, without what a gap cuts off
 _EXPECTED, _ENDS, _CORE, _N_ATTEMPTS = range(4)
+
+
+def electrons_of(origin: IntegerArray, width: int, gain: FloatArray, bias: FloatArray) -> FloatArray:
+    """Return the place ``(x - mu) g`` of every code on its pixel's comb, e-, shape (n, width)."""
+    codes = np.asarray(origin, np.int64)[:, None] + np.arange(width)
+    return np.asarray((codes - bias[:, None]) * gain[:, None])
+
+
+def inside(intervals: Sequence[Interval], electrons: FloatArray) -> BoolArray:
+    """Return which places on the comb lie in one of the intervals."""
+    found = np.zeros(electrons.shape, np.bool_)
+    for low, high in intervals:
+        above = electrons >= (-np.inf if low is None else low)
+        found |= above & (electrons < (np.inf if high is None else high))
+    return found
 
 
 def far_samples(given: Histograms) -> tuple[IntArray, BoolArray]:
@@ -43,21 +58,17 @@ def far_samples(given: Histograms) -> tuple[IntArray, BoolArray]:
 
 def expected_counts(
     given: Histograms,
-    pixels: Pixels,
+    pixels: IndexArray,
     laws: Sequence[SampleLaw] | None,
     parameters: FloatArray,
     satellites: FloatArray,
     left_out: FloatArray,
 ) -> FloatArray:
-    """Return the samples expected in each occupied bin of some pixels, shape (m, all bins).
+    """Return the samples expected in each occupied bin of m pixels, shape (m, all bins).
 
-    Args:
-        given: histograms.
-        pixels: m places.
-        laws: of the samples, the cells integrated; None: the density of the PCD.
-        parameters: (H_1 ... H_J, g, mu, sigma) of these, shape (m, J + 3).
-        satellites: amplitude (e-) and weight of their free satellites, shape (m, 2).
-        left_out: samples that the likelihood of these parameters left out, shape (m,).
+    Under laws of the samples, the cells integrated, or the density of the PCD (None): with (H_1 ... H_J, g,
+    mu, sigma), (m, J + 3), amplitude (e-) and weight of free satellites, (m, 2), and the number of samples
+    that the likelihood of these parameters left out, (m,).
     """
     counts, kept = given.counts[pixels], given.mask[pixels] != SET_ASIDE
     counts = counts if kept.all() else np.where(kept, counts, 0)
@@ -79,7 +90,7 @@ def expected_counts(
     return found
 
 
-def leave_out(given: Histograms, pixels: Pixels, outside: BoolArray) -> tuple[FloatArray, BoolArray]:
+def leave_out(given: Histograms, pixels: IndexArray, outside: BoolArray) -> tuple[FloatArray, BoolArray]:
     """Leave out the samples of m pixels in the bins ``outside``, (m, all bins), and count all others.
 
     The mask of the histograms is updated; what is set aside stays so.
@@ -95,8 +106,8 @@ def leave_out(given: Histograms, pixels: Pixels, outside: BoolArray) -> tuple[Fl
 
 
 def fit_guarded(
-    fit: Callable[[Pixels, bool], None],
-    expect: Callable[[Pixels, FloatArray], FloatArray],
+    fit: Callable[[IndexArray, bool], None],
+    expect: Callable[[IndexArray, FloatArray], FloatArray],
     given: Histograms,
     limits: Limits,
     answers: Answers,
@@ -131,7 +142,8 @@ def fit_guarded(
     fit(np.flatnonzero(~far | resumed), False)
     good = (_scores(answers) <= BEYOND_DOUBT) | limits.cells
     suspicious = ~far & ~resumed & guard.suspicious(everything)
-    guard.keep(np.flatnonzero(suspicious))
+    guard.whole = Answers._make(each[suspicious] for each in answers)
+    guard.place[suspicious] = np.arange(np.count_nonzero(suspicious))
     answers.out[~far & ~suspicious & ~resumed, OUTLYING] = 0.0
     guard.attempt[:] = np.where(resumed | far | ~good, _EXPECTED, _EXPECTED - 1)
     again, stuck = guard.check(np.flatnonzero(resumed), far)
@@ -146,8 +158,8 @@ def fit_guarded(
 class _Guard:
     """What the tail guard knows of n pixels, and works with; see :func:`fit_guarded`."""
 
-    fit: Callable[[Pixels, bool], None]
-    expect: Callable[[Pixels, FloatArray], FloatArray]
+    fit: Callable[[IndexArray, bool], None]
+    expect: Callable[[IndexArray, FloatArray], FloatArray]
     given: Histograms
     limits: Limits
     ends: IntArray  # of the bins that no gap cuts off, shape (n, J, 2)
@@ -158,12 +170,7 @@ class _Guard:
     passes: IntArray  # fits of the attempt
     place: IntArray  # in ``whole``; -1: not there
 
-    def keep(self, pixels: Pixels) -> None:
-        """Keep the answers of pixels of which all samples were fitted."""
-        self.whole = Answers._make(each[pixels] for each in self.answers)
-        self.place[pixels] = np.arange(pixels.size)
-
-    def fit_again(self, pixels: Pixels) -> None:
+    def fit_again(self, pixels: IndexArray) -> None:
         """Fit what the mask leaves of pixels, all of whose samples are not fitted twice."""
         known = (self.place[pixels] >= 0) & (self.gone[pixels] == 0)
         spent = self.answers.words[pixels[known], EVALUATIONS]
@@ -176,12 +183,12 @@ class _Guard:
             if some.size:
                 self.fit(some, quickly)
 
-    def _cut(self, pixels: Pixels) -> BoolArray:
+    def _cut(self, pixels: IndexArray) -> BoolArray:
         """Return which pixels have just had their ends, or what a gap cuts off, left out."""
         cut = (self.attempt[pixels] == _ENDS) | (self.attempt[pixels] == _CORE)
         return np.asarray(cut & (self.passes[pixels] == 0))
 
-    def suspicious(self, pixels: Pixels) -> BoolArray:
+    def suspicious(self, pixels: IndexArray) -> BoolArray:
         """Return which fits may have been led by outliers: by single samples or as a whole."""
         out = self.answers.out[pixels]
         fitted = np.isfinite(self.answers.parameters[pixels]).all(axis=1) & np.isfinite(out[:, OUTLYING])
@@ -189,7 +196,7 @@ class _Guard:
         misfit = (_scores(self.answers)[pixels] > BEYOND_DOUBT) & (not self.limits.cells)
         return np.asarray(fitted & ((out[:, OUTLYING] > 0) | misfit))
 
-    def begin(self, pixels: Pixels, far: BoolArray) -> Pixels:
+    def begin(self, pixels: IndexArray, far: BoolArray) -> IndexArray:
         """Leave out what the next attempt says, or the first that leaves out few enough; return pixels."""
         begun = [pixels[:0]]
         while pixels.size:
@@ -210,7 +217,7 @@ class _Guard:
             pixels = pixels[~few]
         return np.concatenate(begun)
 
-    def _outside(self, pixels: Pixels, attempt: int) -> BoolArray:
+    def _outside(self, pixels: IndexArray, attempt: int) -> BoolArray:
         """Return which bins an attempt leaves out: both ends, what a gap cuts off, or none."""
         counts = self.given.counts[pixels]
         outside = np.zeros(counts.shape, np.bool_)
@@ -227,13 +234,13 @@ class _Guard:
                 outside[:, part] = (upto <= cut) | (total - before <= cut)
         return outside
 
-    def _leave_out_unexpected(self, pixels: Pixels) -> BoolArray:
+    def _leave_out_unexpected(self, pixels: IndexArray) -> BoolArray:
         """Leave out the samples that the last fit does not expect; tell where these are others."""
         outside = self.expect(pixels, self.gone[pixels]) < self.limits.floor
         self.gone[pixels], changed = leave_out(self.given, pixels, outside)
         return changed
 
-    def check(self, pixels: Pixels, far: BoolArray) -> tuple[Pixels, Pixels]:
+    def check(self, pixels: IndexArray, far: BoolArray) -> tuple[IndexArray, IndexArray]:
         """Settle the fits that stand; return those that another pass may settle, and those that none will."""
         answers, last = self.answers, self.attempt[pixels] == _N_ATTEMPTS
         lost = pixels[last & far[pixels] & self.suspicious(pixels)]
@@ -252,7 +259,7 @@ class _Guard:
         more = (self.passes[pixels] < _MOST_PASSES) & self._few(pixels)
         return pixels[more], np.concatenate([stuck, pixels[~more]])
 
-    def _few(self, pixels: Pixels) -> BoolArray:
+    def _few(self, pixels: IndexArray) -> BoolArray:
         total = self.given.counts[pixels].sum(axis=1, dtype=np.float64)
         return np.asarray(self.gone[pixels] <= self.limits.most_outliers * total)
 

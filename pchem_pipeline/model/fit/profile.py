@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit import engine, profile_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
@@ -27,8 +25,7 @@ _FARTHEST = 60.0  # roots from the maximum
 _LEAST_VARIANCE = 1e-12  # DN^2
 
 
-@dataclass(frozen=True)
-class Moments:
+class Moments(NamedTuple):
     """What a likelihood says of how far estimates may be from the truth.
 
     Attributes:
@@ -41,15 +38,6 @@ class Moments:
     covariance: FloatArray
     rival_weight: FloatArray
     rivals: FloatArray
-
-    @classmethod
-    def joined(cls, n: int, parts: Iterable[tuple[NDArray[np.intp], Moments]]) -> Moments:
-        """Return the moments of n pixels, put together from those of some of them each."""
-        found = cls(np.full((n, 4, 4), np.nan), np.zeros((n, 2)), np.full((n, 2, 4), np.nan))
-        for pixels, part in parts:
-            for each in fields(cls):
-                getattr(found, each.name)[pixels] = getattr(part, each.name)
-        return found
 
 
 class Profile:
@@ -64,14 +52,10 @@ class Profile:
     def __init__(
         self, given: Histograms, law: Law, limits: Limits, parameters: FloatArray, satellites: FloatArray
     ) -> None:
-        """Climb to the maximum near the fit of each pixel.
+        """Climb to the maximum near the fit of each pixel, codes left out by the tail guard not counted.
 
-        Args:
-            given: histograms; codes left out by the tail guard do not count.
-            law: of the samples.
-            limits: of the search.
-            parameters: (H_1 ... H_J, g, mu, sigma) of the fit, shape (n, J + 3); NaN where there is none.
-            satellites: amplitude (e-) and weight of the pixels' free satellites, shape (n, 2).
+        The fit is (H_1 ... H_J, g, mu, sigma), shape (n, J + 3), NaN where there is none, with amplitude (e-)
+        and weight of the pixels' free satellites, shape (n, 2).
         """
         self._given, self._law, self._limits = given, law, limits
         self._n, self._amplitudes = given.dark.size, np.ascontiguousarray(satellites[:, 0])
@@ -91,9 +75,9 @@ class Profile:
 
     def _climb(
         self,
-        pixels: NDArray[np.intp],
+        pixels: IndexArray,
         theta: FloatArray,
-        place: NDArray[np.intp] | int | None = None,
+        place: IndexArray | int | None = None,
         tied: BoolArray | bool = False,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Climb from theta, one parameter fixed; see :func:`.profile_numba.climb_tile`."""
@@ -109,7 +93,7 @@ class Profile:
         )
         return found, loglik, covariance
 
-    def _direction(self, pixels: NDArray[np.intp], target: NDArray[np.intp]) -> FloatArray:
+    def _direction(self, pixels: IndexArray, target: IndexArray) -> FloatArray:
         """Return the change of all coordinates per standard error of a parameter; the last is ``sigma g``."""
         n, m = self._n, np.arange(pixels.size)
         tied, place = target == n + 3, np.minimum(target, n + LOG_VARIANCE)
@@ -184,7 +168,7 @@ class Profile:
         ends[pixels, target, side] = np.where(reached, values[np.arange(pixels.size), target], np.nan)
         return ends
 
-    def along_bias(self, reach: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _along_bias(self, reach: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Find the best other parameters at biases on both sides, ``reach`` e- in any case, shape (n,).
 
         Returns:
@@ -216,6 +200,31 @@ class Profile:
                     break
         return found, across, heights
 
+    def moments(self, parameters: FloatArray, reach: FloatArray) -> Moments:
+        """Return the moments of the likelihood over the parameters, along the profile of the bias.
+
+        About parameters at the maximum, shape (n, J + 3), NaN where there is none. Another maximum may lie
+        within ``reach`` on either side, e-, shape (n,).
+        """
+        size = parameters.shape[1]
+        found, across, heights = self._along_bias(reach)
+        walked = heights > -np.inf
+        # Laplace's volume across the bias would multiply this; Jeffreys' prior across divides by it
+        weight = np.exp(np.minimum(heights, _DEEPEST))
+        off = np.where(walked[:, :, None], found - parameters[:, None], 0.0)
+        electrons = off[:, :, size - 2] * parameters[:, None, size - 3]
+        here, beside = abs(electrons) < 0.5, (electrons <= -0.5, electrons >= 0.5)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            own = np.where(here, weight, 0.0)
+            own /= own.sum(axis=1, keepdims=True)
+            rest = np.stack([np.where(side, weight, 0.0) for side in beside], axis=1)
+            share = rest.sum(axis=2) / weight.sum(axis=1, keepdims=True)
+            rest /= rest.sum(axis=2, keepdims=True)
+        covariance = np.einsum("nt,nti,ntj->nij", own, off, off) + np.einsum("nt,ntij->nij", own, across)
+        covariance[~walked[:, _MOST]] = np.nan
+        rivals = parameters[:, None] + np.einsum("nst,nti->nsi", np.nan_to_num(rest), off)
+        return Moments(covariance, np.nan_to_num(share), rivals)
+
     def _natural(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return (H_1 ... H_J, g, mu, sigma), and their slopes in (H_1 ... H_J, 1/g, mu, v), (m, J + 3)."""
         n = self._n
@@ -225,31 +234,3 @@ class Profile:
         slope[:, n + STEP], slope[:, n + LOG_VARIANCE] = -(gain**2), 0.5 * variance / sigma
         exposure = np.where(self._given.dark, 0.0, np.exp(theta[:, :n]))
         return np.column_stack([exposure, gain, theta[:, n + BIAS], sigma]), slope
-
-
-def moments_along_bias(fits: Profile, parameters: FloatArray, reach: FloatArray) -> Moments:
-    """Return the moments of the likelihood over the parameters, along the profile of the bias.
-
-    Args:
-        fits: the likelihood about these.
-        parameters: at the maximum, shape (n, J + 3); NaN where there is none.
-        reach: distance on either side within which another maximum may lie, e-, shape (n,).
-    """
-    size = parameters.shape[1]
-    found, across, heights = fits.along_bias(reach)
-    walked = heights > -np.inf
-    # Laplace's volume across the bias would multiply this; Jeffreys' prior of what is across divides by it
-    weight = np.exp(np.minimum(heights, _DEEPEST))
-    off = np.where(walked[:, :, None], found - parameters[:, None], 0.0)
-    electrons = off[:, :, size - 2] * parameters[:, None, size - 3]
-    here, beside = abs(electrons) < 0.5, (electrons <= -0.5, electrons >= 0.5)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        own = np.where(here, weight, 0.0)
-        own /= own.sum(axis=1, keepdims=True)
-        rest = np.stack([np.where(side, weight, 0.0) for side in beside], axis=1)
-        share = rest.sum(axis=2) / weight.sum(axis=1, keepdims=True)
-        rest /= rest.sum(axis=2, keepdims=True)
-    covariance = np.einsum("nt,nti,ntj->nij", own, off, off) + np.einsum("nt,ntij->nij", own, across)
-    covariance[~walked[:, _MOST]] = np.nan
-    rivals = parameters[:, None] + np.einsum("nst,nti->nsi", np.nan_to_num(rest), off)
-    return Moments(covariance, np.nan_to_num(share), rivals)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IndexArray
 from pchem_pipeline.model.fit.status import describe
 from pchem_pipeline.model.law.parameters import PixelParameters
 
@@ -107,12 +107,12 @@ class FitResult(PixelParameters):
         more = self.bias.size - len(rows)
         return html_table(head, rows) + (f"<p>and {more:,} more</p>" if more else "")
 
-    def of(self, pixels: NDArray[np.intp]) -> FitResult:
+    def of(self, pixels: IndexArray) -> FitResult:
         """Return the fit of some pixels."""
         arrays: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
         return replace(self, **{name: a[pixels] for name, a in arrays.items() if a is not None})
 
-    def with_pixels(self, pixels: NDArray[np.intp], part: FitResult) -> FitResult:
+    def with_pixels(self, pixels: IndexArray, part: FitResult) -> FitResult:
         """Return a copy with the fit of some pixels in their places."""
         arrays: dict[str, Any] = {}
         for each in fields(self):

@@ -19,9 +19,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray, IntegerArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law.mass import LEAST_SEEN, sample_mass, sample_slopes, score_and_information
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -132,7 +131,7 @@ class SharedProblem:
         samples: which rows are of one pixel.
     """
 
-    counts: NDArray[np.integer]
+    counts: IntegerArray
     origin: IntArray
     kept: BoolArray
     law: Law
@@ -393,18 +392,15 @@ class Ascent:
         information that is left of these: shapes (n, P, P), (n, P, d') and (d', d').
         """
         p, information = self.theta.shape[1], self.expansion.information
-        inverse = np.asarray(np.linalg.inv(_damped(information[:, :p, :p], damping)), np.float64)
+        own = information[:, :p, :p]
+        diagonal = np.einsum("naa->na", own)
+        more = damping[:, None] * diagonal + 1e-12 * (1.0 + diagonal)
+        inverse = np.asarray(np.linalg.inv(own + more[:, :, None] * np.eye(p)), np.float64)
         border = information[:, :p, p:][:, :, self._free]
         through = np.einsum("nab,nbd->nad", inverse, border)
         common = information[:, p:, p:].sum(axis=0)[np.ix_(self._free, self._free)]
         common = common * (1.0 + damping.max(initial=0.0) * np.eye(len(common)))
         return inverse, through, common - np.einsum("nad,nae->de", border, through)
-
-
-def _damped(information: FloatArray, damping: FloatArray) -> FloatArray:
-    diagonal = np.einsum("naa->na", information)
-    more = damping[:, None] * diagonal + 1e-12 * (1.0 + diagonal)
-    return np.asarray(information + more[:, :, None] * np.eye(information.shape[1]))
 
 
 def _limits(theta: FloatArray, n_exposures: int) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import IntArray
+from pchem_pipeline.base.arrays import CodeArray, IntArray
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.model.histogram.count_numba import (
     count_frames,
@@ -40,8 +40,6 @@ _FRAMES_PER_TRIM = 64
 #: DN above are no camera's, and squares of them would overflow the exact sums.
 _LARGEST_DN = (1 << 24) - 1
 
-_Frames = NDArray[np.unsignedinteger[Any]]
-
 
 def counts_dtype(n_frames: int) -> np.dtype[Any]:
     """Return the type of counts that cannot overflow: uint16, or uint32 above 65,535 frames."""
@@ -61,7 +59,7 @@ class RowHistograms:
         maximum: largest DN seen, (y, x).
     """
 
-    counts: NDArray[np.unsignedinteger[Any]]
+    counts: CodeArray
     origin: NDArray[np.int32]
     under: NDArray[np.uint32]
     over: NDArray[np.uint32]
@@ -94,7 +92,7 @@ class HistogramAccumulator:
         self._first = False
         return self
 
-    def add(self, frames: _Frames) -> None:
+    def add(self, frames: CodeArray) -> None:
         """Count a block of frames, (frame, y, x).
 
         The first block of a stack places the windows of pixels that do not fit: let it always have the same
@@ -130,7 +128,7 @@ def most_bins(max_bins: int, dtype: np.dtype[Any]) -> int:
     return min(max_bins, 1 << (8 * dtype.itemsize))
 
 
-def pixels_by_range(frames: _Frames, max_bins: int) -> IntArray:
+def pixels_by_range(frames: CodeArray, max_bins: int) -> IntArray:
     """Return the number of pixels by their range of DN in the first frames, (max_bins + 2,).
 
     Of each pixel the most extreme samples are left out, the more the more frames there are. The last number
@@ -163,7 +161,9 @@ def _needed(width: int) -> int:
     return max(MINIMUM_BINS, -(-(2 * width + 16) // 16) * 16)
 
 
-def histogram_frames(frames: _Frames, *, bins: int | None = None, window_frames: int = 256) -> RowHistograms:
+def histogram_frames(
+    frames: CodeArray, *, bins: int | None = None, window_frames: int = 256
+) -> RowHistograms:
     """Return the histograms of a stack of frames in memory, (frame, y, x) of an unsigned type.
 
     The first ``window_frames`` decide the windows, and the number of bins where it is not given.

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import ndimage, special, stats
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from pchem_pipeline.base.wording import short
 from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.histogram.spectrum import MOST_SAMPLES
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 
 KINDS = ("empty", "copied", "far", "moved_x", "moved_y")
@@ -21,6 +22,10 @@ _AROUND, FEWEST_FRAMES, _FEWEST_PIXELS = 101, 32, 64
 _PARTS, _PART_ROWS = 4, 16
 #: Chance of a frame to be as far, by a normal law, in its level or spread, of all rows or of one part.
 FAR_CHANCE = (2 + 2 * _PARTS) * 2.0 * float(special.ndtr(-FAR))
+#: Standard deviations beyond which a difference or a deviation of a single pixel does not count any more.
+_CLIP = 3.0
+#: Rows and columns by which a frame may have moved, and the kinds of two of them each.
+_STEPS, _KINDS = ((0, 1), (0, -1), (1, 0), (-1, 0)), ("moved_x", "moved_y")
 
 
 def odd_frames(
@@ -92,16 +97,13 @@ def frame_scores(row_sum: IntArray, row_sum_square: IntArray, columns: int) -> F
     sums, squares = row_sum[some], row_sum_square[some]
     away = sums - np.median(sums, axis=0)
     away -= np.median(away, axis=1)[:, None]
-    level, spread = (_normal_scores(each) for each in (away, squares - sums * (sums / columns)))
+    # normal quantiles of ranks, equal values at their mean rank
+    ranks = (stats.rankdata(each, axis=0) for each in (away, squares - sums * (sums / columns)))
+    level, spread = (np.asarray(special.ndtri(each / (len(each) + 1))) for each in ranks)
     n_parts, found = min(_PARTS, sums.shape[1] // _PART_ROWS), [spread]
     if n_parts > 1:
         found += [part for each in (level, spread) for part in np.array_split(each, n_parts, axis=1)]
     return np.stack([each.sum(axis=1) / np.sqrt(each.shape[1]) for each in found])
-
-
-def _normal_scores(values: FloatArray) -> FloatArray:
-    """Return the normal quantiles of ranks along the first axis, equal values at their mean rank."""
-    return np.asarray(special.ndtri(stats.rankdata(values, axis=0) / (len(values) + 1)))
 
 
 def chance_of_copies(row_variance: FloatArray, n_frames: int) -> float:
@@ -161,3 +163,63 @@ def odd_words(odd: dict[str, IntArray], mean: FloatArray, variance: FloatArray) 
             listed = f": {', '.join(runs[:4])}, ..." if len(runs) > 4 else ""
             words.append(f"{frame_words(frames)} {verbs[frames.size > 1]} {size}{says}{listed}")
     return "; ".join(words)
+
+
+class MovedFrames:
+    """Finds frames whose pixels look moved by one column or row, by the fixed pattern of the sensor.
+
+    The pattern is the mean of the first frames. Let ``d`` be the difference of a pixel's neighbour from the
+    pixel, and ``u`` the deviation of a sample from the mean of its pixel, both over its standard deviation
+    along time. In a frame that has not moved ``sum(u d)`` is N(0, sum d^2), in one that has moved by that
+    much its mean is ``sum d^2``.
+
+    Attributes:
+        found: numbers of the frames that look moved, by kind.
+    """
+
+    def __init__(self, found: Mapping[str, Sequence[int]] | None = None, n_frames: int = 0) -> None:
+        """Begin with no frames, or behind so many of which some were found."""
+        self._n, self._known = n_frames, False
+        self.found = {kind: list((found or {}).get(kind, ())) for kind in _KINDS}
+
+    def learn(self, mean: FloatArray, sd: FloatArray, n_frames: int) -> None:
+        """Take mean and standard deviation of each pixel over some frames, (y, x), DN, as the pattern."""
+        if n_frames < FEWEST_FRAMES:
+            return
+        (ny, nx), weight = mean.shape, np.divide(1.0, sd, where=sd > 0, out=np.zeros(sd.shape))
+        shown = np.pad(mean, 1, constant_values=np.nan)
+        neighbours = np.stack([shown[1 - dy :, 1 - dx :][:ny, :nx] for dy, dx in _STEPS], axis=-1)
+        scaled = ((neighbours - mean[..., None]) * weight[..., None]).reshape(-1, len(_STEPS))
+        clipped = np.nan_to_num(np.clip(scaled, -_CLIP, _CLIP))
+        # what an offset of the frame, other light (as the variances are) or another gain do is no movement
+        modes = np.stack([weight, sd, mean * weight], axis=-1).reshape(-1, 3)
+        differences = clipped - modes @ np.linalg.lstsq(modes, clipped, rcond=None)[0]
+        self._squares = (differences**2).sum(axis=0)
+        self._bias = np.count_nonzero(clipped, axis=0) / n_frames  # the error of the mean is in u and in d
+        self._mean, self._weight, self._differences = (
+            each.astype(np.float32) for each in (mean.ravel(), weight.ravel(), differences)
+        )
+        self._known = True
+
+    def add(self, frames: CodeArray) -> None:
+        """Compare the next frames, (frame, y, x), of the same rows each."""
+        step = max(FEWEST_FRAMES, MOST_SAMPLES // max(frames[0].size, 1))
+        for part in (frames[t : t + step] for t in range(0, len(frames), step)):
+            if not self._known:
+                self.learn(part.mean(axis=0), part.std(axis=0), len(part))
+            if self._known:
+                self._compare(part.reshape(len(part), -1))
+            self._n += len(part)
+
+    def _compare(self, frames: CodeArray) -> None:
+        """Add the frames, (frame, pixel), that fit better if they have moved."""
+        u = frames.astype(np.float32)
+        u -= self._mean
+        u *= self._weight
+        np.clip(u, -_CLIP, _CLIP, out=u)
+        products = u @ self._differences - self._bias
+        noise = np.maximum(np.einsum("tp,tp->t", u, u) / max(np.count_nonzero(self._weight), 1), 1.0)
+        better = products - 0.5 * self._squares
+        better[products <= FAR * np.sqrt(noise[:, None] * self._squares)] = 0.0
+        for t in np.flatnonzero((better > 0).any(axis=1)).tolist():
+            self.found[_KINDS[int(better[t].argmax()) // 2]].append(self._n + t)

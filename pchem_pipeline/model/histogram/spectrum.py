@@ -9,11 +9,11 @@ is 1 at every frequency, with a standard deviation of 1/sqrt(T) (Fisher 1929).
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, ndimage, special
+
+from pchem_pipeline.base.arrays import CodeArray
 
 #: Samples that are looked at, of the first frames.
 MOST_SAMPLES = 1 << 22
@@ -38,7 +38,7 @@ class FrameSpectrum:
         self._n, self._pixels, self._sd = 0, 0, 0.0
         self._lines = [np.zeros((2, length // 2)) for length in shape]
 
-    def add(self, frames: NDArray[np.unsignedinteger[Any]]) -> None:
+    def add(self, frames: CodeArray) -> None:
         """Add frames, (frame, y, x), until enough have come."""
         frames = frames[: self.most - self._n]
         if len(frames) < 2:

@@ -9,86 +9,29 @@ every frame is read once.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
-from pchem_pipeline.model.histogram.count_numba import update_range
-from pchem_pipeline.model.histogram.summaries_numba import add_products, sum_lines
+from pchem_pipeline.base.arrays import Arrays, BoolArray, CodeArray, FloatArray, IntArray
+from pchem_pipeline.model.histogram.count_numba import add_products, sum_lines, update_range
 
 #: Rows in a group: column sums are taken over it, and neighbour products stay inside.
 ROW_GROUP = 64
 
-_Frames = NDArray[np.unsignedinteger[Any]]
 
+def line_sums(frames: CodeArray) -> dict[str, NDArray[Any]]:
+    """Return the sums along rows and columns of frames (frame, y, x), whole groups of rows from the top.
 
-@dataclass(frozen=True)
-class LineSums:
-    """Sums along the lines of each frame.
-
-    Attributes:
-        row_sum: DN, (frame, y).
-        row_sum_square: DN^2, (frame, y).
-        column_sum: DN, sums over `ROW_GROUP` rows, (frame, row_group, x).
+    By name ``row_sum``, DN, and ``row_sum_square``, DN^2, (frame, y), and ``column_sum``, DN, over
+    `ROW_GROUP` rows, (frame, row_group, x).
     """
-
-    row_sum: IntArray
-    row_sum_square: IntArray
-    column_sum: NDArray[np.int32]
-
-
-@dataclass(frozen=True)
-class BlockSums:
-    """Sums of each pixel over a block of frames.
-
-    Attributes:
-        block_sum: DN, (y, x).
-        block_sum_square: DN^2, (y, x).
-    """
-
-    block_sum: IntArray
-    block_sum_square: IntArray
-
-
-@dataclass(frozen=True)
-class CovarianceMaps:
-    """Covariances within blocks, averaged over the blocks, DN^2; NaN where there is no pair.
-
-    Attributes:
-        lag1_covariance: with the next frame, (y, x); unbiased (zero) for independent frames.
-        neighbour_covariance_x: with the pixel at x + 1, (y, x); NaN in the last column.
-        neighbour_covariance_y: with the pixel at y + 1, (y, x); NaN in the last row of each group.
-    """
-
-    lag1_covariance: FloatArray
-    neighbour_covariance_x: FloatArray
-    neighbour_covariance_y: FloatArray
-
-
-@dataclass(frozen=True)
-class OpenSums:
-    """The sums of a time block that is not whole yet, and of the covariances so far.
-
-    Attributes:
-        sums: of d = DN - reference: d, d^2, d times that of the frame before, of x + 1, of y + 1; then the
-            reference and the DN of the last frame; (7, y, x).
-        covariances: sums over the closed blocks: lag 1, x + 1, y + 1; DN^2, (3, y, x).
-    """
-
-    sums: IntArray
-    covariances: FloatArray
-
-
-def line_sums(frames: _Frames) -> LineSums:
-    """Return the sums along rows and columns of frames (frame, y, x), whole groups of rows from the top."""
     n_frames, ny, nx = frames.shape
     row_sum, row_sum_square = np.empty((2, n_frames, ny), np.int64)
     column_sum = np.zeros((n_frames, -(-ny // ROW_GROUP), nx), np.int32)
     sum_lines(frames, ROW_GROUP, row_sum, row_sum_square, column_sum)
-    return LineSums(row_sum, row_sum_square, column_sum)
+    return {"row_sum": row_sum, "row_sum_square": row_sum_square, "column_sum": column_sum}
 
 
 def block_starts(n_frames: int, block_frames: int) -> IntArray:
@@ -112,7 +55,13 @@ def frame_statistics(
 
 
 class SummaryAccumulator:
-    """Block sums and covariances of the pixels of some rows, while the frames come in."""
+    """Block sums and covariances of the pixels of some rows, while the frames come in.
+
+    Sums of a block are ``block_sum``, DN, and ``block_sum_square``, DN^2, (y, x). Covariances within blocks,
+    averaged over these, DN^2, (y, x), NaN where there is no pair: ``lag1_covariance`` with the next frame,
+    unbiased (zero) for independent frames; ``neighbour_covariance_x`` with the pixel at x + 1, and
+    ``neighbour_covariance_y`` with that at y + 1 of the same group.
+    """
 
     def __init__(self, shape: tuple[int, int], block_frames: int) -> None:
         """Begin with no frames of some rows (from the top of a group) and columns."""
@@ -125,23 +74,29 @@ class SummaryAccumulator:
         self._freedom = 0
 
     @classmethod
-    def resumed(cls, state: OpenSums, n_frames: int, block_frames: int) -> SummaryAccumulator:
+    def resumed(cls, state: Arrays, n_frames: int, block_frames: int) -> SummaryAccumulator:
         """Go on after ``n_frames`` frames with what `open_sums` returned then."""
-        self = cls(state.sums.shape[1:], block_frames)
+        sums, covariances = state["open_sums"], state["open_covariances"]
+        self = cls(sums.shape[1:], block_frames)
         closed, self._in_block = divmod(n_frames, block_frames)
         self._freedom = closed * (block_frames - 1)
-        self._sums[...], self._covariances[...] = state.sums[:5], state.covariances
-        self._reference[...], self._before[...] = state.sums[5:]
+        self._sums[...], self._covariances[...] = sums[:5], covariances
+        self._reference[...], self._before[...] = sums[5:]
         return self
 
-    def open_sums(self) -> OpenSums:
-        """Return all that is needed to go on later; to be taken before `finish`."""
+    def open_sums(self) -> dict[str, NDArray[Any]]:
+        """Return what is needed to go on later with a block that is not whole; to be taken before `finish`.
+
+        ``open_sums`` are of d = DN - reference: d, d^2, d times that of the frame before, of x + 1, of y + 1;
+        then the reference and the DN of the last frame; (7, y, x). ``open_covariances`` are sums over the
+        closed blocks: lag 1, x + 1, y + 1; DN^2, (3, y, x).
+        """
         ends = np.stack([self._reference, self._before]).astype(np.int64)
         covariances = self._covariances.copy()
         covariances[2, ROW_GROUP - 1 :: ROW_GROUP] = covariances[2, -1] = 0.0  # no pair across the border
-        return OpenSums(np.concatenate([self._sums, ends]), covariances)
+        return {"open_sums": np.concatenate([self._sums, ends]), "open_covariances": covariances}
 
-    def add(self, frames: _Frames) -> list[BlockSums]:
+    def add(self, frames: CodeArray) -> list[dict[str, IntArray]]:
         """Take frames (frame, y, x), any number of them, and return the blocks that they complete."""
         done = []
         while len(frames):
@@ -151,24 +106,23 @@ class SummaryAccumulator:
                 done.append(self._close_block())
         return done
 
-    def finish(self) -> tuple[list[BlockSums], CovarianceMaps]:
+    def finish(self) -> tuple[list[dict[str, IntArray]], dict[str, FloatArray]]:
         """Return the last block, if it was incomplete, and the covariances over all blocks."""
         done = [self._close_block()] if self._in_block else []
         lag, right, down = self._covariances / self._freedom if self._freedom else self._covariances * np.nan
         right[:, -1] = np.nan
         down[ROW_GROUP - 1 :: ROW_GROUP] = down[-1] = np.nan
-        return done, CovarianceMaps(lag, right, down)
+        return done, {"lag1_covariance": lag, "neighbour_covariance_x": right, "neighbour_covariance_y": down}
 
-    def exchange(self, pieces: Iterable[_Frames], kept: BoolArray) -> BlockSums:
+    def exchange(self, pieces: Iterable[CodeArray], kept: BoolArray) -> dict[str, IntArray]:
         """Leave frames of a closed block out of the covariances; return the block's sums without them.
 
-        Args:
-            pieces: all frames of the block, (frame, y, x), one after the other.
-            kept: which of them stay, (frame,).
+        The pieces are all frames of the block, (frame, y, x), of which some are kept, (frame,).
         """
         shape, n = self._reference.shape, int(kept.sum())
         before, after = SummaryAccumulator(shape, kept.size), SummaryAccumulator(shape, max(n, 1))
-        done, at = [BlockSums(*np.zeros((2, *shape), np.int64))], 0
+        nothing, at = np.zeros(shape, np.int64), 0
+        done = [{"block_sum": nothing, "block_sum_square": nothing}]
         for piece in pieces:
             before.add(piece)
             done += after.add(piece[kept[at : at + len(piece)]])
@@ -177,7 +131,7 @@ class SummaryAccumulator:
         self._freedom += after._freedom - before._freedom
         return done[-1]
 
-    def _add_part(self, frames: _Frames) -> None:
+    def _add_part(self, frames: CodeArray) -> None:
         """Add frames that all belong to the open block."""
         if self._in_block == 0:
             self._reference[:] = self._before[:] = frames[0]
@@ -189,7 +143,7 @@ class SummaryAccumulator:
         self._before[:] = frames[-1]
         self._in_block += frames.shape[0]
 
-    def _is_narrow(self, frames: _Frames) -> BoolArray:
+    def _is_narrow(self, frames: CodeArray) -> BoolArray:
         """Return for each row whether sums of products over the frames fit into 32 bits, (y,)."""
         low, high = self._before.astype(frames.dtype), self._before.astype(frames.dtype)
         update_range(frames, low, high)
@@ -197,7 +151,7 @@ class SummaryAccumulator:
         largest = np.maximum(reach, np.append(reach[1:], 0))
         return np.asarray(frames.shape[0] * reach * largest < np.iinfo(np.int32).max)
 
-    def _close_block(self) -> BlockSums:
+    def _close_block(self) -> dict[str, IntArray]:
         """Turn the sums of the open block into block sums and covariances, and begin the next."""
         n = self._in_block
         plain, square, lag, right, down = self._sums.astype(np.float64)
@@ -214,4 +168,4 @@ class SummaryAccumulator:
         squares = self._sums[1] + 2 * reference * self._sums[0] + n * reference**2
         self._sums[:] = 0
         self._in_block = 0
-        return BlockSums(total, squares)
+        return {"block_sum": total, "block_sum_square": squares}

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.arrays import FloatArray, IntegerArray
 from pchem_pipeline.model.law import electron_laws_numba
 from pchem_pipeline.model.law.cells_numba import Law
-from pchem_pipeline.model.law.parameters import Parameters
 from pchem_pipeline.model.law.sample_law import CountLaw, SampleLaw
 
 _LAWS: dict[CountLaw, int] = {
@@ -24,19 +22,6 @@ _LAWS: dict[CountLaw, int] = {
 _NO_LIMIT = 2**40  # DN
 
 
-@runtime_checkable
-class HasSatellites(Protocol):
-    """Free satellites of the pixels."""
-
-    @property
-    def satellite_amplitude_e(self) -> FloatArray:
-        """Amplitude, e-; NaN without any."""
-
-    @property
-    def satellite_weight(self) -> FloatArray:
-        """Weight; 0 without any."""
-
-
 def pack(models: Sequence[SampleLaw], n: int) -> Law:
     """Return the law of each sample of n pixels as the loops take them.
 
@@ -44,30 +29,15 @@ def pack(models: Sequence[SampleLaw], n: int) -> Law:
         ValueError: if an array has neither 1 nor n rows, or the weights of a mixture do not sum to 1.
     """
     parts = [_pack_one(model, n) for model in models]
-    return Law(
-        np.stack([part.numbers for part in parts]),
-        _stacked([part.own for part in parts]),
-        _stacked([part.peaks for part in parts]),
-        np.array([part.peaks.shape[2] for part in parts], np.int64),
-        _stacked([part.exposures for part in parts]),
-        _stacked([part.added for part in parts]),
-        _stacked([part.edge_shift for part in parts]),
-        np.array(models[0].free_satellite_pattern, np.float64).reshape(-1, 2),
-    )
+    numbers, own, peaks, exposures, added, edges = (_stacked(each) for each in zip(*parts, strict=True))
+    n_peaks = np.array([part[2].shape[2] for part in parts], np.int64)
+    pattern = np.array(models[0].free_satellite_pattern, np.float64).reshape(-1, 2)
+    return Law(numbers, own, peaks, n_peaks, exposures, added, edges, pattern)
 
 
-class _Part(NamedTuple):
-    """The law of one sample: numbers, and arrays of one row, or a row for each pixel."""
+def _pack_one(model: SampleLaw, n: int) -> tuple[FloatArray, ...]:
+    """Return numbers, own levels, peaks, exposures, added exposures and edges, of one row or n, see `Law`."""
 
-    numbers: FloatArray
-    own: FloatArray
-    peaks: FloatArray
-    exposures: FloatArray
-    added: FloatArray
-    edge_shift: FloatArray
-
-
-def _pack_one(model: SampleLaw, n: int) -> _Part:
     def per_pixel(*names: str) -> FloatArray:
         values = [np.asarray(getattr(model, name), np.float64) for name in names]
         for name, rows in zip(names, values, strict=True):
@@ -99,7 +69,7 @@ def _pack_one(model: SampleLaw, n: int) -> _Part:
     rows = [np.atleast_1d(np.asarray(each, np.float64)) for each in numbers]
     own = per_pixel("level_scale", "level_shift_e", "extra_variance_e2", "extra_variance_dn2")
     edges = np.atleast_2d(np.asarray(model.edge_shift, np.float64))
-    return _Part(np.stack(np.broadcast_arrays(*rows), axis=1), own, peaks, exposures, added, edges)
+    return np.stack(np.broadcast_arrays(*rows), axis=1), own, peaks, exposures, added, edges
 
 
 def _limit(value: float | FloatArray | None, none: float) -> FloatArray | float:
@@ -116,19 +86,15 @@ def _stacked(parts: Sequence[FloatArray]) -> FloatArray:
     return found
 
 
-def satellites_of(
-    parameters: Parameters, satellites: tuple[ArrayLike, ArrayLike] | None, n: int
-) -> FloatArray:
+def satellites_of(satellites: tuple[ArrayLike, ArrayLike] | None, n: int) -> FloatArray:
     """Return amplitude and weight of the pixels' free satellites, shape (n, 2), 0 without any."""
-    if satellites is None and isinstance(parameters, HasSatellites):
-        satellites = parameters.satellite_amplitude_e, parameters.satellite_weight
     found = np.zeros((n, 2))
     if satellites is not None:
         found[:] = np.stack([np.asarray(values, np.float64).ravel() for values in satellites], axis=1)
     return np.nan_to_num(found)
 
 
-def kernel_counts(counts: NDArray[np.integer]) -> NDArray[np.integer]:
+def kernel_counts(counts: IntegerArray) -> IntegerArray:
     """Return histograms in the one type that the kernels are compiled for.
 
     Machine code for another type would round differently in the last bit. Only counts beyond 32 bits keep a

@@ -1,13 +1,15 @@
-"""The mass of codes under any law of a pixel's samples, its slopes, and the parabola of a likelihood."""
+"""The mass of codes under any law of a pixel's samples, its slopes, likelihoods and drawn histograms."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import FloatArray, IndexArray, IntArray, IntegerArray
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.law import mass_numba
 from pchem_pipeline.model.law.cells_numba import CORE, EXACT, NEAR
 from pchem_pipeline.model.law.inputs import pack, satellites_of
@@ -35,13 +37,13 @@ def code_ranges(
     n = columns.shape[0]
     columns[~usable_pixels(*columns.T)] = np.nan
     reach = np.empty((n, 2), np.int64)
-    mass_numba.find_reach(columns, satellites_of(maps, satellites, n), pack([model], n), reach)
+    mass_numba.find_reach(columns, satellites_of(satellites, n), pack([model], n), reach)
     return reach[:, 0], reach[:, 1]
 
 
 def parts_of_similar_width(
     model: SampleLaw, maps: Parameters, limits: tuple[int, int] | None = None
-) -> Iterator[tuple[NDArray[np.intp], IntArray, int]]:
+) -> Iterator[tuple[IndexArray, IntArray, int]]:
     """Give pixels in parts whose codes take little memory: those with as many codes come together.
 
     Of all codes, or those between limits, DN. Pixels without usable parameters are in no part.
@@ -75,8 +77,7 @@ def sample_mass(
         model: the law.
         maps: (H, g, mu, sigma) of n pixels (flattened where they are maps).
         codes: successive whole DN, shape (n_codes,) for all pixels alike or (n, n_codes).
-        satellites: ``satellite_amplitude_e`` and ``satellite_weight`` of the pixels; by default those of
-            ``maps`` where it has any, else none.
+        satellites: amplitude (e-) and weight of the pixels' free satellites; None: none.
         smallest: masses below it may be 0; 1e-50 takes a fraction of the time of all, 1e-17 less again.
 
     Returns:
@@ -95,14 +96,12 @@ def sample_mass(
         first = np.array(np.broadcast_to(wanted[:, 0], (n,)))
         stage = EXACT if smallest < 1e-50 else NEAR if smallest < 1e-17 else CORE
         none = np.empty((0, 4, out.shape[1]))
-        mass_numba.mass_tile(
-            first, columns, satellites_of(maps, satellites, n), pack([model], n), stage, out, none
-        )
+        mass_numba.mass_tile(first, columns, satellites_of(satellites, n), pack([model], n), stage, out, none)
     return out
 
 
 def sample_slopes(
-    model: SampleLaw, maps: Parameters, first: NDArray[np.integer], n_codes: int
+    model: SampleLaw, maps: Parameters, first: IntegerArray, n_codes: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return the probability of successive codes down to 1e-50, (n, n_codes), and its slopes.
 
@@ -114,25 +113,20 @@ def sample_slopes(
     mass, slopes = np.full((n, n_codes), np.nan), np.full((n, 4, n_codes), np.nan)
     start = np.ascontiguousarray(first, np.int64)
     law = pack([model], n)
-    mass_numba.mass_tile(start, columns, satellites_of(maps, None, n), law, NEAR, mass, slopes)
+    mass_numba.mass_tile(start, columns, satellites_of(None, n), law, NEAR, mass, slopes)
     return mass, slopes
 
 
 def sample_parabolas(
     model: SampleLaw,
     maps: Parameters,
-    counts: NDArray[np.integer],
-    origin: NDArray[np.integer],
+    counts: IntegerArray,
+    origin: IntegerArray,
     replaced: ReplacedSamples | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return log-likelihood, its slopes and Fisher's information of every pixel, NaN without parameters.
 
-    Args:
-        model: the law.
-        maps: (H, g, mu, sigma) of n pixels.
-        counts: histograms, shape (n, B), any unsigned type.
-        origin: DN of bin 0, shape (n,).
-        replaced: what becomes of the samples, at the codes of the histograms; None: nothing.
+    Of histograms, (n, B), with the DN of bin 0, (n,), whose samples may have been replaced.
 
     Returns:
         Nats, shape (n,), samples of less than 1e-50 as of that; slopes in log H, 1/g, mu and log sigma_R^2,
@@ -154,7 +148,7 @@ def sample_parabolas(
 
 
 def score_and_information(
-    log_slopes: FloatArray, mass: FloatArray, counts: NDArray[np.integer]
+    log_slopes: FloatArray, mass: FloatArray, counts: IntegerArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the slopes of the log-likelihood of histograms, and Fisher's information of as many samples.
 
@@ -164,3 +158,39 @@ def score_and_information(
     expected = mass * counts.sum(axis=1, keepdims=True)
     score = np.einsum("nab,nb->na", log_slopes, counts)
     return score, (log_slopes * expected[:, None]) @ log_slopes.transpose(0, 2, 1)
+
+
+class DrawnHistograms(NamedTuple):
+    """Counts (n, B), DN of bin 0 (n,), and the true (H, g, mu, sigma), shape (n, 4)."""
+
+    counts: NDArray[np.uint32]
+    origin: IntArray
+    truth: FloatArray
+
+
+def draw_histograms(
+    rng: np.random.Generator,
+    quanta_exposure: ArrayLike,
+    conversion_gain: ArrayLike,
+    bias: ArrayLike,
+    read_noise_e: ArrayLike,
+    n_frames: int,
+) -> DrawnHistograms:
+    """Draw a histogram of every pixel from the exact mass of eq. (PCD_RV_definition), rounding included.
+
+    The parameters are H >= 0, e-, g, e-/DN, mu, DN, and s_e with quantisation, e-, scalars or of shape (n,).
+
+    Raises:
+        ValueError: the read noise is below that of the rounding.
+    """
+    given = [np.asarray(a, np.float64) for a in (quanta_exposure, conversion_gain, bias, read_noise_e)]
+    exposure, gain, offset, noise = (np.ravel(a) for a in np.broadcast_arrays(*given))
+    if (noise**2 < QUANTISATION_VARIANCE * gain**2).any():
+        raise ValueError("the read noise is below the rounding noise")
+    origin = np.floor(offset - 9 * noise / gain).astype(np.int64) - 1
+    width = np.ceil((exposure + 11 * np.sqrt(exposure) + 12 * (exposure > 0) + 18 * noise) / gain) + 3
+    x = origin[:, None] + np.arange(int(width.max()))
+    truth = [exposure, gain, offset, noise / gain]
+    mass = sample_mass(SampleLaw(), truth, x, smallest=1e-50)
+    counts = rng.multinomial(n_frames, mass / mass.sum(axis=1, keepdims=True))
+    return DrawnHistograms(counts.astype(np.uint32), origin, np.stack(truth, axis=1))

@@ -1,8 +1,15 @@
-"""Loops of :mod:`pchem_pipeline.model.law.mass`."""
+"""What each electron number of a known pixel gives to its codes, and the mass of these.
+
+With g, mu and sigma held, ``P(x) = sum_k P(k; H) W_k(x)`` under any law of the samples
+(:mod:`pchem_pipeline.model.law.sample_law`), and only P(k; H) depends on the exposure. A code may be a whole
+DN or a fraction of one (``1 / parts``) where an offset was taken from the samples: the cell of a sample is
+still 1 DN wide.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,16 +17,35 @@ from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.limits import LEAST_VARIANCE, SMALLEST_MASS
-from pchem_pipeline.model.law.cells_numba import Law, cells_of, fill_masses, resolve
-from pchem_pipeline.model.law.levels_numba import place_codes, reach_of_law
+from pchem_pipeline.model.arithmetic.normal_numba import FARTHEST, REACH, normal_mass, reach_of
+from pchem_pipeline.model.arithmetic.simd_math_numba import simd_tail
+from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH, fused, simd_load, simd_store
+from pchem_pipeline.model.law.cells_numba import (
+    Cells,
+    Component,
+    Law,
+    cell_of,
+    cells_of,
+    component,
+    fill_masses,
+    resolve,
+)
+from pchem_pipeline.model.law.electron_laws_numba import electron_number
 from pchem_pipeline.model.law.pixel_numba import (
+    ADDED_EXPOSURE,
+    CLIP_HIGH,
+    CLIP_LOW,
     DERIVATIVES,
+    EDGE,
+    EXPOSURE_FACTOR,
     FIRST,
     LOGLIK_ALONE,
     MASS,
     N_BINS,
     N_BLOCK,
     OWN,
+    SHARE,
+    SHARE_SLOPE,
     SLOPES,
     Pixel,
     Scratch,
@@ -27,7 +53,166 @@ from pchem_pipeline.model.law.pixel_numba import (
     make_scratch,
 )
 
+_TOP_REACH = 12.0
+_SEEN = 7.5  # standard deviations within which samples are seen
+_LEAST_MASS = 1e-14  # of an electron number that is looked at
 _MOST_EXPOSURE = 1e6  # e-: each electron number costs, and cumulants may ask for 1e13 of them
+
+
+class Codes(NamedTuple):
+    """Codes of a pixel: ``first + i / parts`` DN after a whole code, i < n."""
+
+    first: float
+    parts: int
+    n: int
+
+
+@kernel
+def place_codes(
+    index: int, first: int, n: int, parts: int, law: Law, satellites: FloatArray, pixel: Pixel
+) -> tuple[Pixel, Codes]:
+    """Fill what the law says of a pixel whose codes are ``(first + i) / parts`` DN; return both."""
+    value = first / parts
+    whole = math.floor(value + 0.5)
+    codes = Codes(value - whole, parts, n)
+    n_whole = math.floor(codes.first + (n - 1) / parts + 0.5) + 1
+    pixel.facts[0, N_BINS], pixel.facts[0, FIRST] = float(n_whole), 0.0
+    found = Pixel(pixel.bins, pixel.facts, pixel.peaks, pixel.mixtures, whole, 0.0)
+    resolve(law, index, satellites[index, 0], found)
+    return found, codes
+
+
+@kernel
+def share_scratch(n_codes: int) -> FloatArray:
+    """Return an array for what electron numbers give to so many codes, see `fill_level`."""
+    return np.zeros((2, n_codes + 2 * SIMD_WIDTH))
+
+
+@kernel(borrows=True)
+def number_mass(k: int, exposure: float, cells: Cells) -> float:
+    """Return P(k; H) of a pixel; H may be 0."""
+    mass: float = electron_number(
+        cells.count_law, cells.dispersion, k, max(exposure, SMALLEST_MASS), cells.mixtures
+    )[0]
+    return mass
+
+
+@kernel(borrows=True)
+def _span(k: int, theta: FloatArray, cells: Cells, codes: Codes, reach: float) -> tuple[int, int, float]:
+    """Return the codes that an electron number reaches, ends excluded, and how far up it lies at least."""
+    low, high = codes.n, 0
+    nearest = math.inf
+    for peak in range(cells.n_peaks):
+        if cells.peaks[SHARE, peak] == 0.0 and cells.peaks[SHARE_SLOPE, peak] == 0.0:
+            continue
+        part = component(float(k), peak, theta, cells, REACH)
+        width = min(FARTHEST, max(reach, theta[1] / part.sd)) * part.sd + 0.5 + cells.margin
+        bottom, top = part.mean - width - codes.first, part.mean + width - codes.first
+        nearest = min(nearest, bottom + codes.first)
+        low = min(low, int(min(max(math.ceil(bottom * codes.parts), 0.0), float(codes.n))))
+        high = max(high, int(min(max(math.floor(top * codes.parts) + 1.0, 0.0), float(codes.n))))
+    # beyond the limits of the ADC all is counted at the limit
+    if cells.bottom >= 0:
+        high = max(high, min(codes.n, (cells.bottom + 1) * codes.parts))
+        low = 0 if high > 0 and nearest < codes.first else low
+    if cells.top <= cells.n_bins:
+        low = max(0, min(low, (cells.top - 1) * codes.parts - codes.parts // 2))
+        high = codes.n
+    return low, high, nearest
+
+
+@kernel(borrows=True)
+def reach_of_law(exposure: float, index: int, theta: FloatArray, pixel: Pixel, law: Law) -> tuple[int, int]:
+    """Return the first and last whole code that samples of a pixel show, after its centre."""
+    cells = cells_of(pixel, 0)
+    factor = added = 0.0
+    for i in range(cells.mixtures.shape[1]):
+        factor = max(factor, cells.mixtures[EXPOSURE_FACTOR, i])
+        added = max(added, cells.mixtures[ADDED_EXPOSURE, i])
+    margin = 1.0
+    row = index if law.edge_shift.shape[1] > 1 else 0
+    for i in range(law.edge_shift.shape[2]):
+        margin = max(margin, 1.0 + abs(law.edge_shift[0, row, i]))
+    low, high = math.inf, -math.inf
+    k = 0
+    while True:
+        seen = number_mass(k, exposure, cells) > _LEAST_MASS
+        if not seen and k > exposure * factor + added:
+            break
+        for peak in range(cells.n_peaks if seen else 0):
+            part = component(float(k), peak, theta, cells, REACH)
+            reach = _SEEN * part.sd + margin
+            low, high = min(low, part.mean - reach), max(high, part.mean + reach)
+        k += 1
+    facts = pixel.facts[0]
+    bottom, top = facts[CLIP_LOW] - pixel.centre, facts[CLIP_HIGH] - pixel.centre
+    low, high = min(max(low, bottom), top), max(min(high, top), bottom)
+    return math.floor(low), math.ceil(high)
+
+
+@kernel(borrows=True)
+def _add_whole(cells: Cells, part: Component, weight: float, low: int, high: int, share: FloatArray) -> None:
+    """Add the mass of whole codes to the first row of ``share``; the second gets the tails at their edges."""
+    mean, inverse = part.mean, 1.0 / part.sd
+    for i in range(low, high + 1, SIMD_WIDTH):
+        tail, _, _ = simd_tail((simd_load(cells.bins, EDGE, i) - mean) * inverse)
+        simd_store(share, 1, i - low, tail)
+    for i in range(0, high - low, SIMD_WIDTH):
+        inside = simd_load(share, 1, i + 1) - simd_load(share, 1, i)
+        simd_store(share, 0, i, fused(inside, weight, simd_load(share, 0, i)))
+    middle = cell_of(mean, cells, low, high)
+    if low <= middle < high:  # both tails are those beyond its edges
+        share[0, middle - low] += weight
+
+
+@kernel(borrows=True)
+def number_range(theta: FloatArray, cells: Cells, codes: Codes) -> tuple[int, int]:
+    """Return the first electron number that reaches the codes, and the one after the last."""
+    last = codes.first + (codes.n - 1) / codes.parts
+    to_top = cells.top <= cells.n_bins
+    most = max((last - theta[2]) / theta[1], 0.0)
+    most = most + _TOP_REACH * math.sqrt(most + 1.0) + _TOP_REACH
+    first, end = -1, 0
+    k = 0
+    while True:
+        low, high, nearest = _span(k, theta, cells, codes, REACH)
+        if (nearest > last + 1.0 and not to_top) or k > 4.0 * most + 1e3 or (to_top and k > most):
+            break
+        if low < high:
+            first = k if first < 0 else first
+            end = k + 1
+        k += 1
+    return max(first, 0), end
+
+
+@kernel(borrows=True)
+def fill_level(
+    k: int, likely: float, theta: FloatArray, cells: Cells, codes: Codes, share: FloatArray
+) -> tuple[int, int]:
+    """Fill P(code | k) of the codes that an electron number reaches; return these, the end excluded.
+
+    One of little probability (``likely``) is given fewer codes. They go to the first row of the ``share``,
+    see :func:`share_scratch`; the second one is worked in.
+    """
+    low, high, _ = _span(k, theta, cells, codes, reach_of(math.log(likely)))
+    for i in range(high - low):
+        share[0, i] = 0.0
+    for peak in range(cells.n_peaks if low < high else 0):
+        weight = cells.peaks[SHARE, peak] + theta[4] * cells.peaks[SHARE_SLOPE, peak]
+        if weight == 0.0:
+            continue
+        part = component(float(k), peak, theta, cells, REACH)
+        if codes.parts == 1:
+            _add_whole(cells, part, weight, low, high, share)
+            continue
+        for i in range(low, high):
+            value = codes.first + i / codes.parts
+            whole = math.floor(value + 0.5)
+            aside = value - whole
+            lower, upper = cells.bins[EDGE, whole] + aside, cells.bins[EDGE, whole + 1] + aside
+            inside = normal_mass((lower - part.mean) / part.sd, (upper - part.mean) / part.sd)
+            share[0, i - low] += weight * inside
+    return low, max(low, high)
 
 
 @kernel

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray
 
 
 def usable_pixels(
@@ -89,7 +89,7 @@ class UsablePixels(PixelParameters):
         """Return the number of pixels."""
         return int(self.quanta_exposure.size)
 
-    def of(self, pixels: BoolArray | NDArray[np.intp]) -> UsablePixels:
+    def of(self, pixels: BoolArray | IndexArray) -> UsablePixels:
         """Return some of them."""
         return UsablePixels(*(column[pixels] for column in self.maps))
 

@@ -1,4 +1,4 @@
-"""The photon counting distribution (PCD): density and thresholds.
+"""The photon counting distribution (PCD): density, thresholds, and the one nearest to an extended law.
 
 A pixel reads ``X = round((K + R)/g + mu)`` with ``K`` Poisson of mean ``H`` and ``R`` normal of
 standard deviation ``sigma_R`` (Hendrickson et al. 2023, eq. PCD_RV_definition). The PCD is the density that
@@ -15,6 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pchem_pipeline.base.arrays import FloatArray
+from pchem_pipeline.base.units import QUANTISATION_VARIANCE
+from pchem_pipeline.model.law.parameters import Parameters, columns_of
+from pchem_pipeline.model.law.sample_law import SampleLaw
 
 
 class PosteriorMeans(NamedTuple):
@@ -114,3 +117,29 @@ def thresholds(
     k = np.arange(n_thresholds)
     with np.errstate(divide="ignore"):
         return np.asarray(offset + (k + 0.5) / gain + gain * sigma**2 * np.log((k + 1) / exposure))
+
+
+def nearest_pcd(parameters: Parameters, model: SampleLaw) -> tuple[FloatArray, ...]:
+    """Return (H, g, mu, sigma) of the PCD whose peaks lie and widen as the extended law's do near k = H.
+
+    Unlike the fitted read noise it has the whole width of the peaks, that of the named effects included. Free
+    satellites are levels beside the peaks, not part of their width. Each of the four is of shape (n,).
+    """
+    exposure, gain, bias, sigma = columns_of(parameters).T
+    exposure = exposure + (model.added_weights * model.added_exposure).sum(axis=1)
+    step, analog = 1.0 / gain, np.sqrt(np.maximum(sigma**2 - QUANTISATION_VARIANCE, 0.0))
+    weights = model.satellite_weights
+    shift = (
+        step[:, None] * model.satellite_shift_e
+        + model.satellite_shift_dn
+        + model.satellite_shift_sigma * analog[:, None]
+    )
+    centre = (weights * shift).sum(axis=1)
+    own = (weights * ((model.satellite_width * analog[:, None]) ** 2 + shift**2)).sum(axis=1) - centre**2
+    charge = model.extra_variance_e2 + model.variance_per_electron * exposure
+    charge = charge + model.variance_per_electron2 * exposure**2
+    variance = own + step**2 * charge + model.extra_variance_dn2 + QUANTISATION_VARIANCE
+    level = model.level_scale * exposure * (1.0 + 0.5 * model.curvature * (exposure - 1.0))
+    slope = step * model.level_scale * (1.0 + model.curvature * (exposure - 0.5))
+    middle = bias + step * (level + model.level_shift_e) + centre
+    return exposure, 1.0 / slope, middle - slope * exposure, np.sqrt(variance)

@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, IntegerArray
 
 
 @dataclass(frozen=True)
@@ -28,25 +27,15 @@ class ReplacedSamples:
 
     stays: FloatArray
     comes: FloatArray
-    excess: NDArray[np.integer]
+    excess: IntegerArray
 
     @classmethod
     def by(
-        cls,
-        values: NDArray[np.integer],
-        excess: NDArray[np.integer],
-        share: FloatArray,
-        first: NDArray[np.integer],
-        n_codes: int,
+        cls, values: IntegerArray, excess: IntegerArray, share: FloatArray, first: IntegerArray, n_codes: int
     ) -> ReplacedSamples:
-        """Return it by a sample of what stands in for each pixel.
+        """Return it by a sample of what stands in for each pixel: y, DN, shape (frame, n).
 
-        Args:
-            values: y, DN, shape (frame, n).
-            excess: t of each pixel, DN, shape (n,).
-            share: s of each pixel, no unit, shape (n,).
-            first: first code of each pixel, DN, shape (n,).
-            n_codes: number of codes.
+        With t, DN, and s of each pixel, (n,), for so many codes from the first of each on, DN, (n,).
         """
         n_frames, n = values.shape
         stays, comes = np.empty((n, n_codes)), np.empty((n, n_codes))
@@ -57,7 +46,7 @@ class ReplacedSamples:
         # no sample lies beyond the codes
         return cls(stays, comes, np.minimum(excess, n_codes))
 
-    def of(self, pixels: NDArray[np.intp] | BoolArray | slice) -> ReplacedSamples:
+    def of(self, pixels: IndexArray | BoolArray | slice) -> ReplacedSamples:
         """Return it for some of the pixels."""
         return ReplacedSamples(self.stays[pixels], self.comes[pixels], self.excess[pixels])
 

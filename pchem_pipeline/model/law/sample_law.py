@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray
 
 CountLaw = Literal["poisson", "negative_binomial", "borel", "trapped", "lost"]
 #: A number of all pixels, or one of each, shape (n,).
@@ -114,18 +114,16 @@ class SampleLaw:
         names = [each.name for each in fields(self)]
         return all(np.array_equal(getattr(self, name), getattr(plain, name)) for name in names)
 
-    def of(self, pixels: NDArray[np.intp] | BoolArray | slice) -> SampleLaw:
+    def of(self, pixels: IndexArray | BoolArray | slice) -> SampleLaw:
         """Return the law of some of the pixels (an index, a mask or a slice along n)."""
-        rows = {name: getattr(self, name) for name in (*_PER_PIXEL, *self._differing())}
+        rows = {name: getattr(self, name) for name in (*_PER_PIXEL, *_NUMBERS, *_TABLES, "edge_shift")}
+        for name in rows.keys() - _PER_PIXEL:  # a row of each pixel only in laws that were joined
+            if np.ndim(rows[name]) < (1 if name in _NUMBERS else 2):
+                del rows[name]
         return replace(self, **{name: row[pixels] for name, row in rows.items() if row.shape[0] != 1})
 
-    def _differing(self) -> tuple[str, ...]:
-        """Return the fields that have one number for all pixels in other laws, and here a row of each."""
-        own = tuple(name for name in _NUMBERS if isinstance(getattr(self, name), np.ndarray))
-        return own + tuple(name for name in (*_TABLES, "edge_shift") if getattr(self, name).ndim == 2)
-
     @classmethod
-    def joined(cls, parts: Sequence[tuple[NDArray[np.intp], SampleLaw]], n: int) -> SampleLaw:
+    def joined(cls, parts: Sequence[tuple[IndexArray, SampleLaw]], n: int) -> SampleLaw:
         """Return the law of n pixels from the pixels and the law of each group; a pixel is in one group.
 
         Raises:
@@ -149,13 +147,8 @@ class SampleLaw:
         """Return the law of pixels of which a share of the samples follows another law, the others this one.
 
         Noise and exposures become mixtures, which is exact; so are outliers. Of all other numbers the mean is
-        taken: right to first order in what the laws differ by, which holds for what is weak.
-
-        Args:
-            other: the law of the share; both are of the same n pixels.
-            share: 0 to 1.
-            noise_dn2: analog noise sigma_R^2 of the pixels, DN^2, shape (n,).
-            step_dn: 1/g, DN per electron, shape (n,).
+        taken: right to first order in what the laws differ by, which holds for what is weak. Both are of the
+        same n pixels, with analog noise sigma_R^2, DN^2, (n,), and steps 1/g, DN per electron, (n,).
 
         Raises:
             ValueError: the laws differ in their limits of the scale.
@@ -370,7 +363,7 @@ def _plain(name: str, value: Any) -> Any:
     return np.nan if value is None and name.startswith("clip") else value
 
 
-def _rows(name: str, parts: Sequence[tuple[NDArray[np.intp], NDArray[Any]]], n: int) -> NDArray[Any]:
+def _rows(name: str, parts: Sequence[tuple[IndexArray, NDArray[Any]]], n: int) -> NDArray[Any]:
     """Return a row for each of n pixels from those of groups, as long as the longest."""
     values = [each[None] if name in _TABLES and each.ndim == 1 else each for _, each in parts]
     most = max((each.shape[1] for each in values if each.ndim == 2), default=None)
@@ -385,7 +378,7 @@ def _rows(name: str, parts: Sequence[tuple[NDArray[np.intp], NDArray[Any]]], n: 
     return found
 
 
-def _joined_edges(parts: Sequence[tuple[NDArray[np.intp], SampleLaw]], n: int) -> dict[str, Any]:
+def _joined_edges(parts: Sequence[tuple[IndexArray, SampleLaw]], n: int) -> dict[str, Any]:
     """Return the shifts of the code edges of groups of pixels, from one code on."""
     laws = [law for _, law in parts]
     first = laws[0]
@@ -401,9 +394,7 @@ def _joined_edges(parts: Sequence[tuple[NDArray[np.intp], SampleLaw]], n: int) -
     return {"edge_first": low, "edge_shift": shifts}
 
 
-def _joined_satellites(
-    laws: Sequence[SampleLaw], pixels: Sequence[NDArray[np.intp]], n: int
-) -> dict[str, Any]:
+def _joined_satellites(laws: Sequence[SampleLaw], pixels: Sequence[IndexArray], n: int) -> dict[str, Any]:
     """Return which free satellites groups of pixels look for, and which pixels do."""
     looking = [law for law in laws if law.free_satellites]
     if not looking:

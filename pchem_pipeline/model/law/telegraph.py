@@ -7,14 +7,11 @@ the pixel's fit. Frames that were not observed only let the states forget.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import gammaln
 
-from pchem_pipeline.base.arrays import FloatArray, IntArray
+from pchem_pipeline.base.arrays import FloatArray, IntArray, IntegerArray
 from pchem_pipeline.model.law import telegraph_numba
 
 # rise of the log-likelihood, nats, that the first and the second process must bring; pixels of constant
@@ -34,33 +31,10 @@ _STEPS = (0.3, 0.8)
 _REFINED = 2
 
 
-@dataclass(frozen=True)
-class Telegraph:
-    """How the exposure of a pixel blinks.
-
-    Attributes:
-        exposure: with all processes down, e-.
-        step: of each process, e-, shape (d,).
-        share: of the time that each is up, of the law and not of these frames, shape (d,).
-        tau: correlation time of each, frames, shape (d,).
-        rise: of the log-likelihood against a constant exposure, nats.
-        added: exposure added in each state, e-, shape (2 ** d,); the first is 0.
-        weight: part of these frames spent in each state, shape (2 ** d,).
-    """
-
-    exposure: float
-    step: FloatArray
-    share: FloatArray
-    tau: FloatArray
-    rise: float
-    added: FloatArray
-    weight: FloatArray
-
-
 class _Series:
     """The samples of a pixel, and their law given the exposure."""
 
-    def __init__(self, samples: NDArray[np.integer], frames: IntArray, pixel: FloatArray) -> None:
+    def __init__(self, samples: IntegerArray, frames: IntArray, pixel: FloatArray) -> None:
         exposure, gain, bias, sigma = (float(v) for v in pixel)
         codes, place = np.unique(samples, return_inverse=True)
         self.samples = np.ascontiguousarray(place, np.int64)
@@ -114,9 +88,7 @@ def added_of(step: FloatArray) -> FloatArray:
     return np.asarray(((states[:, None] >> np.arange(step.size)) & 1) @ step)
 
 
-def transitions(
-    share: FloatArray, tau: FloatArray, gaps: NDArray[np.integer]
-) -> tuple[FloatArray, FloatArray]:
+def transitions(share: FloatArray, tau: FloatArray, gaps: IntegerArray) -> tuple[FloatArray, FloatArray]:
     """Return the probabilities of the states, (s,), and from each to each over gaps, (g, s, s).
 
     Over a gap, frames, each process keeps its state with its correlation, of time tau, frames, or takes one
@@ -131,14 +103,20 @@ def transitions(
     return start, moves
 
 
-def find_telegraph(samples: NDArray[np.integer], frames: IntArray, pixel: FloatArray) -> Telegraph | None:
+def find_telegraph(
+    samples: IntegerArray, frames: IntArray, pixel: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
     """Return how a pixel's exposure blinks, or None where a constant one explains the samples as well.
 
     The samples, DN, have increasing frame numbers; the pixel is (H, g, mu, sigma), H the mean exposure.
+
+    Returns:
+        Of the states of d processes the exposure that each adds, e-, shape (2 ** d,), the first 0; part of
+        these frames spent in each, shape (2 ** d,).
     """
     series = _Series(samples, frames, pixel)
     theta = np.log([series.mean])
-    constant = found = series.height(theta)[0]
+    found = series.height(theta)[0]
     for rise in _RISES:
         starts = _starts(series, theta)
         if not starts or starts[0][0] < found + _PROMISING:
@@ -149,9 +127,7 @@ def find_telegraph(samples: NDArray[np.integer], frames: IntArray, pixel: FloatA
         found, theta = height, best
     if theta.size == 1:
         return None
-    exposure, step, share, tau = unpacked(theta)
-    weight = series.height(theta, states=True)[1].mean(axis=0)
-    return Telegraph(exposure, step, share, tau, found - constant, added_of(step), weight)
+    return added_of(unpacked(theta)[1]), series.height(theta, states=True)[1].mean(axis=0)
 
 
 def _starts(series: _Series, theta: FloatArray) -> list[tuple[float, FloatArray]]:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray, IntegerArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.fit.status import FAILED, FitStatus, words_of
 from pchem_pipeline.model.maps.ordered import Ordered
@@ -61,14 +60,9 @@ def derived_maps(
     2023, Sec. IV). The analog read noise is ``sigma_R = g sqrt(sigma^2 - 1/12)`` (below eq. X_density): NaN
     where the estimate is below rounding alone.
 
-    Args:
-        parameters: the four maps by name (``variables.PARAMETERS``), each of one shape.
-        covariance: covariance of (H, g, mu, sigma), shape (..., 4, 4).
-        integration_time: t_int, s; None leaves out the rate.
-        rate: name of H / t_int: ``charge_rate``, in the dark ``dark_current``.
-
-    Returns:
-        ``read_noise_e``, ``analog_read_noise_e`` and the rate, each with ``<name>_stderr``.
+    From the four maps by name (``variables.PARAMETERS``) and the covariance of (H, g, mu, sigma), shape
+    (..., 4, 4), to ``read_noise_e``, ``analog_read_noise_e`` and the ``rate``, ``charge_rate`` or in the dark
+    ``dark_current``, each with ``<name>_stderr``; without an integration time, s, there is no rate.
     """
     gain, sigma = parameters["conversion_gain"], parameters["read_noise_dn"]
     analog_variance = sigma**2 - QUANTISATION_VARIANCE
@@ -121,14 +115,14 @@ def electron_shifts(
     return m, probability
 
 
-def quality_map(fit_status: NDArray[np.integer[Any]], conversion_gain: FloatArray) -> NDArray[np.uint8]:
+def quality_map(fit_status: IntegerArray, conversion_gain: FloatArray) -> NDArray[np.uint8]:
     """Grade the pixels: ``GOOD``, ``CAUTION`` (any bit in the status) or ``NO_VALUE`` (NaN)."""
     quality = np.where(fit_status == 0, GOOD, CAUTION).astype(np.uint8)
     quality[((fit_status & int(FAILED)) != 0) | ~np.isfinite(conversion_gain)] = NO_VALUE
     return quality
 
 
-def status_counts(fit_status: NDArray[np.integer[Any]]) -> dict[str, int]:
+def status_counts(fit_status: IntegerArray) -> dict[str, int]:
     """Count the pixels with each reason, by its name in lower case, ``"ok"`` first; words of any shape."""
     counts = {words_of(bit): int(np.count_nonzero(fit_status & int(bit))) for bit in FitStatus if bit}
     return {"ok": int(np.count_nonzero(fit_status == 0))} | counts
@@ -144,16 +138,11 @@ def summarise(
     """Describe a map by order statistics alone.
 
     The standard error of the median is half the distance between the order statistics ``sqrt(n)/2`` ranks to
-    either side: the median's rank has that standard deviation, whatever the distribution.
+    either side: the median's rank has that standard deviation, whatever the distribution. Outliers lie beyond
+    so many ``1.4826 MAD`` of the median. All is NaN where no pixel has a value.
 
-    Args:
-        values: the map, NaN where there is no value; or its values in order.
-        left_out: pixels whose values do not count, same shape; None: none, or done already.
-        percentiles: in %.
-        outlier_sigmas: outliers lie beyond so many ``1.4826 MAD`` of the median.
-
-    Returns:
-        The summary; NaN throughout where no pixel has a value.
+    A map is NaN where there is no value, and pixels of the same shape may be left out; or its values come in
+    order, without these. Percentiles are in %.
     """
     ordered = Ordered.of(values, left_out)
     n, missing, without = ordered.size, ordered.n_missing, ordered.n_left_out

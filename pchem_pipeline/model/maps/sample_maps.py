@@ -3,50 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
 from pchem_pipeline.base.arrays import FloatArray
 
-#: Slope and offset of the exposures over the light level.
-LEVEL_MAPS = ("charge_per_level", "dark_signal")
 _REWEIGHTINGS = 2
 _MOST_RESCALED = 100.0  # no variance is trusted to change by more
 
 
-@dataclass(frozen=True)
-class ExposureLine:
-    """``H_j = slope x_j + offset`` in n pixels; NaN where a pixel has no exposures.
-
-    Attributes:
-        slope: e- per unit of x: the charge rate, e-/px/s, where x is the integration time; shape (n,).
-        offset: e-: charge that does not grow with x (spurious charge; dark signal over light), shape (n,).
-        covariance: of slope and offset, shape (n, 2, 2).
-        residual: H_j minus the line, e-, shape (n, J).
-        residual_stderr: standard error of the residual, e-, shape (n, J); 0 where the line leaves no freedom.
-        chi2: squared residuals over the covariance of the exposures, shape (n,).
-        dof: its degrees of freedom, J - 2.
-        p: probability of a larger one, shape (n,); NaN without degrees of freedom.
-    """
-
-    slope: FloatArray
-    offset: FloatArray
-    covariance: FloatArray
-    residual: FloatArray
-    residual_stderr: FloatArray
-    chi2: FloatArray
-    dof: int
-    p: FloatArray
-
-
 def exposure_line(
     quanta_exposure: FloatArray, covariance: FloatArray, own_variance: FloatArray, x: ArrayLike
-) -> ExposureLine:
-    """Fit a line to the exposures of every pixel by generalised least squares.
+) -> tuple[FloatArray, FloatArray, dict[str, FloatArray]]:
+    """Fit a line, ``H_j = slope x_j + offset``, to the exposures of n pixels by generalised least squares.
 
     The exposures of a pixel share g, mu and sigma, so their errors are correlated. The variance of each
     alone grows with H; it is taken at the line, since small estimates would else claim too much weight.
@@ -56,6 +27,12 @@ def exposure_line(
         covariance: of H_1 ... H_J, e-^2, shape (n, J, J).
         own_variance: the variance of H_j at known g, mu and sigma, e-^2, shape (n, J).
         x: integration times (s) or light levels of the samples, shape (J,), not all equal.
+
+    Returns:
+        Slope, e- per unit of x, and offset, e-, shape (n, 2); their covariance, (n, 2, 2); by name
+        ``linearity_residual``, H_j minus the line, with ``linearity_residual_stderr``, e-, (n, J), and
+        ``linearity_chi2`` with ``linearity_p``, (n,). The standard error is 0, and p NaN, where the line
+        leaves no freedom; all are NaN where a pixel has no exposures.
 
     Raises:
         ValueError: if there are fewer than two different x.
@@ -68,26 +45,26 @@ def exposure_line(
     line, spread = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
     residual, sd, chi2 = np.full((n, n_samples), np.nan), np.full((n, n_samples), np.nan), np.full(n, np.nan)
     good = np.flatnonzero(np.isfinite(quanta_exposure).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2)))
-    if good.size:
-        exposure, own = quanta_exposure[good], covariance[good]
-        fitted = exposure
-        for _ in range(1 + _REWEIGHTINGS):
-            errors = own.copy()
-            change = (_rescaling(exposure, fitted) - 1.0) * own_variance[good]
-            errors[:, np.arange(n_samples), np.arange(n_samples)] += change
-            inverse = np.linalg.inv(errors)
-            weighted = np.einsum("jp,njk->npk", design, inverse)
-            bend = np.linalg.inv(weighted @ design)
-            solution = np.einsum("npq,nqk,nk->np", bend, weighted, exposure)
-            fitted = solution @ design.T
-        rest = exposure - fitted
-        line[good], spread[good], residual[good] = solution, bend, rest
-        left = np.diagonal(errors, axis1=1, axis2=2) - np.einsum("jp,npq,jq->nj", design, bend, design)
-        sd[good] = np.sqrt(np.maximum(left, 0.0)) if n_samples > 2 else 0.0
-        chi2[good] = np.einsum("nj,njk,nk->n", rest, inverse, rest)
+    exposure, own = quanta_exposure[good], covariance[good]
+    fitted = exposure
+    for _ in range(1 + _REWEIGHTINGS):
+        errors = own.copy()
+        change = (_rescaling(exposure, fitted) - 1.0) * own_variance[good]
+        errors[:, np.arange(n_samples), np.arange(n_samples)] += change
+        inverse = np.linalg.inv(errors)
+        weighted = np.einsum("jp,njk->npk", design, inverse)
+        bend = np.linalg.inv(weighted @ design)
+        solution = np.einsum("npq,nqk,nk->np", bend, weighted, exposure)
+        fitted = solution @ design.T
+    rest = exposure - fitted
+    line[good], spread[good], residual[good] = solution, bend, rest
+    rest_square = np.diagonal(errors, axis1=1, axis2=2) - np.einsum("jp,npq,jq->nj", design, bend, design)
+    sd[good] = np.sqrt(np.maximum(rest_square, 0.0)) if n_samples > 2 else 0.0
+    chi2[good] = np.einsum("nj,njk,nk->n", rest, inverse, rest)
     dof = n_samples - 2
     p = np.asarray(chdtrc(dof, chi2)) if dof > 0 else np.full(n, np.nan)
-    return ExposureLine(line[:, 0].copy(), line[:, 1].copy(), spread, residual, sd, chi2, dof, p)
+    left = {"linearity_residual": residual, "linearity_residual_stderr": sd}
+    return line, spread, left | {"linearity_chi2": chi2, "linearity_p": p}
 
 
 def _rescaling(exposure: FloatArray, fitted: FloatArray) -> FloatArray:
@@ -104,7 +81,7 @@ def line_map_names(against: str, rate: str) -> tuple[str, ...]:
     """
     if against == "none":
         return ()
-    return (rate, "spurious_charge") if against == "integration_time" else LEVEL_MAPS
+    return (rate, "spurious_charge") if against == "integration_time" else ("charge_per_level", "dark_signal")
 
 
 def own_variance(covariance: FloatArray) -> FloatArray:
@@ -120,20 +97,19 @@ def own_variance(covariance: FloatArray) -> FloatArray:
     shared[bound, 2, 2] = 1.0
     own = np.full((n, j), np.nan)
     good = np.flatnonzero(np.isfinite(shared).all(axis=(1, 2)))
-    if good.size:
-        # the parameters have scales of their own: the matrix of correlations is inverted
-        scale = np.sqrt(np.diagonal(shared[good], axis1=1, axis2=2))
-        correlation = shared[good] / (scale[:, :, None] * scale[:, None, :])
-        weights = across[good] / scale[:, None, :]
-        explained = np.einsum("nja,nab,njb->nj", weights, np.linalg.inv(correlation), weights)
-        diagonal = np.diagonal(covariance[good, :j, :j], axis1=1, axis2=2)
-        own[good] = np.maximum(diagonal - explained, 0.0)
+    # the parameters have scales of their own: the matrix of correlations is inverted
+    scale = np.sqrt(np.diagonal(shared[good], axis1=1, axis2=2))
+    correlation = shared[good] / (scale[:, :, None] * scale[:, None, :])
+    weights = across[good] / scale[:, None, :]
+    explained = np.einsum("nja,nab,njb->nj", weights, np.linalg.inv(correlation), weights)
+    diagonal = np.diagonal(covariance[good, :j, :j], axis1=1, axis2=2)
+    own[good] = np.maximum(diagonal - explained, 0.0)
     return own
 
 
 def line_maps(
     exposure: FloatArray, covariance: FloatArray, x: FloatArray, names: Sequence[str]
-) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
     """Return the line through the exposures of each pixel, and what is left of them.
 
     Slope and offset with standard errors, (n,), by their names of :func:`line_map_names`; and the residuals
@@ -142,13 +118,11 @@ def line_maps(
     """
     use = np.flatnonzero(np.isfinite(x))
     own = own_variance(covariance)[:, use]
-    line = exposure_line(exposure[:, use], covariance[:, use][:, :, use], own, x[use])
-    maps: dict[str, NDArray[Any]] = {}
-    for i, (name, values) in enumerate(zip(names, (line.slope, line.offset), strict=True)):
-        maps |= {name: values, f"{name}_stderr": np.sqrt(line.covariance[:, i, i])}
-    left: dict[str, NDArray[Any]] = {"linearity_chi2": line.chi2, "linearity_p": line.p}
-    residuals = {"linearity_residual": line.residual, "linearity_residual_stderr": line.residual_stderr}
-    for name, part in residuals.items():
-        left[name] = np.full(exposure.shape, np.nan)
+    line, spread, left = exposure_line(exposure[:, use], covariance[:, use][:, :, use], own, x[use])
+    maps: dict[str, FloatArray] = {}
+    for i, (name, values) in enumerate(zip(names, line.T, strict=True)):
+        maps |= {name: values, f"{name}_stderr": np.sqrt(spread[:, i, i])}
+    for name in ("linearity_residual", "linearity_residual_stderr"):
+        part, left[name] = left[name], np.full(exposure.shape, np.nan)
         left[name][:, use] = part
     return maps, left

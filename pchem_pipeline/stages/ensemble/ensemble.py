@@ -22,16 +22,21 @@ from pchem_pipeline.config.tree import RunConfig
 from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
-from pchem_pipeline.model.electrons.electrons import ErrorTally, compare_electron_numbers
-from pchem_pipeline.model.electrons.error_rates import error_rates
-from pchem_pipeline.model.ensemble.components import COMPONENT_CASES, bias_weight
+from pchem_pipeline.model.electrons.electrons import compare_electron_numbers, error_rates
+from pchem_pipeline.model.ensemble.components import COMPONENT_CASES, bias_weight, moment_rows
 from pchem_pipeline.model.ensemble.curves import components, curves
 from pchem_pipeline.model.ensemble.curves import electron_numbers as electron_numbers_of
-from pchem_pipeline.model.ensemble.ensemble import DnAxis, electron_pmf, nuced_axis
-from pchem_pipeline.model.ensemble.error_sample import WANTED, PixelErrors
-from pchem_pipeline.model.ensemble.moments import moment_rows
+from pchem_pipeline.model.ensemble.ensemble import (
+    ERROR_PIXELS,
+    ERROR_SIZES,
+    DnAxis,
+    EnsembleAxes,
+    EnsembleTotals,
+    PixelErrors,
+    electron_pmf,
+    nuced_axis,
+)
 from pchem_pipeline.model.ensemble.settings import EnsembleSettings
-from pchem_pipeline.model.ensemble.totals import ERROR_SIZES, EnsembleAxes, EnsembleTotals
 from pchem_pipeline.model.fit.status import flags_of
 from pchem_pipeline.model.histogram.count_numba import count_frames
 from pchem_pipeline.model.law.parameters import UsablePixels
@@ -224,9 +229,10 @@ def _do_band(band: Band | Tile, store: RunStore, *, job: _Job) -> None:
         of_tile = None if chosen is None else chosen.of(_in_band(tile, band))
         integers, floats = _sum_tile(store, tile, job, of_tile)
         if key in errors:
-            integers[job.axes.integers["error_sizes"]] = errors[key].by_size
-            integers[job.axes.integers["compared"]] = errors[key].n_samples
-            integers[job.axes.integers["signed_error"]] = errors[key].signed
+            sizes, signed = errors[key]
+            integers[job.axes.integers["error_sizes"]] = sizes
+            integers[job.axes.integers["compared"]] = sizes.sum()
+            integers[job.axes.integers["signed_error"]] = signed
         for name, row in zip(_SUMS, (integers, floats), strict=True):
             store.write(f"ensemble_tiles/{name}", (slice(number, number + 1), slice(None)), row[None])
 
@@ -292,7 +298,7 @@ def _errors(fit: Arrays, tile: Tile, shape: tuple[int, int]) -> PixelErrors | No
     stderr = [fit[f"{name}_stderr"].ravel() for name in PARAMETERS]
     correlation = fit["correlation"]
     place = (np.arange(tile.y0, tile.y1)[:, None] * shape[1] + np.arange(tile.x0, tile.x1)).ravel()
-    share = min(1.0, WANTED / math.prod(shape))
+    share = min(1.0, ERROR_PIXELS / math.prod(shape))
     return PixelErrors(np.stack(stderr, axis=1), correlation.reshape(place.size, -1), place, share)
 
 
@@ -321,7 +327,7 @@ def _count(store: RunStore, job: _Job, band: Band | Tile) -> PixelHistograms:
     return PixelHistograms(counts, origin, under + over)
 
 
-def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, ErrorTally]:
+def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, tuple[IntArray, int]]:
     """Compare estimated with true electron numbers of the chosen frames, tile by tile."""
     assert job.truth is not None
     assert job.source is not None
@@ -329,7 +335,7 @@ def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, ErrorTa
     y0, x0, t0 = job.truth
     first, end = job.frames
     known = min(end, store.array("truth/electron_number").shape[0] - t0)
-    found: dict[str, ErrorTally] = {}
+    found: dict[str, tuple[IntArray, int]] = {}
     if known <= first:
         return found
     columns = slice(x0, x0 + job.source.shape[2])
@@ -342,8 +348,9 @@ def _compare(store: RunStore, job: _Job, band: Band | Tile) -> dict[str, ErrorTa
             for key in markers(band):
                 tile = job.tiles[key][1]
                 part = (slice(None), *_in_band(tile, band))
-                tally = compare_electron_numbers(numbers[part], true[part], ERROR_SIZES)
-                found[key] = found[key] + tally if key in found else tally
+                sizes, signed = compare_electron_numbers(numbers[part], true[part], ERROR_SIZES)
+                before, signed_before = found.get(key, (0, 0))
+                found[key] = before + sizes, signed_before + signed
     return found
 
 

@@ -15,9 +15,14 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.electrons.electrons import KnownPixels, number_tables
-from pchem_pipeline.model.ensemble.ensemble import curve_errors, mass_sums, tally
-from pchem_pipeline.model.ensemble.error_sample import PixelErrors
-from pchem_pipeline.model.ensemble.totals import MODEL_ERRORS, EnsembleAxes
+from pchem_pipeline.model.ensemble.ensemble import (
+    MODEL_ERRORS,
+    EnsembleAxes,
+    PixelErrors,
+    curve_errors,
+    mass_sums,
+    tally,
+)
 from pchem_pipeline.model.law.inputs import kernel_counts
 from pchem_pipeline.model.law.parameters import UsablePixels
 from pchem_pipeline.model.law.sample_law import SampleLaw
@@ -135,7 +140,7 @@ def _group_sums(
         low, high = np.minimum(low, axes.dn.start), np.maximum(high, axes.dn.start + axes.dn.size - 1)
     tables = number_tables(low, high, known.exposure, known, detailed=True)
     numbers, beyond = tables.tally(counts, origin, axes.n_k)
-    expected = tables.outcomes(axes.n_k)
+    estimated, error = tables.outcomes(axes.n_k)
     predicted = mass_sums(tables.mass, tables.first, tables.start, pixels, axes.dn, axes.nuced)
     tallies: dict[str, Any] = {
         "counts": data.raw,
@@ -152,11 +157,11 @@ def _group_sums(
         "share_all": data_all.raw / n_all,
         "nuced_share": data.nuced / n,
         "electron_share": numbers / n,
-        "electron_expected": expected.estimated,
+        "electron_expected": estimated,
         "nuced_sum": data.nuced_sum / n,
         "nuced_sum_square": data.nuced_sum_square / n,
-        "error": expected.error.sum(),
-        "error_variance": np.sum(expected.error * (1.0 - expected.error)),
+        "error": error.sum(),
+        "error_variance": np.sum(error * (1.0 - error)),
         "pcd": predicted.raw,
         "pcd_variance": (predicted.raw - predicted.raw_square) / n,
         "nuced": predicted.nuced,

@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray
 from pchem_pipeline.base.variables import PARAMETERS, VARIABLES
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
-from pchem_pipeline.model.errors.fisher import CORRELATION_PAIRS
-from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding
+from pchem_pipeline.model.errors.expected_information import (
+    CORRELATION_PAIRS,
+    LARGEST_BIAS,
+    biased_by_rounding,
+)
 from pchem_pipeline.model.fit.status import FAILED, MEANINGS, FitStatus, moves_gain
 from pchem_pipeline.model.law.parameters import usable_pixels
 from pchem_pipeline.run.fingerprint import setting_values

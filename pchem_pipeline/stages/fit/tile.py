@@ -19,9 +19,9 @@ from pchem_pipeline.base.arrays import Arrays, FloatArray
 from pchem_pipeline.base.variables import FREE_SATELLITES, INTERVALS, PARAMETERS, interval_names, variables_of
 from pchem_pipeline.effects.framework.compose import AddedExposure, PixelPlaces, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.model.errors.fisher import correlations
+from pchem_pipeline.model.errors.expected_information import correlations
 from pchem_pipeline.model.fit.api import fit_histograms
-from pchem_pipeline.model.fit.excluding_codes import Interval
+from pchem_pipeline.model.fit.guard import Interval
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import AMBIGUOUS, FAILED

@@ -15,24 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pchem_pipeline.base.arrays import IntArray
 from pchem_pipeline.compute.executor import call_all
 from pchem_pipeline.frames.stream import Block, Rows
 from pchem_pipeline.model.histogram.count import HistogramAccumulator, RowHistograms
-from pchem_pipeline.model.histogram.moved_frames import MovedFrames
+from pchem_pipeline.model.histogram.odd_frames import MovedFrames
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
-from pchem_pipeline.model.histogram.summaries import (
-    ROW_GROUP,
-    BlockSums,
-    OpenSums,
-    SummaryAccumulator,
-    line_sums,
-)
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator, line_sums
 from pchem_pipeline.run.stage import open_store
 from pchem_pipeline.stages.histogram.arrays import with_block_length
 
 _ALONG_TIME = ("block_sum", "block_sum_square", "row_sum", "row_sum_square", "column_sum")
-_OPEN = ("open_sums", "open_covariances")
 
 
 class _AlongTime:
@@ -150,9 +144,8 @@ class _BandCounter:
         self._histograms = HistogramAccumulator.resumed(held, self._shape[0])
         if self._summaries is None:
             return
-        state = OpenSums(*map(opened.at(region, "summary").__getitem__, _OPEN))
         length = self._settings.block_length(n_frames)
-        self._summaries = SummaryAccumulator.resumed(state, n_frames, length)
+        self._summaries = SummaryAccumulator.resumed(opened.at(region, "summary"), n_frames, length)
         blocks = n_frames // length
         if self._rows.start == 0:
             known = opened.attributes("summary")
@@ -175,7 +168,7 @@ class _BandCounter:
         if self._summaries is not None:
             for sums in self._summaries.add(frames):
                 self._add_sums(sums)
-            for name, part in vars(line_sums(frames)).items():
+            for name, part in line_sums(frames).items():
                 self._along(name).add(part)
         if self._spectrum is not None:
             self._spectrum.add(frames[:, :ROW_GROUP])
@@ -200,8 +193,8 @@ class _BandCounter:
             for each in self._series.values():
                 each.flush()
             summary = opened.at(region, "summary")
-            summary.update(vars(covariances))
-            summary.update(zip(_OPEN, vars(state).values(), strict=True))
+            summary.update(covariances)
+            summary.update(state)
         for name, values in vars(histograms.finish()).items():
             # file by file: of each that is written there are copies in memory
             step = opened.file_shape(f"histogram/{name}")[1]
@@ -212,8 +205,8 @@ class _BandCounter:
         if self._moved is not None:
             opened.set_attributes("summary", {"moved_frames": self._moved.found})
 
-    def _add_sums(self, sums: BlockSums) -> None:
-        for name, part in vars(sums).items():
+    def _add_sums(self, sums: dict[str, IntArray]) -> None:
+        for name, part in sums.items():
             self._along(name).add(part[None])
 
     def _along(self, name: str) -> _AlongTime:

@@ -14,11 +14,11 @@ from pchem_pipeline.base.arrays import FloatArray, IntArray
 from pchem_pipeline.frames.stream import FrameSource, FrameStream
 from pchem_pipeline.model.histogram.odd_frames import KINDS, left_out, odd_words
 from pchem_pipeline.model.histogram.spectrum import FrameSpectrum
-from pchem_pipeline.model.histogram.summaries import ROW_GROUP, OpenSums, SummaryAccumulator
+from pchem_pipeline.model.histogram.summaries import ROW_GROUP, SummaryAccumulator
 from pchem_pipeline.run.input import open_source
 from pchem_pipeline.run.stage import StageContext
 from pchem_pipeline.stages.bands import FRAMES_AT_ONCE
-from pchem_pipeline.stages.histogram.arrays import COVARIANCES, MAPS, with_block_length
+from pchem_pipeline.stages.histogram.arrays import MAPS, with_block_length
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.store.tiles import Tile, equal_rows
 
@@ -113,16 +113,15 @@ def _leave_out_of_sums(context: StageContext, changed: IntArray, out: IntArray) 
     kept = ~np.isin(np.arange(n_frames), out)
     step = max(context.tile[0], ROW_GROUP)
     for rows in equal_rows(ny, step):
-        band = (slice(None), slice(*rows), slice(None))
-        state = OpenSums(*(store.read(f"summary/open_{name}", band) for name in ("sums", "covariances")))
-        sums = SummaryAccumulator.resumed(state, n_frames, length)
+        band = (slice(*rows), slice(None))
+        sums = SummaryAccumulator.resumed(store.at(band, "summary"), n_frames, length)
         sums.finish()
         for block in np.unique(changed // length).tolist():
             frames = block * length, min((block + 1) * length, n_frames)
             with FrameStream(source, [rows], FRAMES_AT_ONCE, frames=frames) as stream:
                 done = sums.exchange((piece for _, (piece,) in stream), kept[slice(*frames)])
-            for name, values in vars(done).items():
-                store.write(f"summary/{name}", (slice(block, block + 1), *band[1:]), values[None])
+            for name, values in done.items():
+                store.write(f"summary/{name}", (slice(block, block + 1), *band), values[None])
         _, covariances = sums.finish()
-        for name in COVARIANCES:
-            store.write(f"summary/{name}", band[1:], getattr(covariances, name))
+        for name, covariance in covariances.items():
+            store.write(f"summary/{name}", band, covariance)

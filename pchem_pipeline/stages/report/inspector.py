@@ -22,8 +22,8 @@ from pchem_pipeline.base.arrays import Arrays, FloatArray, IntArray
 from pchem_pipeline.base.errors import quoted
 from pchem_pipeline.base.variables import CHARGE_RATES, VARIABLES, Variable
 from pchem_pipeline.compute.executor import call_all
-from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.status import MEANINGS
+from pchem_pipeline.model.law.pcd import nearest_pcd
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.inspector import (
     InspectorData,

@@ -31,8 +31,7 @@ from pchem_pipeline.effects.framework.compose import model_words
 from pchem_pipeline.model.ensemble.components import COMPONENT_CASES
 from pchem_pipeline.model.fit.status import FAILED
 from pchem_pipeline.model.maps.ordered import median_of
-from pchem_pipeline.planning.frames import frames_needed, precision
-from pchem_pipeline.planning.targets import Point, parse_target
+from pchem_pipeline.planning.targets import Point, frames_needed, parse_target, precision
 from pchem_pipeline.report.data import DiscrepancyData, ReportData, Sample, Samples
 from pchem_pipeline.report.figures.ensemble import case_name
 from pchem_pipeline.run.sensor import SensorInfo

@@ -6,13 +6,13 @@ from helpers import reference_pchem
 from helpers.drawn_pixels import draw, samples
 from scipy.stats import kstat
 
-from pchem_pipeline.methods.base import PixelSamples, Sample, methods, sample_moments
+from pchem_pipeline.methods.base import PixelSamples, Sample, methods
 from pchem_pipeline.methods.compare import compare, errors_of, pixel_bounds, summarise_errors
 from pchem_pipeline.methods.peak_valley import comb, read_noise_of_valley
 from pchem_pipeline.methods.plain_em import run_em
 from pchem_pipeline.methods.settings import MethodsSettings
 from pchem_pipeline.model.errors.expected_information import expected_information, inverse_information
-from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.mass import draw_histograms
 
 
 def sample(exposure, noise=0.3, n_pixels=3, n_frames=3000, seed=1, gain=1 / 11):
@@ -29,7 +29,7 @@ def estimated(name, *given, limits=None, **settings):
 def test_drawn_histograms_have_the_moments_of_the_pcd():
     n = 400_000
     drawn = draw_histograms(np.random.default_rng(2), [0.0, 2.0], 0.1, 50.4, 0.31, n)
-    found = sample_moments(drawn.counts, drawn.origin)
+    found = Sample(drawn.counts, drawn.origin).moments()
     exposure, gain, bias, sigma = drawn.truth.T
     variance = sigma**2 + exposure / gain**2
     assert (found.n_frames == n).all()
@@ -42,7 +42,7 @@ def test_drawn_histograms_have_the_moments_of_the_pcd():
 
 def test_moments_are_k_statistics():
     drawn = draw(np.random.default_rng(3), [0.4, 3.0], 10.0, 0.4, n_frames=500)
-    found = sample_moments(drawn.counts, drawn.origin)
+    found = Sample(drawn.counts, drawn.origin).moments()
     raw = [samples(counts, origin) for counts, origin in zip(drawn.counts, drawn.origin, strict=True)]
     for order, name in enumerate(("mean", "variance", "third", "fourth"), 1):
         assert getattr(found, name) == pytest.approx([kstat(each, order) for each in raw], rel=1e-9)

@@ -9,10 +9,16 @@ import pytest
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.commands.plan import make_plan
 from pchem_pipeline.model.errors.expected_information import inverse_information, shared_information
-from pchem_pipeline.planning.frames import best_exposure, frames_needed, precision
 from pchem_pipeline.planning.plan import plan_one_sample, plan_samples
 from pchem_pipeline.planning.split import best_samples, best_split, split_frames
-from pchem_pipeline.planning.targets import TARGET_NAMES, Point, parse_target
+from pchem_pipeline.planning.targets import (
+    TARGET_NAMES,
+    Point,
+    best_exposure,
+    frames_needed,
+    parse_target,
+    precision,
+)
 from pchem_pipeline.planning.verify import frames_simulated, verify
 from pchem_pipeline.report.data import ReportData
 from pchem_pipeline.report.pages.tables import result_tables

@@ -14,7 +14,7 @@ from pchem_pipeline.effects.operators.couple import BlackClamp
 from pchem_pipeline.effects.operators.curve import AdcInl, Clipping
 from pchem_pipeline.effects.operators.offsets import RowNoise
 from pchem_pipeline.effects.operators.replace import RepeatedFrames
-from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
+from pchem_pipeline.model.law.pcd import nearest_pcd
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 

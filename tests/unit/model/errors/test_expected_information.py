@@ -6,10 +6,10 @@ from helpers.plain_law import pcd_mass
 
 from pchem_pipeline.model.errors.expected_information import (
     expected_information,
+    expected_scores,
     inverse_information,
     shared_information,
 )
-from pchem_pipeline.model.errors.fisher import expected_scores
 
 POINTS = [(2.0, 0.2), (0.1, 0.305), (2.0, 0.305), (10.0, 0.45), (2.0, 0.6), (1.0, 1.0)]
 

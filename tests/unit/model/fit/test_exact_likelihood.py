@@ -7,8 +7,12 @@ from helpers.plain_law import pcd_mass
 from scipy.optimize import minimize
 
 from pchem_pipeline.effects.operators.offsets import RowNoise
-from pchem_pipeline.model.errors.expected_information import expected_information
-from pchem_pipeline.model.errors.rounding import LARGEST_BIAS, biased_by_rounding, rounding_bias
+from pchem_pipeline.model.errors.expected_information import (
+    LARGEST_BIAS,
+    biased_by_rounding,
+    expected_information,
+    rounding_bias,
+)
 from pchem_pipeline.model.fit.api import fit_histograms, likelihood_moments
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FitStatus

@@ -9,11 +9,11 @@ from helpers.drawn_pixels import codes, histograms
 from helpers.extended_reference import LAWS
 from scipy.optimize import root
 
-from pchem_pipeline.model.electrons.nearest_pcd import nearest_pcd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.result import FitResult
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.law.mass import sample_mass
+from pchem_pipeline.model.law.pcd import nearest_pcd
 from pchem_pipeline.model.law.sample_law import SampleLaw
 
 FIRST, N_CODES, FRAMES = 40, 330, 4000
@@ -25,9 +25,9 @@ TRUTH = [
 ]
 
 
-def log_likelihood(counts, parameters, law):
+def log_likelihood(counts, parameters, law, satellites=None):
     """Return ``sum_i c_i log P(x_i)`` of every pixel, nats."""
-    mass = sample_mass(law, parameters, np.arange(FIRST, FIRST + N_CODES))
+    mass = sample_mass(law, parameters, np.arange(FIRST, FIRST + N_CODES), satellites=satellites)
     return (counts * np.log(np.where(counts > 0, np.maximum(mass, 1e-300), 1.0))).sum(axis=1)
 
 
@@ -180,8 +180,10 @@ def test_free_satellites_are_found_where_they_are_and_nowhere_else():
     assert (abs(pulls[right]) < 5).all()
     assert (abs(astray[5:20]).max(axis=1) > 10).sum() > 8
     # their log-likelihood holds the satellites
-    np.testing.assert_allclose(extended.log_likelihood, log_likelihood(counts, extended, law), rtol=1e-12)
-    mass = sample_mass(law, extended, np.arange(FIRST, FIRST + N_CODES))
+    levels = extended.satellite_amplitude_e, extended.satellite_weight
+    expected = log_likelihood(counts, extended, law, levels)
+    np.testing.assert_allclose(extended.log_likelihood, expected, rtol=1e-12)
+    mass = sample_mass(law, extended, np.arange(FIRST, FIRST + N_CODES), satellites=levels)
     np.testing.assert_allclose(mass.sum(axis=1), 1.0, atol=1e-6)
 
 

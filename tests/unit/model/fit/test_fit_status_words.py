@@ -10,7 +10,7 @@ from pchem_pipeline.model.fit import search_numba
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, MEANINGS, FitStatus, describe, flags_of
-from pchem_pipeline.model.law.drawn_histograms import draw_histograms
+from pchem_pipeline.model.law.mass import draw_histograms
 
 
 def fit_one(counts, origin=100, **options):

@@ -6,7 +6,7 @@ import pytest
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.operators.light import DarkCurrentRts
 from pchem_pipeline.model.law import telegraph_numba
-from pchem_pipeline.model.law.telegraph import added_of, find_telegraph, transitions
+from pchem_pipeline.model.law.telegraph import find_telegraph, transitions
 
 PIXEL = np.array([1.4, 1 / 12, 100.0, 3.6])
 STEP, SHARE, TAU = 0.9, 0.4, 60.0
@@ -79,13 +79,13 @@ def test_blinking_pixels_are_found_with_their_lower_exposure(gap):
         rng = np.random.default_rng(seed)
         up = course(rng, frames, SHARE, TAU)
         samples = drawn(rng, PIXEL[0] + STEP * up)
-        found, mean = looked_at(samples, frames)
-        assert found.weight.sum() == pytest.approx(1.0)
-        steady = mean - found.added @ found.weight
+        (added, weight), mean = looked_at(samples, frames)
+        assert weight.sum() == pytest.approx(1.0)
+        steady = mean - added @ weight
         # of a pixel whose states are known: the mean of its frames with the lower exposure
         noise = np.sqrt((PIXEL[0] + (PIXEL[1] * PIXEL[3]) ** 2) / (~up).sum())
         pulls.append((steady - PIXEL[0]) / noise)
-        shares.append(found.weight[1:].sum() - up.mean())
+        shares.append(weight[1:].sum() - up.mean())
     # states that are not known cost some precision: not more than twice the error, mean of twelve pixels
     assert abs(np.mean(pulls)) < 2 * 4 / np.sqrt(12)
     assert abs(np.mean(shares)) < 0.08
@@ -96,11 +96,11 @@ def test_two_defects_of_one_pixel_are_told_apart():
     frames = np.arange(4000)
     low, high = course(rng, frames, 0.5, 80.0), course(rng, frames, 0.3, 40.0)
     samples = drawn(rng, PIXEL[0] + 0.8 * low + 1.7 * high)
-    found, _ = looked_at(samples, frames)
-    assert found.step.size == 2
-    np.testing.assert_allclose(np.sort(found.step), [0.8, 1.7], atol=0.25)
-    np.testing.assert_allclose(found.added, added_of(found.step))
-    assert found.exposure == pytest.approx(PIXEL[0], abs=0.15)
+    (added, weight), mean = looked_at(samples, frames)
+    assert added.size == 4
+    np.testing.assert_allclose(np.sort(added[1:3]), [0.8, 1.7], atol=0.25)
+    np.testing.assert_allclose(added[[0, 3]], [0.0, added[1:3].sum()])
+    assert mean - added @ weight == pytest.approx(PIXEL[0], abs=0.15)
 
 
 def test_hardly_a_steady_pixel_is_said_to_blink():

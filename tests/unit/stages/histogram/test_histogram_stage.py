@@ -87,7 +87,7 @@ def test_arrays_are_right(frames, expected):
     np.testing.assert_allclose(expected["summary/frame_variance"], exact.var(axis=(1, 2)), rtol=1e-11)
     summaries = SummaryAccumulator((NY, NX), 128)
     summaries.add(frames)
-    for name, values in vars(summaries.finish()[1]).items():
+    for name, values in summaries.finish()[1].items():
         np.testing.assert_array_equal(expected[f"summary/{name}"], values, err_msg=name)
 
 
@@ -208,7 +208,7 @@ def test_odd_frames_are_in_no_sums_and_empty_ones_in_no_histogram(tmp_path, fram
         for block in blocks:
             summaries = SummaryAccumulator((NY, NX), len(block))
             summaries.add(block.astype(np.uint16))
-            for name, values in vars(summaries.finish()[1]).items():
+            for name, values in summaries.finish()[1].items():
                 summed[name] = summed[name] + values * (len(block) - 1)
         for name, values in summed.items():
             right = values / (len(odd) - 5 - 3)

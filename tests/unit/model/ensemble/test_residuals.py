@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pchem_pipeline.model.checks.residuals import (
+from pchem_pipeline.model.ensemble.curves import (
     central_window,
     chi_square,
     noise_floor,
@@ -33,6 +33,6 @@ def test_chi_square_leaves_out_bins_with_few_samples():
     data, model = np.array([1.1, 0.03, 0.9, 0.5]), np.array([1.0, 0.02, 1.0, 0.4])
     variance = np.array([0.008, 0.001, 0.01, 0.0])
     found = chi_square(data, model, variance, np.array([110, 3, 90, 50]))
-    assert found.dof == 2
-    assert found.value == pytest.approx(0.01 / 0.008 + 0.01 / 0.01)
-    assert found.p == pytest.approx(np.exp(-0.5 * found.value))  # of two degrees of freedom
+    assert found["dof"] == 2
+    assert found["value"] == pytest.approx(0.01 / 0.008 + 0.01 / 0.01)
+    assert found["p"] == pytest.approx(np.exp(-0.5 * found["value"]))  # of two degrees of freedom
