@@ -66,9 +66,12 @@ def reader_class(name: str) -> type[FrameReader]:
     if name not in plugins:
         known = ", ".join([*_OURS, *plugins, "histogram"])
         raise ConfigError(f"unknown input.format {name!r}; choose one of: auto, {known}")
-    point = plugins[name]
+    return _load(plugins[name])
+
+
+def _load(point: EntryPoint) -> type[FrameReader]:
     try:
-        cls: type[FrameReader] = point.load()
+        cls = point.load()
     except Exception as error:
         raise ConfigError(
             f"the reader {point.name!r} ({point.value}) cannot be loaded: {error}; repair or uninstall "
