@@ -60,19 +60,32 @@ class RandomSource(Protocol):
 class EffectContext:
     """A block of frames and a band of rows, seen from an effect.
 
-    All arrays broadcast against (frame, y, x) and are read-only. The run is frame ``0 .. n_frames - 1``;
-    negative numbers are frames before it, simulated only for effects that ask for ``history``. The true maps
-    are ``quanta_exposure`` (e-), ``conversion_gain`` (e-/DN), ``bias`` (DN), ``analog_read_noise_e`` (e-).
+    All arrays broadcast against (frame, y, x) and are read-only.
+
+    Attributes:
+        frames: frame numbers of the block. The run is ``0 .. n_frames - 1``; negative numbers
+            are frames before the run, simulated only for effects that ask for ``history``.
+        n_frames: number of frames of the whole run.
+        rows: sensor rows of the band, ``halo`` rows included; columns are always complete.
+        shape: rows and columns of the whole sensor, px.
+        integration_time: s.
+        bit_depth: bits of the ADC.
+        truth: maps of the band (y, x): ``quanta_exposure`` (e-), ``conversion_gain`` (e-/DN),
+            ``bias`` (DN), ``analog_read_noise_e`` (e-).
+        random: this effect's own random numbers.
+        exposure: H_t behind the EXPOSURE plane, e-; ``None`` before that.
+        charge: electron number K behind the CHARGE plane, e-; ``None`` before that.
+        read_noise: the read noise R that was added, e-; ``None`` before ANALOG.
     """
 
-    frames: IntArray  # frame numbers of the block
-    n_frames: int  # number of frames of the whole run
-    rows: IntArray  # sensor rows of the band, ``halo`` rows included; columns are always complete
-    shape: tuple[int, int]  # rows and columns of the whole sensor, px
-    integration_time: float  # s
-    bit_depth: int  # bits of the ADC
-    truth: Mapping[str, FloatArray]  # maps of the band (y, x), see above
-    random: RandomSource  # this effect's own random numbers
-    exposure: NDArray[Any] | None = None  # H_t behind the EXPOSURE plane, e-; ``None`` before that
-    charge: NDArray[Any] | None = None  # electron number K behind the CHARGE plane, e-; ``None`` before that
-    read_noise: NDArray[Any] | None = None  # the read noise R that was added, e-; ``None`` before ANALOG
+    frames: IntArray
+    n_frames: int
+    rows: IntArray
+    shape: tuple[int, int]
+    integration_time: float
+    bit_depth: int
+    truth: Mapping[str, FloatArray]
+    random: RandomSource
+    exposure: NDArray[Any] | None = None
+    charge: NDArray[Any] | None = None
+    read_noise: NDArray[Any] | None = None
