@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 # CPU seconds on a core of about 2020: of a simulated sample with all that is looked at, of a code in an
 # evaluation of the likelihood by a plain fit, and of the mass of a code under one component
-_SAMPLE, _CODE, _MASS = 2.5e-7, 1.5e-8, 1.0e-7
+_SAMPLE, _CODE, _MASS = 2.5e-7, 1.0e-8, 1.0e-7
 # of the fit of a pixel with effects, by components of the law, and the same by evaluations of its likelihood
 _REFIT, _REFIT_BY = 3.5e-5, 6.0e-7
 # of what is learnt of the sensor from a pixel, and the same by components
