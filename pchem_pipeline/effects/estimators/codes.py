@@ -178,8 +178,7 @@ class CurveResponse:
 
     def fits(self, deviations: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return by how much pairs of deviations (kinds, 2, codes + 1) lower chi2, and their factors."""
-        kinds, _, edges = deviations.shape
-        designs = (self.response @ deviations.reshape(-1, edges).T).reshape(-1, kinds, 2).swapaxes(0, 1)
+        designs = np.einsum("ce,kje->kcj", self.response, deviations, optimize=True)
         factors = [np.linalg.lstsq(design, self.residuals, rcond=None)[0] for design in designs]
         left = [self.residuals - design @ each for design, each in zip(designs, factors, strict=True)]
         total = float((self.residuals**2).sum())
