@@ -24,7 +24,7 @@ from pchem_pipeline.config.load import yaml_text
 from pchem_pipeline.frames.camera import CameraFacts
 from pchem_pipeline.frames.formats.fits_files import FitsImage, camera_cards, image_cards, write_images
 from pchem_pipeline.frames.formats.map_files import MapImage, write_tiff
-from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.arithmetic.statistics import robust_sd
 from pchem_pipeline.run.target import Target
 from pchem_pipeline.stages.defects import stored_defects
 from pchem_pipeline.store.files import whole_file, write_atomic

@@ -21,8 +21,8 @@ from pchem_pipeline.effects.framework.compose import AddedExposure, in_place, pl
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
 from pchem_pipeline.effects.framework.registry import effect_classes
-from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.arithmetic.significance import CLEAR, FALSE_ALARM, NO_CHANCE
+from pchem_pipeline.model.arithmetic.statistics import look_elsewhere
 
 if TYPE_CHECKING:
     from pchem_pipeline.discrepancy.skeleton import Prepared

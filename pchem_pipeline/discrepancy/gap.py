@@ -19,8 +19,8 @@ from scipy import special
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.discrepancy.null import STRAY, Covariance, NullModel, moments
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
-from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
+from pchem_pipeline.model.arithmetic.statistics import chi_square, look_elsewhere, robust_sd
 
 _REST_OF_NAMED = 0.1  # largest remaining gap beside a named effect, over the gap that the effect closes
 _FLOOR_QUANTILE = 0.95

@@ -22,8 +22,8 @@ from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.discrepancy.observe.catalogue import EXACT, STATISTICS
 from pchem_pipeline.discrepancy.observe.laws import without_skew
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, PRICE
+from pchem_pipeline.model.arithmetic.statistics import look_elsewhere, robust_sd
 
 # statistics of neighbouring codes, and their period, DN
 _OF_CODES = {"code.alternating": 2, "code.period2": 2, "code.largest": 2, "code.rough": 3, "code.period4": 4}

@@ -24,8 +24,8 @@ from pchem_pipeline.discrepancy.scan import Stretch, Suspect, scan_event_map, sc
 from pchem_pipeline.discrepancy.verdict import Place
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, Evidence, PixelMaps, TimeSeries
 from pchem_pipeline.effects.framework.region import parse_place
-from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
+from pchem_pipeline.model.arithmetic.statistics import look_elsewhere, robust_sd
 
 #: Maps of neighbours, along x and along y: charge with charge, readout with readout, one with the other.
 PAIRS = ("x.kk", "x.rr", "x.rk", "y.kk", "y.rr", "y.rk")

@@ -21,7 +21,7 @@ from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.methods.base import Method, PixelSamples, Sample, methods
 from pchem_pipeline.methods.photon_transfer import gain_variance
 from pchem_pipeline.methods.settings import MethodsSettings
-from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.arithmetic.statistics import robust_sd
 from pchem_pipeline.model.errors.expected_information import (
     expected_information,
     inverse_information,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.arithmetic.statistics import robust_sd
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.status import FAILED, FLAGGED, flags_of
 from pchem_pipeline.model.law.mass import draw_histograms

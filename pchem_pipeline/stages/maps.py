@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import Arrays, FloatArray
 from pchem_pipeline.base.plain import plain
 from pchem_pipeline.base.variables import INTERVALS, PARAMETERS, interval_names
-from pchem_pipeline.model.arithmetic.robust import false_discovery, poorest
+from pchem_pipeline.model.arithmetic.statistics import false_discovery, poorest
 from pchem_pipeline.model.errors.expected_information import covariance_from
 from pchem_pipeline.model.fit.status import FAILED, FitStatus, flags_of
 from pchem_pipeline.model.maps.maps import (

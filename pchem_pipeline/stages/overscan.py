@@ -8,8 +8,8 @@ import numpy as np
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.frames.sequence import FrameSequence
-from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
+from pchem_pipeline.model.arithmetic.statistics import robust_sd
 from pchem_pipeline.store.run_store import RunStore
 from pchem_pipeline.use.overscan import Overscan
 

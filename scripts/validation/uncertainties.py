@@ -39,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from helpers.drawn_pixels import Drawn  # noqa: E402
 from helpers.plain_law import pcd_mass  # noqa: E402
 
-from pchem_pipeline.model.arithmetic.robust import false_discovery  # noqa: E402
+from pchem_pipeline.model.arithmetic.statistics import false_discovery  # noqa: E402
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of  # noqa: E402
 from pchem_pipeline.model.fit.api import fit_histograms  # noqa: E402
 from pchem_pipeline.model.fit.result import FitResult, quantile_of  # noqa: E402

@@ -8,7 +8,7 @@ from helpers.drawn_pixels import draw
 from scipy.special import chdtrc
 from scipy.stats import binom, kstest
 
-from pchem_pipeline.model.arithmetic.robust import false_discovery
+from pchem_pipeline.model.arithmetic.statistics import false_discovery
 from pchem_pipeline.model.checks.shrinkage import Judged, NoisePool, noise_of
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy import special
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.model.arithmetic.robust import chi_square as chi_square
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
+from pchem_pipeline.model.arithmetic.statistics import chi_square as chi_square
 
 _SMALL = 1e-12
 # an event that is next to impossible counts as much as this many standard deviations

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
+from pchem_pipeline.model.arithmetic.statistics import look_elsewhere
 
 if TYPE_CHECKING:
     from pchem_pipeline.effects.framework.effect import Effect

@@ -21,7 +21,7 @@ from pchem_pipeline.discrepancy.observe.tables_numba import CodeSums
 from pchem_pipeline.discrepancy.observe.vector import width_statistics
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 from pchem_pipeline.discrepancy.quick.frames import normal_p
-from pchem_pipeline.model.arithmetic.robust import look_elsewhere
+from pchem_pipeline.model.arithmetic.statistics import look_elsewhere
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings
 

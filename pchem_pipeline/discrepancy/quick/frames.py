@@ -16,8 +16,8 @@ from pchem_pipeline.discrepancy.observe.laws import FAR, SLOWEST, best, chi_squa
 from pchem_pipeline.discrepancy.observe.sums import FEWEST_FRAMES
 from pchem_pipeline.discrepancy.quick.checks import Check, check_of
 from pchem_pipeline.discrepancy.quick.sums import StackSums
-from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import CERTAIN
+from pchem_pipeline.model.arithmetic.statistics import look_elsewhere, robust_sd
 from pchem_pipeline.model.histogram import odd_frames
 
 #: Frames of a level, at least, and as a share of all.

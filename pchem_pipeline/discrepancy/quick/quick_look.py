@@ -28,8 +28,8 @@ from pchem_pipeline.discrepancy.quick.frames import levels_check, normal_p, odd_
 from pchem_pipeline.discrepancy.quick.sums import Lines, StackSums, sensor_cells, sensor_places
 from pchem_pipeline.discrepancy.scan import Suspect
 from pchem_pipeline.effects.framework.evidence import PixelMaps
-from pchem_pipeline.model.arithmetic.robust import look_elsewhere, robust_sd
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, SIGNIFICANCE
+from pchem_pipeline.model.arithmetic.statistics import look_elsewhere, robust_sd
 from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY
 from pchem_pipeline.model.maps.ordered import median_of
 

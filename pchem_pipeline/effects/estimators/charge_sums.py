@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pchem_pipeline.effects.types import Evidence, FloatArray, IntArray, PixelMaps
-from pchem_pipeline.model.arithmetic.robust import OF_MEDIAN_DEVIATION
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
+from pchem_pipeline.model.arithmetic.statistics import OF_MEDIAN_DEVIATION
 from pchem_pipeline.model.law.pcd import pcd_posterior
 
 

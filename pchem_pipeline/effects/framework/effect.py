@@ -244,7 +244,7 @@ class Effect(Section):
 
     @property
     def measured_parts(self) -> int:
-        """How many forms it has that were measured and have no explanation."""
+        """How many of its forms are measured, not assumed."""
         return int(type(self).empirical)
 
     def at_place(self, region: Region | None, when: When | None = None) -> Self:

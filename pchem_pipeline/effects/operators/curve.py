@@ -185,7 +185,7 @@ class AdcInl(Effect, tag="adc_inl"):
 
     @property
     def measured_parts(self) -> int:
-        """One where the form of the deviation was measured, too."""
+        """One where the curve was measured, none of a sine."""
         return int(self.form == "curve")
 
     def _steepest(self) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import bdtr, stdtr
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.model.arithmetic.robust import OF_MEDIAN_DEVIATION
+from pchem_pipeline.model.arithmetic.statistics import OF_MEDIAN_DEVIATION
 
 #: Chance of a false alarm for a map, all places that are looked at together.
 _ALARM = 1e-4

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, erfc
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
-from pchem_pipeline.model.arithmetic.robust import false_discovery
+from pchem_pipeline.model.arithmetic.statistics import false_discovery
 from pchem_pipeline.model.checks.settings import allowed
 from pchem_pipeline.model.fit.api import fit_histograms
 from pchem_pipeline.model.fit.settings import FitSettings

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
-from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.arithmetic.statistics import robust_sd
 from pchem_pipeline.model.fit.settings import FitSettings
 
 #: Largest change of the logarithm of a pixel's information over one standard error of its read noise. Beyond,

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IndexArray, IntArray, IntegerArray
-from pchem_pipeline.model.arithmetic.robust import chi_square
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT
+from pchem_pipeline.model.arithmetic.statistics import chi_square
 from pchem_pipeline.model.fit import guard_numba
 from pchem_pipeline.model.fit.climb_numba import Limits
 from pchem_pipeline.model.fit.search_numba import CHI2, FIT_NOT_CONVERGED, GAIN_NOT_IDENTIFIED, OUTLYING

@@ -9,7 +9,7 @@ from scipy import ndimage, special, stats
 
 from pchem_pipeline.base.arrays import BoolArray, CodeArray, FloatArray, IntArray
 from pchem_pipeline.base.wording import short
-from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.arithmetic.statistics import robust_sd
 from pchem_pipeline.model.histogram.spectrum import MOST_SAMPLES
 from pchem_pipeline.model.histogram.summaries import ROW_GROUP
 

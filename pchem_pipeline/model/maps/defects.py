@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import Arrays, BoolArray, FloatArray, IntArray
 from pchem_pipeline.model.arithmetic.limits import SMALLEST_MASS
-from pchem_pipeline.model.arithmetic.robust import robust_sd
+from pchem_pipeline.model.arithmetic.statistics import robust_sd
 from pchem_pipeline.model.fit.status import FLAGGED, FitStatus, flags_of, words_of
 
 

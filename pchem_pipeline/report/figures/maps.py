@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray
 from pchem_pipeline.base.wording import count, measured, percent, plain, short, stored_unit, symbol
-from pchem_pipeline.model.arithmetic.robust import misfit
+from pchem_pipeline.model.arithmetic.statistics import misfit
 from pchem_pipeline.model.fit.status import FitStatus
 from pchem_pipeline.model.maps.ordered import Ordered
 from pchem_pipeline.report.charts.chart import (

@@ -34,8 +34,8 @@ from pchem_pipeline.discrepancy.scan_pairs import FEWEST_PIXELS, LARGEST, Shared
 from pchem_pipeline.discrepancy.where import N_SETS, frame_series, pixel_maps, rare_samples, suspected_regions
 from pchem_pipeline.effects.framework.evidence import Evidence, TimeSeries
 from pchem_pipeline.effects.framework.region import When
-from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
+from pchem_pipeline.model.arithmetic.statistics import robust_sd
 
 #: Of a place among all places of all maps: maps rest on fits, whose errors are not quite normal. What is
 #: found among pairs, series and rare samples rests on the order of the frames and the number of samples.

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.discrepancy.effort import MOST_LEARNT_FROM
-from pchem_pipeline.model.arithmetic.robust import robust_sd
 from pchem_pipeline.model.arithmetic.significance import POSSIBLE
+from pchem_pipeline.model.arithmetic.statistics import robust_sd
 from pchem_pipeline.model.fit.climb_numba import LEAST_STEP, MAX_LOG_EXPOSURE
 from pchem_pipeline.model.fit.shared import LOWEST_LOG_VARIANCE, Ascent, Expansion, to_parameters, to_theta
 from pchem_pipeline.model.law.mass import sample_mass, sample_parabolas

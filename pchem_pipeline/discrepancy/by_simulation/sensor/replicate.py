@@ -127,9 +127,8 @@ class Replicate:
         parts = (taken.numbers,) if taken.other is None else (taken.numbers, taken.other)
         seen = taken.numbers if taken.other is None else np.union1d(taken.numbers, taken.other)
         frames = simulate_frames(self.maps, self.effects, self.seed, replace(taken, numbers=seen))
-        start, evaluated = self.maps, 0.0
-        if taken.other is not None:
-            start, evaluated = fitted_maps(frames, ~self.maps.usable)
+        anew = taken.other is not None
+        start, evaluated = fitted_maps(frames, ~self.maps.usable) if anew else (self.maps, 0.0)
         for numbers in parts:
             some = frames[np.isin(seen, numbers)]
             found = taken.observe(some, numbers, start)

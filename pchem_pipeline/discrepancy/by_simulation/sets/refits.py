@@ -30,8 +30,8 @@ from pchem_pipeline.discrepancy.effort import EffortSpentError
 from pchem_pipeline.discrepancy.null import Covariance, NullModel
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere
 from pchem_pipeline.model.arithmetic.significance import BEYOND_DOUBT, FALSE_ALARM, NO_DIFFERENCE, OUTLYING
+from pchem_pipeline.model.arithmetic.statistics import chi_square, look_elsewhere
 
 _SPLITS = 2  # train and test frames, whose mean is explained
 #: Replicates at each strength on the way.

@@ -297,7 +297,7 @@ class Search:
         if named and price(trial.effects) > best.price:
             return False
         if trial.way is None:
-            # a form that was measured may stand for an effect whose fingerprint misses details
+            # a measured form fits what others make: it leaves no effect out for what a fingerprint misses
             measured = any(effect.measured_parts for effect in best.effects)
             if named and not measured and self._is_blind(trial.members, best):
                 return False

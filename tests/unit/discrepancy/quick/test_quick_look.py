@@ -20,8 +20,8 @@ from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.region import Region
 from pchem_pipeline.effects.operators.offsets import ColumnNoise, RowNoise
-from pchem_pipeline.model.arithmetic.robust import look_elsewhere
 from pchem_pipeline.model.arithmetic.significance import SIGNIFICANCE
+from pchem_pipeline.model.arithmetic.statistics import look_elsewhere
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.histogram.settings import HistogramSettings
 from pchem_pipeline.model.histogram.spectrum import SEEN_MIDWAY, FrameSpectrum

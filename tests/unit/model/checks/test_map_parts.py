@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pchem_pipeline.model.arithmetic.robust import chi_square, look_elsewhere, robust_sd
+from pchem_pipeline.model.arithmetic.statistics import chi_square, look_elsewhere, robust_sd
 from pchem_pipeline.model.checks.map_parts import map_parts
 
 

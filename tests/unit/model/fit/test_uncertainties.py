@@ -8,7 +8,7 @@ from scipy.stats import false_discovery_control
 
 from pchem_pipeline.base.variables import INTERVALS, interval_names
 from pchem_pipeline.effects.operators.offsets import RowNoise
-from pchem_pipeline.model.arithmetic.robust import false_discovery, misfit, poorest
+from pchem_pipeline.model.arithmetic.statistics import false_discovery, misfit, poorest
 from pchem_pipeline.model.ensemble.ensemble import DnAxis, NucedAxis, curve_errors
 from pchem_pipeline.model.errors.expected_information import correlations, covariance_from
 from pchem_pipeline.model.fit.api import fit_histograms

@@ -1,4 +1,4 @@
-"""Figures that a few values far from the others do not move, many tests at once, and sums of squares.
+"""Robust standard deviations, many tests at once, and sums of squares as normal deviates.
 
 All are of arrays in any unit.
 """
