@@ -12,9 +12,20 @@ from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntA
 from pchem_pipeline.base.kernel import kernel
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.model.arithmetic.significance import SMALLEST_EXPECTATION
+from pchem_pipeline.model.arithmetic.simd_numba import (
+    SIMD_WIDTH,
+    counting,
+    fused,
+    simd_load,
+    simd_store,
+    simd_sum,
+)
 from pchem_pipeline.model.law.cell_scores_numba import N_COLUMNS, N_NUISANCE, REACH, electron_range, fill_law
 
 N_TESTS = N_COLUMNS - N_NUISANCE
+#: Rows of the table of a pixel after the columns of its law: 1/p, or 0 for codes to be left out, and samples.
+INVERSE, SEEN = N_COLUMNS, N_COLUMNS + 1
+N_ROWS = N_COLUMNS + 2
 #: Codes are summed by their number modulo this.
 FOLD = 16
 #: Squared length of a column, over that before, below which it is none of its own.
@@ -92,22 +103,29 @@ def _support(law: FloatArray, samples: float, allowed: float) -> tuple[int, int,
 
 
 @kernel
-def whiten(law: FloatArray, inverse: FloatArray, factor: FloatArray) -> None:
+def _product(table: FloatArray, i: int, j: int) -> float:
+    """Return ``sum_x a b / p`` of two rows of a table over all codes."""
+    total = counting() * 0.0
+    for x in range(0, table.shape[1], SIMD_WIDTH):
+        total = fused(simd_load(table, i, x) * simd_load(table, INVERSE, x), simd_load(table, j, x), total)
+    return simd_sum(total)
+
+
+@kernel
+def whiten(table: FloatArray, factor: FloatArray) -> None:
     """Make the first columns of a law orthonormal, and the tests orthogonal to them (Gram and Schmidt).
 
     A parameter on which the law does not depend here, or not in a way of its own, takes nothing from the
     tests: its column becomes 0. The read noise is one where each electron number has the same two codes.
 
     Args:
-        law: columns times mass; changed in place, (code, N_COLUMNS).
-        inverse: 1/p, or 0 for codes to be left out, (code,).
+        table: columns times mass, 1/p (`INVERSE`; 0 for codes to be left out), samples (`SEEN`), by codes, to
+            a whole number of vectors; the columns are changed in place, (N_ROWS, code).
         factor: out, triangular: column j was ``sum_i factor[i, j] (new column i)``, (N_NUISANCE, N_COLUMNS).
     """
-    factor[:] = 0.0
-    for x in range(law.shape[0]):
-        for i in range(N_NUISANCE):
-            for j in range(N_COLUMNS):
-                factor[i, j] += law[x, i] * inverse[x] * law[x, j]
+    for i in range(N_NUISANCE):
+        for j in range(N_COLUMNS):
+            factor[i, j] = _product(table, i, j) if j >= i else 0.0
     # elimination of the Gram matrix
     for i in range(N_NUISANCE):
         scale = 1.0 / math.sqrt(factor[i, i]) if factor[i, i] > SINGULAR else 0.0
@@ -116,34 +134,34 @@ def whiten(law: FloatArray, inverse: FloatArray, factor: FloatArray) -> None:
         for k in range(i + 1, N_NUISANCE):
             for j in range(N_COLUMNS):
                 factor[k, j] -= factor[i, k] * factor[i, j]
-    for x in range(law.shape[0]):
-        for i in range(N_NUISANCE):
-            law[x, i] = law[x, i] / factor[i, i] if factor[i, i] > 0.0 else 0.0
+    for i in range(N_NUISANCE):
+        scale = 1.0 / factor[i, i] if factor[i, i] > 0.0 else 0.0
+        for x in range(0, table.shape[1], SIMD_WIDTH):
+            own = simd_load(table, i, x) * scale
+            simd_store(table, i, x, own)
             for j in range(i + 1, N_COLUMNS):
-                law[x, j] -= factor[i, j] * law[x, i]
+                simd_store(table, j, x, fused(own, -factor[i, j], simd_load(table, j, x)))
 
 
 @kernel
-def sum_scores(law: FloatArray, inverse: FloatArray, seen: FloatArray, sums: FloatArray) -> None:
-    """Sum over the codes of a whitened law what the scores of its tests are made of.
+def sum_scores(table: FloatArray, sums: FloatArray) -> None:
+    """Sum over the codes of a whitened table what the scores of its tests are made of.
 
-    Args:
-        law: whitened, (code, N_COLUMNS).
-        inverse: 1/p, or 0 for codes to be left out, (code,).
-        seen: samples of each code, (code,).
-        sums: out, for each test its products with all tests, the sum over the samples, and its third and
-            fourth power, (N_TESTS, N_TESTS + 3).
+    ``sums``: out, for each test its products with all tests, the sum over the samples, and its third and
+    fourth power, (N_TESTS, N_TESTS + 3).
     """
-    sums[:] = 0.0
-    for x in range(law.shape[0]):
-        for i in range(N_TESTS):
-            test = law[x, N_NUISANCE + i]
-            score = test * inverse[x]
-            for j in range(N_TESTS):
-                sums[i, j] += score * law[x, N_NUISANCE + j]
-            sums[i, _TOTAL] += score * seen[x]
-            sums[i, _CUBE] += score * score * test
-            sums[i, _FOURTH] += score * score * score * test
+    for i in range(N_TESTS):
+        for j in range(i + 1):
+            sums[i, j] = sums[j, i] = _product(table, N_NUISANCE + i, N_NUISANCE + j)
+        sums[i, _TOTAL] = _product(table, N_NUISANCE + i, SEEN)
+        cube = fourth = counting() * 0.0
+        for x in range(0, table.shape[1], SIMD_WIDTH):
+            test = simd_load(table, N_NUISANCE + i, x)
+            score = test * simd_load(table, INVERSE, x)
+            square = score * test
+            cube = fused(square, score, cube)
+            fourth = fused(square * score, score, fourth)
+        sums[i, _CUBE], sums[i, _FOURTH] = simd_sum(cube), simd_sum(fourth)
 
 
 @kernel
@@ -153,6 +171,8 @@ def _count(
     """Fill the samples of each code of the support; add those beyond it, and far beyond, to the moments."""
     low, high, far_low, far_high = ends
     for b in range(counts.size):
+        if counts[b] == 0:
+            continue
         count, x = float(counts[b]), start + b
         moments.low[0] += count if x < low else 0.0
         moments.high[0] += count if x > high else 0.0
@@ -163,19 +183,17 @@ def _count(
 
 
 @kernel
-def _expect(law: FloatArray, inverse: FloatArray, seen: FloatArray, expected: FloatArray) -> None:
+def _expect(table: FloatArray, expected: FloatArray) -> None:
     """Add the samples expected of each code, the parameters moved, to first order, to suit the samples."""
     for i in range(N_NUISANCE):
-        moved = 0.0
-        for x in range(seen.size):
-            moved += law[x, i] * seen[x] * inverse[x]
-        for x in range(seen.size):
-            expected[x] += moved * law[x, i]
+        moved = _product(table, i, SEEN)
+        for x in range(expected.size):
+            expected[x] += moved * table[i, x]
 
 
 @kernel
 def _goodness(
-    law: FloatArray, seen: FloatArray, expected: FloatArray, shortest: float
+    table: FloatArray, seen: FloatArray, expected: FloatArray, shortest: float
 ) -> tuple[float, float, float]:
     """Return Pearson's chi-square of groups of codes, with its mean and variance for fitted parameters."""
     taken = np.zeros(N_NUISANCE)
@@ -187,7 +205,7 @@ def _goodness(
         observed += seen[x]
         wanted += expected[x]
         for i in range(N_NUISANCE):
-            taken[i] += law[x, i]
+            taken[i] += table[i, x]
         full = wanted >= SMALLEST_EXPECTATION and merged >= shortest
         if (full and remaining - wanted >= SMALLEST_EXPECTATION) or x == seen.size - 1:
             if wanted <= 0.0:
@@ -218,26 +236,29 @@ def _centre(mass: FloatArray, k: FloatArray, r: FloatArray, seen: FloatArray, mo
         values = k if i == 0 else r
         mean = square = centre = 0.0
         for x in range(mass.size):
-            mean += mass[x] * values[x] / total
-            square += mass[x] * values[x] * values[x] / total
-            centre += seen[x] * values[x] / n
-        spread[i] = math.sqrt(max(square - mean * mean, 0.0))
+            mean += mass[x] * values[x]
+            square += mass[x] * values[x] * values[x]
+            centre += seen[x] * values[x]
+        spread[i] = math.sqrt(max(square / total - (mean / total) ** 2, 0.0))
         for x in range(mass.size):
-            values[x] -= centre
+            values[x] -= centre / n
     moments.charge_std, moments.readout_std = spread[0], spread[1]
+    kk = rr = kr = krr = kkrr = rrrr = 0.0
     for x in range(mass.size):
-        weight, kk, rr = seen[x] / n, k[x] * k[x], r[x] * r[x]
-        moments.kk += weight * kk
-        moments.rr += weight * rr
-        moments.kr += weight * k[x] * r[x]
-        moments.krr += weight * k[x] * rr
-        moments.kkrr += weight * kk * rr
-        moments.rrrr += weight * rr * rr
+        of_k, of_r = seen[x] * k[x], r[x] * r[x]
+        kk += of_k * k[x]
+        rr += seen[x] * of_r
+        kr += of_k * r[x]
+        krr += of_k * of_r
+        kkrr += of_k * k[x] * of_r
+        rrrr += seen[x] * of_r * of_r
+    moments.kk, moments.rr, moments.kr = kk / n, rr / n, kr / n
+    moments.krr, moments.kkrr, moments.rrrr = krr / n, kkrr / n, rrrr / n
 
 
 @kernel
 def _add_codes(
-    law: FloatArray, seen: FloatArray, expected: FloatArray, shift: FloatArray, first: int, sums: CodeSums
+    table: FloatArray, seen: FloatArray, expected: FloatArray, shift: FloatArray, first: int, sums: CodeSums
 ) -> None:
     """Add residuals of a pixel and their covariance: per code (from ``first`` on), modulo 16, and by bin.
 
@@ -252,9 +273,9 @@ def _add_codes(
         at, fold, place = first + x, (first + x + sums.first) % FOLD, (first + x) // sums.coarse
         residual, explained = seen[x] - expected[x], 0.0
         for i in range(N_NUISANCE):
-            explained += law[x, i] * law[x, i]
-            folds[i, fold] += law[x, i]
-            bins[i, place - low] += law[x, i] * shift[x]
+            explained += table[i, x] * table[i, x]
+            folds[i, fold] += table[i, x]
+            bins[i, place - low] += table[i, x] * shift[x]
         sums.single[2, at] += residual
         sums.single[3, at] += max(expected[x] - n * explained, 0.0)
         sums.fold[fold] += residual
@@ -308,17 +329,18 @@ def compare_pixels(
         low, high, below, above = _support(full, samples, _ALLOWED)
         far_low, far_high, far_below, far_above = _support(full, samples, _ALLOWED / n_good)
         first, size = window + low, high - low + 1
-        law, mass, inverse = np.empty((size, N_COLUMNS)), np.empty(size), np.zeros(size)
-        k, r, within, expected = np.empty(size), np.empty(size), np.zeros(size), np.zeros(size)
+        table = np.zeros((N_ROWS, -(-size // SIMD_WIDTH) * SIMD_WIDTH))
+        inverse, within = table[INVERSE, :size], table[SEEN, :size]
+        mass, k, r, expected = np.empty(size), np.empty(size), np.empty(size), np.zeros(size)
         for x in range(size):
             for column in range(N_COLUMNS):
-                law[x, column] = full[low + x, column]
-            mass[x] = law[x, 0]
+                table[column, x] = full[low + x, column]
+            mass[x] = table[0, x]
             value = x + first - bias
             k[x] = min(max(math.floor(value / step + 0.5), fits.electrons[p, 0]), fits.electrons[p, 1])
             if mass[x] > _NOTHING:
                 inverse[x] = 1.0 / mass[x]
-                k[x] = exposure + math.sqrt(exposure) * law[x, 1] * inverse[x]
+                k[x] = exposure + math.sqrt(exposure) * table[1, x] * inverse[x]
             r[x] = value - k[x] * step
         if not inverse.any():
             good[p] = False
@@ -329,9 +351,9 @@ def compare_pixels(
         found.low[0] = found.far_low[0] = seen.outside[p, 0]
         found.high[0] = found.far_high[0] = seen.outside[p, 1]
         _count(seen.counts[p], seen.origin[p] - window, (low, high, far_low, far_high), within, found)
-        whiten(law, inverse, factors[p])
-        sum_scores(law, inverse, within, score_sums[p])
-        _expect(law, inverse, within, expected)
+        whiten(table, factors[p])
+        sum_scores(table, score_sums[p])
+        _expect(table, expected)
         for b in range(seen.counts.shape[1]):
             at = seen.origin[p] + b - codes.first
             if 0 <= at < codes.single.shape[1]:
@@ -340,8 +362,8 @@ def compare_pixels(
             at = window + x - codes.first
             if 0 <= at < codes.single.shape[1]:
                 codes.single[1, at] += expected[x - low] if low <= x <= high else samples * full[x, 0]
-        found.goodness[0], found.goodness[1], found.goodness[2] = _goodness(law, within, expected, 1.0)
-        found.peaks[0], found.peaks[1], found.peaks[2] = _goodness(law, within, expected, np.rint(width))
+        found.goodness[0], found.goodness[1], found.goodness[2] = _goodness(table, within, expected, 1.0)
+        found.peaks[0], found.peaks[1], found.peaks[2] = _goodness(table, within, expected, np.rint(width))
         ends = within.copy()
         ends[0] += found.low[0]
         ends[-1] += found.high[0]
@@ -352,4 +374,4 @@ def compare_pixels(
         row += size
         for x in range(size):
             r[x] /= width * width + QUANTISATION_VARIANCE
-        _add_codes(law, within, expected, r, first - codes.first, codes)
+        _add_codes(table, within, expected, r, first - codes.first, codes)

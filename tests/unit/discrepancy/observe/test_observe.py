@@ -16,9 +16,10 @@ from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
 from pchem_pipeline.discrepancy.observe.observe import _without_steps, observe, observe_histograms
 from pchem_pipeline.discrepancy.observe.sums import blocks_of
 from pchem_pipeline.discrepancy.observe.tables import efficient_scores
-from pchem_pipeline.discrepancy.observe.tables_numba import N_TESTS, sum_scores, whiten
+from pchem_pipeline.discrepancy.observe.tables_numba import INVERSE, N_ROWS, N_TESTS, SEEN, sum_scores, whiten
 from pchem_pipeline.discrepancy.where import expected_beyond, rare_samples, single_samples
 from pchem_pipeline.effects.framework.evidence import MOST_HITS, SCORES, Evidence, PixelMaps
+from pchem_pipeline.model.arithmetic.simd_numba import SIMD_WIDTH
 from pchem_pipeline.model.histogram.count import histogram_frames
 from pchem_pipeline.model.law import cell_scores_numba
 
@@ -35,11 +36,15 @@ def _law(width: float = WIDTH) -> np.ndarray:
 def whitened(law: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """Whiten the law (code, column) of one pixel in place; return the factor, and what scores its samples."""
     factor = np.zeros((cell_scores_numba.N_NUISANCE, cell_scores_numba.N_COLUMNS))
-    whiten(law, inverse, factor)
+    table = np.zeros((N_ROWS, -(-len(law) // SIMD_WIDTH) * SIMD_WIDTH))
+    table[:INVERSE, : len(law)], table[INVERSE, : len(law)] = law.T, inverse
+    whiten(table, factor)
+    law[:] = table[:INVERSE, : len(law)].T
 
     def scored(seen: np.ndarray) -> np.ndarray:
         sums = np.zeros((N_TESTS, N_TESTS + 3))
-        sum_scores(law, inverse, seen, sums)
+        table[SEEN, : len(law)] = seen
+        sum_scores(table, sums)
         return efficient_scores(sums[None], factor[None], np.array([seen.sum()]), np.array([H]))[0, 0]
 
     return factor, scored
