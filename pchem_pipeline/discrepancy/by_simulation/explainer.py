@@ -239,8 +239,7 @@ class FrameExplainer(Explainer[Screened]):
     def _put(self, found: Comparison, added: Refitted, explanation: Screened, *, certain: bool) -> NullModel:
         by_law = HistogramLikelihood(self._likelihood).standard_errors(found.chosen.hypotheses)
         refitter = replace(self._refitter(), allow=lambda _: None)
-        measured = standard_errors(refitter, found.chosen, added.stderr)
-        stderr = [by_law.get(h.tag, {}) | own for h, own in zip(added.hypotheses, measured, strict=True)]
+        stderr = standard_errors(refitter, found.chosen, added.stderr, by_law)
         own = self.accept, found, added, stderr, explanation.hypotheses, certain
         self.extension = Extension.of(self.work, self.given, *own)
         return self.extension.last

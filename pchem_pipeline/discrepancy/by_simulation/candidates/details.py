@@ -8,7 +8,7 @@ Levenberg 1944), the slopes by secants from step to step (Broyden 1965).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,12 +95,15 @@ def tuned(refitter: Refitter, one: Refitted) -> Refitted:
     return way.best
 
 
-def standard_errors(refitter: Refitter, one: Refitted, least: FloatArray) -> list[dict[str, float]]:
+def standard_errors(
+    refitter: Refitter, one: Refitted, least: FloatArray, by_law: Mapping[str, Mapping[str, float]]
+) -> list[dict[str, float]]:
     """Return the standard errors of the strength and parameters of each effect of a set, by name.
 
     The root of the inverse of the information of all together, and of the square of the change that the data
     still ask for; none of a parameter that the data hardly constrain. ``least`` are relative errors of the
-    factors where the parameters are known, shape (e,).
+    factors where the parameters are known, shape (e,). Errors ``by_law``, by tag, are of fits to histograms:
+    the strength is known no better than by a fit that has it vary together with other parameters.
     """
     details = _details(refitter, one)
     information, score = _normal_equations(refitter, one, details)
@@ -111,7 +114,9 @@ def standard_errors(refitter: Refitter, one: Refitted, least: FloatArray) -> lis
     found: list[dict[str, float]] = []
     for h, error in zip(one.hypotheses, np.maximum(relative[: len(least)], least), strict=True):
         strength = abs(float(getattr(h.effect, h.effect.strength))) if h.effect.strength else np.nan
-        found.append({h.effect.strength: strength * float(error) / h.effect.power})
+        law = by_law.get(h.tag, {})
+        tied = law.get(h.effect.strength, 0.0) if len(law) > 1 else 0.0
+        found.append({**law, h.effect.strength: max(strength * float(error) / h.effect.power, tied)})
     for detail, error in zip(details, relative[len(least) :], strict=True):
         if error < _LEARNT * _USUAL_ERROR:
             value = getattr(one.effects[detail.place], detail.name)

@@ -64,7 +64,7 @@ def test_standard_errors_are_those_of_a_fit_of_all_numbers_together() -> None:
     """The scatter of least squares with other derivatives; a number that nothing tells has none."""
     world = world_of(TRUE)
     one = refined(world, TRUE)
-    [found] = standard_errors(world.refitter(), one, np.zeros(1))
+    [found] = standard_errors(world.refitter(), one, np.zeros(1), {})
     [taken] = one.effects
     names = ["fraction", "step_e", "dwell_low_frames", "dwell_high_frames"]
     ahead, back = ([taken.times(n, factor) for n in names] for factor in (1.01, 0.99))
@@ -77,15 +77,19 @@ def test_standard_errors_are_those_of_a_fit_of_all_numbers_together() -> None:
         assert found[name] == pytest.approx(relative * getattr(taken, name), rel=0.25)
     alone = taken.fraction / np.linalg.norm(slopes[0] / noise)
     assert found["fraction"] > 1.5 * alone
-    [blind] = standard_errors(replace(world.refitter(), draw=lambda *_: one.vectors), one, np.ones(1))
+    [blind] = standard_errors(replace(world.refitter(), draw=lambda *_: one.vectors), one, np.ones(1), {})
     assert blind == {"fraction": pytest.approx(taken.fraction)}
+    # a fit to histograms in which the strength varies with another number knows better, no other
+    tied, held = ({taken.tag: {"fraction": 9.0} | more} for more in ({"level_dn": 1.0}, {}))
+    of_law = [standard_errors(world.refitter(), one, np.zeros(1), law)[0] for law in (tied, held)]
+    assert of_law == [found | tied[taken.tag], found]
 
 
 def test_errors_away_from_the_maximum_hold_the_change_that_the_data_still_ask_for() -> None:
     world = world_of(TRUE)
     one = refined(world, BLINKING)
     [found], [right] = (
-        standard_errors(world.refitter(), each, np.zeros(1)) for each in (one, refined(world, TRUE))
+        standard_errors(world.refitter(), each, np.zeros(1), {}) for each in (one, refined(world, TRUE))
     )
     [taken] = one.effects
     off = {n: abs(getattr(taken, n) - getattr(TRUE, n)) for n in ("step_e", "dwell_low_frames")}
@@ -180,6 +184,6 @@ def test_what_an_effect_of_another_package_raises_ends_no_search(strange: type[D
     compare(search, hypotheses, world.likely(*hypotheses))
     assert "dark_current_rts" in search.best.tags
     own = refined(world, guessed)
-    assert standard_errors(refitter, own, own.stderr)[0].keys() == {"fraction"}
+    assert standard_errors(refitter, own, own.stderr, {})[0].keys() == {"fraction"}
     assert refitter.defects
     assert all("dark_current_rts" in failed for failed in refitter.defects)
