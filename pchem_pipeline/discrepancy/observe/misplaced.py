@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, CodeArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.discrepancy.observe.digital import MOST_PAIRED
-from pchem_pipeline.discrepancy.observe.observe_numba import N_PLACES, STEPS, compare_rows
+from pchem_pipeline.discrepancy.observe.observe_numba import N_PLACES, STEPS, compare_codes, compare_rows
 from pchem_pipeline.effects.framework.effect import Effect
-from pchem_pipeline.effects.framework.neighbours import neighbours
 from pchem_pipeline.model.arithmetic.significance import CERTAIN
 from pchem_pipeline.model.histogram.count import histogram_frames
 
@@ -119,15 +118,8 @@ class _Table:
         own = np.log(real, out=real).astype(np.float32).reshape(*usable.shape, -1)
         del real
         first = (origin + some[0] - 1).reshape(usable.shape)
-        ratios, codes = np.empty((*own.shape, len(STEPS)), np.float32), np.arange(own.shape[2])
-        for j, (dy, dx) in enumerate(STEPS):
-            # where one of two pixels does not count, it tells nothing
-            (other, there), (start, _), (counts_there, _) = (
-                neighbours(each.reshape(*usable.shape, -1), (dy, dx, 0)) for each in (own, first, usable)
-            )
-            at = np.clip(codes + first[:, :, None] - start, 0, codes.size - 1)
-            known = there[:, :, :1] & usable[:, :, None] & counts_there
-            ratios[..., j] = known * (np.take_along_axis(other, at, axis=2) - own)
+        ratios = np.empty((*own.shape, len(STEPS)), np.float32)
+        compare_codes(own, first, usable, ratios)
         return cls(first, ratios)
 
     def along(self, lines: Lines) -> _Table:

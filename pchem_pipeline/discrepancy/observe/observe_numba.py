@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pchem_pipeline.base.arrays import Float32Array, FloatArray, IntArray
+from pchem_pipeline.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from pchem_pipeline.base.kernel import kernel
 
 #: Rows and columns from a pixel to that whose samples it may hold: the next line, that before, early, late.
@@ -102,6 +102,24 @@ def add_frames(values: Float32Array, total: FloatArray) -> None:
 
 
 # -- rows at other places ----------------------------------------------------------------------------
+
+
+@kernel
+def compare_codes(own: Float32Array, first: IntArray, usable: BoolArray, ratios: Float32Array) -> None:
+    """Fill ratios (y, x, B, 4): log probabilities (y, x, B) of codes at pixels :data:`STEPS` away, less own.
+
+    ``first``: DN of the first code of each pixel. Where one of two pixels does not count, it tells nothing.
+    """
+    ny, nx, last = own.shape[0], own.shape[1], own.shape[2] - 1
+    for y in range(ny):
+        for x in range(nx):
+            for j in range(len(STEPS)):
+                v, u = y + STEPS[j][0], x + STEPS[j][1]
+                known = 0 <= v < ny and 0 <= u < nx and usable[y, x] and usable[v, u]
+                shift = first[y, x] - first[v, u] if known else 0
+                for code in range(last + 1):
+                    other = own[v, u, min(max(code + shift, 0), last)] if known else own[y, x, code]
+                    ratios[y, x, code, j] = other - own[y, x, code]
 
 
 @kernel
