@@ -10,18 +10,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 # CPU seconds on a core of about 2020: of a simulated sample with all that is looked at, of a code in an
-# evaluation of the likelihood by a plain fit, and of the mass of a code under one component
-_SAMPLE, _CODE, _MASS = 2.5e-7, 1.0e-8, 1.0e-7
-# of the fit of a pixel with effects, by components of the law, and the same by evaluations of its likelihood
-_REFIT, _REFIT_BY = 3.5e-5, 6.0e-7
+# evaluation of the likelihood by a plain fit, of one with effects by components of the law, and of the mass
+# of a code under one component
+_SAMPLE, _CODE, _REFIT, _MASS = 2.5e-7, 1.0e-8, 1.4e-8, 1.0e-7
 # of what is learnt of the sensor from a pixel, and the same by components
 _LEARN, _LEARN_BY = 4.0e-4, 1.0e-4
 MOST_LEARNT_FROM = 1000  # pixels
 # of a sample that is asked for guesses of all effects, or for all forms of what no effect explains
 _ASKED = 2.0e-6
-#: By how many times as long the fit of a pixel takes more where its bias may be off by an electron: more
-#: starts, flat maxima and more electron numbers.
-_AMBIGUOUS = 4.0
 #: CPU seconds, by count, that a search has at least, and what it has of the cost of the null distribution.
 _LEAST, _OF_NULL = 170.0, 6.0
 #: Shares of that: kept for measuring what no effect explains, and for the choice among the sets.
@@ -46,7 +42,6 @@ class Effort:
         for_choice: for the choice among the sets that were tried.
         for_fits: the least that is left for fits of candidates once they are compared.
         tried: tags of all effects with which the pixels were fitted.
-        ambiguous: share of the pixels whose bias may be off by an electron.
         replicates: parts of simulated stacks, or sets of histograms, drawn so far.
     """
 
@@ -57,7 +52,6 @@ class Effort:
     for_choice: float = 0.0
     for_fits: float = 0.0
     tried: set[str] = field(default_factory=set)
-    ambiguous: float = 0.0
     replicates: int = 0
 
     def begin(self) -> None:
@@ -86,9 +80,9 @@ class Effort:
         """Count a simulated stack whose plain fits evaluated so many codes, see `Evidence.evaluated`."""
         self.spent += _SAMPLE * samples + _CODE * evaluated
 
-    def refit(self, pixels: int, components: int, evaluations: float, tags: Iterable[str]) -> None:
-        """Count a fit of pixels with effects, ``evaluations`` of the likelihood of each on average."""
-        self.spent += self._difficulty * pixels * components * (_REFIT + _REFIT_BY * evaluations)
+    def refit(self, evaluated: float, components: int, tags: Iterable[str]) -> None:
+        """Count fits with effects that evaluated so many codes, see `FitResult.evaluated`."""
+        self.spent += _REFIT * evaluated * components
         self.tried |= set(tags)
 
     def learn(self, pixels: int, components: int) -> None:
@@ -118,8 +112,3 @@ class Effort:
         """State where the search ended, and which candidates (tags) were not tried."""
         untried = ", ".join(tag for tag in dict.fromkeys(candidates) if tag not in self.tried)
         return f"the search used its budget before {spent}" + (f"; not tried: {untried}" if untried else "")
-
-    @property
-    def _difficulty(self) -> float:
-        """How many times as long a fit takes as where all peaks are resolved."""
-        return 1.0 + _AMBIGUOUS * self.ambiguous

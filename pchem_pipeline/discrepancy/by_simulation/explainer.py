@@ -146,7 +146,7 @@ class FrameExplainer(Explainer[Screened]):
         mapper: Mapper,
     ) -> FrameExplainer:
         """Simulate and observe the fitted model, refit included: the null distribution of the statistics."""
-        effort = Effort(settings.effort, ambiguous=observed.plain.ambiguous)
+        effort = Effort(settings.effort)
         work = Simulations(observed, mapper, settings.seed, effort, model)
         vectors = work.replicates(model, work.mapped(model).sensor, "r0", settings.replicates)
         own = observed.statistics()

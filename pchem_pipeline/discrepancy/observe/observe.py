@@ -197,7 +197,7 @@ def _compared(
         tail_expected=np.stack([mapped(low[:, 1]), mapped(high[:, 1])]),
         covariance=None if fit is None else fit.covariance.reshape(*shape, 4, 4),
         ambiguous=float(ambiguous),
-        evaluated=_evaluated(seen, fit),
+        evaluated=0.0 if fit is None else fit.evaluated(seen.counts),
     )
     return evidence, laws
 
@@ -245,11 +245,7 @@ def fitted_maps(frames: CodeArray, exclude: BoolArray) -> tuple[PixelMaps, float
     """
     seen = PixelHistograms.of(frames)
     fit, parameters, usable = _fitted(seen, ~exclude.ravel())
-    return PixelMaps.known(parameters.T, usable.reshape(exclude.shape)), _evaluated(seen, fit)
-
-
-def _evaluated(seen: PixelHistograms, fit: FitResult | None) -> float:
-    return 0.0 if fit is None else float(fit.n_iterations @ np.count_nonzero(seen.counts, axis=1))
+    return PixelMaps.known(parameters.T, usable.reshape(exclude.shape)), fit.evaluated(seen.counts)
 
 
 def _clusters(hits: IntArray, laws: PixelLaws, shape: tuple[int, ...]) -> float:

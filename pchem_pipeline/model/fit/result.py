@@ -107,6 +107,10 @@ class FitResult(PixelParameters):
         more = self.bias.size - len(rows)
         return html_table(head, rows) + (f"<p>and {more:,} more</p>" if more else "")
 
+    def evaluated(self, counts: NDArray[Any]) -> float:
+        """Return at how many codes the likelihood of histograms (n, B) was evaluated, all together."""
+        return float(self.n_iterations @ np.count_nonzero(counts, axis=1))
+
     def of(self, pixels: IndexArray) -> FitResult:
         """Return the fit of some pixels."""
         arrays: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}

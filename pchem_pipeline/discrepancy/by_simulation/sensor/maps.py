@@ -67,7 +67,7 @@ class Refit:
         moved: by parameter: change against the maps before, of the pixels on which the effects act.
         covariance: of (H, g, mu, sigma) of each pixel, shape (y, x, 4, 4).
         components: of the law of a sample, with all effects.
-        evaluations: of the likelihood of a pixel, on average.
+        evaluated: codes at which its fits evaluated the likelihood, see `FitResult.evaluated`.
         added: exposure that the effects add to H of each pixel, (j, y, x); None: it counts as part of H.
     """
 
@@ -75,7 +75,7 @@ class Refit:
     moved: Mapping[str, Moved]
     covariance: FloatArray
     components: int = 1
-    evaluations: float = 0.0
+    evaluated: float = 0.0
     added: AddedExposure | None = None
 
 
@@ -116,9 +116,14 @@ def refit_maps(
         mean = (added.flat().exposure_e * added.flat().weight).sum(axis=0)
         near[:, 0] = np.maximum(near[:, 0] - mean, _LEAST_LEFT * near[:, 0])
 
+    evaluated = 0.0
+
     def fitted(some: NDArray[np.intp], start: FloatArray = near) -> FitResult:
+        nonlocal evaluated
         origin = histograms.origin.ravel()[some]
-        return fit_histograms(counts[some], origin, law=law.of(some), start=start[some], settings=_SEARCHED)
+        found = fit_histograms(counts[some], origin, law=law.of(some), start=start[some], settings=_SEARCHED)
+        evaluated += found.evaluated(counts[some])
+        return found
 
     acted_on = _acted_on(effects, (shape[0], shape[1])).ravel()
     # an effect of a part of the sensor leads no other pixels astray
@@ -145,7 +150,7 @@ def refit_maps(
     moved = changes(plain.columns[inside], fit.columns[inside], stderr[inside])
     new_maps = PixelMaps.known(fit.maps, good.reshape(shape))
     covariance = fit.covariance[:, :4, :4].reshape(*shape, 4, 4)
-    return Refit(new_maps, moved, covariance, law.components, float(fit.n_iterations.mean()), added)
+    return Refit(new_maps, moved, covariance, law.components, evaluated, added)
 
 
 def _acted_on(effects: Sequence[Effect], shape: tuple[int, int]) -> BoolArray:
