@@ -95,7 +95,7 @@ def test_work_costs_what_makes_it_long():
     assert spent(lambda e: e.refit(1e9, mixed.components, [])) > 2.9 * plain
     # a sensor that is learnt, from so many pixels at most
     assert spent(lambda e: e.learn(1000, 15)) == spent(lambda e: e.learn(10**6, 15)) > 1.0
-    assert 1.0 < spent(lambda e: e.ask(10**6)) < 5.0
+    assert 0.1 < spent(lambda e: e.ask(10**6)) < 1.0
 
 
 def test_a_law_that_differs_by_pixel_costs_no_more_for_that():
@@ -137,4 +137,5 @@ def test_a_simulated_stack_costs_what_its_fits_evaluate():
     wide = frames + np.random.default_rng(2).integers(0, 200, frames.shape).astype(frames.dtype)
     usual, poor = (observe(each, numbers, n_run=1000, block_frames=100).evaluated for each in (frames, wide))
     assert poor > 5.0 * usual > 0.0
-    assert spent(lambda e: e.simulate(0, poor)) > 5.0 * spent(lambda e: e.simulate(0, usual))
+    stack, *both = (spent(lambda e, n=n: e.simulate(0, n)) for n in (0.0, usual, poor))
+    assert both[1] - stack > 5.0 * (both[0] - stack) > 0.0
