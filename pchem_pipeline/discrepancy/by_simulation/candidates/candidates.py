@@ -28,6 +28,7 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     note_defect,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import DampedSteps
+from pchem_pipeline.discrepancy.observe.catalogue import check_signature
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.compose import along_chain
@@ -133,6 +134,7 @@ class ReplicateSimulator:
             if tag in self.defects or any(present.everywhere for present in taken):
                 continue
             try:
+                check_signature(effect.signature)
                 guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
                 if not guessed and known and known[0].strongest(*effect.signature[:2]) > CERTAIN:
                     guessed = list(effect.typical())
