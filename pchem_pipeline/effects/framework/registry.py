@@ -32,11 +32,6 @@ def effect_classes() -> Mapping[str, type[Effect]]:
     return _discover()[0]
 
 
-def broken_plugins() -> Mapping[str, str]:
-    """Return the plug-ins that were left out, with the reason, by name of their entry point."""
-    return _discover()[1]
-
-
 def effect_class(tag: str) -> type[Effect]:
     """Return the effect of a tag; ConfigError: there is none; it names those there are."""
     classes, broken = _discover()

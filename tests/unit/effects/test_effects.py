@@ -105,8 +105,8 @@ def test_a_broken_plugin_is_named_and_left_out(installed, caplog, point, reason)
     installed(point, entry("Shine"))
     with caplog.at_level(logging.WARNING):
         assert registry.effect_class("shine") is Shine
-    assert list(registry.broken_plugins()) == [point.name]
-    assert reason in registry.broken_plugins()[point.name]
+    assert list(registry._discover()[1]) == [point.name]
+    assert reason in registry._discover()[1][point.name]
     assert point.name in caplog.text
     assert registry.effect_class("row_noise") is not Impostor
 
@@ -115,7 +115,7 @@ def test_of_two_plugins_with_one_tag_the_first_counts_and_a_broken_one_that_is_a
     gone = entry("gone", "package_that_is_not_there:Effect")
     installed(entry("Shine"), entry("other", f"{__name__}:Shine"), gone)
     assert registry.effect_class("shine") is Shine
-    assert "taken" in registry.broken_plugins()["other"]
+    assert "taken" in registry._discover()[1]["other"]
     with pytest.raises(ConfigError, match="left out: package_that_is_not_there"):
         registry.effect_class("gone")
 
