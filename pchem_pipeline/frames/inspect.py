@@ -84,15 +84,12 @@ def survey(
 def _open(entry: FileReport, settings: InputSettings) -> FrameReader | None:
     try:
         name = settings.format if settings.format != "auto" else detect_format(entry.path)
-        kind = reader_class(name)
         with sound(entry.path, f"{name} file"):  # a reader of another package may raise anything
-            reader = kind.open(entry.path, settings)
-            empty = 0 in reader.shape
+            reader = reader_class(name).open(entry.path, settings)
+            entry.problem = "has no frames; omit it" if 0 in reader.shape else ""
     except InputError as error:
         entry.problem = str(error).removeprefix(f"{entry.path}: ")
         return None
-    if empty:
-        entry.problem = "has no frames; omit it"
     return reader
 
 
