@@ -10,6 +10,8 @@ import shlex
 from enum import IntEnum
 from pathlib import Path
 
+from pydantic_core import ValidationError
+
 #: Extra to the libraries that it installs, as ``pyproject.toml`` has them.
 EXTRAS = {
     "fits": ("astropy>=6.1",),
@@ -71,8 +73,12 @@ class PchEmError(Exception):
 
 
 def error_words(error: BaseException) -> str:
-    """Return an error in words: our own messages as they are, others with their kind."""
-    return str(error) if isinstance(error, PchEmError) else f"{type(error).__name__}: {error}"
+    """Return an error in one line: ours as it is, of settings the first complaint, others with their kind."""
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        words = first["msg"].removeprefix("Value error, ")
+        return one_line(f"{'.'.join(map(str, first['loc']))}: {words}".removeprefix(": "))
+    return str(error) if isinstance(error, PchEmError) else one_line(f"{type(error).__name__}: {error}")
 
 
 class ConfigError(PchEmError):

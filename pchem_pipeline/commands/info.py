@@ -19,7 +19,7 @@ from pchem_pipeline.frames.histogram_files import is_histogram_input, read_histo
 from pchem_pipeline.frames.inspect import survey
 from pchem_pipeline.frames.open import joined
 from pchem_pipeline.frames.reader import FrameReader, described
-from pchem_pipeline.frames.registry import reader_class, reader_names
+from pchem_pipeline.frames.registry import readers
 from pchem_pipeline.frames.resolve import HISTOGRAM_SUFFIXES
 from pchem_pipeline.frames.sequence import FrameSequence
 from pchem_pipeline.frames.settings import InputSettings
@@ -31,11 +31,12 @@ _MOST_CODES_OF = 4_000_000  # samples whose codes are counted
 def about_program() -> list[str]:
     """Return the version, the formats with their libraries, the effects by tag, and the cache of kernels."""
     lines = [f"pchem {__version__}", "", "formats:"]
-    for name in reader_names():
-        reader = reader_class(name)
+    for reader in readers():
         own = "built in" if reader.__module__.startswith("pchem_pipeline.") else "plug-in"
         missing = "" if not reader.library or find_spec(reader.library) else ", not installed"
-        lines.append(f"  {name:10}{' '.join(reader.suffixes):32}{reader.library or own}{missing}")
+        lines.append(
+            f"  {reader.format_name:10}{' '.join(reader.suffixes):32}{reader.library or own}{missing}"
+        )
     lines += [f"  {'histogram':10}{' '.join(HISTOGRAM_SUFFIXES):32}built in", "", "effects:"]
     lines += [f"  {tag:28} {effect.title or tag}" for tag, effect in effect_classes().items()]
     return [*lines, "", f"compiled kernels: {os.environ.get('NUMBA_CACHE_DIR') or cache_folder()}"]

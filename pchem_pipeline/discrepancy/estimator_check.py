@@ -12,7 +12,7 @@ from scipy.special import stdtr
 
 from pchem_pipeline.base.arrays import FloatArray
 from pchem_pipeline.base.errors import ConfigError
-from pchem_pipeline.discrepancy.observe.catalogue import STATISTICS
+from pchem_pipeline.discrepancy.observe.catalogue import check_signature
 from pchem_pipeline.discrepancy.observe.observe import observe
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.simulate.chain import simulate_block
@@ -83,11 +83,7 @@ def recovered_strength(
     """
     if not effect.strength:
         raise ConfigError(f"effect {effect.tag!r} has no strength; name the field that scales it")
-    if unknown := [name for name in effect.signature if name not in STATISTICS]:
-        raise ConfigError(
-            f"effect {effect.tag!r}: its signature names no statistics: {', '.join(unknown)}; they are "
-            "listed in pchem_pipeline/discrepancy/observe/catalogue.py"
-        )
+    check_signature(effect.signature)
     _check_reach(effect, shape, seed)
     found = np.full(stacks, np.nan)
     for i in range(stacks):

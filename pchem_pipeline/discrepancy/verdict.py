@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.base.errors import StoreError
+from pchem_pipeline.base.errors import StoreError, error_words
 from pchem_pipeline.base.wording import percent, short
 from pchem_pipeline.discrepancy.observe.catalogue import FAMILIES, STATISTICS
 from pchem_pipeline.effects.framework.compose import AddedExposure
@@ -402,9 +402,7 @@ class Verdict(_Part):
         try:
             return cls.model_validate(content)
         except ValidationError as error:
-            first = error.errors()[0]
-            place = ".".join(str(part) for part in first["loc"])
-            raise StoreError(f"{source} is damaged ({place}: {first['msg']}); {cure}") from error
+            raise StoreError(f"{source} is damaged ({error_words(error)}); {cure}") from error
 
     @property
     def closed_in_model(self) -> float:

@@ -11,7 +11,7 @@ from typing import Literal
 
 from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.identity import file_size, hash_file, sample_hash
-from pchem_pipeline.frames.reader import FrameReader, shared_notes
+from pchem_pipeline.frames.reader import FrameReader, shared_notes, sound
 from pchem_pipeline.frames.registry import detect_format, reader_class
 from pchem_pipeline.frames.resolve import resolve_files
 from pchem_pipeline.frames.settings import InputSettings
@@ -84,12 +84,12 @@ def survey(
 def _open(entry: FileReport, settings: InputSettings) -> FrameReader | None:
     try:
         name = settings.format if settings.format != "auto" else detect_format(entry.path)
-        reader = reader_class(name).open(entry.path, settings)
+        with sound(entry.path, f"{name} file"):  # a reader of another package may raise anything
+            reader = reader_class(name).open(entry.path, settings)
+            entry.problem = "has no frames; omit it" if 0 in reader.shape else ""
     except InputError as error:
         entry.problem = str(error).removeprefix(f"{entry.path}: ")
         return None
-    if 0 in reader.shape:
-        entry.problem = "has no frames; omit it"
     return reader
 
 

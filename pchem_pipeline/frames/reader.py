@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import FloatArray, IntArray
-from pchem_pipeline.base.errors import ConfigError, InputError
+from pchem_pipeline.base.errors import InputError, PchEmError, error_words
 from pchem_pipeline.frames.camera import CameraFacts, StatedFacts
 from pchem_pipeline.frames.settings import Area, InputSettings
 
@@ -99,7 +99,8 @@ class FrameReader(ABC):
         t1 = self.shape[0] if t1 is None else t1
         y1 = self.shape[1] if y1 is None else y1
         buffer = np.empty((t1 - t0, y1 - y0, self.shape[2]), self.dtype)
-        self.read_into(buffer, t0, t1, y0, y1)
+        with sound(self.paths[0], f"{self.format_name} file"):
+            self.read_into(buffer, t0, t1, y0, y1)
         return buffer
 
     def take_facts(self, facts: StatedFacts) -> None:
@@ -174,16 +175,18 @@ def sound(path: Path, what: str) -> Iterator[None]:
     """Turn what a library says of a damaged file into one line: damage can break it anywhere.
 
     Raises:
-        InputError: always in place of another error, but for those of settings and missing libraries.
+        InputError: in place of all but our own errors and a lack of memory.
     """
     try:
         yield
-    except (InputError, ConfigError):
+    except (PchEmError, MemoryError):
         raise
     except Exception as error:
         if isinstance(error, FileNotFoundError | PermissionError) and error.strerror:
             raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-        raise InputError(f"{path}: not a valid {what}, or truncated ({error}); copy it again") from error
+        raise InputError(
+            f"{path}: not a valid {what}, or truncated ({error_words(error)}); copy it again"
+        ) from error
 
 
 def changed(path: Path, what: str) -> InputError:

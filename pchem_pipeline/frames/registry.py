@@ -8,13 +8,24 @@ from __future__ import annotations
 
 import functools
 import importlib
+import logging
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from typing import Any
 
-from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependencyError, install_hint
+from pchem_pipeline.base.errors import (
+    ConfigError,
+    InputError,
+    MissingDependencyError,
+    error_words,
+    install_hint,
+)
 from pchem_pipeline.frames.reader import FrameReader
 
 ENTRY_POINT_GROUP = "pchem_pipeline.readers"
+
+_log = logging.getLogger(__name__)
 
 #: our formats: ``formats/npy.py`` has the class ``NpyReader``; raw comes last since any bytes could be raw
 _OURS = ("npy", "tiff", "fits", "hdf5", "zarr", "ser", "dcimg", "spe", "sif", "nd2", "raw")
@@ -31,20 +42,28 @@ _PACKED = {
 
 @functools.cache
 def _plugins() -> dict[str, EntryPoint]:
-    """Return others' readers by format name, not loaded; refuse doubles."""
+    """Return others' readers by format name, not loaded; of doubles the first, or ours."""
     found: dict[str, EntryPoint] = {}
     for point in entry_points(group=ENTRY_POINT_GROUP):
-        other = found.get(point.name)
-        if other is not None and other.value == point.value:
-            continue  # the same distribution seen twice on the path
-        if other is not None or point.name in _OURS or point.name in ("auto", "histogram"):
-            first = other.value if other is not None else "pchem_pipeline itself"
-            raise ConfigError(
-                f"two readers are named {point.name!r}: {first} and {point.value}; uninstall or rename "
-                "one of them"
-            )
-        found[point.name] = point
+        ours = point.name in (*_OURS, "auto", "histogram")
+        first = "pchem_pipeline" if ours else found.setdefault(point.name, point).value
+        if first != point.value:
+            _warn(f"the reader {point.name!r} ({point.value}) is left out: {first} has that name")
     return found
+
+
+@functools.cache  # once
+def _warn(words: str) -> None:
+    _log.warning(words)
+
+
+def readers() -> Iterator[type[FrameReader]]:
+    """Yield the readers of all formats, ours first; a plug-in that cannot be loaded is left out."""
+    for name in reader_names():
+        try:
+            yield reader_class(name)
+        except ConfigError as error:
+            _warn(str(error))
 
 
 def reader_names() -> list[str]:
@@ -60,35 +79,28 @@ def reader_class(name: str) -> type[FrameReader]:
     """
     if name in _OURS:
         module = importlib.import_module(f"pchem_pipeline.frames.formats.{name}")
-        found: type[FrameReader] = getattr(module, f"{name.capitalize()}Reader")
-        return found
+        ours: type[FrameReader] = getattr(module, f"{name.capitalize()}Reader")
+        return ours
     plugins = _plugins()
     if name not in plugins:
         known = ", ".join([*_OURS, *plugins, "histogram"])
         raise ConfigError(f"unknown input.format {name!r}; choose one of: auto, {known}")
-    return _load(plugins[name])
-
-
-def _load(point: EntryPoint) -> type[FrameReader]:
     try:
-        cls = point.load()
+        found: Any = plugins[name].load()
+        if not (isinstance(found, type) and issubclass(found, FrameReader)) or found.format_name != name:
+            raise ConfigError(f"it must be a FrameReader with format_name = {name!r}")
     except Exception as error:
         raise ConfigError(
-            f"the reader {point.name!r} ({point.value}) cannot be loaded: {error}; repair or uninstall "
-            "that package"
+            f"the reader {name!r} ({plugins[name].value}) cannot be loaded: {error_words(error)}; repair or "
+            "uninstall that package"
         ) from error
-    if not (isinstance(cls, type) and issubclass(cls, FrameReader)) or cls.format_name != point.name:
-        raise ConfigError(
-            f"the reader {point.name!r} ({point.value}) must be a FrameReader with format_name = "
-            f"{point.name!r}; repair or uninstall that package"
-        )
-    return cls
+    return found
 
 
 def frame_suffixes(name: str = "auto") -> dict[str, str]:
     """Return suffix -> format name, of one format or of all."""
-    names = reversed(reader_names()) if name == "auto" else [name]  # of several readers the first counts
-    return {suffix: each for each in names for suffix in reader_class(each).suffixes}
+    found = list(readers())[::-1] if name == "auto" else [reader_class(name)]  # of several the first counts
+    return {suffix: each.format_name for each in found for suffix in each.suffixes}
 
 
 def detect_format(path: Path) -> str:
@@ -108,17 +120,16 @@ def detect_format(path: Path) -> str:
         ) from error
     if not head and not path.is_dir():
         raise InputError(f"{path}: the file is empty; copy it again or omit it")
-    names = reader_names()
-    for name in names:
-        if reader_class(name).recognises(path, head):
-            return name
+    for reader in readers():
+        if reader.recognises(path, head):
+            return reader.format_name
     by_suffix = frame_suffixes().get(path.suffix.lower())
     if by_suffix != "raw":  # raw samples may begin like anything
         check_unpacked(path, head)
     if by_suffix is None:
         raise InputError(
-            f"{path}: unknown camera format (known: {', '.join(names)}); set input.format (raw needs "
-            "input.shape and input.dtype, or a sidecar file)"
+            f"{path}: unknown camera format (known: {', '.join(reader_names())}); set input.format (raw "
+            "needs input.shape and input.dtype, or a sidecar file)"
         )
     return by_suffix
 

@@ -16,7 +16,7 @@ from pchem_pipeline.base.errors import InputError
 from pchem_pipeline.frames.camera import shared_facts
 from pchem_pipeline.frames.identity import SCRATCH_BYTES
 from pchem_pipeline.frames.inspect import InputReport
-from pchem_pipeline.frames.reader import FrameReader, check_window, described, shared_notes
+from pchem_pipeline.frames.reader import FrameReader, check_window, described, shared_notes, sound
 from pchem_pipeline.frames.settings import Area, InputSettings
 
 
@@ -176,7 +176,8 @@ class FrameSequence(FrameReader):
         rows = (rows[0] + self._y0, rows[1] + self._y0)
         for reader, first, end, offset in self.pieces(t0, t1):
             part = buffer[offset : offset + end - first]
-            self._read_part(reader, part, first, end, rows)
+            with sound(reader.paths[0], f"{reader.format_name} file"):
+                self._read_part(reader, part, first, end, rows)
             yield reader, part
 
     @property

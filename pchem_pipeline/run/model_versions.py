@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.base.errors import ConfigError, StoreError
+from pchem_pipeline.base.errors import ConfigError, StoreError, error_words
 from pchem_pipeline.effects.framework.compose import AddedExposure
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.settings import ModelSettings
@@ -97,10 +97,9 @@ class ModelVersion:
         try:
             return ModelSettings.model_validate(self.model)
         except ValidationError as error:
-            reason = error.errors()[0]["msg"].removeprefix("Value error, ")
             raise ConfigError(
-                f"model {self.number} of the run: {reason}; install the missing package, or use another "
-                "version: pchem model --use"
+                f"model {self.number} of the run: {error_words(error)}; install the missing package, or use "
+                "another version: pchem model --use"
             ) from error
 
     @property

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
-from pchem_pipeline.base.errors import ConfigError, PchEmError
+from pchem_pipeline.base.errors import ConfigError, PchEmError, error_words
 from pchem_pipeline.effects.framework.context import EffectContext
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.simulate.streams import (
@@ -197,9 +197,7 @@ def _checked(effect: Effect, plane: Plane, values: NDArray[Any], context: Effect
     try:
         result: Any = effect.apply(_frozen(values), context)
     except Exception as error:
-        raise PchEmError(
-            f"{name} failed: {type(error).__name__}: {error}; correct it or leave it out"
-        ) from error
+        raise PchEmError(f"{name} failed: {error_words(error)}; correct it or leave it out") from error
     if not isinstance(result, np.ndarray) or result.shape != values.shape or result.dtype != values.dtype:
         got = f"{result.dtype}{result.shape}" if isinstance(result, np.ndarray) else type(result).__name__
         raise PchEmError(f"{name} returned {got} instead of {values.dtype}{values.shape}; correct it")

@@ -137,7 +137,7 @@ def test_a_stopped_search_without_the_truth_goes_on_to_the_same_verdict(searched
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("[row_noise, frame_noise]", "[row_nois]", "unknown effects row_nois"),
+        ("[row_noise, frame_noise]", "[row_nois]", "effect 'row_nois' is unknown; did you mean row_noise"),
         ("n_frames: 1500", "n_frames: 250", "take more frames"),
         ("shape: [12, 16]", "shape: [4, 4]", "32 are needed"),
     ],
@@ -146,4 +146,4 @@ def test_what_cannot_be_searched_is_one_clear_line(tmp_path, old, new, message):
     other = Shell(tmp_path)
     (tmp_path / "run.yaml").write_text(CAMERA.replace(old, new))
     other.ok("simulate", "run.yaml")
-    assert message in other.refused(2 if "effects" in message else 4, "discrepancy", "run.yaml")
+    assert message in other.refused(2 if "effect" in message else 4, "discrepancy", "run.yaml")

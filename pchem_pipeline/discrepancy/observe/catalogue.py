@@ -7,9 +7,10 @@ statistic changes its definition, since vectors of different versions are not co
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework.evidence import SCORES
 from pchem_pipeline.effects.framework.region import parse_place
 
@@ -225,6 +226,16 @@ class _Catalogue(dict[str, Statistic]):
 
 #: Every statistic by name, in the order of the vector.
 STATISTICS: dict[str, Statistic] = _Catalogue((s.name, s) for s in map(_statistic, _records()))
+
+
+def check_signature(signature: Sequence[str]) -> None:
+    """Raise ConfigError where the signature of an effect names what is no statistic."""
+    if unknown := [name for name in signature if name not in STATISTICS]:
+        raise ConfigError(
+            f"its signature names no statistics: {', '.join(unknown)}; they are listed in "
+            "pchem_pipeline/discrepancy/observe/catalogue.py"
+        )
+
 
 #: Exact tests without false positives, and the increase by each event (rows come by the dozen).
 EXACT: dict[str, float] = {

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pchem_pipeline.base.arrays import BoolArray, FloatArray, IntArray
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError, PchEmError, error_words
 from pchem_pipeline.base.units import QUANTISATION_VARIANCE
 from pchem_pipeline.effects.framework.effect import Effect, Plane
 from pchem_pipeline.effects.framework.evidence import PixelMaps
@@ -58,7 +58,7 @@ def added_exposures(
         except Exception as error:
             raise ConfigError(
                 f"model.effects: {effect.tag} ({type(effect).__module__}) cannot tell what it adds to the "
-                f"exposure: {type(error).__name__}: {error}; remove it from model.effects"
+                f"exposure: {error_words(error)}; remove it from model.effects"
             ) from error
         if added is not None:
             found = added if found is None else found.combined_with(added)
@@ -158,7 +158,8 @@ def sample_law(
     a time need the ``places`` of the pixels.
 
     Raises:
-        ConfigError: if an effect cannot say what it does to these pixels; it is named.
+        ConfigError: an effect has no law of these pixels (ValueError, ConfigError); it is named.
+        PchEmError: it raises anything else.
     """
     n = maps.bias.size
     groups = [(np.arange(n), SampleLaw())]
@@ -168,9 +169,10 @@ def sample_law(
             for each in (effect,) if places is None else effect.by_law(places.shape):
                 groups = [part for group in groups for part in _with_effect(each, *group, maps, places)]
         except Exception as error:
-            raise ConfigError(
+            kind = ConfigError if isinstance(error, ValueError | ConfigError) else PchEmError
+            raise kind(
                 f"model.effects: {effect_words(effect)} ({type(effect).__module__}) cannot be fitted with: "
-                f"{type(error).__name__}: {error}; remove it from model.effects"
+                f"{error_words(error)}; remove it from model.effects"
             ) from error
     model = groups[0][1] if len(groups) == 1 else SampleLaw.joined(groups, n)
     if added is not None:

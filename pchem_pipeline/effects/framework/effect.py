@@ -449,7 +449,7 @@ def registered_effects() -> dict[str, type[Effect]]:
 
 
 def tag_of(effect: Any) -> str:
-    """Return the tag of an effect class; ConfigError: it lacks a tag, a plane or its own ``apply``."""
+    """Return the tag of an effect class; ConfigError: it lacks a tag, a plane, a method or its strength."""
     where = f"{getattr(effect, '__module__', '?')}.{getattr(effect, '__qualname__', effect)}"
     if not (isinstance(effect, type) and issubclass(effect, Effect)):
         raise ConfigError(
@@ -460,6 +460,8 @@ def tag_of(effect: Any) -> str:
         raise ConfigError(f'{where} has no tag; add a field `tag: Literal["name"] = "name"`')
     if not isinstance(getattr(effect, "plane", None), Plane):
         raise ConfigError(f"{where} has no plane; add `plane: ClassVar[Plane] = Plane....`")
-    if effect.apply is Effect.apply:
-        raise ConfigError(f"{where} does nothing; give it a method apply(self, values, context)")
+    if missing := sorted(effect.__abstractmethods__):
+        raise ConfigError(f"{where} does nothing; give it the method {', '.join(missing)}")
+    if effect.strength not in ("", *effect.model_fields):
+        raise ConfigError(f"{where} has no field {effect.strength!r}; name the one that is its strength")
     return tag

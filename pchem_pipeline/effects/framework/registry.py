@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, SerializeAsAny, ValidationInfo
 
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError, error_words
 from pchem_pipeline.effects.framework.effect import Effect, registered_effects, tag_of
 
 ENTRY_POINT_GROUP = "pchem_pipeline.effects"
@@ -30,11 +30,6 @@ _log = logging.getLogger(__name__)
 def effect_classes() -> Mapping[str, type[Effect]]:
     """Return every effect by tag, ours and others', in alphabetical order."""
     return _discover()[0]
-
-
-def broken_plugins() -> Mapping[str, str]:
-    """Return the plug-ins that were left out, with the reason, by name of their entry point."""
-    return _discover()[1]
 
 
 def effect_class(tag: str) -> type[Effect]:
@@ -67,8 +62,9 @@ def _discover() -> tuple[Mapping[str, type[Effect]], Mapping[str, str]]:
             tag = tag_of(effect)
             if tag in classes:
                 raise ConfigError(f"tag {tag!r} is taken by {classes[tag].__module__}")
+            effect.typical()
         except Exception as error:
-            broken[point.name] = f"{point.value}: {type(error).__name__}: {error}"
+            broken[point.name] = f"{point.value}: {error_words(error)}"
             _log.warning("effect plug-in %s left out: %s", point.name, broken[point.name])
         else:
             classes[tag] = effect

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from pchem_pipeline.base.errors import InputError
+from pchem_pipeline.base.errors import InputError, error_words
 from pchem_pipeline.frames.camera import facts_from_names
 from pchem_pipeline.frames.formats.contiguous import ContiguousReader, Layout, even_offsets, write_plain
 from pchem_pipeline.frames.formats.kinds import check_samples
@@ -78,10 +78,8 @@ def _read_sidecar(path: Path) -> _Sidecar:
         readers: dict[str, Callable[[str], Any]] = {".json": json.loads, ".inf": _from_inf}
         return _Sidecar.model_validate(readers.get(found.suffix, yaml.safe_load)(text))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
         raise InputError(
-            f"{path}: sidecar {found.name}: {where}: {first['msg']}; correct the sidecar"
+            f"{path}: sidecar {found.name}: {error_words(error)}; correct the sidecar"
         ) from error
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         words = "not valid YAML" if isinstance(error, yaml.YAMLError) else error

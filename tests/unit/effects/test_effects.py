@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint
 from typing import ClassVar, Literal
 
 import pytest
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.effects.framework import registry
@@ -49,6 +49,15 @@ class Idle(Effect):
     plane: ClassVar[Plane] = Plane.ANALOG
 
 
+class Strengthless(Shine):
+    strength: ClassVar[str] = "brightness"
+
+
+class OutOfBounds(Shine):
+    typical_values: ClassVar = ({"extra": 0.2},)
+    extra: float = Field(ge=1.0, le=0.0)
+
+
 NOT_AN_EFFECT = 3
 
 
@@ -87,15 +96,17 @@ def test_a_plugin_is_found_and_used(installed):
         (entry("NOT_AN_EFFECT"), "is not an effect"),
         (entry("Tagless"), "has no tag"),
         (entry("Planeless"), "has no plane"),
-        (entry("Idle"), "does nothing"),
+        (entry("Idle"), "does nothing; give it the method apply"),
+        (entry("Strengthless"), "has no field 'brightness'"),
+        (entry("OutOfBounds"), "OutOfBounds: extra: Input should be less than or equal to 0"),
     ],
 )
 def test_a_broken_plugin_is_named_and_left_out(installed, caplog, point, reason):
     installed(point, entry("Shine"))
     with caplog.at_level(logging.WARNING):
         assert registry.effect_class("shine") is Shine
-    assert list(registry.broken_plugins()) == [point.name]
-    assert reason in registry.broken_plugins()[point.name]
+    assert list(registry._discover()[1]) == [point.name]
+    assert reason in registry._discover()[1][point.name]
     assert point.name in caplog.text
     assert registry.effect_class("row_noise") is not Impostor
 
@@ -104,7 +115,7 @@ def test_of_two_plugins_with_one_tag_the_first_counts_and_a_broken_one_that_is_a
     gone = entry("gone", "package_that_is_not_there:Effect")
     installed(entry("Shine"), entry("other", f"{__name__}:Shine"), gone)
     assert registry.effect_class("shine") is Shine
-    assert "taken" in registry.broken_plugins()["other"]
+    assert "taken" in registry._discover()[1]["other"]
     with pytest.raises(ConfigError, match="left out: package_that_is_not_there"):
         registry.effect_class("gone")
 

@@ -14,7 +14,7 @@ from helpers.camera_files import not_opened, opened, write_fits
 from helpers.nd2_files import nd2_bytes
 from helpers.sif_files import sif_bytes
 
-from pchem_pipeline.base.errors import ConfigError, MissingDependencyError
+from pchem_pipeline.base.errors import ConfigError, InputError, MissingDependencyError
 from pchem_pipeline.frames import registry
 from pchem_pipeline.frames.open import open_frames
 from pchem_pipeline.frames.reader import FrameReader, check_window
@@ -62,6 +62,7 @@ def _forget_plug_ins():
     """Readers are looked up once per process."""
     yield
     registry._plugins.cache_clear()
+    registry._warn.cache_clear()
 
 
 def plug_in(monkeypatch, *points):
@@ -84,20 +85,38 @@ def test_reader_from_a_plug_in_which_is_not_loaded_without_need(tmp_path, monkey
         open_frames(InputSettings(files=("a.npy",), format="broken"), tmp_path)
 
 
-def test_doubles_and_what_is_no_reader_are_refused(monkeypatch):
-    for points, words in (
-        ([("tiff", "other.package:Tiff")], "'tiff': pchem_pipeline itself and other.package:Tiff"),
-        ([("lab", "one.package:Lab"), ("lab", "two.package:Lab")], "'lab': one.package:Lab and two.package"),
-    ):
-        plug_in(monkeypatch, *points)
-        with pytest.raises(ConfigError, match=f"named {words}"):
-            registry.reader_names()
-    plug_in(monkeypatch, *[("lab", "one.package:Lab")] * 2)  # one that is listed twice is no double
-    assert registry.reader_names()[-1] == "lab"
+def test_doubles_and_what_is_no_reader_are_left_out(monkeypatch, caplog):
+    points = [("tiff", "other.package:Tiff"), ("lab", "one.package:Lab"), ("lab", "two.package:Lab")]
+    plug_in(monkeypatch, *points, points[1])  # one that is listed twice is no double
+    assert registry.reader_names()[-2:] == ["raw", "lab"]
+    assert registry._plugins()["lab"].value == "one.package:Lab"
+    assert [record.getMessage() for record in caplog.records] == [
+        "the reader 'tiff' (other.package:Tiff) is left out: pchem_pipeline has that name",
+        "the reader 'lab' (two.package:Lab) is left out: one.package:Lab has that name",
+    ]
     for name, cls in (("noreader", "EntryPoint"), ("othername", "TextReader")):
         plug_in(monkeypatch, (name, f"{__name__}:{cls}"))
         with pytest.raises(ConfigError, match=f"must be a FrameReader with format_name = '{name}'"):
             registry.reader_class(name)
+
+
+def test_a_plug_in_that_is_broken_is_one_line_and_leaves_others_as_they_are(tmp_path, monkeypatch, caplog):
+    plug_in(monkeypatch, ("broken", "there_is_no:Reader"), ("textframes", f"{__name__}:TextReader"))
+    path = tmp_path / "a.txf"
+    path.write_text("TEXTFRAMES\n1 2|3 4\n5 6|7 8\n")
+    assert registry.detect_format(path) == "textframes"
+    assert registry.frame_suffixes()[".txf"] == "textframes"
+    assert [record.getMessage() for record in caplog.records] == [
+        "the reader 'broken' (there_is_no:Reader) cannot be loaded: ModuleNotFoundError: No module named "
+        "'there_is_no'; repair or uninstall that package"
+    ]
+    frames = open_frames(InputSettings(files=("a.txf",)), tmp_path)
+    monkeypatch.setattr(TextReader, "read_into", lambda *_: {}["x"])
+    with pytest.raises(InputError, match=r"a\.txf: not a valid textframes file, .*KeyError: 'x'"):
+        frames.read()
+    monkeypatch.setattr(TextReader, "open", lambda *_: object())
+    with pytest.raises(InputError, match=r"a\.txf: not a valid textframes file, .*no attribute 'shape'"):
+        open_frames(InputSettings(files=("a.txf",)), tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pchem_pipeline.base.arrays import FloatArray
-from pchem_pipeline.base.errors import ConfigError
 from pchem_pipeline.discrepancy.by_simulation.candidates.fingerprints import (
     FAR,
     FAR_SHARE_OF_PART,
@@ -28,12 +27,13 @@ from pchem_pipeline.discrepancy.by_simulation.sets.pixel_likelihood import (
     note_defect,
 )
 from pchem_pipeline.discrepancy.by_simulation.sets.refits import DampedSteps
+from pchem_pipeline.discrepancy.observe.catalogue import check_signature
 from pchem_pipeline.discrepancy.observe.places import Part, SensorWindow
 from pchem_pipeline.discrepancy.settings import DiscrepancySettings
 from pchem_pipeline.effects.framework.compose import along_chain
 from pchem_pipeline.effects.framework.effect import Effect
 from pchem_pipeline.effects.framework.evidence import Evidence, PixelMaps
-from pchem_pipeline.effects.framework.registry import broken_plugins, effect_classes
+from pchem_pipeline.effects.framework.registry import effect_class, effect_classes
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, POSSIBLE
 
 Vector = Mapping[str, float]
@@ -69,19 +69,12 @@ def candidate_classes(settings: DiscrepancySettings) -> dict[str, type[Effect]]:
     Raises:
         ConfigError: a candidate is unknown.
     """
-    known = effect_classes()
-    wanted = tuple(known) if settings.candidates is None else settings.candidates
-    unknown = sorted(({*wanted, *settings.exclude}) - set(known))
-    if unknown:
-        broken = "; ".join(f"{name}: {why}" for name, why in broken_plugins().items())
-        raise ConfigError(
-            f"discrepancy.candidates: unknown effects {', '.join(unknown)}; known are {', '.join(known)}"
-            + (f" (left out: {broken})" if broken else "")
-        )
+    wanted = tuple(effect_classes()) if settings.candidates is None else settings.candidates
+    known = {tag: effect_class(tag) for tag in (*wanted, *settings.exclude)}
     return {
-        tag: known[tag]
-        for tag in wanted
-        if tag not in settings.exclude and not known[tag].untestable and not known[tag].empirical
+        tag: effect
+        for tag, effect in known.items()
+        if tag not in settings.exclude and not effect.untestable and not effect.empirical
     }
 
 
@@ -133,6 +126,7 @@ class ReplicateSimulator:
             if tag in self.defects or any(present.everywhere for present in taken):
                 continue
             try:
+                check_signature(effect.signature)
                 guessed = next(filter(None, (list(effect.estimate(e)) for e in (*known, *evidence))), [])
                 if not guessed and known and known[0].strongest(*effect.signature[:2]) > CERTAIN:
                     guessed = list(effect.typical())

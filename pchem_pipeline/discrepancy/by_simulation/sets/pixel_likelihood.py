@@ -173,10 +173,11 @@ class PixelLikelihood:
             fitted = _multistart(sets, fitted)
             if fitted.fit.log_likelihood.sum() - without > _ASTRAY * len(fitted.fit.log_likelihood):
                 fitted = sets.with_right_peaks(fitted)
+        except (ValueError, ConfigError):  # such parameters do not go together, or are no law of the pixels
+            return None
         # an effect of a plug-in may raise anything: the others are compared all the same
         except Exception as error:
-            if not _refuses(error):
-                note_defect(self._defects, (*besides, *effects)[-1].tag, error)
+            note_defect(self._defects, (*besides, *effects)[-1].tag, error)
             return None
         return None if without - float(fitted.fit.log_likelihood.sum()) > NO_DIFFERENCE else fitted
 
@@ -346,15 +347,8 @@ def identifiable_from_histograms(effect: Effect) -> bool:
     member = Member.of(effect)
     try:
         return not member.law.free_satellites and not member.tabulated and bool(member.coordinates)
-    except ConfigError as error:
-        if not _refuses(error):
-            raise
+    except ConfigError:
         return False
-
-
-def _refuses(error: Exception) -> bool:
-    """Return whether an effect says that its parameters do not go together, or are no law of the pixels."""
-    return isinstance(error.__cause__ or error, ValueError | ConfigError)
 
 
 def note_defect(defects: dict[str, str], tag: str, error: Exception) -> None:

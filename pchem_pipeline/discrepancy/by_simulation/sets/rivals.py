@@ -74,10 +74,10 @@ class Comparison:
                 # neither need be the very law of the samples
                 probability = float(special.ndtr(behind / max(error, 1e-9)))
             else:
-                behind = one.penalised_log_likelihood - self.chosen.penalised_log_likelihood
-                error = _apart(one, self.chosen)
-                # predictions d errors apart tell d^2 / 2 nats (Kullback and Leibler 1951); more is chance
-                probability = float(np.exp(min(max(behind, -0.5 * error**2), 0.0)))
+                error, told = _apart(one, self.chosen)
+                # a score that says more than the predictions tell is chance
+                behind = max(one.penalised_log_likelihood - self.chosen.penalised_log_likelihood, -told)
+                probability = float(np.exp(min(behind, 0.0)))
             found[name] = Contender(effect, behind, error, probability)
         total = sum(c.probability for c in found.values())
         shared = [replace(c, probability=c.probability / total) for c in found.values()]
@@ -163,7 +163,15 @@ def _all_seen(search: Search, one: Refitted) -> bool:
     return True
 
 
-def _apart(first: Refitted, second: Refitted) -> float:
-    """Return how far two predictions lie apart, in standard deviations of the statistics."""
+def _apart(first: Refitted, second: Refitted) -> tuple[float, float]:
+    """Return how far two predictions lie apart, d standard deviations of the statistics, and what this tells.
+
+    That is d^2 / 2 nats (Kullback and Leibler 1951) less what the chance of the simulations adds to d^2:
+    products of different replicates have none of it.
+    """
     covariance = first.covariance.plus(second.covariance.own).with_modes(second.covariance.common)
-    return float(np.linalg.norm(covariance.times(0.5).white(first.mean - second.mean)))
+    n = min(len(first.vectors), len(second.vectors))
+    rows = covariance.times(0.5).white(first.vectors[:n] - second.vectors[:n])
+    apart = float(np.linalg.norm(rows.mean(axis=0)))
+    chance = float(rows.var(axis=0, ddof=1).sum()) / n
+    return apart, max(apart**2 - chance, 0.0) / 2.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import confloat
 
-from pchem_pipeline.base.errors import ConfigError
+from pchem_pipeline.base.errors import ConfigError, PchEmError
 from pchem_pipeline.effects.framework.compose import along_chain, model_words, pixel_maps, sample_law
 from pchem_pipeline.effects.framework.draws import regrouped
 from pchem_pipeline.effects.framework.effect import Effect, Plane
@@ -80,8 +80,9 @@ def test_new_effects_stand_where_the_signal_comes_to_them():
 
 def test_an_effect_that_raises_is_named():
     words = r"model\.effects: broken \(test_effects_compose\).*IndexError.*remove it"
-    with pytest.raises(ConfigError, match=words):
+    with pytest.raises(PchEmError, match=words) as caught:
         sample_law([RowNoise(row_noise_dn=0.5), Broken()], maps_of(1.0))
+    assert not isinstance(caught.value, ConfigError)  # that says that there is no law
 
 
 def test_the_nearest_pcd_has_the_whole_width_of_the_peaks():

@@ -60,3 +60,12 @@ def test_what_chance_hides_of_an_effect_is_seen_at_a_larger_strength() -> None:
     assert guessed.effect.share == pytest.approx(4 * 0.0019)
     assert guessed.fingerprint[2] == pytest.approx(7.6)
     assert clear is hypotheses[2]
+
+
+def test_a_signature_of_no_statistic_is_a_defect(monkeypatch: pytest.MonkeyPatch) -> None:
+    acquisition: Any = SimpleNamespace(numbers=np.arange(100), window=None)
+    simulator = ReplicateSimulator(evidence().maps, (), acquisition, NAMES, lambda _: [], 1)
+    kind = effect_class("row_noise")
+    monkeypatch.setattr(kind, "signature", ("frame.readout.varience",))
+    assert simulator.guesses({"row_noise": kind}, [evidence()]) == []
+    assert "names no statistics: frame.readout.varience" in simulator.defects["row_noise"]
