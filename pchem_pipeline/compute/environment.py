@@ -12,7 +12,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from pchem_pipeline.base.kernel_cache import cache_folder
+from platformdirs import user_config_path
+
+from pchem_pipeline.base.kernel_cache import cache_folder, is_writable
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLOSC_NTHREADS", "NUMBA_NUM_THREADS")
@@ -23,12 +25,14 @@ def prepare_environment() -> None:
 
     Inner thread pools are set to one thread, since the tiles are the parallelism. Compiled kernels are
     cached in ``NUMBA_CACHE_DIR``, by default in the user's cache folder, or in a temporary one where the home
-    is read-only.
+    is read-only; there matplotlib, too, which would warn in each run.
     """
     for name in _POOLS:
         os.environ.setdefault(name, "1")
     os.environ.setdefault("MPLBACKEND", "Agg")
     os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_folder()))
+    if "MPLCONFIGDIR" not in os.environ and not is_writable(user_config_path("matplotlib")):
+        os.environ["MPLCONFIGDIR"] = os.environ["NUMBA_CACHE_DIR"]
 
 
 class Dispensable:

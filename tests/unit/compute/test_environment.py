@@ -54,6 +54,18 @@ def test_a_folder_in_the_temporary_one_is_taken_if_nobody_else_can_write_it(tmp_
         assert not first.exists()  # it ended with its process
 
 
+def test_figures_need_no_home_and_print_nothing(tmp_path):
+    code = CODE + "; import matplotlib.pyplot"
+    place = str(Path(pchem_pipeline.__file__).parents[1])
+    for home in ("/proc/nowhere", str(tmp_path)):
+        known = {"PYTHONPATH": place, "PATH": "/usr/bin:/bin", "HOME": home, "TMPDIR": str(tmp_path)}
+        found = subprocess.run(
+            [sys.executable, "-c", code], cwd="/", env=known, capture_output=True, text=True
+        )
+        assert (found.returncode, found.stderr) == (0, "")
+    assert (tmp_path / ".config/matplotlib").is_dir()  # where there is a home, the user's own settings count
+
+
 def test_the_users_own_values_are_kept(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "5")
     monkeypatch.delenv("MPLBACKEND", raising=False)
