@@ -174,7 +174,8 @@ def yaml_content(text: str, name: str) -> dict[str, Any]:
     try:
         content = yaml.load(text, Loader=_StrictLoader)
     except (yaml.YAMLError, ValueError) as error:  # numbers of thousands of digits, dates that are none
-        raise ConfigError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from error
+        tab = "; indent with spaces, not with tabs" if re.search(r"^ *\t", text, re.MULTILINE) else ""
+        raise ConfigError(f"{name}: not valid YAML: {' '.join(str(error).split())}{tab}") from error
     except RecursionError as error:
         raise ConfigError(f"{name}: not valid YAML: brackets within brackets too deep to read") from error
     if not isinstance(content, dict):

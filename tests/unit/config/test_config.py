@@ -68,6 +68,7 @@ def bomb(start):
         ("input: {files: [a]}\nrun: {tile: 50}", "run.tile"),
         ("input: {files: [a]}\ninput: {files: [b]}", "'input' is given twice"),
         ("input: {files: [a]", "not valid YAML"),
+        ("run:\n\tstore: x.zarr", "indent with spaces, not with tabs"),
         ("- a", "no settings"),
         ("", "no settings"),
         ("run: {tile: 64}", "no input"),
