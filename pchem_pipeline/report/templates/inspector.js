@@ -885,7 +885,7 @@
     const every = Math.max(1, Math.ceil(s.limits.length / 18));
     s.limits.forEach(([k, dn], i) => {
       const from = i ? s.limits[i - 1][1] : s.low - 0.5;
-      if (k % every === 0) marks.push({ kind: "words", x: (from + dn) / 2, up: 0.9, text: k === 0 ? "k = 0" : String(k), align: "center", colour: "blue" });
+      if (k % every === 0) marks.push({ kind: "words", x: (from + dn) / 2, up: 0.9, text: String(k), align: "center", colour: "blue" });
     });
     return { height: 3, y: { label: s.all ? `${facts.samples} per DN` : "density", ends, log: s.logarithmic }, marks };
   };
