@@ -924,7 +924,7 @@
     clearPlot = () => {};
     byId("inspector-caption").textContent = "";
     byId("inspector-counts").hidden = !s || !s.all;
-    if (!s) return;
+    if (!s?.all && !s?.curve.length) return; // of a model with effects the curve is stored with the histogram
     const panels = [densityPanel(s), ...(s.all ? [residualPanel(s)] : [])];
     const stack = { height: 76, x: { label: "signal (DN)", ends: [s.low - 0.5, s.high + 0.5], whole: true }, panels };
     clearPlot = window.pchemChart(byId("inspector-plot"), { widths: [1], stacks: [stack] }, describePlot(s));
