@@ -406,7 +406,7 @@ class Run:
         """Return several pixels, each given as (y, x); see :meth:`pixel`."""
         ny, nx = self.shape
         for y, x in places:
-            if not (0 <= y < ny and 0 <= x < nx):
+            if not (0 <= y < ny and 0 <= x < nx and y % 1 == x % 1 == 0):
                 raise ConfigError(f"pixel y = {y}, x = {x} is outside the sensor of {ny} x {nx} pixels")
         maps, fit = self.group("maps"), self.group("fit")  # which read the pixels asked for alone
         chosen = [("", int(y), int(x)) for y, x in places]

@@ -55,10 +55,7 @@ def resolve_files(settings: InputSettings, base_dir: Path) -> list[Path]:
             missing.append(path)
     if missing:
         more = f" and {len(missing) - 1} more (last {missing[-1].name})" if len(missing) > 1 else ""
-        raise InputError(
-            f"{missing[0]}{more}: no such file or folder; restore it, or correct its path (a run keeps its "
-            "own copy of the frames with input.mode: copy)"
-        )
+        raise InputError(f"{missing[0]}{more}: no such file or folder; restore it, or correct its path")
     for path in found:
         if not (path.is_file() or path.is_dir()):
             raise InputError(f"{path}: not a regular file; write its content to a file first")

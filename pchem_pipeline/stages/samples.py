@@ -139,7 +139,7 @@ def exposure_axis(settings: InputSettings, samples: Sequence[Sample]) -> FloatAr
             continue
         if settings.against == "light_level":
             exposure = given.light_level
-            missing = "light_level; give one to each sample, or set input.against: none"
+            missing = "light_level; give one for each: pchem joint RUNS --level 0,1,2.4"
         else:
             exposure = sample.integration_time if given.integration_time is None else given.integration_time
             missing = (

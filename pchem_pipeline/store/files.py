@@ -26,9 +26,8 @@ _CURES = {
     errno.EDQUOT: "the disk quota is exhausted: free space and run again, finished tiles are kept",
     errno.EFBIG: "the file exceeds the size limit (see ulimit -f): raise it and run again",
     errno.EIO: "the disk reports an error: check it, then run again, finished tiles are kept",
-    errno.EROFS: "the file system is read-only: choose another place for the store",
-    errno.EACCES: "no permission to write there: choose another place for the store",
-    errno.EPERM: "no permission to write there: choose another place for the store",
+    errno.EROFS: "the file system is read-only: choose another place",
+    **dict.fromkeys((errno.EACCES, errno.EPERM), "no permission to write there: choose another place"),
 }
 
 #: of one place, not of every other as well
@@ -39,7 +38,7 @@ _CURES_OF_A_PLACE = {
     errno.ENAMETOOLONG: "choose a shorter name",
     **dict.fromkeys(
         (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP),
-        "the file system does not support file locks or similar: choose another place for the store",
+        "the file system does not support file locks or similar: choose another place",
     ),
 }
 

@@ -209,6 +209,19 @@ def test_a_pixel_that_is_not_in_full_says_so(tab, store):
     assert "frames." in tab.text("#inspector-caption")
 
 
+def test_a_pixel_without_histogram_and_curve_has_no_chart(open_tab, store, tmp_path):
+    """Of a model with effects the curve is stored with the histogram."""
+    text = (store.path / "report.html").read_text()
+    assert text.count('"model":""') == 1
+    (tmp_path / "report.html").write_text(text.replace('"model":""', '"model":"PCD + rts_noise"'))
+    tab = open_tab((tmp_path / "report.html").as_uri())
+    known = np.isfinite(store.read("maps/bias").ravel())
+    i = next(i for i in range(2000, NX * NY) if i not in in_full(tab) and known[i])
+    tab.click(*divmod(i, NX))
+    assert "histogram is not in the file" in tab.text("#inspector-note")
+    assert tab.page.locator("#inspector-plot canvas").count() == 0
+
+
 def test_keyboard_only(tab, store):
     press = tab.page.keyboard.press
     for _ in range(80):

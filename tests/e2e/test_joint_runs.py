@@ -210,7 +210,7 @@ def test_what_looks_at_a_run_looks_at_this_one(joint, tmp_path):
         (["dark_1s.zarr", "twin.yaml"], "", "has the same frames as sample dark_1s.zarr"),
         (["timeless.yaml", "dark_2s.zarr"], "", "has no integration time, needed for the charge rate"),
         (["dark_1s.zarr", "bias.zarr, bias: true"], "", "a slope needs two exposures"),
-        (["dark_1s.zarr", "dark_2s.zarr"], "light_level", "sample dark_1s.zarr has no light_level"),
+        (["dark_1s.zarr", "dark_2s.zarr"], "light_level", "give one for each: pchem joint RUNS --level"),
         (["bias.zarr, bias: true"], "", "every sample is a bias"),
         (["dark_1s.zarr, bia: true"], "", "input.samples.0.bia: unknown key; did you mean bias?"),
         (["nowhere.yaml", "dark_1s.zarr"], "", "nowhere.yaml: no such file"),

@@ -91,7 +91,7 @@ def test_a_pixel_is_that_of_the_store(run, store):
     assert pixel.plot(width="60mm")._repr_png_().startswith(b"\x89PNG")
     assert pixel.plot().axes[0].get_title("left").startswith(f"pixel y = {y}, x = {x}\n")
     assert len(run.pixels([(0, 0), (1, 2)])) == 2
-    for place in ((-1, 0), (20, 0), (0, 28)):
+    for place in ((-1, 0), (20, 0), (0, 28), (3.5, 5)):
         with pytest.raises(ConfigError, match="is outside the sensor of 20 x 28"):
             run.pixel(*place)
 

@@ -284,7 +284,8 @@ def _pair(
         changed[[each.y for each in defects], [each.x for each in defects]] = True
         compared |= changed
     arrays = _compared_arrays(first.store, second.store, tolerance, reporter) if same_data else []
-    reasons = {name: reasons_of_change(found) for name, found in maps.items() if limits or not same_data}
+    frames = [SensorInfo.read(each.store).n_frames for each in (first, second)]
+    reasons = {name: reasons_of_change(maps[name], frames) for name in maps if limits or not same_data}
     if limits:
         reasons = {
             name: replace(reasons[name], spread=False, pixels=False) for name in limits if name in reasons

@@ -25,6 +25,8 @@ from pchem_pipeline.model.maps.maps import summarise
 
 #: Standard errors beyond which a single pixel, or a statistic of all pixels, counts as changed.
 LIMIT = 5.0
+#: Bias of the estimates times the number of frames, in standard errors of one frame: up to 4.5, measured.
+_BIAS = 5.0
 #: By how much the standard errors of the fits themselves may be wrong.
 _TRUST = 0.1
 #: Share of the pixels that non-quadratic likelihoods can make stand out; more need no confirmation.
@@ -257,18 +259,21 @@ class Reasons:
         return self.shifted or self.spread or self.pixels
 
 
-def reasons_of_change(found: MapDifference) -> Reasons:
-    """Judge two independent measurements of a map.
+def reasons_of_change(found: MapDifference, n_frames: Sequence[int] = (1, 1)) -> Reasons:
+    """Judge two independent measurements of a map, from so many frames.
 
     Where all values moved by just the limit, ``z`` less the limit is N(0, 1): its median has standard error
     ``sqrt(pi / 2 n)``, its robust standard deviation ``1.166 / sqrt(n)`` (Maronna et al., *Robust
-    Statistics*, 2019, Sec. 2.5), to which a tenth is added since the standard errors are estimates.
+    Statistics*, 2019, Sec. 2.5), to which a tenth is added since the standard errors are estimates. The
+    bias of the estimates falls as 1/N, and is not the same in runs of unlike numbers N of frames.
     """
     n = found.n_counted
     if n < 2:
         return Reasons(False, False, False)
+    share = 1.0 / np.asarray(n_frames)
+    bias = _BIAS * np.ptp(share) / np.sqrt(share.sum())
     return Reasons(
-        shifted=bool(found.beyond_z > LIMIT * np.sqrt(np.pi / (2.0 * n))),
+        shifted=bool(found.beyond_z > bias + LIMIT * np.sqrt(np.pi / (2.0 * n))),
         spread=bool(found.spread_z > 1.0 + _TRUST + LIMIT * 1.166 / np.sqrt(n)),
         pixels=found.n_changed > 0,
     )

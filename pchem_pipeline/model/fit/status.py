@@ -54,7 +54,7 @@ AMBIGUOUS = FitStatus.BIAS_AMBIGUOUS | FitStatus.GAIN_AMBIGUOUS
 FLAGGED = AMBIGUOUS | FitStatus.BIAS_UNSURE | FitStatus.NOT_INFORMATIVE | FitStatus.WEAKLY_IDENTIFIED
 
 #: What a bias that is an electron off concerns; the distance of the peaks and their width stay.
-_COUNTS_ELECTRONS = ("quanta_exposure", "bias", "spurious_charge", *CHARGE_RATES)
+_COUNTS_ELECTRONS = ("quanta_exposure", "bias", "spurious_charge", "dark_signal", *CHARGE_RATES)
 
 _LARGEST_GAIN_CHANGE = 0.03  # relative; a rival that differs by less has the same gain
 

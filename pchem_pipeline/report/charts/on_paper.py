@@ -328,7 +328,7 @@ def _draw_panel(axes: Axes, panel: Panel, stack: Stack, look: Look, width_mm: fl
     most = 5 if any(isinstance(mark, Image) for mark in panel.marks) else 8
     both = (("x", stack.x), ("y", tick_rows(panel.y, width_mm)))
     for name, axis in both:
-        _scale(axes, name, axis, most)
+        _scale(axes, name, axis, most if name == "y" or look.wide else 5)
         if axis.low is not None and axis.high is not None:
             _end(axes, name, axis)  # so that no mark is asked for its ends
     if panel.square:
@@ -366,7 +366,7 @@ def _note(axes: Axes, text: str, corner: str) -> None:
 
 
 def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
-    """Set scale and ticks of an axis; of whole numbers at most so many."""
+    """Set scale and ticks of an axis; of whole numbers, and along x, at most so many."""
     one, set_scale = getattr(axes, f"{name}axis"), getattr(axes, f"set_{name}scale")
     if axis.log:
         set_scale("log")
@@ -381,6 +381,8 @@ def _scale(axes: Axes, name: str, axis: Axis, most: int) -> None:
         one.set_major_locator(MaxNLocator(most, integer=True))
     if not axis.ticks and isinstance(one.get_major_formatter(), ScalarFormatter):
         one.get_major_formatter().set_useOffset(False)
+        if name == "x":
+            one.get_major_locator().set_params(nbins=most)
 
 
 def _decade(place: float, _: object) -> str:

@@ -266,9 +266,6 @@ def cells_chart(tables: Sequence[DataTable]) -> Chart:
     dashed = Sticks(edges, ends, colour="blue", dash="--", width=0.9, label="limit between numbers k")
     cells = np.concatenate([[low], edges, [high]])
     every = -(-len(cells) // 18)  # of more cells not each has its number
-    words = [
-        Words((cells[k] + cells[k + 1]) / 2, 0.87, f"k = {k}" if k == 0 else str(k))
-        for k in range(0, len(cells) - 1, every)
-    ]
+    words = [Words((cells[k] + cells[k + 1]) / 2, 0.87, str(k)) for k in range(0, len(cells) - 1, every)]
     panel = Panel(Axis("density (1/DN)", 0.0, top), (bars, curve, dashed, *words))
     return Chart((Stack((panel,), Axis("signal (DN)", low, high), height_mm=55.0),), legend=(3, 3))

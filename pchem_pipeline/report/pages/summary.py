@@ -163,7 +163,7 @@ def nothing_found(look: QuickLook) -> str:
     return f"{text}."
 
 
-KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "quanta_exposure", "bias")
+KEY_MAPS = ("read_noise_e", "conversion_gain", *CHARGE_RATES, "charge_per_level", "quanta_exposure", "bias")
 
 #: Ratio of an RMSE to that of sampling noise alone up to which a significant difference is small, and from
 #: which it is large.

@@ -885,7 +885,7 @@
     const every = Math.max(1, Math.ceil(s.limits.length / 18));
     s.limits.forEach(([k, dn], i) => {
       const from = i ? s.limits[i - 1][1] : s.low - 0.5;
-      if (k % every === 0) marks.push({ kind: "words", x: (from + dn) / 2, up: 0.9, text: k === 0 ? "k = 0" : String(k), align: "center", colour: "blue" });
+      if (k % every === 0) marks.push({ kind: "words", x: (from + dn) / 2, up: 0.9, text: String(k), align: "center", colour: "blue" });
     });
     return { height: 3, y: { label: s.all ? `${facts.samples} per DN` : "density", ends, log: s.logarithmic }, marks };
   };
@@ -924,7 +924,7 @@
     clearPlot = () => {};
     byId("inspector-caption").textContent = "";
     byId("inspector-counts").hidden = !s || !s.all;
-    if (!s) return;
+    if (!s?.all && !s?.curve.length) return; // of a model with effects the curve is stored with the histogram
     const panels = [densityPanel(s), ...(s.all ? [residualPanel(s)] : [])];
     const stack = { height: 76, x: { label: "signal (DN)", ends: [s.low - 0.5, s.high + 0.5], whole: true }, panels };
     clearPlot = window.pchemChart(byId("inspector-plot"), { widths: [1], stacks: [stack] }, describePlot(s));

@@ -221,10 +221,8 @@ def _input_text(sensor: SensorInfo) -> str:
 def _missing(name: str, sensor: SensorInfo, maps: Arrays, ensemble: Arrays, compared: bool) -> dict[str, str]:
     """Say why parts are left out."""
     found: dict[str, str] = {}
-    if not set(CHARGE_RATES) & maps.keys():
-        found["charge_rate"] = (
-            "no charge rate: input.against is not integration_time" if sensor.samples else NO_TIME
-        )
+    if not {*CHARGE_RATES, "charge_per_level"} & maps.keys():
+        found["charge_rate"] = "no charge rate: input.against is none" if sensor.samples else NO_TIME
     if not any(np.isfinite(values).any() for values in maps.values()):
         found["maps"] = "no pixel has a value"
     why = "no pixel has parameters" if "maps" in found else "the stage ensemble has no result"

@@ -11,6 +11,7 @@ from pchem_pipeline.model.checks.run_differences import (
     compare_maps,
     reasons_of_change,
 )
+from pchem_pipeline.model.fit.api import fit_histograms
 
 SHAPE = (100, 100)
 N = 10_000
@@ -191,3 +192,19 @@ def test_a_pixel_whose_likelihood_is_not_quadratic_is_no_change():
     found = compare_maps(maps, good, same_data=False, confirm=confirm)["bias"]
     assert found.n_changed == 0
     assert not reasons_of_change(found)
+
+
+def test_the_bias_of_the_estimates_in_runs_of_unlike_length_is_no_change():
+    """The read noise of one sensor, from 500 and from 2,000 frames: biased by some 3 standard errors / N."""
+    rng = np.random.default_rng(12)
+    runs = []
+    for frames in (500, 2000):
+        parts = [fit_histograms(*histograms(codes(rng, (N // 5, frames), 2.0, 8.0, 0.29))) for _ in range(5)]
+        noise = [np.concatenate([each.read_noise_dn for each in parts])]
+        noise.append(np.sqrt(np.concatenate([each.covariance[:, 3, 3] for each in parts])))
+        runs.append(tuple(values.reshape(SHAPE) for values in noise))
+    found = compared(*runs)
+    assert found.median_z == pytest.approx(3.0 * (1 / 500 - 1 / 2000) / np.sqrt(1 / 500 + 1 / 2000), abs=0.05)
+    assert reasons_of_change(found).shifted  # as in runs of one length
+    assert not reasons_of_change(found, (500, 2000))
+    assert reasons_of_change(compared(*two_captures(3, shift=0.3)), (500, 2000)).shifted

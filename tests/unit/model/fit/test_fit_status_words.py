@@ -90,7 +90,7 @@ def test_a_rival_is_of_bias_where_peaks_are_resolved_and_of_gain_where_they_over
 
 
 def test_flags_name_what_they_concern():
-    for name in ("quanta_exposure", "bias", "dark_current"):
+    for name in ("quanta_exposure", "bias", "dark_current", "spurious_charge", "dark_signal"):
         assert flags_of(name) == FLAGGED
     for name in ("conversion_gain", "read_noise_dn", "read_noise_e", "analog_read_noise_e"):
         assert flags_of(name) == FLAGGED & ~(FitStatus.BIAS_AMBIGUOUS | FitStatus.BIAS_UNSURE)

@@ -1,6 +1,7 @@
 """Charts: one description, and what paper and the page make of it."""
 
 import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 from urllib.parse import unquote
@@ -238,3 +239,11 @@ def test_axes_end_where_they_are_told_or_beyond_the_marks() -> None:
     # equal ends are none: the drawing follows the marks, without a warning
     same = Chart((Stack((Panel(Axis("y", low=1.0, high=1.0), (line,)),), Axis("x")),))
     assert np.diff(draw_chart(Look(), same).axes[0].get_ylim()) > 1.9
+
+
+def test_the_texts_of_an_x_axis_stand_apart() -> None:
+    """Six characters need 11 mm; a column has room for five of them and the space between."""
+    axis = Axis("conversion gain (e⁻/DN)", 0.1163, 0.1335)
+    look = Look(70.0, svg_text=True)
+    drawing = draw_chart(look, Chart((Stack((Panel(Axis("pixels", 0.0, 1.0), ()),), axis),)))
+    assert re.findall(r">(0\.1\d+)<", drawing_bytes(drawing, "svg").decode()) == ["0.120", "0.125", "0.130"]
