@@ -28,6 +28,7 @@ from typing import Literal, NamedTuple, TypeVar
 import numpy as np
 
 from pchem_pipeline.base.arrays import Float32Array
+from pchem_pipeline.effects.framework.evidence import Wave
 from pchem_pipeline.effects.types import AnyArray, FloatArray, IntArray
 from pchem_pipeline.model.arithmetic.significance import CERTAIN, FALSE_ALARM
 
@@ -351,19 +352,8 @@ _STRETCH = 128
 _FRAME_LIKE = 5
 
 
-@dataclass(frozen=True)
-class Line:
-    """A line of a spectrum."""
-
-    amplitude: float  # of the sine in the means, DN
-    along: float  # cycles per row (column)
-    per_frame: float  # cycles per frame; 0 for an incoherent line
-    phase: float  # of the sine at row (column) 0 of frame 0, rad; 0 for an incoherent line
-    excess: float  # logarithm of the inverse chance of such a power at any of the places
-
-
-def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:
-    """Return the highest line over frames and lines, or None where none stands out.
+def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Wave | None:
+    """Return the highest wave over frames and lines, as if these were rows, or None where none stands out.
 
     What is constant in time (part of the bias map), drifts (slower than three cycles per run) and alternation
     (half the frame rate) are taken away first. Means (n, lines), DN, with NaN for lines that do not count, of
@@ -390,8 +380,8 @@ def coherent_line(means: AnyArray, frames: IntArray, n_run: int) -> Line | None:
     return _refined(field, numbers, lines, start, (1.0 / length, 1.0 / n_lines), float(excess))
 
 
-def incoherent_line(means: AnyArray) -> Line | None:
-    """Return the highest line within frames, of means as in `coherent_line`, whose phase is new in each."""
+def incoherent_line(means: AnyArray) -> Wave | None:
+    """Return the highest wave within frames, of means as in `coherent_line`, whose phase is new in each."""
     field, lines = _prepared(means)
     if field.shape[0] < 16 or field.shape[1] < 8:
         return None
@@ -410,7 +400,7 @@ def incoherent_line(means: AnyArray) -> Line | None:
     peaks = _mean_power(field, lines, fine)
     best = int(peaks.argmax())
     amplitude = 2.0 * np.sqrt(max(float(peaks[best]) - level, 0.0) / lines.size)
-    return Line(float(amplitude), float(fine[best]), 0.0, 0.0, excess)
+    return Wave(float(amplitude), None, float(fine[best]), 0.0, 0.0, excess)
 
 
 def _prepared(means: AnyArray) -> tuple[FloatArray, IntArray]:
@@ -458,7 +448,7 @@ def _refined(
     start: tuple[float, float],
     width: tuple[float, float],
     excess: float,
-) -> Line:
+) -> Wave:
     """Return the line near a peak of the spectrum: ever finer grids around the best place."""
     (f_frame, f_line), (w_frame, w_line) = start, width
     steps = np.linspace(-1.0, 1.0, 9)
@@ -477,7 +467,7 @@ def _refined(
     if f_line == 0.0 and f_frame < 0.0:
         # along frames alone the negative frequency is the same line
         f_frame, phase = -f_frame, np.pi - phase
-    return Line(amplitude, _wrapped(f_line), _wrapped(f_frame), phase, excess)
+    return Wave(amplitude, _wrapped(f_frame), _wrapped(f_line), 0.0, phase, excess)
 
 
 def _wrapped(frequency: float) -> float:

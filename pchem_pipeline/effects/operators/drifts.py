@@ -485,7 +485,7 @@ class ExposureFlicker(Effect, tag="exposure_flicker"):
     def _sine(cls, profile: ExposureProfile, n_run: int) -> list[Self]:
         """Return a sine at the highest line of the spectrum, if one stands out."""
         line = coherent_line(profile.deviation[:, None], profile.frames, n_run)
-        if line is None or not 0.0 < line.per_frame < 1.0:
+        if line is None or line.per_frame is None or not 0.0 < line.per_frame < 1.0:
             return []
         rms = min(line.amplitude / 2.0**0.5, 1.0)
         cycles = line.phase / (2.0 * np.pi) % 1.0

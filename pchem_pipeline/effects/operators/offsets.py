@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -350,31 +350,25 @@ class PeriodicPickup(OffsetEffect, tag="periodic_pickup"):
         if evidence.time is None:
             return ()
         time, alpha = evidence.time, responsivity(evidence)
-        found: list[tuple[float, Self]] = []
-        for name, means in (("cycles_per_row", time.row_readout), ("cycles_per_column", time.column_readout)):
+        found = [(wave, mean_response(evidence)) for wave in time.waves if not wave.alternates]
+        for means in (time.row_readout, time.column_readout):
             line, loose = coherent_line(means, time.frames, time.n_run), incoherent_line(means)
-            if line is not None:
-                fields: dict[str, Any] = {name: line.along, "cycles_per_frame": line.per_frame}
-                fields |= {"amplitude_dn": line.amplitude / alpha, "phase": line.phase}
-                found.append((line.excess, cls(**fields)))
             # a phase that runs on explains all that a random one would
-            if loose is not None and (line is None or line.amplitude < 0.7 * loose.amplitude):
-                fields = {name: loose.along, "amplitude_dn": loose.amplitude / alpha, "random_phase": True}
-                found.append((loose.excess, cls(**fields)))
-        for wave in time.waves:
-            if wave.alternates:
-                continue
+            if line is not None and loose is not None and line.amplitude >= 0.7 * loose.amplitude:
+                loose = None
+            for wave in filter(None, (line, loose)):
+                across = wave._replace(per_row=0.0, per_column=wave.per_row)
+                found.append((wave if means is time.row_readout else across, alpha))
+        kept: list[Self] = []
+        for wave, response in sorted(found, key=lambda each: -each[0].excess):
             pickup = cls(
-                amplitude_dn=wave.amplitude / mean_response(evidence),
+                amplitude_dn=wave.amplitude / response,
                 cycles_per_row=wave.per_row,
                 cycles_per_column=wave.per_column,
                 cycles_per_frame=wave.per_frame or 0.0,
                 phase=0.0 if wave.per_frame is None else wave.phase,
                 random_phase=wave.per_frame is None,
             )
-            found.append((wave.excess, pickup))
-        kept: list[Self] = []
-        for _, pickup in sorted(found, key=lambda pair: -pair[0]):
             # rows and columns both see a line along frames alone
             places = [(p.cycles_per_row, p.cycles_per_column, p.cycles_per_frame) for p in (pickup, *kept)]
             if not any(np.allclose(places[0], other, rtol=0.0, atol=1e-4) for other in places[1:]):

@@ -23,8 +23,8 @@ from pchem_pipeline.discrepancy.by_simulation.measured.samples import (
     PartSamples,
     frames_apart,
 )
-from pchem_pipeline.effects.estimators.series import Line, coherent_line
-from pchem_pipeline.effects.framework.evidence import PixelMaps
+from pchem_pipeline.effects.estimators.series import coherent_line
+from pchem_pipeline.effects.framework.evidence import PixelMaps, Wave
 from pchem_pipeline.effects.operators.empirical_noise import (
     Changed,
     Cycles,
@@ -221,8 +221,8 @@ class _Change(NamedTuple):
         line = _line(sums, power, model) if key[1] in _WAVES else None
         if line is None:
             return cls(*key, sums, shape, power, gain, None)
-        along = round(line.along, 6)
-        wave = round(line.per_frame, 7), along * (key[0] == "row"), along * (key[0] == "column")
+        along = round(line.per_row, 6)
+        wave = round(line.per_frame or 0.0, 7), along * (key[0] == "row"), along * (key[0] == "column")
         gain = max(gain, line.excess)
         return cls(*key, sums, shape, power, gain, (wave, line.amplitude * root_mean_square(wave)))
 
@@ -282,10 +282,10 @@ def _shaped(one: Sums) -> tuple[Sums, tuple[tuple[float, ...], ...]]:
     return Sums((sums @ shape)[:, None], np.array([information @ shape**2]), one.numbers), blocks
 
 
-def _line(one: Sums, power: float, model: Sums) -> Line | None:
+def _line(one: Sums, power: float, model: Sums) -> Wave | None:
     """Return the wave that a change is for the most part; none that a model makes or whole frames share."""
     line, known = _highest_line(one), int(np.count_nonzero(one.information))
-    if line is None or (one.information.size > 1 and abs(line.along) * known < _SAME_PHASE):
+    if line is None or (one.information.size > 1 and abs(line.per_row) * known < _SAME_PHASE):
         return None
     made = _highest_line(model)
     if made is not None and made.amplitude > MADE * line.amplitude:
@@ -293,7 +293,7 @@ def _line(one: Sums, power: float, model: Sums) -> Line | None:
     return line if 0.5 * line.amplitude**2 > _MOST_OF_POWER * power else None
 
 
-def _highest_line(one: Sums) -> Line | None:
+def _highest_line(one: Sums) -> Wave | None:
     """Return the highest line of the changes that scores tell, over frames and lines."""
     known = one.information > 0.0
     means = np.where(known, one.sums / np.where(known, one.information, 1.0), np.nan)
