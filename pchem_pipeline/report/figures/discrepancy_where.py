@@ -55,14 +55,14 @@ _MOST_RINGS = 60
 
 
 _SCORE_WORDS = {
-    "C2": "charge: variance beyond Poisson (C2)",
-    "C3": "charge: skew beyond Poisson (C3)",
-    "He3": "readout: skew (He3)",
-    "He4": "readout: heavy tails (He4)",
-    "He2C1": "peaks widen with k (He2C1)",
-    "He1C2": "peak spacing grows with k (He1C2)",
-    "He2C2": "peak width grows faster at high k (He2C2)",
-    "He3C1": "peak skewness grows with k (He3C1)",
+    "C2": "charge: variance beyond Poisson",
+    "C3": "charge: skew beyond Poisson",
+    "He3": "readout: skew",
+    "He4": "readout: heavy tails",
+    "He2C1": "peaks widen with electron number",
+    "He1C2": "peak spacing grows with electron number",
+    "He2C2": "peak width grows faster at high electron numbers",
+    "He3C1": "peak skewness grows with electron number",
 }
 
 _PAIR_WORDS = {
@@ -169,8 +169,9 @@ class PixelMap(NamedTuple):
 
 
 def regions_of(data: DiscrepancyData) -> dict[str, Region]:
-    """Return by the name of a map the region that the verdict has for it, the most significant map first."""
-    placed = [each for each in data.found.where if each.region is not None and map_of(each.statistic)]
+    """Return by the name of a map the region that stands out in it, the most significant map first."""
+    # a statistic of a part is no test that it stands out
+    placed = [each for each in data.found.where if map_of(each.statistic) and each.region_p < 1.0]
     placed.sort(key=lambda each: each.region_p)
     found: dict[str, Region] = {}
     for each in placed:
