@@ -168,18 +168,19 @@ class PixelMap(NamedTuple):
     region: Region | None = None  # deviating part of the sensor; None: uniform
 
 
-def regions_of(data: DiscrepancyData) -> dict[str, Region]:
-    """Return by the name of a map the region that stands out in it, the most significant map first."""
-    # a statistic of a part is no test that it stands out
-    placed = [each for each in data.found.where if map_of(each.statistic) and each.region_p < 1.0]
-    placed.sort(key=lambda each: each.region_p)
-    found: dict[str, Region] = {}
+def regions_of(data: DiscrepancyData) -> dict[str, Region | None]:
+    """Return maps that deviate in a region, by name, the most significant first; None: elsewhere as much."""
+    placed = [each for each in data.found.where if each.region is not None and map_of(each.statistic)]
+    # a statistic of a part has no p-value of its region: it is not known to stand out
+    placed.sort(key=lambda each: each.region_p if math.isfinite(each.region_p) else 1.0)
+    found: dict[str, Region | None] = {}
     for each in placed:
-        found.setdefault(map_of(each.statistic), Region.model_validate(each.region))
+        outlined = math.isfinite(each.region_p)
+        found.setdefault(map_of(each.statistic), Region.model_validate(each.region) if outlined else None)
     return found
 
 
-def largest_maps(arrays: Arrays, regions: Mapping[str, Region] | None = None) -> list[PixelMap]:
+def largest_maps(arrays: Arrays, regions: Mapping[str, Region | None] | None = None) -> list[PixelMap]:
     """Return three maps: any with a deviating region, then goodness of fit, then the most deviating ones."""
     regions = regions or {}
     named = _named_maps(arrays)

@@ -303,7 +303,8 @@ def test_a_map_with_a_place_comes_first_with_its_outline(end: int) -> None:
     assert place_text(place) == f"mainly in columns {x + 3} to {x + end - 1}"
     assert place_text(place) in figure.alt
     part = Place.of("space.x.rr@columns=3:7", 20.0, region={"columns": [[3, 7]]})  # not tested to stand out
-    assert not regions_of(replace(data, found=found.model_copy(update={"where": (part,)})))
+    shown = regions_of(replace(data, found=found.model_copy(update={"where": (part,)})))
+    assert shown == {"x.rr": None}  # drawn without its outline
     # two edges of each row and two of each column
     rows, columns = first.z.shape
     assert outlined(figure) == 2 * rows + 2 * (min(end, columns) - 3)
